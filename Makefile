@@ -1,0 +1,37 @@
+# make demo   simulate a traverse, run the real graph over DDS on it, write results/latest
+# make test   the whole test suite
+# make lint   ruff and mypy
+.PHONY: demo test lint install clean
+SHELL := /bin/bash
+
+VENV ?= .venv
+SEED ?= 1
+DEMO ?=
+PYTHON ?= $(shell for p in python3.12 python3.11 python3; do $$p -c 'import sys; sys.exit(not (3,11) <= sys.version_info[:2] <= (3,12))' 2>/dev/null && echo $$p && break; done)
+BIN := $(VENV)/bin
+
+demo: install
+	@$(BIN)/umf demo --seed $(SEED) $(DEMO)
+
+test: install
+	@$(BIN)/python -m pytest
+
+lint: install
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+install: $(VENV)/.installed
+
+# requirements first: they change rarely and take the time
+$(VENV)/.installed: requirements.txt requirements-dev.txt setup.py setup.cfg pyproject.toml
+	@test -n "$(PYTHON)" || { echo "make: Python 3.11 or 3.12 is needed (set PYTHON=...)" >&2; exit 1; }
+	@./tools/system_packages.sh
+	@test -x $(BIN)/python || { echo "Making $(VENV) with $$($(PYTHON) --version)"; $(PYTHON) -m venv $(VENV); }
+	@echo "Installing the requirements (one to three minutes the first time)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+clean:
+	rm -rf build install log results data *.egg-info

@@ -1,0 +1,146 @@
+"""Simulated drives with known poses, as frames for the detector, from shards or made on the spot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from umf_ros.frames import Frame, Image, StereoCamera
+from umf_ros.geometry import Array, make_pose, relative, rotation_angle, transform
+from umf_ros.sensors.calibration import Calibration, load_calibration
+from umf_ros.simulation.camera import TRAINING_SIZE, resized
+from umf_ros.simulation.families import FAMILIES
+from umf_ros.simulation.passes import SETTINGS, plan_passes
+from umf_ros.simulation.shards import Survey
+from umf_ros.simulation.world import World, ground
+from umf_ros.verification.lifting import project
+
+SPEED_M_S = 1.0
+SCALE_ERROR, TURN_ERROR_RAD_M = 0.01, 0.001  # of the odometry, per metre driven
+DEPTH_STRIDE = 4
+FAR_M = 40.0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Frames of one world in the order they were taken.
+
+    Attributes:
+        name: seed, family and aliasing.
+        frames: with odometry that drifts.
+        truth: (N, 4, 4) `world_T_body`.
+        depths: (N, 56, 56) metres along the optical axis, 0 for sky.
+    """
+
+    name: str
+    frames: list[Frame]
+    truth: Array
+    depths: Array
+
+    def overlap(self, query: int, match: int) -> float:
+        """Share of what the query's camera sees (nearer than 40 m) that the match's camera sees too."""
+        camera, body_T_camera = self.frames[query].camera, self.frames[query].body_T_camera
+        seen, points = _unproject(self.depths[query], camera, body_T_camera)
+        if not seen:
+            return 0.0
+        pixels, depth = project(
+            transform(relative(self.truth[match], self.truth[query]), points), camera, body_T_camera
+        )
+        cells = np.floor(pixels / DEPTH_STRIDE).astype(int)
+        inside = (depth > 0.5) & (cells >= 0).all(axis=1) & (cells < self.depths.shape[1]).all(axis=1)
+        there = self.depths[match][cells[inside, 1], cells[inside, 0]].astype(float)
+        return float((np.abs(there - depth[inside]) < 0.1 * depth[inside] + 0.3).sum()) / seen
+
+    def error(self, query: int, match: int, match_T_query: Array) -> tuple[float, float]:
+        """Distance in metres and angle in degrees of an estimated pose from the truth."""
+        gap = relative(relative(self.truth[match], self.truth[query]), match_T_query)
+        return float(np.linalg.norm(gap[:3, 3])), float(np.degrees(rotation_angle(gap)))
+
+    def error_vector(self, query: int, match: int, match_T_query: Array) -> Array:
+        """Error (6,) in ROS order, axes of the match."""
+        true = relative(self.truth[match], self.truth[query])
+        turn = Rotation.from_matrix(match_T_query[:3, :3] @ true[:3, :3].T).as_rotvec()
+        return np.concatenate([match_T_query[:3, 3] - true[:3, 3], turn])
+
+
+def load_shard(path: Path) -> Drive:
+    """A training or validation shard as a drive."""
+    with np.load(path) as shard:
+        facts = {name: float(shard[name]) for name in ("fx", "fy", "cx", "cy", "baseline")}
+        camera = StereoCamera(int(shard["width"]), int(shard["height"]), **facts)
+        calibration = replace(load_calibration("simulated"), camera=camera, body_T_camera=shard["body_T_camera"])
+        truth = shard["world_T_body"].astype(float)
+        images, points, depths, seed = shard["images"], shard["points"], shard["depth"], int(shard["seed"])
+        name = f"{seed} {shard['family']} {float(shard['aliasing']):g}"
+    frames = _frames(images, points, truth, calibration, seed)
+    return Drive(name, frames, truth, depths)
+
+
+def simulate(seed: int, family: str, aliasing: float, step_m: float = 1.6, setting: str = "hard") -> Drive:
+    """Three passes through a fresh world: the second and third with offsets, turned headings and another sun."""
+    chosen = replace(SETTINGS[setting], aliasing=aliasing)
+    trail = ground(seed, family, aliasing).trail
+    passes = plan_passes(trail, ("first", "offset", "offset"), chosen, step_m, seed)
+    world = World(seed, family, aliasing, np.concatenate([drive.path for drive in passes]))
+    calibration = load_calibration("simulated")
+    samples = list(Survey(world, passes, calibration))
+    truth = np.array([sample.world_T_body for sample in samples], float)
+    frames = _frames([sample.image for sample in samples], [s.points for s in samples], truth, calibration, seed)
+    return Drive(f"{seed} {family} {aliasing:g}", frames, truth, np.array([sample.depth for sample in samples]))
+
+
+def test_worlds(count: int, seed: int) -> Iterator[tuple[int, str, float]]:
+    """Seeds, families and aliasing of unseen worlds: families in turn, every second one repeats itself fully."""
+    for number in range(count):
+        yield 20_000 + (100 * seed + number) % 10_000, FAMILIES[number % len(FAMILIES)], (1.0, 0.6)[number % 2]
+
+
+def _frames(
+    images: Iterable[Image], points: Iterable[Any], truth: Array, calibration: Calibration, seed: int
+) -> list[Frame]:
+    camera = resized(calibration.camera, *TRAINING_SIZE)
+    travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
+    odometry = _drifting(truth, np.random.default_rng([seed, 17]))
+    frames = []
+    for image, cloud, distance, odom in zip(images, points, travelled, odometry, strict=True):
+        returns = cloud[np.isfinite(cloud[:, 0])].astype(np.float32)
+        frames.append(
+            Frame(
+                stamp_ns=10**9 + round(distance / SPEED_M_S * 1e9),
+                camera=camera,
+                body_T_camera=calibration.body_T_camera,
+                body_T_lidar=calibration.body_T_lidar,
+                left=image,
+                points=returns[:, :3],
+                intensity=returns[:, 3],
+                odom_T_body=odom,
+            )
+        )
+    return frames
+
+
+def _drifting(truth: Array, rng: np.random.Generator) -> list[Array]:
+    """Odometry: every step a little too long or short and turned, with a bias of its own for the whole drive."""
+    scale, bias = 1 + SCALE_ERROR * rng.standard_normal(), TURN_ERROR_RAD_M * rng.standard_normal(3)
+    odometry = [truth[0]]
+    for before, after in pairwise(truth):
+        step = relative(before, after)
+        length = float(np.linalg.norm(step[:3, 3]))
+        turn = length * bias + np.sqrt(length) * TURN_ERROR_RAD_M * rng.standard_normal(3)
+        moved = make_pose(step[:3, :3] @ Rotation.from_rotvec(turn).as_matrix(), scale * step[:3, 3])
+        odometry.append(odometry[-1] @ moved)
+    return odometry
+
+
+def _unproject(depths: Array, camera: StereoCamera, body_T_camera: Array) -> tuple[int, Array]:
+    rows, columns = np.nonzero((depths > 0.5) & (depths < FAR_M))
+    depth = depths[rows, columns].astype(float)
+    u, v = columns * DEPTH_STRIDE + DEPTH_STRIDE // 2, rows * DEPTH_STRIDE + DEPTH_STRIDE // 2
+    ray = np.column_stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))])
+    return len(depth), transform(body_T_camera, ray * depth[:, None])

@@ -1,0 +1,228 @@
+"""How well the pose graph resists wrong closures, and what it costs.
+
+`python benchmarks/pose_graph.py [--quick] [--seed N] [--json FILE] [FILES.g2o ...]`
+
+Generated graphs and, if given, g2o files (their closures count as right) get 0 to 50 % wrong
+closures: far at random, in groups that agree with each other, and as such groups to similar places
+close by. Times are CPU time of this process, which is wall time on a quiet core and does not depend
+on what else the machine does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from umf_ros.config import PoseGraph as Settings
+from umf_ros.geometry import Array
+from umf_ros.pose_graph import lie
+from umf_ros.pose_graph.closures import State
+from umf_ros.pose_graph.condensed import Edge, between
+from umf_ros.pose_graph.g2o import read_g2o
+from umf_ros.pose_graph.graph import PoseGraph
+from umf_ros.pose_graph.replay import PERIOD_NS, as_recording
+from umf_ros.pose_graph.synthetic import WORLDS, Kind, World, WorldClosure, rover_loops, with_wrong_closures
+
+FIRST_SEED = 20_000
+MOST_CLOSURES_OF_A_FILE = 1500
+MOST_SOLUTIONS_OF_A_FILE = 150
+SETTINGS = Settings(keyframe_spacing_m=1e-6, max_gap_s=1.5, estimate_scale=True, max_closure_m=1e7)
+KINDS: tuple[Kind, ...] = ("random", "groups", "near")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One run: shares of closures, RMS position error in metres, seconds of CPU per event."""
+
+    precision: float
+    recall: float
+    error_m: float
+    transient_wrong: float
+    seconds: Array
+
+
+def drive(
+    world: World, reference: Array, stated: float = 1.0, settings: Settings = SETTINGS, batch: int = 1
+) -> Outcome:
+    """Feed a world in order; `stated` multiplies the odometry's stated standard deviations."""
+    graph, vertex, seconds, wrong_events = PoseGraph(settings), 0, [], 0
+    right = {(c.first * PERIOD_NS, c.second * PERIOD_NS): c.right for c in world.closures}
+    for start in range(0, len(world.closures), batch):
+        rows = range(start, min(start + batch, len(world.closures)))
+        vertex = feed_odometry(graph, world, vertex, world.closures[rows[-1]].second + 1, stated)
+        before = time.process_time()
+        graph.add_closures([world.message(row) for row in rows])
+        graph.map_T_odom()
+        seconds.append(time.process_time() - before)
+        wrong_events += not all(judged(graph, right))
+    feed_odometry(graph, world, vertex, len(world.truth), stated)
+    graph.settle()
+    accepted = judged(graph, right)
+    stamps, poses = graph.trajectory()
+    error = poses[:, :3, 3] - reference[stamps // PERIOD_NS, :3, 3]
+    return Outcome(
+        sum(accepted) / max(len(accepted), 1),
+        sum(accepted) / max(sum(right.values()), 1),
+        float(np.sqrt((error**2).sum(axis=1).mean())),
+        wrong_events / max(len(seconds), 1),
+        np.array(seconds),
+    )
+
+
+def feed_odometry(graph: PoseGraph, world: World, start: int, end: int, stated: float) -> int:
+    for k in range(start, end):
+        if k and k in world.chains:
+            graph.begin_session()
+        covariance = world.step_covariance(k)
+        graph.add_odometry(k * PERIOD_NS, world.odometry[k], None if covariance is None else covariance * stated**2)
+    return max(start, end)
+
+
+def judged(graph: PoseGraph, right: dict[tuple[int, int], bool]) -> list[bool]:
+    """Whether each accepted closure is right."""
+    accepted = [v.closure for v in graph.closures() if v.state is State.ACCEPTED]
+    return [right[c.match_stamp_ns, c.query_stamp_ns] for c in accepted]
+
+
+def batch_optimum(world: World, initial: Array) -> tuple[Array, float]:
+    """(N, 4, 4) Levenberg-Marquardt optimum of odometry and right closures, and its seconds of CPU."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    steps = lie.invert(world.odometry[:-1]) @ world.odometry[1:]
+    for k, pose in enumerate(initial):
+        values.insert(k, gtsam.Pose3(pose))
+        if k not in world.chains:
+            graph.add(between(Edge(k - 1, k, steps[k - 1], world.step_covariances[k])))
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(world.odometry[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    for closure in world.closures:
+        if closure.right:
+            graph.add(between(Edge(closure.first, closure.second, closure.pose, closure.covariance)))
+    before = time.process_time()
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
+    seconds = time.process_time() - before
+    return np.stack([result.atPose3(k).matrix() for k in range(len(initial))]), seconds
+
+
+def optimum_near_truth(world: World) -> Array:
+    """The outlier-free optimum, reached to the last digit by starting again from where it was found."""
+    poses = world.truth
+    for _ in range(3):
+        poses, _ = batch_optimum(world, poses)
+    return poses
+
+
+def generated(seed: int, quick: bool) -> Iterator[tuple[str, World]]:
+    sizes = {
+        "rover": [400] if quick else [400, 5000],
+        "sphere": [400 if quick else 1000],
+        "garage": [500 if quick else 1000],
+    }
+    for offset in range(1 if quick else 5):
+        for name, own_sizes in sizes.items():
+            for size in own_sizes:
+                yield f"{name} {size} seed {seed + offset}", WORLDS[name](size, seed + offset)
+
+
+def from_file(path: Path) -> World:
+    """A g2o file as a world whose truth is its own optimum."""
+    recording = as_recording(read_g2o(path))
+    chosen = np.unique(np.linspace(0, len(recording.closures) - 1, MOST_CLOSURES_OF_A_FILE).astype(int))
+    edges = [recording.closures[row] for row in chosen] if len(recording.closures) else []
+    closures = [WorldClosure(e.first, e.second, e.pose, e.covariance, True) for e in edges]
+    world = World(recording.odometry, recording.odometry, recording.steps, closures, tuple(recording.chains))
+    graph = PoseGraph(SETTINGS.model_copy(update={"use_gate": False, "use_support": False, "estimate_scale": False}))
+    feed_odometry(graph, world, 0, len(world.truth), 1.0)
+    graph.add_closures([world.message(row) for row in range(len(closures))])
+    graph.settle()
+    stamps, poses = graph.trajectory()
+    truth = recording.odometry.copy()
+    truth[stamps // PERIOD_NS] = poses
+    return replace(world, truth=truth)
+
+
+def resist(worlds: list[tuple[str, World]], quick: bool, console: Console) -> dict[str, float]:
+    """Every cell of wrong closures, rightly stated and mis-stated odometry."""
+    table = Table("graph", "wrong closures", "stated sigma", "precision", "recall", "error m", "wrong in map")
+    plain: list[Outcome] = []
+    misscaled: list[Outcome] = []
+    shares = (0.5,) if quick else (0.1, 0.3, 0.5)
+    for name, world in track(worlds, "Wrong closures", console=console, transient=True):
+        reference = optimum_near_truth(world)
+        batch = max(1, len(world.closures) // MOST_SOLUTIONS_OF_A_FILE) if name.startswith("file") else 1
+        cells: list[tuple[float, Kind, float]] = [(0.0, "random", 1.0)]
+        cells += [(share, kind, 1.0) for kind in KINDS for share in shares]
+        if not name.startswith("file"):
+            cells += [(share, kind, stated) for kind in KINDS for share in (shares[-1],) for stated in (1 / 3, 3.0)]
+        for share, kind, stated in cells:
+            trial = with_wrong_closures(world, share, kind, 1) if share else world
+            outcome = drive(trial, reference, stated, batch=batch)
+            (plain if stated == 1 else misscaled).append(outcome)
+            numbers = (outcome.precision, outcome.recall, outcome.error_m, outcome.transient_wrong)
+            label = f"{share:.0%} {kind}" if share else "none"
+            table.add_row(name, label, f"x {stated:.2f}", *(f"{number:.3f}" for number in numbers))
+    console.print(table)
+    return {
+        "precision_worst": min(outcome.precision for outcome in plain),
+        "recall_worst": min(outcome.recall for outcome in plain),
+        "error_worst_m": max(outcome.error_m for outcome in plain),
+        "transient_wrong_share_worst": max(outcome.transient_wrong for outcome in plain),
+        "misscaled_error_worst_m": max((outcome.error_m for outcome in misscaled), default=0.0),
+        "misscaled_precision_worst": min((outcome.precision for outcome in misscaled), default=1.0),
+    }
+
+
+def cost(seed: int, console: Console) -> dict[str, float]:
+    """Milliseconds per event over the last fifth of drives of 1,000, 5,000 and 10,000 poses, 30 % grouped wrong."""
+    table = Table("poses", "events", "p50 ms", "p95 ms", "full LM ms", "ratio")
+    medians: dict[int, float] = {}
+    result: dict[str, float] = {}
+    for size in track((1000, 5000, 10000), "Cost", console=console, transient=True):
+        world = with_wrong_closures(rover_loops(size, seed), 0.3, "groups", 1)
+        seconds = drive(world, world.truth).seconds
+        late = 1e3 * seconds[[closure.second >= 0.8 * size for closure in world.closures]]
+        p50, p95 = np.percentile(late, [50, 95])
+        full = 1e3 * min(batch_optimum(world, world.odometry)[1] for _ in range(3))
+        medians[size] = float(p50)
+        table.add_row(str(size), str(len(late)), f"{p50:.1f}", f"{p95:.1f}", f"{full:.0f}", f"{p50 / full:.3f}")
+        if size == 5000:
+            result = {"event_ms_p50_5k": float(p50), "event_ms_p95_5k": float(p95), "ratio_to_lm_5k": float(p50 / full)}
+    console.print(table)
+    return result | {"growth_1k_10k": medians[10000] / medians[1000]}
+
+
+def equality(worlds: list[tuple[str, World]]) -> dict[str, float]:
+    """Largest RMS distance to the batch optimum in mm with nothing wrong and everything accepted."""
+    settings = SETTINGS.model_copy(update={"use_gate": False, "use_support": False, "estimate_scale": False})
+    errors = [drive(world, optimum_near_truth(world), settings=settings, batch=20).error_m for _, world in worlds]
+    return {"batch_equality_mm": 1e3 * max(errors)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", nargs="*", type=Path, help="g2o files to try as well")
+    parser.add_argument("--quick", action="store_true", help="fewer and smaller graphs")
+    parser.add_argument("--seed", type=int, default=FIRST_SEED, help="seed of the first generated graph")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    arguments = parser.parse_args()
+    console = Console()
+    worlds = list(generated(arguments.seed, arguments.quick))
+    files = [(f"file {path.name}", from_file(path)) for path in arguments.files]
+    figures = resist(worlds + files, arguments.quick, console)
+    figures |= cost(arguments.seed, console) | equality(worlds[:3])
+    for name, value in figures.items():
+        console.print(f"{name:32s} {value:.4g}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

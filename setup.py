@@ -1,0 +1,41 @@
+"""ament_python package: everything a Jazzy workspace or a plain venv needs."""
+
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = "umf_ros"
+
+
+def shared(folder: str) -> list[tuple[str, list[str]]]:
+    """Data files of a folder and its subfolders, under share/umf_ros."""
+    folders = [Path(folder), *sorted(path for path in Path(folder).rglob("*") if path.is_dir())]
+    files = {path: [name for name in glob(f"{path}/*") if Path(name).is_file()] for path in folders}
+    return [(f"share/{PACKAGE}/{path}", names) for path, names in files.items() if names]
+
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        *shared("config"),
+        *shared("launch"),
+        *shared("models"),
+    ],
+    python_requires=">=3.11",
+    zip_safe=True,
+    description="Multimodal place recognition and loop closure for rovers with a camera and a LiDAR",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "umf = umf_ros.cli:main",
+            "loop_closure_node = umf_ros.nodes.loop_closure_node:main",
+            "pose_graph_node = umf_ros.nodes.pose_graph_node:main",
+            "bag_player_node = umf_ros.nodes.bag_player_node:main",
+        ],
+    },
+)

@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import (
+    CLOUD,
+    LEFT,
+    ODOMETRY,
+    RIGHT,
+    START_NS,
+    cloud,
+    drive,
+    image,
+    scan,
+    small_settings,
+    traverse,
+    write_db3,
+    write_mcap,
+    write_ros1,
+)
+from rosbags.typesys import Stores, get_typestore
+
+from umf_ros.bags.frames import FrameReader, read_frames
+from umf_ros.bags.images import read_left_images
+from umf_ros.bags.presets import TOPICS, detect_dataset
+from umf_ros.bags.reader import open_bag
+from umf_ros.bags.trajectories import Trajectory
+from umf_ros.config import load_settings
+from umf_ros.errors import BagError
+
+ENTRIES = traverse(3.0)
+SCANS = int(3.0 * 4.7)
+
+
+def test_a_recording_becomes_one_frame_per_scan(tmp_path: Path) -> None:
+    bag = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES))
+    told: list[str] = []
+    reader = FrameReader(bag, small_settings(tmp_path), warn=told.append)
+    frames = list(reader)
+    assert len(frames) == SCANS and told == []
+    assert reader.progress == pytest.approx(1)
+    for frame in frames:
+        assert frame.left is not None and frame.points is not None and frame.odom_T_body is not None
+        assert np.allclose(frame.odom_T_body, drive((frame.stamp_ns - START_NS) / 1e9), atol=1e-3)
+    assert sum(frame.right is not None for frame in frames) > SCANS // 2
+    assert {name: counter.lost for name, counter in reader.counters.items()} == dict.fromkeys(reader.counters, 0)
+
+
+def test_the_format_does_not_matter(tmp_path: Path) -> None:
+    settings = small_settings(tmp_path)
+    first = list(read_frames(open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), settings))
+    second = list(read_frames(open_bag(write_db3(tmp_path / "b", ENTRIES)), settings))
+    assert [(f.stamp_ns, f.image_stamp_ns) for f in first] == [(f.stamp_ns, f.image_stamp_ns) for f in second]
+    assert all(np.array_equal(a.points, b.points) for a, b in zip(first, second, strict=True))
+
+
+def test_topics_that_are_missing_are_not_waited_for(tmp_path: Path) -> None:
+    entries = [entry for entry in ENTRIES if entry[0] in (LEFT, CLOUD)]
+    reader = FrameReader(open_bag(write_mcap(tmp_path / "a.mcap", entries)), small_settings(tmp_path))
+    stamps = [frame.stamp_ns for frame in reader]
+    assert len(stamps) == SCANS
+    images = [entry for entry in ENTRIES if entry[0] in (LEFT, RIGHT)]
+    frames = list(FrameReader(open_bag(write_mcap(tmp_path / "b.mcap", images)), small_settings(tmp_path)))
+    assert len(frames) == 90 and all(frame.points is None for frame in frames)
+
+
+def test_odometry_can_come_from_a_file(tmp_path: Path) -> None:
+    entries = [entry for entry in ENTRIES if entry[0] != ODOMETRY]
+    seconds = np.arange(0, 4, 0.1)
+    path = Trajectory(START_NS + np.round(seconds * 1e9).astype(np.int64), np.stack([drive(s) for s in seconds]))
+    bag = open_bag(write_mcap(tmp_path / "a.mcap", entries))
+    frames = list(read_frames(bag, small_settings(tmp_path), path))
+    assert len(frames) == SCANS
+    for frame in frames:
+        assert frame.odom_T_body is not None
+        assert np.allclose(frame.odom_T_body, drive((frame.stamp_ns - START_NS) / 1e9), atol=2e-3)
+
+
+def test_odometry_of_another_recording_is_said(tmp_path: Path) -> None:
+    path = Trajectory(np.array([1, 2]) * 10**9, np.stack([np.eye(4), np.eye(4)]))
+    bag = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES))
+    with pytest.raises(BagError, match="covers none of the recording"):
+        FrameReader(bag, small_settings(tmp_path), path)
+
+
+def test_bad_messages_are_skipped_counted_and_told_once(tmp_path: Path) -> None:
+    bad = [
+        (LEFT, START_NS + i * 10**8, image(START_NS + i * 10**8, np.zeros((48, 64), np.uint8), "yuv422"))
+        for i in range(9)
+    ]
+    bag = open_bag(write_mcap(tmp_path / "a.mcap", sorted([*ENTRIES, *bad], key=lambda entry: entry[1])))
+    told: list[str] = []
+    reader = FrameReader(bag, small_settings(tmp_path), warn=told.append)
+    assert len(list(reader)) == SCANS
+    assert reader.counters["left"].dropped["encoding"] == 9
+    assert len(told) == 1 and "yuv422" in told[0]
+
+
+def test_a_recording_that_breaks_off_is_used_and_said(tmp_path: Path) -> None:
+    whole = write_mcap(tmp_path / "a.mcap", ENTRIES).read_bytes()
+    path = tmp_path / "broken.mcap"
+    path.write_bytes(whole[: len(whole) * 2 // 3])
+    told: list[str] = []
+    frames = list(FrameReader(open_bag(path), small_settings(tmp_path), warn=told.append))
+    assert SCANS // 3 < len(frames) < SCANS
+    assert len(told) == 1 and "breaks off" in told[0]
+
+
+def test_a_recording_without_sensors_is_refused(tmp_path: Path) -> None:
+    bag = open_bag(write_mcap(tmp_path / "a.mcap", [entry for entry in ENTRIES if entry[0] == ODOMETRY]))
+    with pytest.raises(BagError, match="neither images nor scans"):
+        FrameReader(bag, small_settings(tmp_path))
+
+
+def test_images_of_chosen_frames(tmp_path: Path) -> None:
+    settings = small_settings(tmp_path)
+    bag = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES))
+    frames = list(read_frames(bag, settings))
+    images = read_left_images(bag, settings, {frames[2].stamp_ns, frames[9].stamp_ns, 17})
+    assert set(images) == {frames[2].stamp_ns, frames[9].stamp_ns}
+    assert np.array_equal(images[frames[9].stamp_ns], frames[9].left)
+
+
+def test_a_topic_of_another_type_is_refused(tmp_path: Path) -> None:
+    odometry = next(message for topic, _, message in ENTRIES if topic == ODOMETRY)
+    bag = open_bag(write_mcap(tmp_path / "a.mcap", [(LEFT, START_NS, odometry)]))
+    with pytest.raises(BagError, match="is of type nav_msgs/msg/Odometry, expected sensor_msgs/msg/Image"):
+        FrameReader(bag, small_settings(tmp_path))
+
+
+def test_bytes_that_are_no_message_are_skipped_and_counted(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", ENTRIES, garble=lambda i, topic: topic == CLOUD and i % 3 == 0)
+    told: list[str] = []
+    reader = FrameReader(open_bag(path), small_settings(tmp_path), warn=told.append)
+    frames = list(reader)
+    garbled = reader.counters["cloud"].dropped["undecodable"]
+    assert garbled > 2 and len(frames) == SCANS - garbled
+    assert len(told) == 1 and "not what its type" in told[0]
+    with pytest.raises(BagError, match=f"{path}: {CLOUD}: message is not what its type"):
+        list(open_bag(path).messages())
+
+
+def test_raw_bayer_images_of_vulcano_arrive_rectified(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    left, right = TOPICS["s3li-vulcano"].left_image, TOPICS["s3li-vulcano"].right_image
+    pixels = np.full((1544, 2064), 90, np.uint8)
+    entries = []
+    for i in range(3):
+        stamp = START_NS + i * 100_000_000
+        entries += [(topic, stamp, image(stamp, pixels, "bayer_rggb8", store)) for topic in (left, right)]
+    points = np.random.default_rng(1).uniform((-5, 5, -2), (5, 15, 2), (50, 3))
+    entries.append((CLOUD, START_NS + 90_000_000, cloud(START_NS + 90_000_000, scan(points), store)))
+    bag = open_bag(write_ros1(tmp_path / "a.bag", sorted(entries, key=lambda entry: entry[1])))
+    (frame,) = FrameReader(bag, load_settings(dataset=detect_dataset(bag)))
+    assert frame.stamp_ns == START_NS + 90_000_000 and frame.image_stamp_ns == START_NS + 100_000_000
+    assert frame.left is not None and frame.right is not None and frame.points is not None
+    assert frame.left.shape == frame.right.shape == (512, 688) == (frame.camera.height, frame.camera.width)
+    assert np.abs(frame.left.astype(int) - 90).max() <= 1
+    assert frame.camera.baseline == pytest.approx(0.0892, abs=1e-4)

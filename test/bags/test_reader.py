@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from recordings import (
+    CLOUD,
+    LEFT,
+    ODOMETRY,
+    START_NS,
+    STORE,
+    TRUTH,
+    image,
+    traverse,
+    write_db3,
+    write_mcap,
+    write_ros1,
+)
+from rosbags.typesys import Stores, get_typestore
+
+from umf_ros.bags.presets import TOPICS, detect_dataset, topics_of
+from umf_ros.bags.reader import open_bag
+from umf_ros.config import load_settings
+from umf_ros.errors import BagError
+from umf_ros.sensors.messages import decode_cloud, decode_image, decode_odometry, stamp_ns
+
+ENTRIES = traverse(1.0)
+
+
+def write_mcap_folder(path: Path) -> Path:
+    """As `ros2 bag record` leaves it when it splits: x_9.mcap before x_10.mcap, and metadata.yaml."""
+    path.mkdir()
+    write_mcap(path / "run_9.mcap", ENTRIES[: len(ENTRIES) // 2])
+    write_mcap(path / "run_10.mcap", ENTRIES[len(ENTRIES) // 2 :])
+    (path / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": {"version": 9}}))
+    return path
+
+
+def write_db3_file(path: Path) -> Path:
+    (file,) = write_db3(path, ENTRIES).glob("*.db3")
+    return file
+
+
+def write_db3_without_metadata(path: Path) -> Path:
+    (write_db3(path, ENTRIES) / "metadata.yaml").unlink()
+    return path
+
+
+FORMATS: dict[str, Callable[[Path], Path]] = {
+    "mcap": lambda folder: write_mcap(folder / "a.mcap", ENTRIES),
+    "mcap folder": lambda folder: write_mcap_folder(folder / "run"),
+    "db3 folder": lambda folder: write_db3(folder / "b", ENTRIES),
+    "db3 file": lambda folder: write_db3_file(folder / "b"),
+    "db3 without metadata": lambda folder: write_db3_without_metadata(folder / "b"),
+    "ROS 1": lambda folder: write_ros1(folder / "c.bag", traverse(1.0, get_typestore(Stores.ROS1_NOETIC))),
+}
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_every_format_gives_the_same_messages_in_the_same_order(form: str, tmp_path: Path) -> None:
+    bag = open_bag(FORMATS[form](tmp_path))
+    read = list(bag.messages())
+    assert [(topic, log_ns) for topic, log_ns, _ in read] == [(topic, log_ns) for topic, log_ns, _ in ENTRIES]
+    for (topic, _, got), (_, _, put) in zip(read, ENTRIES, strict=True):
+        if topic == LEFT:
+            assert (decode_image(got) == decode_image(put)).all()
+        elif topic == CLOUD:
+            assert (decode_cloud(got).points == decode_cloud(put).points).all()
+        elif topic == ODOMETRY:
+            assert np.allclose(decode_odometry(got).odom_T_body, decode_odometry(put).odom_T_body)
+        assert stamp_ns(got) == stamp_ns(put)
+    assert {topic: info.count for topic, info in bag.topics.items()} == {
+        topic: sum(entry[0] == topic for entry in ENTRIES) for topic in {entry[0] for entry in ENTRIES}
+    }
+    assert bag.topics[LEFT].type == "sensor_msgs/msg/Image"
+    assert (bag.start_ns, bag.end_ns) == (ENTRIES[0][1], ENTRIES[-1][1])
+    assert bag.duration_s == pytest.approx((ENTRIES[-1][1] - ENTRIES[0][1]) / 1e9)
+    assert bag.warning == ""
+
+
+@pytest.mark.parametrize("form", ["mcap", "db3 folder", "ROS 1"])
+def test_topics_can_be_chosen_and_read_again(form: str, tmp_path: Path) -> None:
+    bag = open_bag(FORMATS[form](tmp_path))
+    for _ in range(2):
+        assert {topic for topic, _, _ in bag.messages([CLOUD, "/not/there"])} == {CLOUD}
+    assert list(bag.messages(["/not/there"])) == []
+    raw = next(bag.raw_messages([CLOUD]))
+    assert (raw.type, type(raw.data)) == ("sensor_msgs/msg/PointCloud2", bytes)
+    assert stamp_ns(STORE.deserialize_cdr(raw.data, raw.type)) == START_NS
+
+
+@pytest.mark.parametrize("part", [0.3, 0.9, 0.999])
+def test_truncated_mcap_is_read_as_far_as_it_goes(part: float, tmp_path: Path) -> None:
+    whole = write_mcap(tmp_path / "a.mcap", ENTRIES).read_bytes()
+    path = tmp_path / "broken.mcap"
+    path.write_bytes(whole[: int(len(whole) * part)])
+    bag = open_bag(path)
+    read = [(topic, log_ns) for topic, log_ns, _ in bag.messages()]
+    expected = [(topic, log_ns) for topic, log_ns, _ in ENTRIES]
+    assert 0 < len(read) == sum(info.count for info in bag.topics.values())
+    assert read == expected[: len(read)]
+    assert part < 0.5 or len(read) > 0.5 * len(expected)
+    assert f"{path} breaks off" in bag.warning and f"{len(read)} messages" in bag.warning
+
+
+def test_mcap_whose_tail_is_garbage_is_read_up_to_it(tmp_path: Path) -> None:
+    whole = write_mcap(tmp_path / "a.mcap", ENTRIES).read_bytes()
+    path = tmp_path / "broken.mcap"
+    path.write_bytes(whole[: len(whole) // 2] + bytes(range(256)) * 50)
+    bag = open_bag(path)
+    assert len(list(bag.messages())) > 20
+    assert "breaks off" in bag.warning
+
+
+def test_mcap_without_an_index_is_put_in_order(tmp_path: Path) -> None:
+    whole = write_mcap(tmp_path / "a.mcap", [ENTRIES[i] for i in (3, 1, 0, 2, 5, 4)], chunk_size=10**9).read_bytes()
+    path = tmp_path / "broken.mcap"
+    path.write_bytes(whole[:-20])
+    assert [log_ns for _, log_ns, _ in open_bag(path).messages()] == [log_ns for _, log_ns, _ in ENTRIES[:6]]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "text"),
+    [
+        ("empty.mcap", b"", "is empty"),
+        ("foreign.mcap", b"PK\x03\x04 a zip file, renamed", "is no recording"),
+        ("short.mcap", b"\x89MCAP0\r\n", "holds no message"),
+        ("foreign.bag", b"\x00" * 5000, "is no recording"),
+        ("broken.bag", b"#ROSBAG V2.0\n" + bytes(50), "cannot be read"),
+        ("broken.db3", b"SQLite format 3\x00" + bytes(5000), "cannot be read"),
+    ],
+)
+def test_what_is_no_recording_is_one_clear_line(name: str, content: bytes, text: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(BagError) as caught:
+        open_bag(path)
+    assert text in str(caught.value) and str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file_and_foreign_folder(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="there is no recording"):
+        open_bag(tmp_path / "nothing.mcap")
+    with pytest.raises(BagError, match=r"holds neither metadata\.yaml nor"):
+        open_bag(tmp_path)
+    (tmp_path / "metadata.yaml").write_text("nonsense: true")
+    with pytest.raises(BagError, match="cannot be read"):
+        open_bag(tmp_path)
+
+
+def test_recording_without_messages_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="holds no message"):
+        open_bag(write_mcap(tmp_path / "a.mcap", []))
+
+
+def test_truncated_ros1_bag_says_so(tmp_path: Path) -> None:
+    path = FORMATS["ROS 1"](tmp_path)
+    path.write_bytes(path.read_bytes()[:-4000])
+    with pytest.raises(BagError, match="cannot be read") as caught:
+        open_bag(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_data_sets_are_told_by_their_topics(tmp_path: Path) -> None:
+    def dataset(name: str, topics: set[str]) -> str:
+        return detect_dataset(open_bag(write_mcap(tmp_path / name, [e for e in ENTRIES if e[0] in topics])))
+
+    assert dataset("a.mcap", {LEFT, CLOUD, TRUTH}) == "simulated"
+    assert dataset("b.mcap", {LEFT, CLOUD}) == "s3li-etna"
+    assert dataset("c.mcap", {CLOUD}) == "s3li-etna"
+    raw = TOPICS["s3li-vulcano"].left_image
+    bayer = [(raw, START_NS, image(START_NS, np.zeros((4, 4), np.uint8), "bayer_rggb8"))]
+    assert detect_dataset(open_bag(write_mcap(tmp_path / "d.mcap", bayer))) == "s3li-vulcano"
+    with pytest.raises(BagError, match="/odom"):
+        dataset("e.mcap", {ODOMETRY})
+
+
+def test_topics_of_the_settings_win_over_those_of_the_data_set() -> None:
+    assert topics_of(load_settings()).left_image == LEFT
+    settings = load_settings(dataset="s3li-vulcano", topics__cloud="/other/points")
+    topics = topics_of(settings)
+    assert (topics.left_image, topics.cloud, topics.left_info) == ("/g319c_left/image_raw", "/other/points", "")

@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import LEFT, START_NS, TRUTH, drive, traverse, write_mcap
+from scipy.spatial.transform import Rotation
+
+from umf_ros.bags.reader import open_bag
+from umf_ros.bags.trajectories import Trajectory, read_ground_truth, read_odometry, read_tum, write_tum
+from umf_ros.config import load_settings
+from umf_ros.errors import BagError, OutputError
+from umf_ros.geometry import make_pose
+from umf_ros.sensors.calibration import load_calibration
+
+S = 10**9
+
+
+def trajectory(count: int = 20, step_s: float = 0.5) -> Trajectory:
+    seconds = np.arange(count) * step_s
+    stamps = START_NS + (seconds * S).astype(np.int64) + 123
+    return Trajectory(stamps, np.stack([drive(second) for second in seconds]))
+
+
+def test_tum_keeps_every_nanosecond_and_the_pose(tmp_path: Path) -> None:
+    path, written = tmp_path / "a.tum", trajectory()
+    write_tum(path, written)
+    read = read_tum(path)
+    assert (read.stamps_ns == written.stamps_ns).all()
+    assert np.abs(read.poses - written.poses).max() < 5e-9
+    assert read.has_orientation
+    stamp, *numbers = path.read_text().splitlines()[3].split()
+    assert len(stamp.split(".")[1]) == 9 and all(len(number.split(".")[1]) == 9 for number in numbers)
+
+
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        ("1.0 0 0 0 0 0 0", "expected 8 numbers"),
+        ("1.0 0 0 0 0 0 0 1 5", "expected 8 numbers"),
+        ("1.0 0 0 zero 0 0 0 1", "expected numbers, found '1.0 0 0 zero 0 0 0 1'"),
+        ("soon 0 0 0 0 0 0 1", "expected numbers"),
+        ("1.0 0 0 0 0 0 0 2", "no unit quaternion"),
+        ("1.0 nan 0 0 0 0 0 1", "not finite"),
+        ("0.5 0 0 0 0 0 0 1", "not later than the one before"),
+        ("nan 0 0 0 0 0 0 1", "expected numbers"),
+    ],
+)
+def test_wrong_line_of_a_tum_file_is_named(line: str, text: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text(f"# stamp x y z qx qy qz qw\n0.5 0 0 0 0 0 0 1\n\n{line}\n")
+    with pytest.raises(BagError) as caught:
+        read_tum(path)
+    assert f"{path}, line 4: " in str(caught.value)
+    assert text in str(caught.value)
+
+
+def test_tum_files_that_cannot_be_read_or_written(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="cannot read"):
+        read_tum(tmp_path / "nothing.tum")
+    (tmp_path / "empty.tum").write_text("# nothing\n")
+    with pytest.raises(BagError, match="holds no pose"):
+        read_tum(tmp_path / "empty.tum")
+    (tmp_path / "binary.tum").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(BagError, match="no text file"):
+        read_tum(tmp_path / "binary.tum")
+    with pytest.raises(OutputError, match="cannot write"):
+        write_tum(tmp_path / "no folder" / "a.tum", trajectory())
+
+
+def test_poses_between_the_samples_are_those_of_the_drive() -> None:
+    path = trajectory()
+    stamps = START_NS + np.array([0.25, 3.1, 9.4]) * S + 123
+    poses, known = path.at(stamps.astype(np.int64))
+    assert known.all()
+    for pose, second in zip(poses, (0.25, 3.1, 9.4), strict=True):
+        assert np.allclose(pose[:3, :3], drive(second)[:3, :3], atol=1e-6)
+        assert np.allclose(pose[:3, 3], drive(second)[:3, 3], atol=0.012)
+
+
+def test_nothing_is_known_outside_and_across_gaps() -> None:
+    path = trajectory()
+    keep = np.r_[0:5, 12:20]
+    path = Trajectory(path.stamps_ns[keep], path.poses[keep])
+    seconds = np.array([-0.001, 0.0, 2.0, 2.001, 5.999, 6.0, 9.5, 9.501])
+    poses, known = path.at(START_NS + np.round(seconds * S).astype(np.int64) + 123)
+    assert known.tolist() == [False, True, True, False, False, True, True, False]
+    assert (poses[~known] == np.eye(4)).all()
+    assert np.array_equal(poses[1], path.poses[0])
+
+
+def test_trajectory_of_a_sensor_becomes_that_of_the_body() -> None:
+    body_T_imu = make_pose(Rotation.from_euler("x", 180, degrees=True).as_matrix(), [0.3, 0.0, 0.1])
+    body = trajectory()
+    imu = Trajectory(body.stamps_ns, body.poses @ body_T_imu)
+    assert np.allclose(imu.of_body(body_T_imu).poses, body.poses)
+
+
+def test_truth_of_a_recording(tmp_path: Path) -> None:
+    bag = open_bag(write_mcap(tmp_path / "a.mcap", traverse(1.0)))
+    truth = read_ground_truth(bag)
+    assert truth is not None and len(truth) == 20 and truth.has_orientation
+    assert np.allclose(truth.poses[-1], drive(0.95))
+    assert truth.stamps_ns[1] - truth.stamps_ns[0] == 50_000_000
+    without = open_bag(write_mcap(tmp_path / "b.mcap", [entry for entry in traverse(0.5) if entry[0] == LEFT]))
+    assert TRUTH not in without.topics and read_ground_truth(without) is None
+    write_tum(tmp_path / "a.tum", trajectory())
+    chosen = read_ground_truth(bag, tmp_path / "a.tum")
+    assert chosen is not None and len(chosen) == 20 and chosen.stamps_ns[0] == START_NS + 123
+
+
+POS = """% program   : RTKPOST
+%  GPST                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)
+2021/07/07 10:00:18.000   37.750000000   15.000000000  2600.0000   1  12   0.0100
+2021/07/07 10:00:18.200   37.750009000   15.000000000  2600.0000   2  12   0.0100
+2021/07/07 10:00:18.400   37.750000000   15.000011300  2600.0000   5  12   0.0100
+2021/07/07 10:00:18.600   37.750000000   15.000011300  2601.5000   1  12   0.0100
+"""
+
+
+@pytest.mark.parametrize("zone", ["UTC", "Europe/Berlin", "America/New_York"])
+def test_rtklib_positions_are_in_utc_and_metres_on_every_machine(
+    zone: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(os.environ, "TZ", zone)
+    time.tzset()
+    path = tmp_path / "a.pos"
+    path.write_text(POS)
+    truth = read_ground_truth(None, path)
+    monkeypatch.undo()
+    time.tzset()
+    assert truth is not None and not truth.has_orientation
+    # 2021-07-07 10:00:00 UTC is 1625652000; the float solution counts, the single one does not
+    assert [(stamp - 1625652000 * S) / 1e9 for stamp in truth.stamps_ns] == [0.0, 0.2, 0.6]
+    assert np.allclose(truth.poses[:, :3, :3], np.eye(3))
+    east_north_up = truth.poses[:, :3, 3]
+    # a degree of latitude is 110.99 km and one of longitude 88.13 km there (GRS 80 at 37.75 deg), plus height
+    assert np.allclose(east_north_up[1], [0, 9e-6 * 110_988 * (1 + 2600 / 6.36e6), 0], atol=1e-3)
+    assert np.allclose(east_north_up[2], [11.3e-6 * 88_128 * (1 + 2600 / 6.38e6), 0, 1.5], atol=2e-3)
+
+
+def test_rtklib_week_and_seconds_are_the_same_time(tmp_path: Path) -> None:
+    path = tmp_path / "a.pos"
+    # 2021-07-07 is a Wednesday: day 3 of GPS week 2165
+    path.write_text("2165 295218.000 37.75 15.0 2600.0 1 12\n")
+    truth = read_ground_truth(None, path)
+    assert truth is not None and truth.stamps_ns[0] == 1625652000 * S
+
+
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        ("2021/07/07 10:00:18.000 37.75 15.0 2600.0", "line 1"),
+        ("2021/07/07 noon 37.75 15.0 2600.0 1", "line 1"),
+        ("2021/07/07 10:00:18.000 95.0 15.0 2600.0 1", "line 1"),
+        ("2021/07/07 10:00:18.000 37.75 15.0 2600.0 5", "no position of quality 2"),
+    ],
+)
+def test_wrong_rtklib_files_are_one_clear_line(line: str, text: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.pos"
+    path.write_text(line + "\n")
+    with pytest.raises(BagError, match=text) as caught:
+        read_ground_truth(None, path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("frame", ["body", "imu", "camera", "lidar"])
+def test_odometry_of_any_sensor_becomes_that_of_the_body(tmp_path: Path, frame: str) -> None:
+    settings = load_settings(None, dataset="s3li-etna")
+    calibration = load_calibration("s3li-etna")
+    mounting = np.eye(4) if frame == "body" else getattr(calibration, f"body_T_{frame}")
+    rng = np.random.default_rng(5)
+    bodies = np.stack([make_pose(Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 9, 3)) for _ in range(4)])
+    write_tum(tmp_path / "sensor.tum", Trajectory(np.arange(4) * 10**8, bodies @ mounting))
+    found = read_odometry(tmp_path / "sensor.tum", frame, settings)
+    np.testing.assert_allclose(found.poses, bodies, atol=1e-6)
+
+
+def test_an_unknown_frame_of_the_odometry_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="unknown frame 'wheel'"):
+        read_odometry(tmp_path / "any.tum", "wheel", load_settings())

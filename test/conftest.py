@@ -1,0 +1,98 @@
+"""Frames and keyframes made of noise, for tests that need no world."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from umf_ros.frames import Embedding, Frame, Keyframe, LocalFeatures, StereoCamera, SuperFeatures
+from umf_ros.geometry import make_pose
+
+if TYPE_CHECKING:
+    from umf_ros.simulation.relief import Relief
+
+CAMERA = StereoCamera(688, 512, 579.488, 579.488, 342.133, 255.806, 0.2003)
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    return (vector / np.linalg.norm(vector)).astype(np.float32)
+
+
+def make_keyframe(
+    stamp_s: float,
+    travelled_m: float = float("nan"),
+    seed: int = 0,
+    session: int = 0,
+    dimension: int = 16,
+    descriptor: np.ndarray | None = None,
+) -> Keyframe:
+    rng = np.random.default_rng(seed)
+    image = LocalFeatures(
+        positions=rng.uniform(0, 500, (5, 2)).astype(np.float32),
+        descriptors=rng.standard_normal((5, 8)).astype(np.float16),
+        saliency=rng.random(5).astype(np.float32),
+        points=np.full((5, 3), np.nan, np.float32),
+    )
+    super_image = SuperFeatures(rng.standard_normal((4, 8)).astype(np.float16), rng.random(4).astype(np.float32))
+    found = unit(rng.standard_normal(dimension)) if descriptor is None else descriptor
+    return Keyframe(
+        stamp_ns=round(stamp_s * 1e9),
+        embedding=Embedding(found, image=image, super_image=super_image),
+        camera=CAMERA,
+        body_T_camera=make_pose(np.eye(3), rng.standard_normal(3)),
+        points=rng.standard_normal((20, 3)).astype(np.float32),
+        odom_T_body=np.eye(4) if np.isfinite(travelled_m) else None,
+        travelled_m=travelled_m,
+        session=session,
+    )
+
+
+def make_frame(stamp_s: float, odom_T_body: np.ndarray | None = None, session: int = 0) -> Frame:
+    return Frame(
+        stamp_ns=round(stamp_s * 1e9),
+        camera=CAMERA,
+        body_T_camera=np.eye(4),
+        body_T_lidar=np.eye(4),
+        points=np.zeros((10, 3), np.float32),
+        intensity=np.zeros(10, np.float32),
+        odom_T_body=odom_T_body,
+        session=session,
+    )
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+@pytest.fixture(scope="session")
+def mini_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fast drive around a small loop, one and a half times, in a world no one trained or tuned on."""
+    from umf_ros.bags.writer import BagWriter
+    from umf_ros.simulation.presets import DEMO, Preset, gentle_loop
+    from umf_ros.simulation.recording import record, write_side_files
+    from umf_ros.simulation.route import Walker
+    from umf_ros.simulation.simulator import Simulator
+
+    def plan(relief: Relief, rng: np.random.Generator) -> Walker:
+        return Walker(gentle_loop(relief, 30.0, rng), rng).forward(29).forward(20, lateral_m=0.5)
+
+    look = {"speed_m_s": 2.5, "swing_deg": 2.0, "sun_deg": 15.0, "drift": DEMO.drift}
+    preset = Preset("a small loop", plan, length_m=46, samples=50, **look)
+    path = tmp_path_factory.mktemp("bags") / "mini.mcap"
+    simulator = Simulator(preset, seed=20_777)
+    with BagWriter(path) as bag:
+        record(simulator, bag)
+    write_side_files(simulator, path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def mini_config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Settings for the mini bag: its loop closes sooner than a rover's."""
+    path = tmp_path_factory.mktemp("config") / "mini.yaml"
+    path.write_text("/**: {ros__parameters: {loop: {min_time_gap_s: 8.0, min_travel_m: 15.0}}}\n")
+    return path

@@ -1,0 +1,183 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from conftest import CAMERA
+from networks.conftest import TINY, some_scan
+
+from umf_ros.config import Embedding as EmbeddingSettings
+from umf_ros.embedding import make_embedder
+from umf_ros.embedding.baselines import ScanContextEmbedder, ThumbnailEmbedder
+from umf_ros.embedding.ground_truth import GroundTruthEmbedder
+from umf_ros.embedding.umf_embedder import UmfEmbedder
+from umf_ros.errors import ConfigError, UmfError, WeightsError
+from umf_ros.frames import Frame
+from umf_ros.geometry import make_pose
+from umf_ros.networks.umf import UMF
+from umf_ros.networks.weights import save_weights
+
+
+def some_frame(seed: int = 0, **changes: object) -> Frame:
+    rng = np.random.default_rng(seed)
+    image = np.kron(rng.integers(0, 255, (32, 43)), np.ones((16, 16))).astype(np.uint8)
+    values = {"left": image, "points": some_scan(seed), "intensity": rng.uniform(20, 500, 2000).astype(np.float32)}
+    return Frame(stamp_ns=seed, camera=CAMERA, body_T_camera=np.eye(4), body_T_lidar=np.eye(4), **(values | changes))
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    save_weights(UMF(TINY), path, {})
+    return path
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def embedder(weights):
+    return UmfEmbedder(weights, "torch", threads=1, super_features=True)
+
+
+def test_what_comes_out(embedder):
+    found = embedder.embed(some_frame())
+    assert found.descriptor.shape == (embedder.dimension,)
+    assert found.descriptor.dtype == np.float32
+    assert np.linalg.norm(found.descriptor) == pytest.approx(1, abs=1e-5)
+    assert 0 < len(found.image.positions) <= 400
+    assert found.image.positions.min() >= 0
+    assert (found.image.positions.max(0) < (688, 512)).all()
+    assert np.isnan(found.image.points).all()
+    assert found.image.descriptors.dtype == np.float16
+    np.testing.assert_array_equal(found.cloud.positions, found.cloud.points)
+    assert (np.diff(found.image.saliency) <= 0).all()
+    assert (np.diff(found.cloud.saliency) <= 0).all()
+    assert found.super_image.descriptors.shape == TINY.image_supers
+    assert found.super_cloud.strength.shape == (TINY.cloud_supers[0],)
+
+
+def test_cloud_features_lie_on_the_scan(embedder):
+    frame = some_frame()
+    positions = embedder.embed(frame).cloud.positions
+    nearest = np.linalg.norm(positions[:, None] - frame.points[None], axis=-1).min(1)
+    assert nearest.max() < 0.8
+
+
+def test_the_same_frame_gives_the_same_embedding(embedder):
+    one, two = embedder.embed(some_frame()), embedder.embed(some_frame())
+    np.testing.assert_array_equal(one.descriptor, two.descriptor)
+    np.testing.assert_array_equal(one.cloud.descriptors, two.cloud.descriptors)
+
+
+def test_either_modality_may_be_missing(embedder):
+    whole, dark = embedder.embed(some_frame()), embedder.embed(some_frame(left=None))
+    blind = embedder.embed(some_frame(points=None, intensity=None))
+    assert dark.image is None
+    assert dark.super_image is None
+    assert blind.cloud is None
+    assert blind.super_cloud is None
+    for found in (dark, blind):
+        assert np.linalg.norm(found.descriptor) == pytest.approx(1, abs=1e-5)
+        assert 0 < found.descriptor @ whole.descriptor < 1
+    black = embedder.embed(some_frame(left=np.zeros((512, 688), np.uint8)))
+    np.testing.assert_array_equal(black.descriptor, dark.descriptor)
+    empty = embedder.embed(some_frame(points=np.empty((0, 3), np.float32), intensity=np.empty(0, np.float32)))
+    np.testing.assert_array_equal(empty.descriptor, blind.descriptor)
+
+
+@pytest.mark.parametrize("shape", [(512, 688), (480, 640), (64, 96), (37, 53)])
+def test_positions_belong_to_the_image_given(embedder, shape):
+    image = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
+    positions = embedder.embed(some_frame(left=image)).image.positions
+    assert (positions.max(0) < (shape[1], shape[0])).all()
+    assert positions[:, 0].max() > shape[1] / 2
+
+
+def test_openvino_agrees_with_torch_and_is_kept(tmp_path):
+    """With the shipped weights: OpenVINO's CPU plugin hangs on networks as narrow as the tests' own."""
+    plain = UmfEmbedder(None, "torch", threads=1, super_features=True)
+    fast = UmfEmbedder(None, "openvino", threads=1, super_features=True)
+    kept = UmfEmbedder(None, "openvino", threads=1, super_features=True)
+    assert len(list((tmp_path / "cache" / "umf_ros").glob("*.xml"))) == 1
+    for frame in (some_frame(), some_frame(1, left=None), some_frame(2, points=None, intensity=None)):
+        wanted = plain.embed(frame)
+        for other in (fast.embed(frame), kept.embed(frame)):
+            assert wanted.descriptor @ other.descriptor > 0.9999
+            if wanted.cloud is not None:
+                assert len(wanted.cloud.positions) == len(other.cloud.positions)
+
+
+def test_shipped_weights_load():
+    """The default network reads its own weights and knows a frame from another."""
+    embedder = make_embedder(EmbeddingSettings(runtime="torch", threads=1))
+    one, two = embedder.embed(some_frame(0)), embedder.embed(some_frame(1))
+    assert embedder.dimension == 256
+    assert one.descriptor @ two.descriptor < 0.99
+
+
+def test_missing_weights_are_one_clear_error(tmp_path):
+    with pytest.raises(WeightsError, match="do not exist"):
+        make_embedder(EmbeddingSettings(weights=str(tmp_path / "none.safetensors")))
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"method": "magic"}, "unknown method"),
+        ({"runtime": "openvino", "device": "cuda"}, "openvino"),
+        ({"device": "abacus"}, "device"),
+    ],
+)
+def test_wrong_settings(weights, changes, word):
+    with pytest.raises(ConfigError, match=word):
+        make_embedder(EmbeddingSettings(weights=str(weights), **changes))
+
+
+@pytest.mark.parametrize("embedder", [ThumbnailEmbedder(), ScanContextEmbedder()], ids=lambda found: found.name)
+def test_baselines_know_a_place_again(embedder):
+    here, again, elsewhere = some_frame(0), some_frame(0), some_frame(1)
+    noisy = np.clip(again.left.astype(int) + 8, 0, 255).astype(np.uint8)
+    again = replace(again, left=noisy, points=again.points[::2], intensity=None)
+    codes = [embedder.embed(frame).descriptor for frame in (here, again, elsewhere)]
+    assert codes[0] @ codes[1] > codes[0] @ codes[2] + 0.01
+    nothing = embedder.embed(some_frame(left=None, points=None, intensity=None)).descriptor
+    assert np.linalg.norm(nothing) == pytest.approx(1)
+    assert embedder.embed(here).descriptor.shape == (embedder.dimension,)
+
+
+def test_baselines_by_name():
+    for name in ("thumbnail", "scan_context"):
+        assert make_embedder(EmbeddingSettings(method=name)).name == name
+
+
+def ground_truth() -> GroundTruthEmbedder:
+    def pose(x: float, degrees: float) -> np.ndarray:
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        return make_pose([[c, -s, 0], [s, c, 0], [0, 0, 1]], [x, 0, 0])
+
+    return GroundTruthEmbedder({0: pose(0, 0), 10**9: pose(3, 5), 2 * 10**9: pose(60, 0), 3 * 10**9: pose(0, 180)})
+
+
+def test_true_descriptors_fall_with_distance_and_turn():
+    embedder = ground_truth()
+    here, near, far, back = (embedder.embed(replace(some_frame(), stamp_ns=k * 10**9)).descriptor for k in range(4))
+    assert here @ near > 0.8
+    assert here @ far < 0.3
+    assert here @ back < 0.3
+    assert np.linalg.norm(here) == pytest.approx(1, abs=1e-5)
+
+
+def test_frames_without_a_true_pose_are_refused():
+    embedder = ground_truth()
+    assert (
+        embedder.embed(replace(some_frame(), stamp_ns=50_000_000)).descriptor @ embedder.embed(some_frame()).descriptor
+        > 0.999
+    )
+    with pytest.raises(UmfError, match=r"within 0\.1 s"):
+        embedder.embed(replace(some_frame(), stamp_ns=5 * 10**9))

@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from networks.conftest import TINY, some_input
+
+from umf_ros.networks.presets import PRESETS, NetworkConfig
+from umf_ros.networks.umf import UMF, channels_last, count_parameters
+
+
+def test_shapes_and_norms(network):
+    found = network(some_input(TINY), super_features=True, attention=True)
+    assert found.descriptor.shape == (2, 16)
+    assert found.image.descriptors.shape == (2, 16 * 24, 8)
+    assert found.cloud.descriptors.shape == (2, 96, 8)
+    assert found.super_image.descriptors.shape == (2, 6, 8)
+    assert found.super_cloud.attention.shape == (2, 5, 96)
+    assert set(found.attention[0]) == {"image", "cloud", "image_cross", "cloud_cross"}
+    for vectors in (found.descriptor, found.image.descriptors, found.super_image.descriptors):
+        torch.testing.assert_close(vectors.norm(dim=-1), torch.ones(vectors.shape[:-1]))
+
+
+def test_a_landmark_moved_sideways_changes_the_descriptor(network):
+    """The reference averages the image's columns and cannot see this."""
+    batch = some_input(TINY)
+    left, right = torch.zeros_like(batch.image), torch.zeros_like(batch.image)
+    left[..., 24:40, 16:32] = 3
+    right[..., 24:40, 64:80] = 3
+    moved = (network(replace(batch, image=left)).descriptor - network(replace(batch, image=right)).descriptor).norm()
+    assert moved > 1e-3
+
+
+def test_a_rock_moved_sideways_changes_the_descriptor(network):
+    batch = some_input(TINY)
+    mirrored = replace(batch, grid=batch.grid.flip(2))
+    assert (network(batch).descriptor - network(mirrored).descriptor).norm() > 1e-4
+
+
+@pytest.mark.parametrize("backbone", ["resnet18", "resnet34", "resnet50", "mobile"])
+def test_every_parameter_learns(backbone):
+    """The reference's optimiser forgets its heads."""
+    network = UMF(replace(TINY, backbone=backbone)).train()
+    batch = some_input(TINY, 3)
+    features = network.encode(batch)
+    fused = network.fuse(features, torch.tensor([True, True, False]), torch.tensor([True, False, True])).descriptor
+    image, cloud = network.describe_local(features, batch)
+    supers = network.super_image(image.tokens, image.mask), network.super_cloud(cloud.tokens, cloud.mask)
+    parts = [fused, image.descriptors, cloud.descriptors, *(found.descriptors for found in supers)]
+    generator = torch.Generator().manual_seed(0)
+    sum((part * torch.randn(part.shape, generator=generator)).sum() for part in parts).backward()
+    idle = [name for name, value in network.named_parameters() if value.grad is None or not value.grad.abs().any()]
+    # a bias before a softmax over keys is the one thing attention cannot feel
+    assert [name for name in idle if not name.endswith("key_value.bias")] == []
+
+
+def test_trimmed_padding_changes_nothing(network):
+    full, trimmed = network(some_input(TINY)), network(some_input(replace(TINY), trim=True))
+    torch.testing.assert_close(full.descriptor, trimmed.descriptor, atol=1e-5, rtol=1e-4)
+
+
+def test_a_missing_modality_counts_nothing(network):
+    features = network.encode(some_input(TINY))
+    yes, no = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool)
+    whole, seen, felt = (
+        network.fuse(features, yes, yes),
+        network.fuse(features, yes, no),
+        network.fuse(features, no, yes),
+    )
+    assert seen.descriptor[:, 8:].abs().max() < 1e-5
+    assert felt.descriptor[:, :8].abs().max() < 1e-5
+    torch.testing.assert_close(whole.weights.sum(-1), torch.ones(2))
+    torch.testing.assert_close(seen.weights, torch.tensor([[1.0, 0.0], [1.0, 0.0]]))
+    # similarity to a whole frame is that of the half both have, times its share there
+    half = (seen.image @ whole.image.T) * whole.weights[:, 0].sqrt()
+    torch.testing.assert_close(seen.descriptor @ whole.descriptor.T, half, atol=1e-5, rtol=1e-4)
+
+
+def test_each_modality_is_told_of_the_other(network):
+    features = network.encode(some_input(TINY))
+    yes, no = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool)
+    together, alone = network.fuse(features, yes, yes), network.fuse(features, yes, no)
+    assert (together.image - alone.image).norm() > 1e-4
+
+
+def test_the_content_of_a_missing_modality_does_not_matter(network):
+    batch = some_input(TINY)
+    dark = replace(batch, image_present=torch.zeros(2, dtype=torch.bool))
+    other = replace(dark, image=torch.randn(dark.image.shape))
+    torch.testing.assert_close(network(dark).descriptor, network(other).descriptor)
+
+
+def test_nothing_at_all_is_still_a_number(network):
+    batch = some_input(TINY)
+    empty = replace(
+        batch,
+        image_present=torch.zeros(2, dtype=torch.bool),
+        grid=torch.zeros_like(batch.grid),
+        coarse_mask=torch.zeros_like(batch.coarse_mask),
+        fine_mask=torch.zeros_like(batch.fine_mask),
+    )
+    found = network(empty, super_features=True)
+    assert torch.isfinite(found.descriptor).all()
+    assert not found.cloud.saliency.any()
+    assert torch.isfinite(found.super_cloud.descriptors).all()
+
+
+def test_memory_order_of_the_weights_changes_nothing(network):
+    batch = some_input(TINY)
+    before = network(batch).descriptor
+    channels_last(network)
+    torch.testing.assert_close(before, network(batch).descriptor, atol=1e-5, rtol=1e-4)
+
+
+def test_the_thesis_network_has_about_39_million_parameters():
+    assert count_parameters(UMF(PRESETS["umf_resnet50"])) == pytest.approx(39.4e6, rel=0.02)
+
+
+@pytest.mark.parametrize("wrong", [{"image_size": (100, 128)}, {"tokens": 30, "heads": 4}])
+def test_impossible_sizes_are_refused(wrong):
+    with pytest.raises(ValueError, match="multiple"):
+        NetworkConfig(**wrong)

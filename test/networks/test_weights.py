@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from networks.conftest import TINY, some_input
+from safetensors.torch import load_file, save_file
+
+from umf_ros.errors import OutputError, WeightsError
+from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.weights import load_weights, read_card, save_weights
+
+
+@pytest.fixture
+def weights(network, tmp_path):
+    path = tmp_path / "tiny.safetensors"
+    save_weights(network, path, {"name": "tiny"})
+    return path
+
+
+def rewrite(path, tensors=None, architecture=None):
+    content = load_file(path) if tensors is None else tensors
+    shape = TINY.as_dict() if architecture is None else architecture
+    save_file(content, path, metadata={"architecture": json.dumps(shape)})
+
+
+def test_weights_come_back(network, weights):
+    batch = some_input(TINY)
+    similarity = (network(batch).descriptor * load_weights(weights)(batch).descriptor).sum(-1)
+    assert similarity.min() > 0.9999
+    assert read_card(weights)["architecture"] == TINY.as_dict()
+    assert NetworkConfig.from_dict(read_card(weights)["architecture"]) == TINY
+
+
+def test_weights_are_half_precision(weights):
+    assert load_file(weights)["fusion.image_head.weight"].dtype == torch.float16
+
+
+def test_missing(tmp_path):
+    with pytest.raises(WeightsError, match="do not exist"):
+        load_weights(tmp_path / "none.safetensors")
+
+
+def test_truncated(weights):
+    weights.write_bytes(weights.read_bytes()[:5000])
+    with pytest.raises(WeightsError, match="truncated"):
+        load_weights(weights)
+
+
+def test_not_weights_at_all(weights):
+    weights.write_text("hello")
+    with pytest.raises(WeightsError, match="not a safetensors file"):
+        load_weights(weights)
+
+
+def test_not_a_number(weights):
+    tensors = load_file(weights)
+    tensors["fusion.image_head.weight"][0, 0] = float("nan")
+    rewrite(weights, tensors)
+    with pytest.raises(WeightsError, match=r"fusion\.image_head\.weight holds values that are not finite"):
+        load_weights(weights)
+
+
+def test_another_architecture_by_name(weights):
+    rewrite(weights, architecture=TINY.as_dict() | {"vision": "transformer"})
+    with pytest.raises(WeightsError, match="another architecture"):
+        load_weights(weights)
+
+
+def test_another_architecture_by_shape(weights):
+    rewrite(weights, architecture=TINY.as_dict() | {"tokens": 48})
+    with pytest.raises(WeightsError, match="another architecture"):
+        load_weights(weights)
+
+
+def test_someone_elses_tensors(weights):
+    rewrite(weights, {"layer.weight": torch.zeros(3)})
+    with pytest.raises(WeightsError, match="another architecture"):
+        load_weights(weights)
+
+
+def test_no_word_about_the_architecture(weights):
+    save_file(load_file(weights), weights)
+    with pytest.raises(WeightsError, match="does not say which"):
+        load_weights(weights)
+
+
+def test_card_is_missing(weights):
+    weights.with_suffix(".json").unlink()
+    with pytest.raises(WeightsError, match="card"):
+        read_card(weights)
+
+
+def test_nowhere_to_write(network, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot write"):
+        save_weights(network, tmp_path / "file" / "w.safetensors", {})

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from scipy.spatial.transform import Rotation
+
+from umf_ros.errors import MessageError
+from umf_ros.frames import LoopClosure
+from umf_ros.geometry import make_pose
+from umf_ros.nodes import conversions
+from umf_ros.nodes.conversions import Odometry, closure_from_message, closure_to_message
+
+
+def random_closure(rng: np.random.Generator) -> LoopClosure:
+    root = rng.standard_normal((6, 6))
+    pose = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 5, 3))
+    return LoopClosure(1_667_000_000_123_456_789, 1_666_999_999_000_000_001, pose, root @ root.T)
+
+
+def test_a_closure_survives_the_wire(rng: np.random.Generator) -> None:
+    closure = random_closure(rng)
+    wire = serialize_message(closure_to_message(closure))
+    found = closure_from_message(deserialize_message(wire, Odometry))
+    assert (found.query_stamp_ns, found.match_stamp_ns) == (closure.query_stamp_ns, closure.match_stamp_ns)
+    np.testing.assert_allclose(found.match_T_query, closure.match_T_query, atol=1e-12)
+    np.testing.assert_array_equal(found.covariance, closure.covariance)
+
+
+def test_the_message_names_its_ends_as_documented(rng: np.random.Generator) -> None:
+    message = closure_to_message(random_closure(rng))
+    assert message.header.frame_id == "keyframe/1666999999000000001"
+    assert message.child_frame_id == "keyframe/1667000000123456789"
+    assert conversions.from_time(message.header.stamp) == 1_667_000_000_123_456_789
+    assert message.twist.covariance[0] == -1.0
+
+
+@pytest.mark.parametrize("frame", ["", "odom", "keyframe/", "keyframe/12a", "xkeyframe/12"])
+def test_foreign_frames_are_refused(rng: np.random.Generator, frame: str) -> None:
+    message = closure_to_message(random_closure(rng))
+    message.child_frame_id = frame
+    with pytest.raises(MessageError, match="expected keyframe/<stamp in ns>"):
+        closure_from_message(message)
+
+
+def test_a_pose_that_is_none_is_refused(rng: np.random.Generator) -> None:
+    message = closure_to_message(random_closure(rng))
+    message.pose.pose.position.x = float("nan")
+    with pytest.raises(MessageError, match="not finite"):
+        closure_from_message(message)
+    message = closure_to_message(random_closure(rng))
+    message.pose.pose.orientation.w = 4.0
+    with pytest.raises(MessageError, match="not a unit quaternion"):
+        closure_from_message(message)

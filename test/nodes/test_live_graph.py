@@ -1,0 +1,105 @@
+"""The real graph over DDS: player, front-end, back-end and a foreign SLAM system, against the replay."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from processes import Process
+
+from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.reader import open_bag
+from umf_ros.config import load_settings
+from umf_ros.loop_detector import make_detector_embedder
+from umf_ros.replay import Replay
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "slam_subscriber.py"
+
+
+# what is compared is what was found, not what a busy machine lost
+QOS = [
+    word for text in ("qos.reliability:=reliable", "qos.depth:=500", "worker.queue_size:=500") for word in ("-p", text)
+]
+
+
+@dataclass
+class LiveRun:
+    folder: Path
+    subscriber: str
+
+
+@pytest.fixture(scope="module")
+def live(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRun]:
+    """Play the mini bag once, at half speed: what is compared is what was found, not how fast."""
+    folder = tmp_path_factory.mktemp("live")
+    common = ["--ros-args", "--params-file", str(mini_config), "-p", f"results_dir:={folder}", *QOS]
+    nodes = [
+        Process("", folder / f"{name}.log", command=[sys.executable, "-m", f"umf_ros.nodes.{name}", *common])
+        for name in ("loop_closure_node", "pose_graph_node")
+    ]
+    subscriber = Process("", folder / "subscriber.log", command=[sys.executable, str(EXAMPLE)])
+    player_command = [sys.executable, "-m", "umf_ros.nodes.bag_player_node", str(mini_bag), "--rate", "0.5"]
+    try:
+        for node in nodes:
+            node.wait_for("ready")
+        player = Process("", folder / "player.log", command=[*player_command, "--wait-for-subscribers", "--quiet"])
+        assert player._process.wait(240) == 0, player.output
+        player.kill()
+        assert nodes[0].interrupt() == 0, nodes[0].output
+        assert nodes[1].interrupt() == 0, nodes[1].output
+        subscriber.interrupt()
+        yield LiveRun(folder, subscriber.output)
+    finally:
+        for process in (*nodes, subscriber):
+            process.kill()
+
+
+@pytest.fixture(scope="module")
+def offline(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("offline")
+    settings = load_settings(mini_config)
+    replay = Replay(folder, settings, make_detector_embedder(settings))
+    for _ in replay.run(FrameReader(open_bag(mini_bag), settings)):
+        pass
+    replay.finish({})
+    return folder
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_live_and_offline_find_exactly_the_same(live: LiveRun, offline: Path) -> None:
+    summary = json.loads((live.folder / "summary.json").read_text())
+    assert summary["drops"]["worker"] == 0
+    assert rows(live.folder / "keyframes.csv") == rows(offline / "keyframes.csv")
+    assert rows(live.folder / "closures.csv") == rows(offline / "closures.csv")
+    assert len(rows(live.folder / "closures.csv")) >= 3
+
+
+def test_every_scan_with_an_image_becomes_a_pair(live: LiveRun, offline: Path) -> None:
+    live_summary, offline_summary = (json.loads((f / "summary.json").read_text()) for f in (live.folder, offline))
+    assert live_summary["pairs"] == offline_summary["pairs"] > 60
+
+
+def test_the_back_end_optimises_what_the_front_end_found(live: LiveRun) -> None:
+    text = (live.folder / "graph.g2o").read_text()
+    vertices, edges = (len(re.findall(f"^{kind} ", text, re.M)) for kind in ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"))
+    verdicts = [row["verdict"] for row in rows(live.folder / "graph_verdicts.csv")]
+    assert len(verdicts) == len(rows(live.folder / "closures.csv"))
+    assert edges - (vertices - 1) == verdicts.count("accepted") >= 3
+
+
+def test_a_slam_system_gets_every_closure_as_a_factor(live: LiveRun) -> None:
+    closures = rows(live.folder / "closures.csv")
+    found = re.findall(r"closure (\d+): (\d+) -> (\d+)", live.subscriber)
+    assert [(match, query) for _, match, query in found] == [
+        (c["match_stamp_ns"], c["query_stamp_ns"]) for c in closures
+    ]

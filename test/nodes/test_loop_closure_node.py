@@ -1,0 +1,187 @@
+"""The live front-end over real DDS: bad input, parameters, services, an orderly end."""
+
+from __future__ import annotations
+
+import json
+from array import array
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from processes import Process, wait_until
+from rclpy.node import Node
+from recordings import POINT
+from sensor_msgs.msg import Image, PointCloud2, PointField
+from std_srvs.srv import SetBool, Trigger
+
+from umf_ros.nodes.conversions import to_time
+
+MODULE = "umf_ros.nodes.loop_closure_node"
+# a thumbnail needs no weights; no odometry or camera_info, so that nothing waits for them
+PARAMETERS = (
+    "embedding.method:=thumbnail",
+    "topics.odometry:=''",
+    "topics.left_info:=''",
+    "topics.right_info:=''",
+    "topics.right_image:=''",
+    "keyframe.untracked_period_s:=0.1",
+    "keyframe.min_period_s:=0.1",
+    "qos.reliability:=reliable",
+)
+START_NS = 1_700_000_000 * 10**9
+
+
+class Rig(Node):
+    """Publishes one camera and one LiDAR, listens to diagnostics."""
+
+    def __init__(self) -> None:
+        super().__init__("rig")
+        self.images = self.create_publisher(Image, "/stereo/left/image_rect", 10)
+        self.clouds = self.create_publisher(PointCloud2, "/bf_lidar/points_raw", 10)
+        self.values: dict[str, str] = {}
+        self.messages: dict[str, str] = {}
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._listen, 10)
+        self._rng = np.random.default_rng(0)
+
+    def _listen(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.messages[status.name] = status.message
+            if status.name == "loop_closure_node: detector":
+                self.values = {pair.key: pair.value for pair in status.values}
+
+    def image(self, stamp_ns: int, **changes: object) -> Image:
+        pixels = self._rng.integers(0, 255, 688 * 512, np.uint8)
+        message = Image(height=512, width=688, step=688, encoding="mono8", data=array("B", pixels.tobytes()))
+        message.header.stamp = to_time(stamp_ns)
+        for name, value in changes.items():
+            setattr(message, name, value)
+        return message
+
+    def cloud(self, stamp_ns: int) -> PointCloud2:
+        points = np.zeros(500, POINT)
+        points["x"], points["y"] = self._rng.uniform(-5, 5, 500), self._rng.uniform(3, 20, 500)
+        points["intensity"] = 100
+        fields = [
+            PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32 if i < 3 else PointField.UINT32, count=1)
+            for i, name in enumerate(POINT.names)
+        ]
+        message = PointCloud2(height=1, width=500, fields=fields, point_step=28, row_step=500 * 28)
+        message.data = array("B", points.tobytes())
+        message.header.stamp = to_time(stamp_ns)
+        return message
+
+    def publish_pair(self, stamp_ns: int) -> None:
+        self.images.publish(self.image(stamp_ns))
+        self.clouds.publish(self.cloud(stamp_ns))
+
+    def count(self, name: str) -> int:
+        return int(self.values.get(name, "0"))
+
+    def until(self, condition: Callable[[], bool], timeout_s: float = 30.0) -> bool:
+        return wait_until(condition, timeout_s, spin=lambda: rclpy.spin_once(self, timeout_sec=0.05))
+
+    def call(self, kind: type, service: str, request: object) -> object:
+        client = self.create_client(kind, f"/loop_closure_node/{service}")
+        assert client.wait_for_service(20.0)
+        future = client.call_async(request)
+        assert self.until(future.done)
+        return future.result()
+
+
+@pytest.fixture
+def rig(ros_context: None) -> Iterator[Rig]:
+    node = Rig()
+    yield node
+    node.destroy_node()
+
+
+@pytest.fixture
+def node(rig: Rig, tmp_path: Path) -> Iterator[Process]:
+    process = Process(MODULE, tmp_path / "node.log", *PARAMETERS, f"results_dir:={tmp_path / 'run'}")
+    process.wait_for("ready")
+    assert rig.until(lambda: rig.images.get_subscription_count() > 0 and rig.clouds.get_subscription_count() > 0)
+    yield process
+    process.kill()
+
+
+def test_it_takes_frames_survives_bad_ones_and_ends_in_order(rig: Rig, node: Process, tmp_path: Path) -> None:
+    step = 213_000_000
+    for i in range(5):
+        rig.publish_pair(START_NS + i * step)
+        rig.until(lambda i=i: rig.count("left_received") > i)
+    bad = START_NS + 5 * step
+    rig.images.publish(rig.image(bad, encoding="yuv422"))
+    rig.images.publish(rig.image(bad, height=0, width=0, step=0, data=array("B")))
+    rig.images.publish(rig.image(bad, step=5))
+    nameless = rig.cloud(bad)
+    nameless.fields = nameless.fields[1:]
+    rig.clouds.publish(nameless)
+    assert rig.until(lambda: "yuv422" in node.output and rig.values and "x" in node.output)
+    for i in range(6, 9):
+        rig.publish_pair(START_NS + i * step)
+        rig.until(lambda i=i: rig.count("cloud_received") > i)
+    assert rig.until(lambda: rig.count("places") >= 6), node.output
+    assert node.exit_code is None
+    assert node.interrupt() == 0
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["pairs"] == 8 and summary["keyframes"] == 8
+    assert summary["drops"]["image"] == 3 and summary["drops"]["cloud"] == 1
+    assert "Traceback" not in node.output
+
+
+def test_a_clock_that_jumps_back_starts_a_new_session(rig: Rig, node: Process) -> None:
+    for lap in range(2):
+        for i in range(4):
+            rig.publish_pair(START_NS + i * 213_000_000)
+            rig.until(lambda i=i, lap=lap: rig.count("cloud_received") > 4 * lap + i)
+    # the last scan of each lap waits for later stamps; the jump completes the first lap
+    assert rig.until(lambda: rig.count("cloud_received") == 8)
+    assert rig.until(lambda: 0 < rig.count("places") <= 4), node.output
+    assert node.exit_code is None
+
+
+def test_services_pause_save_and_forget(rig: Rig, node: Process) -> None:
+    for i in range(4):
+        rig.publish_pair(START_NS + i * 213_000_000)
+    assert rig.until(lambda: rig.count("places") >= 3)
+    assert rig.call(SetBool, "pause", SetBool.Request(data=True)).message == "paused"
+    assert rig.until(lambda: rig.messages.get("loop_closure_node: detector") == "paused")
+    before = rig.count("cloud_received")
+    rig.publish_pair(START_NS + 10 * 213_000_000)
+    assert not rig.until(lambda: rig.count("cloud_received") > before, timeout_s=2.5)
+    assert rig.call(Trigger, "reset", Trigger.Request()).success
+    assert rig.until(lambda: rig.count("places") == 0)
+
+
+def test_a_silent_topic_is_explained(rig: Rig, node: Process) -> None:
+    assert rig.until(
+        lambda: (
+            "silent for" in rig.messages.get("loop_closure_node: input left_image", "")
+            or "nothing received from 1 publisher" in rig.messages.get("loop_closure_node: input left_image", "")
+        )
+    )
+    rig.destroy_publisher(rig.clouds)
+    expected = "nothing received: no publisher on /bf_lidar/points_raw"
+    assert rig.until(lambda: rig.messages.get("loop_closure_node: input cloud") == expected)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "message"),
+    [
+        ("loop.topk:=3", "umf: unknown parameter loop.topk"),
+        ("embedding.method:=magic", "umf: .*magic"),
+        ("calibration:=/nowhere.yaml", "umf: cannot read /nowhere.yaml"),
+        ("results_dir:=/proc/results", "umf: cannot write to /proc/results"),
+    ],
+)
+def test_wrong_parameters_end_the_node_with_one_line(tmp_path: Path, parameter: str, message: str) -> None:
+    import re
+
+    process = Process(MODULE, tmp_path / "node.log", *PARAMETERS, parameter)
+    assert wait_until(lambda: process.exit_code is not None, 60)
+    process.kill()
+    assert process.exit_code == 1
+    assert re.search(message, process.output) and "Traceback" not in process.output

@@ -1,0 +1,221 @@
+"""The live back-end over real DDS: a drive with right and wrong closures, bad input, services, an orderly end."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from processes import Process, wait_until
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from umf_ros.geometry import Array
+from umf_ros.nodes.announcer import CLOSURES_QOS, LATCHED_QOS
+from umf_ros.nodes.conversions import closure_to_message, from_pose, from_time, to_pose, to_time
+from umf_ros.pose_graph.g2o import read_g2o
+from umf_ros.pose_graph.synthetic import PERIOD_NS, World, rover_loops, with_wrong_closures
+
+MODULE = "umf_ros.nodes.pose_graph_node"
+
+
+class Rig(Node):
+    """A rover's odometry and front-end, and ears for everything the back-end says."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__("rig")
+        self.world = world
+        self.odometry = self.create_publisher(Odometry, "/odom", 50)
+        self.closures = self.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS)
+        self.reject = self.create_publisher(String, "/pose_graph_node/reject_edge", 10)
+        self.heard: dict[str, list] = {}
+        self._hear(PathMessage, "path", LATCHED_QOS)
+        self._hear(MarkerArray, "markers", LATCHED_QOS)
+        self._hear(DiagnosticArray, "verdicts", CLOSURES_QOS)
+        self._hear(PoseWithCovarianceStamped, "pose", qos_profile_sensor_data)
+        self._hear(TransformStamped, "map_to_odom", qos_profile_sensor_data)
+        self.values: dict[str, str] = {}
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
+
+    def _hear(self, kind: type, name: str, qos: object) -> None:
+        self.heard[name] = []
+        self.create_subscription(kind, f"/pose_graph_node/{name}", self.heard[name].append, qos)
+
+    def _diagnose(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == "pose_graph_node: pose graph":
+                self.values = {pair.key: pair.value for pair in status.values}
+
+    def spin(self) -> None:
+        rclpy.spin_once(self, timeout_sec=0.02)
+
+    def until(self, condition: Callable[[], object]) -> None:
+        assert wait_until(lambda: bool(condition()), 40.0, self.spin), self.values
+
+    def drive(self, first: int, last: int) -> None:
+        for k in range(first, last):
+            self.odometry.publish(odometry(k * PERIOD_NS, self.world.odometry[k]))
+            if k % 10 == 0:
+                # best effort: what is sent faster than it is taken is lost
+                wait_until(lambda k=k: self._answered(k * PERIOD_NS), 5.0, self.spin)
+
+    @property
+    def taken(self) -> int:
+        return int(self.values.get("odometry", 0))
+
+    def _answered(self, stamp_ns: int) -> bool:
+        poses = self.heard["pose"]
+        return bool(poses) and from_time(poses[-1].header.stamp) == stamp_ns
+
+    def call(self, service: str) -> Trigger.Response:
+        client = self.create_client(Trigger, f"/pose_graph_node/{service}")
+        assert client.wait_for_service(20.0)
+        future = client.call_async(Trigger.Request())
+        self.until(future.done)
+        return future.result()
+
+
+def odometry(stamp_ns: int, pose: Array) -> Odometry:
+    message = Odometry(child_frame_id="base_link")
+    message.header.stamp = to_time(stamp_ns)
+    message.header.frame_id = "odom"
+    message.pose.pose = to_pose(pose)
+    return message
+
+
+@pytest.fixture
+def rig(ros_context: None) -> Iterator[Rig]:
+    world = with_wrong_closures(rover_loops(300, 10003), 0.3, "groups", 1)
+    node = Rig(world)
+    yield node
+    node.destroy_node()
+
+
+@pytest.fixture
+def process(tmp_path: Path) -> Iterator[Process]:
+    started = Process(MODULE, tmp_path / "node.log", f"results_dir:={tmp_path / 'results'}", "pose_graph.max_gap_s:=3")
+    started.wait_for("ready")
+    yield started
+    started.kill()
+
+
+def verdicts(rig: Rig) -> dict[str, str]:
+    latest = {}
+    for message in rig.heard["verdicts"]:
+        for status in message.status:
+            latest[status.name] = next(pair.value for pair in status.values if pair.key == "verdict")
+    return latest
+
+
+def test_a_drive_ends_on_its_true_path_and_wrong_closures_stay_out(rig: Rig, process: Process, tmp_path: Path) -> None:
+    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    rig.drive(0, len(rig.world.truth))
+    rig.until(lambda: rig.taken >= len(rig.world.truth) - 5)
+    for row in range(len(rig.world.closures)):
+        rig.closures.publish(closure_to_message(rig.world.message(row)))
+    rig.until(lambda: len(verdicts(rig)) == len(rig.world.closures))
+    names = [f"keyframe/{i * PERIOD_NS} keyframe/{j * PERIOD_NS}" for i, j, *_ in rig.world.closures]
+    right = {name for name, closure in zip(names, rig.world.closures, strict=True) if closure.right}
+    rig.until(lambda: sum(v == "accepted" for v in verdicts(rig).values()) >= len(right) - 2)
+    assert {name for name, verdict in verdicts(rig).items() if verdict == "accepted"} <= right
+
+    # the pose follows the odometry with the newest correction, whatever the optimiser does
+    rig.heard["pose"].clear()
+    rig.until(lambda: rig.values.get("accepted") and float(rig.values["accepted"]) >= len(right) - 2)
+    rig.odometry.publish(odometry(len(rig.world.truth) * PERIOD_NS, rig.world.odometry[-1]))
+    rig.until(lambda: rig.heard["pose"])
+    pose = rig.heard["pose"][-1]
+    assert pose.header.frame_id == "map"
+    error_m = np.linalg.norm(from_pose(pose.pose.pose)[:3, 3] - rig.world.truth[-1][:3, 3])
+    drift_m = np.linalg.norm(rig.world.odometry[-1][:3, 3] - rig.world.truth[-1][:3, 3])
+    assert error_m < 0.5 * drift_m
+    assert np.linalg.eigvalsh(np.reshape(pose.pose.covariance, (6, 6))).min() > 0
+    assert rig.heard["map_to_odom"][-1].child_frame_id == "odom"
+    assert len(rig.heard["path"][-1].poses) >= len(rig.world.truth) - 5
+    rig.until(lambda: sum(len(m.points) for m in rig.heard["markers"][-1].markers) == 2 * len(rig.world.closures))
+    green, red = rig.heard["markers"][-1].markers
+    assert (green.ns, red.ns) == ("accepted", "rejected")
+
+    assert process.interrupt() == 0
+    results = tmp_path / "results"
+    assert len((results / "trajectory_optimized.tum").read_text().splitlines()) >= len(rig.world.truth) - 5
+    assert (results / "trajectory_odometry.tum").is_file()
+    assert read_g2o(results / "graph.g2o").problems == []
+    rows = list(csv.DictReader((results / "graph_verdicts.csv").open()))
+    ends = {(int(r["match_stamp_ns"]), int(r["query_stamp_ns"])) for r in rows if r["verdict"] == "accepted"}
+    assert {f"keyframe/{match} keyframe/{query}" for match, query in ends} == right
+
+
+def test_bad_messages_are_counted_and_the_node_goes_on(rig: Rig, process: Process) -> None:
+    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    world = rig.world
+    broken = odometry(0, world.odometry[0])
+    broken.pose.pose.orientation.w = 3.0
+    rig.odometry.publish(broken)
+    rig.drive(0, 100)
+    foreign = closure_to_message(world.message(0))
+    foreign.header.frame_id = "elsewhere"
+    flat = closure_to_message(world.message(0))
+    flat.pose.covariance = np.zeros(36)
+    own = closure_to_message(world.message(0))
+    own.header.frame_id = own.child_frame_id
+    for message in (foreign, flat, own):
+        rig.closures.publish(message)
+    wanted = ("pose_not_a_rotation", "closure_frame", "reject_edge")
+
+    def all_counted() -> bool:
+        # a best-effort message may be lost: broken ones are sent until each kind was seen
+        rig.odometry.publish(broken)
+        rig.reject.publish(String(data="the red one"))
+        return all(name in rig.values for name in wanted)
+
+    rig.until(all_counted)
+    rig.until(lambda: sum(name.startswith("closure refused") for name in rig.values) == 2)
+    rig.until(lambda: rig.taken >= 95)
+
+
+def test_services_revoke_save_and_reset(rig: Rig, process: Process, tmp_path: Path) -> None:
+    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    assert not rig.call("reject_last").success
+    rig.drive(0, len(rig.world.truth))
+    rig.until(lambda: rig.taken >= len(rig.world.truth) - 5)
+    for row in range(len(rig.world.closures)):
+        rig.closures.publish(closure_to_message(rig.world.message(row)))
+    rig.until(lambda: "accepted" in verdicts(rig).values())
+    assert rig.call("save").success
+    assert (tmp_path / "results" / "graph.g2o").is_file()
+    answer = rig.call("reject_last")
+    assert answer.success and "revoked" in answer.message
+    match, query = answer.message.split()[1:3]
+    rig.until(lambda: verdicts(rig)[f"{match} {query}"] == "rejected")
+    assert rig.call("reset").success
+    rig.until(lambda: rig.values.get("accepted") is None)
+    assert process.exit_code is None
+
+
+def test_a_clock_that_goes_back_begins_a_session(rig: Rig, process: Process) -> None:
+    rig.until(lambda: rig.odometry.get_subscription_count())
+    rig.drive(0, 60)
+    rig.until(lambda: rig.taken >= 55)
+    rig.drive(0, 20)
+    process.wait_for("a new session begins")
+    rig.until(lambda: rig.taken >= 75)
+
+
+def test_a_wrong_parameter_is_one_line(tmp_path: Path) -> None:
+    process = Process(MODULE, tmp_path / "node.log", "pose_graph.gate:=3")
+    wait_until(lambda: process.exit_code is not None, 90.0)
+    assert process.exit_code == 1
+    assert "unknown parameter pose_graph.gate" in process.output
+    assert len(process.output.strip().splitlines()) == 1
+    process.kill()

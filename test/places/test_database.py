@@ -1,0 +1,143 @@
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import make_keyframe
+
+from umf_ros.config import Database, Loop
+from umf_ros.errors import OutputError, UmfError
+from umf_ros.frames import Keyframe
+from umf_ros.places.database import PlaceDatabase
+from umf_ros.places.packing import pack, unpack
+
+RULES = Loop(min_similarity=-1, min_time_gap_s=20, min_travel_m=15, top_k=50)
+
+
+def database(path: Path | None = None, embedder: str = "test", cached: int = 400) -> PlaceDatabase:
+    return PlaceDatabase(Database(path=str(path or ""), cached_keyframes=cached), embedder, 16)
+
+
+def assert_same(a: Keyframe, b: Keyframe) -> None:
+    assert (a.stamp_ns, a.session, a.camera) == (b.stamp_ns, b.session, b.camera)
+    np.testing.assert_array_equal(a.points, b.points)
+    np.testing.assert_array_equal(a.travelled_m, b.travelled_m)
+    assert (a.odom_T_body is None) == (b.odom_T_body is None)
+    for name in ("image", "cloud", "super_image", "super_cloud"):
+        left, right = getattr(a.embedding, name), getattr(b.embedding, name)
+        assert (left is None) == (right is None)
+        for item in fields(left) if left is not None else ():
+            np.testing.assert_array_equal(getattr(left, item.name), getattr(right, item.name))
+            assert getattr(left, item.name).dtype == getattr(right, item.name).dtype
+
+
+@pytest.mark.parametrize("travelled_m", [3.5, math.nan])
+def test_packing_loses_nothing(travelled_m: float) -> None:
+    keyframe = make_keyframe(1667.123456789, travelled_m, session=3)
+    assert_same(unpack(pack(keyframe)), keyframe)
+
+
+def stamps_found(places: PlaceDatabase, query: Keyframe) -> list[float]:
+    return sorted(found.stamp_ns / 1e9 for found in places.query(query, RULES))
+
+
+def test_matches_must_be_old_and_far_along_the_path() -> None:
+    places = database()
+    for stamp_s, travelled_m in [(0, 0), (10, 80), (30, 86), (79, 90), (81, 10)]:
+        places.add(make_keyframe(stamp_s, travelled_m))
+    # (30, 86): old enough but 14 m back; (79, 90) and (81, 10): too recent
+    assert stamps_found(places, make_keyframe(100, 100)) == [0, 10]
+
+
+def test_without_odometry_time_alone_decides() -> None:
+    places = database()
+    places.add(make_keyframe(0))
+    places.add(make_keyframe(1, 99))
+    places.add(make_keyframe(90))
+    assert stamps_found(places, make_keyframe(100, 100)) == [0]
+    assert stamps_found(places, make_keyframe(100)) == [0, 1]
+
+
+def test_other_sessions_are_always_admissible() -> None:
+    places = database()
+    places.add(make_keyframe(99, 99, session=0))
+    assert stamps_found(places, make_keyframe(100, 100, session=1)) == [99]
+    assert places.next_session == 1
+
+
+def test_best_match_comes_first_and_weak_ones_can_be_cut() -> None:
+    places = database()
+    for seed in range(30):
+        places.add(make_keyframe(seed * 0.1, seed=seed))
+    query = make_keyframe(100, descriptor=places[17].embedding.descriptor)
+    best = places.query(query, RULES)[0]
+    assert best.index == 17 and best.similarity == pytest.approx(1, abs=1e-6)
+    assert len(places.query(query, Loop(min_similarity=0.99))) == 1
+
+
+def test_memory_is_bounded_and_the_disk_remembers() -> None:
+    places = database(cached=20)
+    keyframes = [make_keyframe(i, seed=i) for i in range(100)]
+    for keyframe in keyframes:
+        places.add(keyframe)
+    assert len(places._store._cache) == 20
+    for index in (0, 57, 99):
+        assert_same(places[index], keyframes[index])
+
+
+def test_a_stored_database_is_found_again(tmp_path: Path) -> None:
+    first = database(tmp_path / "map.sqlite")
+    for i in range(5):
+        first.add(make_keyframe(i, i, seed=i))
+    first.close()
+    second = database(tmp_path / "map.sqlite")
+    assert len(second) == 5 and second.next_session == 1
+    assert_same(second[3], make_keyframe(3, 3, seed=3))
+
+
+def test_a_crash_loses_no_keyframe(tmp_path: Path) -> None:
+    crashed = database(tmp_path / "map.sqlite")
+    crashed.add(make_keyframe(1))
+    assert len(database(tmp_path / "map.sqlite")) == 1  # opened beside it, nothing closed
+
+
+def test_saving_copies_everything(tmp_path: Path) -> None:
+    places = database()
+    places.add(make_keyframe(1))
+    places.save(tmp_path / "sub" / "copy.sqlite")
+    places.add(make_keyframe(2))
+    assert len(database(tmp_path / "sub" / "copy.sqlite")) == 1
+
+
+def test_forgetting_the_future() -> None:
+    places = database()
+    for i in range(10):
+        places.add(make_keyframe(i, i, seed=i))
+    assert places.forget_from(round(4e9)) == 6
+    assert len(places) == 4
+    places.add(make_keyframe(5, 5, seed=50))
+    assert_same(places[4], make_keyframe(5, 5, seed=50))
+    assert stamps_found(places, make_keyframe(100, 100)) == [0, 1, 2, 3, 5]
+
+
+def test_a_database_of_another_embedder_is_refused(tmp_path: Path) -> None:
+    database(tmp_path / "map.sqlite").close()
+    with pytest.raises(UmfError, match="made with embedder test, not other"):
+        database(tmp_path / "map.sqlite", embedder="other")
+
+
+def test_a_foreign_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("not a database, but long enough to be looked at " * 20)
+    with pytest.raises(UmfError, match=r"notes\.txt cannot be used as a place database"):
+        database(path)
+    assert path.read_text().startswith("not a database")
+
+
+def test_an_unwritable_copy_is_one_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot write"):
+        database().save(tmp_path / "file" / "copy.sqlite")

@@ -1,0 +1,171 @@
+"""g2o in and out, and `umf graph` on files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from umf_ros.commands.graph import app
+from umf_ros.errors import GraphError, OutputError, UmfError
+from umf_ros.geometry import heading
+from umf_ros.pose_graph import lie
+from umf_ros.pose_graph.condensed import Edge
+from umf_ros.pose_graph.g2o import read_g2o, write_g2o
+from umf_ros.pose_graph.replay import as_recording
+from umf_ros.pose_graph.synthetic import World, rover_loops, with_wrong_closures
+
+
+def edges(count: int, planar: bool) -> list[Edge]:
+    rng = np.random.default_rng(0)
+    keep = np.array([0, 0, 1, 1, 1, 0]) if planar else np.ones(6)
+    result = []
+    for k in range(count):
+        root = rng.normal(size=(6, 6))
+        covariance = 0.01 * (root @ root.T + np.eye(6))
+        pose = lie.exp((keep * rng.normal(0, 0.8, 6))[None])[0]
+        result.append(Edge(k, k + 1, pose, covariance))
+    return result
+
+
+def write_world(path: Path, world: World) -> None:
+    steps = lie.invert(world.odometry[:-1]) @ world.odometry[1:]
+    odometry = [Edge(k, k + 1, step, world.step_covariances[k + 1]) for k, step in enumerate(steps)]
+    closures = [Edge(c.first, c.second, c.pose, c.covariance) for c in world.closures]
+    write_g2o(path, world.odometry, odometry + closures)
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_what_was_written_is_read(tmp_path: Path) -> None:
+    poses = [np.eye(4), *(edge.pose for edge in edges(5, False))]
+    write_g2o(tmp_path / "a.g2o", poses, edges(5, False))
+    content = read_g2o(tmp_path / "a.g2o")
+    assert not content.planar and not content.problems
+    for found, expected in zip(content.edges, edges(5, False), strict=True):
+        assert (found.first, found.second) == (expected.first, expected.second)
+        np.testing.assert_allclose(found.pose, expected.pose, atol=1e-10)
+        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-7)
+    np.testing.assert_allclose(np.stack(list(content.poses.values())), np.stack(poses), atol=1e-10)
+
+
+def test_gtsam_reads_the_same_poses_and_noise(tmp_path: Path) -> None:
+    path = tmp_path / "a.g2o"
+    write_g2o(path, [np.eye(4)] * 4, edges(3, False))
+    graph, _ = gtsam.readG2o(str(path), True)
+    for k, edge in enumerate(edges(3, False)):
+        factor = graph.at(k)
+        np.testing.assert_allclose(factor.measured().matrix(), edge.pose, atol=1e-10)
+        np.testing.assert_allclose(factor.noiseModel().covariance(), edge.covariance, rtol=1e-6)
+
+
+def test_two_dimensions_there_and_back(tmp_path: Path) -> None:
+    path = tmp_path / "plane.g2o"
+    write_g2o(path, [np.eye(4)] * 4, edges(3, True), planar=True)
+    content = read_g2o(path)
+    assert content.planar
+    plane = np.ix_([3, 4, 2], [3, 4, 2])
+    for found, expected in zip(content.edges, edges(3, True), strict=True):
+        assert heading(found.pose) == pytest.approx(heading(expected.pose))
+        np.testing.assert_allclose(found.pose[:2, 3], expected.pose[:2, 3], atol=1e-10)
+        np.testing.assert_allclose(found.covariance[plane], expected.covariance[plane], rtol=1e-6)
+        assert np.linalg.eigvalsh(found.covariance).min() > 0
+
+
+def test_the_old_spelling_is_understood(tmp_path: Path) -> None:
+    path = tmp_path / "toro.graph"
+    path.write_text("VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0.5\nEDGE2 0 1 1 2 0.5 4 1 5 9 2 3\n")
+    content = read_g2o(path)
+    information = np.linalg.inv(content.edges[0].covariance)
+    np.testing.assert_allclose(information[np.ix_([3, 4, 2], [3, 4, 2])], [[4, 1, 2], [1, 5, 3], [2, 3, 9]], atol=1e-9)
+
+
+GOOD = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        ("EDGE_SE2 0 1 1 0", "has 4 values instead of 11"),
+        ("EDGE_SE2 0 one 1 0 0 1 0 0 1 0 1", "invalid literal"),
+        ("EDGE_SE2 0 1 nan 0 0 1 0 0 1 0 1", "not finite"),
+        ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 -1", "not positive definite"),
+        ("EDGE_SE2 1 1 1 0 0 1 0 0 1 0 1", "to itself"),
+        ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 2", "not a unit quaternion"),
+        ("VERTEX_SE2 -1 0 0 0", "negative vertex id"),
+        ("HELLO world", "unknown tag HELLO"),
+    ],
+)
+def test_a_malformed_line_is_named_and_the_rest_is_read(tmp_path: Path, line: str, problem: str) -> None:
+    path = tmp_path / "bad.g2o"
+    path.write_text(f"# a comment\n{GOOD}{line}\nFIX 0\n{GOOD}")
+    content = read_g2o(path)
+    assert len(content.edges) == 2
+    (found,) = content.problems
+    assert found.startswith("line 3: ") and problem in found
+
+
+def test_files_that_cannot_be_used(tmp_path: Path) -> None:
+    with pytest.raises(GraphError, match="No such file"):
+        read_g2o(tmp_path / "missing.g2o")
+    (tmp_path / "picture.g2o").write_bytes(bytes(range(256)))
+    with pytest.raises(GraphError, match="not a text file"):
+        read_g2o(tmp_path / "picture.g2o")
+    (tmp_path / "empty.g2o").write_text("VERTEX_SE2 0 0 0 0\n")
+    with pytest.raises(GraphError, match="no usable edge"):
+        read_g2o(tmp_path / "empty.g2o")
+    with pytest.raises(OutputError):
+        write_g2o(tmp_path / "no" / "folder.g2o", [], [])
+
+
+def test_chains_and_backward_edges_are_sorted_out(tmp_path: Path) -> None:
+    path = tmp_path / "two.g2o"
+    edge = "0 0 0 1 0 0 1 0 1\n"
+    path.write_text(f"EDGE_SE2 11 10 {edge}EDGE_SE2 11 12 {edge}EDGE_SE2 40 41 {edge}EDGE_SE2 41 10 {edge}")
+    recording = as_recording(read_g2o(path))
+    assert recording.ids.tolist() == [10, 11, 12, 40, 41] and recording.chains == [0, 3]
+    assert [(closure.first, closure.second) for closure in recording.closures] == [(0, 4)]
+
+
+def test_optimize_rejects_what_is_wrong_and_writes_what_is_right(tmp_path: Path) -> None:
+    world = with_wrong_closures(rover_loops(300, 12), 0.3, "groups", 1)
+    write_world(tmp_path / "in.g2o", world)
+    output, table = tmp_path / "out.g2o", tmp_path / "verdicts.csv"
+    result = run("optimize", tmp_path / "in.g2o", "-o", output, "--verdicts", table)
+    assert result.exit_code == 0, result.output
+    right = sum(closure.right for closure in world.closures)
+    assert f"{right} accepted" in result.output and "contradicts the map" in result.output
+    assert len(read_g2o(output).edges) == len(world.truth) - 1 + right
+    assert len(table.read_text().splitlines()) == 1 + len(world.closures)
+
+
+def test_optimize_without_guards_accepts_all(tmp_path: Path) -> None:
+    world = rover_loops(200, 12)
+    write_world(tmp_path / "in.g2o", world)
+    result = run("optimize", tmp_path / "in.g2o", "--reject", "none")
+    assert f"{len(world.closures)} accepted" in result.output and "rejected" not in result.output
+
+
+def test_optimize_says_which_line_it_skipped(tmp_path: Path) -> None:
+    (tmp_path / "bad.g2o").write_text(GOOD + "EDGE_SE2 1 2 oops\n")
+    result = run("optimize", tmp_path / "bad.g2o")
+    assert result.exit_code == 0 and "skipped line 2:" in result.output
+
+
+def test_wrong_arguments_are_one_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "good.g2o").write_text(GOOD)
+    result = run("optimize", tmp_path / "good.g2o", "--reject", "magic")
+    assert isinstance(result.exception, UmfError) and "expected all, none" in str(result.exception)
+    assert isinstance(run("optimize", tmp_path / "none.g2o").exception, GraphError)
+
+
+def test_plot_draws_a_picture(tmp_path: Path) -> None:
+    write_world(tmp_path / "in.g2o", rover_loops(200, 12))
+    assert run("plot", tmp_path / "in.g2o", "-o", tmp_path / "graph.png").exit_code == 0
+    assert (tmp_path / "graph.png").stat().st_size > 10_000
+    assert isinstance(run("plot", tmp_path / "in.g2o", "-o", tmp_path / "no" / "a.png").exception, OutputError)

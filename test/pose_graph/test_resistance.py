@@ -1,0 +1,49 @@
+"""The promise: wrong closures stay out, right ones come in, the map is the outlier-free optimum."""
+
+from __future__ import annotations
+
+import pytest
+from graph_worlds import SETTINGS, accepted, batch_optimum, drive, right, rms
+
+from umf_ros.pose_graph.synthetic import Kind, World, garage, rover_loops, sphere, with_wrong_closures
+
+ROVER = rover_loops(400, 11)
+
+
+@pytest.mark.parametrize("kind", ["random", "groups", "near"])
+def test_half_of_all_closures_wrong(kind: Kind) -> None:
+    world = with_wrong_closures(ROVER, 0.5, kind, 1)
+    graph = drive(world)
+    assert accepted(graph) == right(world)
+    assert rms(graph.trajectory()[1], batch_optimum(world)) < 0.03
+
+
+@pytest.mark.parametrize("stated", [1 / 3, 3.0])
+@pytest.mark.parametrize("kind", ["groups", "near"])
+def test_odometry_stated_three_times_too_well_or_too_badly(kind: Kind, stated: float) -> None:
+    world = with_wrong_closures(ROVER, 0.5, kind, 2)
+    graph = drive(world, stated=stated)
+    assert graph.scale.odometry == pytest.approx(1 / stated, rel=0.4)
+    assert accepted(graph) <= right(world)
+    assert len(accepted(graph)) >= 0.96 * len(right(world))
+    assert rms(graph.trajectory()[1], batch_optimum(world)) < 0.3
+
+
+@pytest.mark.parametrize("world", [sphere(240, 1), garage(300, 1)], ids=["sphere", "garage"])
+def test_other_shapes(world: World) -> None:
+    graph = drive(with_wrong_closures(world, 0.3, "groups", 1))
+    assert accepted(graph) == right(world)
+    assert rms(graph.trajectory()[1], batch_optimum(world)) < 0.03
+
+
+def test_accepting_everything_gives_the_batch_optimum() -> None:
+    everything = SETTINGS.model_copy(update={"use_gate": False, "use_support": False, "estimate_scale": False})
+    graph = drive(ROVER, everything)
+    assert accepted(graph) == right(ROVER)
+    assert rms(graph.trajectory()[1], batch_optimum(ROVER)) < 1e-3
+
+
+def test_without_its_guards_the_graph_swallows_wrong_closures() -> None:
+    everything = SETTINGS.model_copy(update={"use_gate": False, "use_support": False})
+    world = with_wrong_closures(ROVER, 0.3, "groups", 1)
+    assert not accepted(drive(world, everything)) <= right(world)

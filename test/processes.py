@@ -1,0 +1,69 @@
+"""Nodes as processes, for tests over real DDS."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+ENVIRONMENT = {
+    **os.environ,
+    "RCUTILS_LOGGING_USE_STDOUT": "1",
+    "RCUTILS_CONSOLE_OUTPUT_FORMAT": "{message}",
+    "RCUTILS_LOGGING_BUFFERED_STREAM": "0",
+    "PYTHONUNBUFFERED": "1",
+    "OMP_NUM_THREADS": "1",
+}
+
+
+class Process:
+    """A node that runs while a test does."""
+
+    def __init__(self, module: str, log: Path, *parameters: str, command: list[str] | None = None) -> None:
+        arguments = ["--ros-args", *(word for parameter in parameters for word in ("-p", parameter))]
+        self._log = log
+        self._file = log.open("w")
+        self._process = subprocess.Popen(
+            [*(command or [sys.executable, "-m", module]), *(arguments if parameters else [])],
+            stdout=self._file,
+            stderr=subprocess.STDOUT,
+            env=ENVIRONMENT,
+        )
+
+    @property
+    def output(self) -> str:
+        return self._log.read_text()
+
+    @property
+    def exit_code(self) -> int | None:
+        return self._process.poll()
+
+    def wait_for(self, text: str, timeout_s: float = 90.0) -> None:
+        wait_until(lambda: text in self.output or self.exit_code is not None, timeout_s)
+        assert text in self.output, f"'{text}' not in:\n{self.output}"
+
+    def interrupt(self, timeout_s: float = 60.0) -> int:
+        if self.exit_code is None:
+            self._process.send_signal(signal.SIGINT)
+        return self._process.wait(timeout_s)
+
+    def kill(self) -> None:
+        if self.exit_code is None:
+            self._process.kill()
+        self._process.wait()
+        self._file.close()
+
+
+def wait_until(
+    condition: Callable[[], bool], timeout_s: float = 30.0, spin: Callable[[], object] | None = None
+) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        spin() if spin else time.sleep(0.05)
+    return True

@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from recordings import CALIBRATION, camera_info
+
+from umf_ros.errors import CalibrationError
+from umf_ros.geometry import make_pose, transform
+from umf_ros.sensors.calibration import load_calibration
+from umf_ros.sensors.messages import decode_camera_info
+from umf_ros.sensors.rectification import RawCamera, StereoRectifier
+
+DATASETS = ("simulated", "s3li-etna", "s3li-vulcano")
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_axes_of_every_data_set_are_as_the_frames_say(name: str) -> None:
+    calibration = load_calibration(name)
+    camera, lidar = calibration.body_T_camera[:3, :3], calibration.body_T_lidar[:3, :3]
+    for pose in (camera, lidar, calibration.body_T_imu[:3, :3]):
+        assert np.allclose(pose @ pose.T, np.eye(3), atol=1e-6)
+        assert np.linalg.det(pose) == pytest.approx(1)
+    forward, left, up = np.eye(3)
+    # the simulated camera looks down by some degrees
+    assert camera[:, 2] @ forward > 0.97 and camera[:, 0] @ left < -0.97 and camera[:, 1] @ up < -0.97
+    assert lidar[:, 1] @ forward > 0.97 and lidar[:, 0] @ left < -0.97 and lidar[:, 2] @ up > 0.97
+    # both sensors sit on one bar
+    assert np.linalg.norm(calibration.body_T_camera[:3, 3] - calibration.body_T_lidar[:3, 3]) < 0.2
+
+
+def test_etna_imu_hangs_upside_down_and_feels_gravity_upwards_in_the_body() -> None:
+    calibration = load_calibration("s3li-etna")
+    at_rest = np.array([0.0, 0.0, -9.81])  # what an accelerometer reads whose z axis points down
+    assert np.allclose(calibration.body_T_imu[:3, :3] @ at_rest, [0, 0, 9.81], atol=1e-5)
+
+
+def test_etna_camera_is_where_the_data_set_says_relative_to_the_imu() -> None:
+    imu_T_camera = np.linalg.inv(load_calibration("s3li-etna").body_T_imu) @ load_calibration("s3li-etna").body_T_camera
+    published = np.array(
+        [
+            [0.9999198, 0.00649271, -0.01087349, -0.1372],
+            [-0.01079265, -0.01235939, -0.99986537, -0.0551],
+            [-0.00662623, 0.99990254, -0.01228832, -0.0691],
+            [0, 0, 0, 1],
+        ]
+    )
+    assert np.allclose(imu_T_camera, published, atol=1e-6)
+
+
+def test_etna_lidar_points_land_where_the_data_set_projects_them() -> None:
+    calibration = load_calibration("s3li-etna")
+    camera_T_lidar = np.linalg.inv(calibration.body_T_camera) @ calibration.body_T_lidar
+    rotation = [[0.997479, -0.059131, -0.039222], [-0.040101, -0.013762, -0.999101], [0.058538, 0.998155, -0.016099]]
+    assert np.allclose(camera_T_lidar, make_pose(rotation, [0.1, 0, 0]), atol=2e-6)
+    assert calibration.lidar_time_offset_s == pytest.approx(0.1)
+
+
+def test_camera_info_replaces_intrinsics_and_keeps_a_known_baseline() -> None:
+    calibration = load_calibration("s3li-etna")
+    left, right = camera_info(0, 500.0, (688, 512)), camera_info(0, 500.0, (688, 512), baseline=0.3)
+    both = calibration.with_camera(decode_camera_info(left, right))
+    assert (both.camera.fx, both.camera.baseline) == (500, pytest.approx(0.3))
+    assert calibration.with_camera(decode_camera_info(left)).camera.baseline == calibration.camera.baseline
+    raw = load_calibration("s3li-vulcano")
+    assert raw.with_camera(decode_camera_info(left, right)) is raw
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"min_intensity": None}, "min_intensity"),
+        ({"min_intensty": 3}, "unknown key min_intensty"),
+        ({"body_T_lidar": {"translation": [0, 0, 0], "quaternion": [0, 0, 0, 2]}}, "body_T_lidar.quaternion"),
+        ({"body_T_camera": {"translation": [0, 0], "quaternion": [0, 0, 0, 1]}}, "body_T_camera.translation"),
+        ({"camera": {"width": 0}}, "camera.width"),
+        ({"camera": None}, "either camera"),
+        ({"lidar_time_offset_s": "soon"}, "lidar_time_offset_s"),
+    ],
+)
+def test_faults_are_named_by_key_on_one_line(change: dict[str, object], text: str, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(CALIBRATION) | change))
+    with pytest.raises(CalibrationError) as caught:
+        load_calibration(path)
+    assert text in str(caught.value) and str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_key_missing_file_and_no_yaml(tmp_path: Path) -> None:
+    content = yaml.safe_load(CALIBRATION)
+    del content["body_T_imu"]
+    path = tmp_path / "calibration.yaml"
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(CalibrationError, match="body_T_imu is missing"):
+        load_calibration(path)
+    with pytest.raises(CalibrationError, match="cannot read"):
+        load_calibration(tmp_path / "nothing.yaml")
+    path.write_text("camera: [")
+    with pytest.raises(CalibrationError, match="not valid YAML"):
+        load_calibration(path)
+    path.write_text("just words")
+    with pytest.raises(CalibrationError, match="the file"):
+        load_calibration(path)
+
+
+def blob(camera: RawCamera, point: np.ndarray, camera_T_left: np.ndarray) -> np.ndarray:
+    """A raw image with one bright spot where the camera sees a point of the left camera's frame."""
+    rotation, _ = cv2.Rodrigues(camera_T_left[:3, :3])
+    distortion = np.array(camera.distortion)
+    matrix = camera.matrix((camera.width, camera.height))
+    pixel, _ = cv2.projectPoints(point[None], rotation, camera_T_left[:3, 3], matrix, distortion)
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    away = (u - pixel[0, 0, 0]) ** 2 + (v - pixel[0, 0, 1]) ** 2
+    return (250 * np.exp(-away / 72)).astype(np.uint8)
+
+
+def centre(image: np.ndarray) -> np.ndarray:
+    v, u = np.nonzero(image > 30)
+    weight = image[v, u].astype(float)
+    return np.array([u @ weight, v @ weight]) / weight.sum()
+
+
+def test_rectified_pair_sees_points_where_an_ideal_pair_would() -> None:
+    lens = (-0.2, 0.08, 0.001, -0.0005)
+    left = RawCamera(1032, 772, 870.0, 868.0, 520.0, 380.0, lens)
+    right = RawCamera(1032, 772, 865.0, 866.0, 512.0, 390.0, lens)
+    turn, _ = cv2.Rodrigues(np.array([0.01, -0.015, 0.02]))
+    left_T_right = make_pose(turn, [0.2, 0.003, -0.002])
+    rectifier = StereoRectifier(left, right, left_T_right, size=(344, 256))
+    camera, rectified_T_left = rectifier.camera, np.linalg.inv(rectifier.raw_T_rectified)
+    assert camera.baseline == pytest.approx(np.linalg.norm(left_T_right[:3, 3]), rel=1e-6)
+    for point in np.array([[0.3, -0.2, 4.0], [-1.0, 0.8, 6.0], [1.5, 0.9, 9.0]]):
+        seen_left = centre(rectifier.left(blob(left, point, np.eye(4))))
+        seen_right = centre(rectifier.right(blob(right, point, np.linalg.inv(left_T_right))))
+        x, y, z = transform(rectified_T_left, point[None])[0]
+        assert np.allclose(seen_left, [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], atol=0.15)
+        assert seen_left[1] - seen_right[1] == pytest.approx(0, abs=0.15)
+        assert seen_left[0] - seen_right[0] == pytest.approx(camera.fx * camera.baseline / z, abs=0.15)

@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import CALIBRATION, CLOUD, LEFT, LEFT_INFO, START_NS, camera_info, cloud, image, odometry, scan
+
+from umf_ros.config import Sync, Topics
+from umf_ros.sensors.calibration import load_calibration
+from umf_ros.sensors.intake import Intake, wanted_inputs
+from umf_ros.sensors.synchronizer import Synchronizer
+
+
+@pytest.fixture
+def synchronizer(tmp_path: Path) -> Synchronizer:
+    path = tmp_path / "calibration.yaml"
+    path.write_text(CALIBRATION)
+    return Synchronizer(
+        Sync(), load_calibration(path), wanted_inputs(Topics(odometry="", right_image="", right_info=""))
+    )
+
+
+def test_inputs_without_a_topic_are_not_wanted() -> None:
+    assert wanted_inputs(Topics()) == {"left", "right", "cloud", "odometry", "camera_info"}
+    assert wanted_inputs(Topics(cloud="", left_info="", odometry="")) == {"left", "right"}
+
+
+def test_every_bad_message_is_counted_and_each_kind_told_once(synchronizer: Synchronizer) -> None:
+    told: list[str] = []
+    intake = Intake(synchronizer, Topics(), told.append)
+    pixels = np.zeros((48, 64), np.uint8)
+    for i in range(3):
+        intake.take(LEFT, image(START_NS + i, pixels, "yuv422"))
+        intake.take(LEFT, image(START_NS + i, pixels, step=10))
+        intake.take(LEFT, image(START_NS + i, np.zeros((4, 4), np.uint8)))
+        intake.take(CLOUD, cloud(START_NS + i, scan(np.ones((3, 3))), data=np.zeros(5, np.uint8)))
+        broken = odometry(START_NS + i, np.eye(4))
+        broken.pose.pose.orientation.w = 0.0
+        intake.take("/odom", broken)
+    assert synchronizer.counters["left"].dropped == {"encoding": 3, "step": 3, "size": 3}
+    assert synchronizer.counters["cloud"].dropped == {"truncated": 3}
+    assert synchronizer.counters["odometry"].dropped == {"pose": 3}
+    assert len(told) == 5
+    assert any(LEFT in line and "yuv422" in line for line in told)
+
+
+def test_good_messages_after_bad_ones_still_make_a_frame(synchronizer: Synchronizer) -> None:
+    intake = Intake(synchronizer, Topics(right_info=""), lambda _: None)
+    intake.take(LEFT_INFO, camera_info(START_NS, 77.0, (64, 48)))
+    intake.take(CLOUD, cloud(START_NS, scan(np.full((3, 3), 4.0))))
+    intake.take(LEFT, image(START_NS + 90_000_000, np.zeros((48, 64), np.uint8), height=0))
+    intake.take(LEFT, image(START_NS + 100_000_000, np.full((48, 64), 9, np.uint8)))
+    (frame,) = synchronizer.pop()
+    assert frame.left is not None and frame.left.max() == 9
+    assert frame.points is not None and len(frame.points) == 3
+    assert (frame.camera.fx, frame.camera.baseline) == (77, 0.2)
+
+
+def test_useless_camera_info_is_told_and_the_calibration_file_stands(synchronizer: Synchronizer) -> None:
+    told: list[str] = []
+    intake = Intake(synchronizer, Topics(right_info=""), told.append)
+    intake.take(LEFT_INFO, camera_info(START_NS, 77.0, (64, 48), k=np.zeros(9), p=np.zeros(12)))
+    intake.take(CLOUD, cloud(START_NS, scan(np.full((3, 3), 4.0))))
+    intake.take(LEFT, image(START_NS + 100_000_000, np.zeros((48, 64), np.uint8)))
+    (frame,) = synchronizer.pop()
+    assert frame.camera.fx == 60
+    assert len(told) == 1 and "not calibrated" in told[0]

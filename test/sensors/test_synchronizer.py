@@ -1,0 +1,364 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recordings import CALIBRATION, drive
+
+from umf_ros.config import Sync
+from umf_ros.errors import MessageError
+from umf_ros.frames import Frame, StereoCamera
+from umf_ros.geometry import invert, transform
+from umf_ros.sensors.calibration import Calibration, load_calibration
+from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.synchronizer import INPUTS, Synchronizer
+
+S = 10**9
+MS = 10**6
+OFFSET = 100 * MS  # of the calibration: a scan's key is its middle
+T0 = 1_625_680_800 * S
+
+Measurement = tuple[str, int, Any]
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Calibration:
+    path = tmp_path / "calibration.yaml"
+    path.write_text(CALIBRATION)
+    return load_calibration(path)
+
+
+def picture(value: int = 0) -> np.ndarray:
+    return np.full((48, 64), value % 256, np.uint8)
+
+
+def points(count: int = 20, duration_ns: int = 200 * MS) -> Cloud:
+    xyz = np.random.default_rng(count).uniform((-5, 5, -3), (5, 15, 3), (count, 3)).astype(np.float32)
+    return Cloud(xyz, np.full(count, 50, np.float32), np.linspace(0, duration_ns, count).astype(np.int64))
+
+
+def rover(duration_s: float = 10.0) -> dict[str, list[Measurement]]:
+    """Measurements of each input: stereo at 30 Hz whose right camera drops some, scans, odometry at 20 Hz."""
+    lefts = [T0 + round(i * S / 30) for i in range(int(duration_s * 30))]
+    scans = [T0 + round(i * S / 4.7) for i in range(int(duration_s * 4.7))]
+    poses = [T0 + round(i * S / 20) for i in range(int(duration_s * 20))]
+    return {
+        "left": [("left", stamp, picture(i)) for i, stamp in enumerate(lefts)],
+        "right": [("right", stamp, picture(i + 1)) for i, stamp in enumerate(lefts) if i % 11 != 5],
+        "cloud": [("cloud", stamp, points(20 + i % 5)) for i, stamp in enumerate(scans)],
+        "odometry": [("odometry", stamp, drive((stamp - T0) / S)) for stamp in poses],
+    }
+
+
+def feed(synchronizer: Synchronizer, measurements: list[Measurement]) -> list[Frame]:
+    frames: list[Frame] = []
+    for name, stamp, value in measurements:
+        getattr(synchronizer, f"add_{name}")(stamp, value)
+        frames += synchronizer.pop()
+    return frames
+
+
+def in_order(streams: dict[str, list[Measurement]]) -> list[Measurement]:
+    return sorted((item for stream in streams.values() for item in stream), key=lambda item: item[1])
+
+
+def same(a: Frame, b: Frame) -> bool:
+    fields = ("left", "right", "points", "intensity", "odom_T_body", "body_T_camera")
+    arrays = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in fields)
+    return arrays and (a.stamp_ns, a.image_stamp_ns, a.session) == (b.stamp_ns, b.image_stamp_ns, b.session)
+
+
+def check_accounts(synchronizer: Synchronizer) -> None:
+    """After a flush every message has found its fate."""
+    for counter in synchronizer.counters.values():
+        assert counter.waiting == 0
+        assert counter.received == counter.used + counter.dropped.total()
+
+
+def test_one_frame_per_scan_with_the_nearest_image_and_its_own_right_one(calibration: Calibration) -> None:
+    streams = rover()
+    synchronizer = Synchronizer(Sync(), calibration)
+    frames = feed(synchronizer, in_order(streams)) + synchronizer.flush()
+    assert [frame.stamp_ns for frame in frames] == [stamp + OFFSET for _, stamp, _ in streams["cloud"]]
+    lefts = {stamp: value for _, stamp, value in streams["left"]}
+    rights = {stamp: value for _, stamp, value in streams["right"]}
+    for frame in frames:
+        assert frame.image_stamp_ns == min(lefts, key=lambda stamp: abs(stamp - frame.stamp_ns))
+        assert frame.left is lefts[frame.image_stamp_ns]
+        assert frame.right is rights.get(frame.image_stamp_ns)
+    assert sum(frame.right is None for frame in frames) > 0
+    assert synchronizer.counters["cloud"].used == len(frames)
+    assert synchronizer.counters["left"].lost == 0
+    check_accounts(synchronizer)
+
+
+def test_right_image_within_half_a_period_is_taken_when_stamps_differ(calibration: Calibration) -> None:
+    def right_of(shift_ms: int) -> np.ndarray | None:
+        synchronizer = Synchronizer(Sync(), calibration, {"left", "right", "cloud"})
+        right = ("right", T0 + shift_ms * MS, picture(2))
+        arrivals = [("left", T0, picture(1)), ("cloud", T0 - OFFSET, points()), right]
+        return (feed(synchronizer, arrivals) + synchronizer.flush())[0].right
+
+    assert right_of(16) is not None and right_of(-16) is not None
+    assert right_of(18) is None and right_of(-18) is None
+
+
+def test_odometry_is_interpolated_at_the_key(calibration: Calibration) -> None:
+    synchronizer = Synchronizer(Sync(), calibration)
+    frames = feed(synchronizer, in_order(rover()))
+    for frame in frames:
+        assert frame.odom_T_body is not None
+        assert np.allclose(frame.odom_T_body, drive((frame.stamp_ns - T0) / S), atol=1e-3)
+
+
+def test_a_wall_scanned_on_the_drive_is_where_it_is(calibration: Calibration, rng: np.random.Generator) -> None:
+    world = rng.uniform((2, -5, 0), (12, 5, 3), (500, 3))
+    scan_start = 3 * S
+    offsets = np.sort(rng.integers(0, 200 * MS, 500))
+    seen = [
+        transform(invert(drive((scan_start + offset) / S) @ calibration.body_T_lidar), point[None])[0]
+        for point, offset in zip(world, offsets, strict=True)
+    ]
+    cloud = Cloud(np.array(seen, np.float32), np.full(500, 50, np.float32), offsets)
+    streams = rover(6.0)
+    streams["cloud"] = [("cloud", T0 + scan_start, cloud)]
+    frame = feed(Synchronizer(Sync(), calibration), in_order(streams))[0]
+    truth = transform(invert(drive((scan_start + OFFSET) / S)), world)
+    assert frame.points is not None
+    assert np.abs(frame.points - truth).max() < 0.005
+    skewed = transform(calibration.body_T_lidar, cloud.points)
+    assert np.abs(skewed - truth).max() > 0.1
+
+
+def test_without_odometry_the_scan_stays_as_it_is(calibration: Calibration) -> None:
+    streams = rover(2.0)
+    del streams["odometry"]
+    frames = feed(Synchronizer(Sync(), calibration, {"left", "right", "cloud"}), in_order(streams))
+    for frame, (_, _, cloud) in zip(frames, streams["cloud"], strict=False):
+        assert frame.odom_T_body is None
+        assert np.array_equal(frame.points, transform(calibration.body_T_lidar, cloud.points))
+        assert np.array_equal(frame.body_T_camera, calibration.body_T_camera)
+
+
+def test_camera_pose_makes_up_for_the_time_since_the_exposure(calibration: Calibration) -> None:
+    frames = feed(Synchronizer(Sync(), calibration), in_order(rover()))
+    for frame in frames:
+        assert frame.image_stamp_ns is not None
+        exposed, key = ((stamp - T0) / S for stamp in (frame.image_stamp_ns, frame.stamp_ns))
+        truth = invert(drive(key)) @ drive(exposed) @ calibration.body_T_camera
+        assert np.allclose(frame.body_T_camera, truth, atol=2e-3)
+    assert any(not np.allclose(frame.body_T_camera, calibration.body_T_camera, atol=5e-3) for frame in frames)
+
+
+def test_weak_and_high_returns_are_dropped(calibration: Calibration) -> None:
+    xyz = np.array([[0, 5, 0], [0, 5, 21], [0, 5, -21], [0, 6, 0]], np.float32)
+    cloud = Cloud(xyz, np.array([16, 90, 90, 15], np.float32))
+    synchronizer = Synchronizer(Sync(), calibration, {"cloud"})
+    frame = feed(synchronizer, [("cloud", T0, cloud)])[0]
+    assert frame.intensity is not None and frame.intensity.tolist() == [16]
+    assert np.array_equal(frame.points, transform(calibration.body_T_lidar, xyz[:1]))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_interleaving_of_arrivals_changes_nothing(seed: int, calibration: Calibration) -> None:
+    streams = rover()
+    reference = Synchronizer(Sync(), calibration)
+    expected = feed(reference, in_order(streams)) + reference.flush()
+    rng = np.random.default_rng(seed)
+    arrivals: list[tuple[float, Measurement]] = []
+    for stream in streams.values():
+        delays = np.maximum.accumulate(
+            np.array([item[1] - T0 for item in stream]) + rng.uniform(0, 0.4 * S, len(stream))
+        )
+        lag = rng.uniform(0, 0.5 * S)
+        arrivals += [(delay + lag, item) for delay, item in zip(delays, stream, strict=True)]
+    shuffled = [item for _, item in sorted(arrivals, key=lambda arrival: arrival[0])]
+    assert shuffled != in_order(streams)
+    synchronizer = Synchronizer(Sync(), calibration)
+    frames = feed(synchronizer, shuffled) + synchronizer.flush()
+    assert len(frames) == len(expected)
+    assert all(same(a, b) for a, b in zip(frames, expected, strict=True))
+    assert synchronizer.counters == reference.counters
+    check_accounts(synchronizer)
+
+
+def test_a_scan_waits_until_no_nearer_image_can_come(calibration: Calibration) -> None:
+    synchronizer = Synchronizer(Sync(), calibration, {"left", "cloud"})
+    early = [("left", T0 - 30 * MS, picture(1)), ("cloud", T0 - OFFSET, points())]
+    assert feed(synchronizer, early) == []
+    assert synchronizer.waiting == 1
+    frame = feed(synchronizer, [("left", T0 + 3 * MS, picture(2))])[0]
+    assert frame.image_stamp_ns == T0 + 3 * MS
+
+
+def test_images_beyond_the_slop_do_not_count(calibration: Calibration) -> None:
+    measurements = [
+        ("left", T0 - 51 * MS, picture()),
+        ("cloud", T0 - OFFSET, points()),
+        ("left", T0 + 51 * MS, picture()),
+    ]
+    frame = feed(Synchronizer(Sync(), calibration, {"left", "cloud"}), measurements)[0]
+    assert frame.left is None and frame.image_stamp_ns is None
+    strict = Synchronizer(Sync(require_image=True), calibration, {"left", "cloud"})
+    assert feed(strict, measurements) + strict.flush() == []
+    assert strict.counters["cloud"].dropped == {"no image": 1}
+    check_accounts(strict)
+
+
+@pytest.mark.parametrize("name", ["left", "right", "odometry"])
+def test_an_input_that_dies_delays_scans_by_stream_time_only(name: str, calibration: Calibration) -> None:
+    streams = rover()
+    streams[name] = [item for item in streams[name] if item[1] < T0 + 3 * S]
+    synchronizer = Synchronizer(Sync(), calibration)
+    keys: list[tuple[int, int]] = []
+    for item in in_order(streams):
+        keys += [(frame.stamp_ns, item[1]) for frame in feed(synchronizer, [item])]
+    frames = len(keys) + len(synchronizer.flush())
+    assert frames == len(streams["cloud"])
+    waited = [now - key for key, now in keys]
+    assert max(waited[:10]) < 0.35 * S
+    assert all(S < wait < 1.1 * S for wait in waited[20:])
+    check_accounts(synchronizer)
+
+
+def test_an_input_that_never_speaks_costs_no_latency_after_a_while(calibration: Calibration) -> None:
+    streams = rover(12.0)
+    late_odometry = [item for item in streams["odometry"] if item[1] > T0 + 9 * S]
+    synchronizer = Synchronizer(Sync(), calibration, {*INPUTS, "camera_info"})
+    waits: dict[int, float] = {}
+    frames: list[Frame] = []
+    for item in in_order({**streams, "odometry": late_odometry}):
+        new = feed(synchronizer, [item])
+        waits |= {frame.stamp_ns: (item[1] - frame.stamp_ns) / S for frame in new}
+        frames += new
+    assert max(wait for stamp, wait in waits.items() if stamp < T0 + 4 * S) > 1
+    assert max(wait for stamp, wait in waits.items() if stamp > T0 + 5.5 * S) < 0.2
+    # it is used, and waited for, as soon as it speaks
+    known = [frame.stamp_ns for frame in frames if frame.odom_T_body is not None]
+    assert len(known) > 10 and min(known) < T0 + 9.4 * S
+
+
+def test_images_that_come_too_late_are_told_from_surplus(calibration: Calibration) -> None:
+    synchronizer = Synchronizer(Sync(max_wait_s=0.2), calibration, {"left", "cloud"})
+    feed(synchronizer, [("cloud", T0 + i * 200 * MS, points()) for i in range(5)])
+    feed(synchronizer, [("left", T0 + OFFSET + i * 200 * MS, picture(i)) for i in range(5)])
+    synchronizer.flush()
+    assert synchronizer.counters["left"].dropped["late"] == 3
+    assert synchronizer.counters["left"].used == 2
+    assert synchronizer.counters["left"].lost == 3
+    check_accounts(synchronizer)
+
+
+def test_camera_alone_makes_one_frame_per_image(calibration: Calibration) -> None:
+    streams = rover(3.0)
+    del streams["cloud"]
+    synchronizer = Synchronizer(Sync(), calibration, {"left", "right", "odometry"})
+    frames = feed(synchronizer, in_order(streams)) + synchronizer.flush()
+    assert [frame.stamp_ns for frame in frames] == [stamp for _, stamp, _ in streams["left"]]
+    assert all(frame.points is None and frame.left is not None for frame in frames)
+    assert sum(frame.right is not None for frame in frames) == len(streams["right"])
+    check_accounts(synchronizer)
+
+
+def test_neither_image_nor_points_is_no_frame(calibration: Calibration) -> None:
+    empty = Cloud(np.empty((0, 3), np.float32), np.empty(0, np.float32))
+    alone = Synchronizer(Sync(), calibration, {"cloud"})
+    assert feed(alone, [("cloud", T0, empty)]) == []
+    assert alone.counters["cloud"].dropped == {"empty": 1}
+    with_image = Synchronizer(Sync(), calibration, {"cloud", "left"})
+    frame = feed(with_image, [("cloud", T0 - OFFSET, empty), ("left", T0, picture())])[0]
+    assert frame.points is None and frame.left is not None
+
+
+def test_a_recording_that_starts_again_is_a_new_session(calibration: Calibration) -> None:
+    once = in_order(rover(4.0))
+    synchronizer = Synchronizer(Sync(), calibration)
+    first = feed(synchronizer, once)
+    second = feed(synchronizer, once)
+    # the jump completed what was waiting; it comes out first
+    ending = [frame for frame in second if frame.session == 0]
+    second = [frame for frame in second if frame.session == 1] + synchronizer.flush()
+    whole = first + ending
+    assert len(whole) == len(second) == int(4.0 * 4.7)
+    assert synchronizer.session == 1
+    fields = [(frame.stamp_ns, frame.image_stamp_ns) for frame in whole]
+    assert fields == [(frame.stamp_ns, frame.image_stamp_ns) for frame in second]
+    assert all(frame.odom_T_body is not None for frame in second[:-1])
+    check_accounts(synchronizer)
+
+
+def test_stragglers_of_the_session_before_do_not_start_another_one(calibration: Calibration) -> None:
+    streams = rover(4.0)
+    synchronizer = Synchronizer(Sync(), calibration)
+    late_clouds = streams["cloud"][-2:]
+    feed(synchronizer, [item for item in in_order(streams) if item not in late_clouds and item[1] < T0 + 3.8 * S])
+    feed(synchronizer, streams["left"][:3] + late_clouds)
+    frames = feed(synchronizer, in_order({**streams, "left": streams["left"][3:]})) + synchronizer.flush()
+    assert synchronizer.session == 1
+    assert synchronizer.counters["cloud"].dropped == {"stale": 2}
+    assert sum(frame.session == 1 for frame in frames) == len(streams["cloud"])
+    check_accounts(synchronizer)
+
+
+def test_duplicates_and_messages_out_of_order_are_counted_not_used(calibration: Calibration) -> None:
+    synchronizer = Synchronizer(Sync(), calibration, {"left", "cloud"})
+    feed(synchronizer, [("left", T0, picture(1)), ("left", T0, picture(2)), ("left", T0 - 20 * MS, picture(3))])
+    feed(synchronizer, [("cloud", T0 - OFFSET, points())])
+    synchronizer.flush()
+    assert synchronizer.counters["left"].dropped == {"duplicate": 1, "out of order": 1}
+    assert (synchronizer.session, synchronizer.counters["left"].used) == (0, 1)
+    check_accounts(synchronizer)
+
+
+@pytest.mark.parametrize("name", ["left", "odometry", "cloud"])
+def test_memory_is_bounded_when_only_one_input_talks(name: str, calibration: Calibration) -> None:
+    sync = Sync(queue_size=10, max_wait_s=10, odometry_buffer_s=1)
+    synchronizer = Synchronizer(sync, calibration)
+    values = {"left": picture(), "odometry": np.eye(4), "cloud": points()}
+    for i in range(500):
+        feed(synchronizer, [(name, T0 + i * 10 * MS, values[name])])
+    held = {
+        "left": len(synchronizer._left._images),
+        "odometry": len(synchronizer._odometry._stamps),
+        "cloud": synchronizer.waiting,
+    }
+    assert held["left"] <= 10 and held["cloud"] <= 10 and held["odometry"] <= 201
+    assert synchronizer.counters[name].received == 500
+    synchronizer.flush()
+    check_accounts(synchronizer)
+
+
+def test_nothing_is_interpolated_across_a_gap_of_the_odometry(calibration: Calibration) -> None:
+    streams = rover(6.0)
+    streams["odometry"] = [item for item in streams["odometry"] if not T0 + 2 * S < item[1] < T0 + 4 * S]
+    frames = feed(Synchronizer(Sync(max_wait_s=5), calibration), in_order(streams))
+    known = [frame.stamp_ns for frame in frames if frame.odom_T_body is not None]
+    assert all(not T0 + 2 * S < stamp < T0 + 4 * S for stamp in known)
+    assert len(known) > 15 and len(frames) > 25
+
+
+def test_an_image_of_another_size_is_refused_and_counted_once(calibration: Calibration) -> None:
+    synchronizer = Synchronizer(Sync(), calibration)
+    with pytest.raises(MessageError, match="32 x 24 pixels, the calibration is for 64 x 48") as caught:
+        synchronizer.add_left(T0, np.zeros((24, 32), np.uint8))
+    synchronizer.reject("left", caught.value.kind)
+    assert synchronizer.counters["left"].dropped == {"size": 1}
+    check_accounts(synchronizer)
+
+
+def test_frames_wait_for_the_camera_info_they_shall_use(calibration: Calibration) -> None:
+    other = StereoCamera(64, 48, 70.0, 70.0, 31.0, 23.0, 0.3)
+    streams = rover(2.0)
+    synchronizer = Synchronizer(Sync(), calibration, {*INPUTS, "camera_info"})
+    before = in_order(streams)[:40]
+    assert feed(synchronizer, before) == []
+    synchronizer.use_camera(other)
+    frames = feed(synchronizer, in_order(streams)[40:]) + synchronizer.flush()
+    assert len(frames) == len(streams["cloud"])
+    assert {frame.camera for frame in frames} == {other}
+    # one that is useless is not waited for
+    synchronizer = Synchronizer(Sync(), calibration, {*INPUTS, "camera_info"})
+    synchronizer.reject("camera_info", "camera_info")
+    assert feed(synchronizer, in_order(streams))[0].camera == calibration.camera

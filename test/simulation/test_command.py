@@ -1,0 +1,49 @@
+"""What `umf simulate` refuses, each with one clear line and nothing left behind."""
+
+from __future__ import annotations
+
+import pytest
+
+from umf_ros.commands.simulate import command
+from umf_ros.errors import UmfError
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({"seed": -1}, "seed -1 is not between"),
+        ({"preset": "olympus"}, "unknown preset 'olympus'"),
+        ({"family": "venus"}, "unknown family 'venus'"),
+        ({"aliasing": 2.0}, "aliasing 2.0 is not between"),
+        ({"image_rate": 0.0}, "image rate 0 Hz is not between"),
+        ({"duration": 1e9}, "duration 1e\\+09 s is not between"),
+    ],
+)
+def test_impossible_drives(tmp_path, options, line):
+    with pytest.raises(UmfError, match=line) as raised:
+        command(tmp_path / "drive.mcap", **options)
+    assert "\n" not in str(raised.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_places_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file" / "drive.mcap", tmp_path / "drive.bag"):
+        with pytest.raises(UmfError, match="cannot write"):
+            command(out)
+
+
+def test_without_a_place_to_write_it_says_what_is_missing():
+    with pytest.raises(UmfError, match=r"OUT\.mcap"):
+        command(None)
+
+
+@pytest.mark.parametrize("worlds", ["5:2", "abc", "-3:2"])
+def test_seeds_that_hold_no_world(tmp_path, worlds):
+    with pytest.raises(UmfError, match="seeds"):
+        command(shards=tmp_path, worlds=worlds)
+
+
+def test_unknown_sequences(tmp_path):
+    with pytest.raises(UmfError, match="etna, thesis"):
+        command(shards=tmp_path, sequences="luna")

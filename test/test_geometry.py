@@ -1,0 +1,49 @@
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from umf_ros.geometry import Array, gtsam_to_ros_covariance, make_pose, ros_to_gtsam_covariance
+
+POSES = [gtsam.Pose3.Expmap(np.random.default_rng(seed).normal(0, 1.5, 6)).matrix() for seed in range(5)]
+
+
+def covariance(seed: int) -> Array:
+    root = np.random.default_rng(seed).normal(size=(6, 6))
+    return root @ root.T + 0.1 * np.eye(6)
+
+
+def ros_error(pose: Array, moved: Array) -> Array:
+    """What a ROS covariance speaks of: displacement and rotation vector about the parent's axes."""
+    turn = gtsam.Rot3.Logmap(gtsam.Rot3(moved[:3, :3] @ pose[:3, :3].T))
+    return np.concatenate([moved[:3, 3] - pose[:3, 3], turn])
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_covariance_conversion_is_the_derivative_of_retract(pose: Array) -> None:
+    step = 1e-6
+    columns = [
+        (
+            ros_error(pose, gtsam.Pose3(pose).retract(step * axis).matrix())
+            - ros_error(pose, gtsam.Pose3(pose).retract(-step * axis).matrix())
+        )
+        / (2 * step)
+        for axis in np.eye(6)
+    ]
+    ros_from_gtsam = np.stack(columns, axis=1)
+    in_ros = covariance(3)
+    expected = np.linalg.inv(ros_from_gtsam) @ in_ros @ np.linalg.inv(ros_from_gtsam).T
+    np.testing.assert_allclose(ros_to_gtsam_covariance(in_ros, pose), expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_covariance_conversion_and_back(pose: Array) -> None:
+    there = ros_to_gtsam_covariance(covariance(1).ravel(), pose)
+    np.testing.assert_allclose(gtsam_to_ros_covariance(there, pose), covariance(1), atol=1e-12)
+
+
+def test_a_quarter_turn_swaps_the_axes_of_the_position() -> None:
+    pose = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [5, 0, 0])
+    converted = ros_to_gtsam_covariance(np.diag([1.0, 2, 3, 4, 5, 6]), pose)
+    np.testing.assert_allclose(np.diag(converted), [5, 4, 6, 2, 1, 3])

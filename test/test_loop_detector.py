@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_frame
+from scipy.spatial.transform import Rotation
+
+from umf_ros.config import Settings, load_settings
+from umf_ros.embedding.ground_truth import GroundTruthEmbedder
+from umf_ros.frames import Frame
+from umf_ros.geometry import invert, make_pose, relative, rotation_angle, transform
+from umf_ros.loop_detector import Detection, LoopDetector
+
+LAP_S = 40
+RADIUS_M = 8.0
+
+
+def pose_at(second: float) -> np.ndarray:
+    angle = 2 * math.pi * second / LAP_S
+    place = [RADIUS_M * math.cos(angle), RADIUS_M * math.sin(angle), 0.3 * math.sin(3 * angle)]
+    return make_pose(Rotation.from_euler("z", angle + math.pi / 2).as_matrix(), place)
+
+
+@pytest.fixture(scope="module")
+def ground() -> np.ndarray:
+    """(N, 3) points of a rough hilly ground with boulders, m, world frame."""
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(-45, 45, (160_000, 2))
+    z = sum(
+        a * np.sin(xy @ rng.normal(0, k, 2) + rng.uniform(0, 6)) for a, k in [(0.5, 0.3), (0.3, 0.6), (0.12, 1.2)] * 4
+    )
+    for centre, size in zip(rng.uniform(-40, 40, (150, 2)), rng.uniform(0.3, 1.5, 150), strict=True):
+        z += size * np.exp(-((np.linalg.norm(xy - centre, axis=1) / size) ** 2))
+    return np.c_[xy, z - 1.5]
+
+
+def scan_from(ground: np.ndarray, world_T_body: np.ndarray, seed: int) -> np.ndarray:
+    """What a 70 degree LiDAR sees of it, thinned with range, with 1 cm noise."""
+    rng = np.random.default_rng(seed)
+    points = transform(invert(world_T_body), ground)
+    reach = np.linalg.norm(points[:, :2], axis=1)
+    seen = (np.abs(np.arctan2(points[:, 1], points[:, 0])) < 0.61) & (reach < 35) & (reach > 2)
+    seen &= rng.random(len(points)) < np.minimum(1, 8 / np.maximum(reach, 1))
+    return (points[seen] + rng.normal(0, 0.01, (seen.sum(), 3))).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def frames(ground: np.ndarray) -> list[Frame]:
+    made = []
+    for i, second in enumerate(np.arange(0, 1.5 * LAP_S, 1.0)):
+        pose = pose_at(second)
+        points = scan_from(ground, pose, i)
+        frame = make_frame(second, odom_T_body=pose)
+        made.append(replace(frame, points=points, intensity=np.full(len(points), 100, np.float32)))
+    return made
+
+
+def detector(settings: Settings | None = None) -> LoopDetector:
+    truth = {round(second * 1e9): pose_at(second) for second in np.arange(0, 1.5 * LAP_S, 1.0)}
+    return LoopDetector(settings or load_settings(), GroundTruthEmbedder(truth))
+
+
+@pytest.fixture(scope="module")
+def detections(frames: list[Frame]) -> list[Detection]:
+    found = detector()
+    return [found.process(frame) for frame in frames]
+
+
+def test_a_revisit_becomes_a_metric_closure_without_any_network(detections: list[Detection]) -> None:
+    closures = [closure for detection in detections for closure in detection.closures]
+    assert len(closures) >= 8
+    for closure in closures:
+        truth = relative(pose_at(closure.match_stamp_ns * 1e-9), pose_at(closure.query_stamp_ns * 1e-9))
+        error = invert(truth) @ closure.match_T_query
+        assert np.linalg.norm(error[:3, 3]) < 0.3 and np.degrees(rotation_angle(error)) < 3
+        assert closure.query_stamp_ns - closure.match_stamp_ns >= 20e9
+        assert closure.probability >= 0.9
+        assert (np.linalg.eigvalsh(closure.covariance) > 0).all()
+
+
+def test_the_first_lap_has_nothing_to_close(detections: list[Detection]) -> None:
+    assert not any(detection.verdicts for detection in detections[:20])
+
+
+def test_every_verdict_has_a_reason_and_every_stage_a_time(detections: list[Detection]) -> None:
+    last = detections[-1]
+    assert last.keyframe is not None and last.verdicts
+    assert all(verdict.reason for verdict in last.verdicts)
+    assert set(last.latency_ms) == {"embed", "query", "verify", "total"}
+    assert last.latency_ms["total"] == pytest.approx(sum(last.latency_ms[s] for s in ("embed", "query", "verify")))
+
+
+def test_the_same_frames_give_the_same_verdicts_bit_for_bit(frames: list[Frame], detections: list[Detection]) -> None:
+    again = detector()
+    for frame, before in zip(frames, detections, strict=True):
+        now = again.process(frame)
+        assert [v.reason for v in now.verdicts] == [v.reason for v in before.verdicts]
+        for a, b in zip(now.closures, before.closures, strict=True):
+            np.testing.assert_array_equal(a.match_T_query, b.match_T_query)
+            np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_a_standing_rover_makes_no_keyframes(frames: list[Frame]) -> None:
+    found = detector()
+    still = [replace(frames[0], stamp_ns=frames[0].stamp_ns + i * 10**7) for i in range(20)]
+    assert [found.process(frame).keyframe is not None for frame in still] == [True] + [False] * 19
+
+
+def test_a_clock_that_jumps_back_forgets_the_future(frames: list[Frame]) -> None:
+    found = detector()
+    for frame in frames[:30]:
+        found.process(frame)
+    assert len(found.database) == 30
+    restarted = found.process(replace(frames[10], session=1))
+    assert len(found.database) == 11
+    # what the first session knew of the time before is another session's, and may be matched at once
+    assert restarted.keyframe is not None and restarted.keyframe.session == 1
+    assert restarted.verdicts
+
+
+def test_reset_forgets_everything(frames: list[Frame]) -> None:
+    found = detector()
+    for frame in frames[:5]:
+        found.process(frame)
+    found.reset()
+    assert len(found.database) == 0
+    assert found.process(frames[6]).verdicts == []
+
+
+@pytest.fixture
+def image() -> Iterator[np.ndarray]:
+    yield np.random.default_rng(0).integers(0, 255, (512, 688), np.uint8)
+
+
+def test_either_modality_may_be_missing(frames: list[Frame], image: np.ndarray) -> None:
+    found = detector()
+    camera_only = replace(frames[0], left=image, right=image, points=None, intensity=None)
+    lidar_only, blind = frames[3], replace(frames[6], left=image * 0, points=np.empty((0, 3), np.float32))
+    for frame in (camera_only, lidar_only, blind):
+        assert found.process(frame).keyframe is not None
+    assert len(found.database) == 3

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import threading
+import time
+
+from umf_ros.worker import Worker
+
+
+def test_items_are_done_in_order() -> None:
+    done: list[int] = []
+    worker: Worker[int] = Worker(done.append, lambda _: None, queue_size=100)
+    for i in range(50):
+        worker.submit(i)
+    worker.close()
+    assert done == list(range(50)) and worker.dropped == 0
+
+
+def test_a_late_worker_drops_the_oldest_and_counts() -> None:
+    gate, started, done = threading.Event(), threading.Event(), []
+
+    def work(item: int) -> None:
+        started.set()
+        gate.wait()
+        done.append(item)
+
+    worker: Worker[int] = Worker(work, lambda _: None, queue_size=3)
+    worker.submit(0)
+    started.wait()
+    for i in range(1, 11):
+        worker.submit(i)
+    gate.set()
+    worker.close()
+    assert done == [0, 8, 9, 10] and worker.dropped == 7
+
+
+def test_submitting_never_waits_for_the_work() -> None:
+    gate = threading.Event()
+    worker: Worker[int] = Worker(lambda _: gate.wait() and None, lambda _: None, queue_size=2)
+    submitted = threading.Thread(target=lambda: [worker.submit(i) for i in range(1000)])
+    submitted.start()
+    submitted.join(timeout=10)
+    assert not submitted.is_alive()
+    gate.set()
+    worker.close()
+
+
+def test_an_error_is_reported_and_the_thread_lives_on() -> None:
+    errors: list[Exception] = []
+    done: list[int] = []
+
+    def work(item: int) -> None:
+        if item == 1:
+            raise ValueError("no")
+        done.append(item)
+
+    worker: Worker[int] = Worker(work, errors.append, queue_size=9)
+    for i in range(3):
+        worker.submit(i)
+    worker.close()
+    assert done == [0, 2] and str(errors[0]) == "no"
+
+
+def test_nothing_is_taken_after_closing() -> None:
+    done: list[int] = []
+    worker: Worker[int] = Worker(done.append, lambda _: None, queue_size=9)
+    worker.close()
+    worker.submit(1)
+    time.sleep(0.01)
+    assert done == []

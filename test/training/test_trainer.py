@@ -1,0 +1,247 @@
+"""Whole runs on a world small enough to train in seconds."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from networks.conftest import TINY
+from training.conftest import write_world
+
+from umf_ros.datasets.simulated import SimulatedWorld, WorldFolder
+from umf_ros.errors import ConfigError, UmfError, WeightsError
+from umf_ros.networks.presets import PRESETS
+from umf_ros.networks.umf import UMF
+from umf_ros.networks.weights import load_weights, read_card
+from umf_ros.training.batches import BatchMaker
+from umf_ros.training.config import load_training
+from umf_ros.training.distributed import Team
+from umf_ros.training.labels import Rule
+from umf_ros.training.objective import Bank, Objective
+from umf_ros.training.run import train
+from umf_ros.training.sampler import PairSampler, places_drawn
+from umf_ros.training.trainer import Trainer
+from umf_ros.training.validation import retrieve, validate
+from umf_ros.training.views import Augmentation, ViewMaker
+
+RULE = Rule(positive_m=5)
+
+
+@pytest.fixture(autouse=True)
+def tiny_preset(monkeypatch):
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "worlds").mkdir()
+    for seed in (1, 2):
+        write_world(tmp_path / "worlds" / f"world_{seed:05d}.npz", seed)
+    return tmp_path / "worlds"
+
+
+def settings_for(folder, **changes):
+    small = {
+        "preset": "tiny",
+        "steps": 4,
+        "epoch_steps": 2,
+        "batch": 8,
+        "local_pairs": 2,
+        "bank_from_step": 2,
+        "warmup_steps": 1,
+    }
+    return load_training(None, train=str(folder), **(small | changes))
+
+
+def silent(_):
+    pass
+
+
+def weights_of(path):
+    return torch.cat([value.flatten().float() for value in load_weights(path).state_dict().values()])
+
+
+def batch_of(world, seed=0):
+    pairs = PairSampler([world], RULE).draw(4, np.random.default_rng(seed))
+    return BatchMaker([world], ViewMaker(TINY, Augmentation()), 2, 16).make(pairs, np.random.default_rng(seed))
+
+
+def test_pairs_show_one_place_in_different_passes(world):
+    for anchor, positive in PairSampler([world], RULE).draw(8, np.random.default_rng(0)):
+        assert anchor.mirror == positive.mirror
+        assert world.pass_index[anchor.index] != world.pass_index[positive.index]
+        apart = world.world_T_body[anchor.index, :2, 3] - world.world_T_body[positive.index, :2, 3]
+        assert np.linalg.norm(apart) < 5
+
+
+def test_a_mirrored_world_is_another_world(world):
+    places = places_drawn(
+        [draw for pair in PairSampler([world], RULE).draw(8, np.random.default_rng(1)) for draw in pair], [world]
+    )
+    mirrored = places.world == 1
+    assert 0 < mirrored.sum() < 16
+    assert (places.position[mirrored, 1] <= 0).all()
+    assert (places.position[~mirrored, 1] >= 0).all()
+
+
+@pytest.mark.parametrize("loss", ["multi_similarity", "triplet"])
+def test_every_parameter_of_the_run_learns(world, folder, loss):
+    torch.manual_seed(0)
+    network = UMF(TINY).train()
+    batch = batch_of(world)
+    image = torch.tensor([True] * 7 + [False])
+    cloud = torch.tensor([False] + [True] * 7)
+    losses, _ = Objective(network, settings_for(folder, loss=loss), RULE)(batch, image, cloud, Bank(0, 16))
+    losses["total"].backward()
+    idle = [n for n, p in network.named_parameters() if p.grad is None or not p.grad.abs().any()]
+    assert [name for name in idle if not name.endswith("key_value.bias")] == []
+
+
+def test_frozen_encoders_stay(folder, tmp_path):
+    torch.manual_seed(3)
+    network = UMF(TINY)
+    before = {name: value.clone() for name, value in network.named_parameters()}
+    trainer = Trainer(
+        network, settings_for(folder, freeze_encoders=True, steps=2), WorldFolder(folder).refresh, list, tmp_path,
+        Team(0, 1, torch.device("cpu")),
+    )  # fmt: skip
+    trainer.run(silent, lambda *_: None)
+    moved = {name for name, value in network.named_parameters() if not torch.equal(value, before[name])}
+    assert not [name for name in moved if "encoder" in name]
+    assert "fusion.image_head.weight" in moved
+
+
+def test_a_run_leaves_weights_card_log_and_settings(folder, tmp_path):
+    settings = settings_for(folder, validation=str(folder), validate_epochs=1)
+    path = train(settings, tmp_path / "run", resume=False, report=silent)
+    assert load_weights(path).config == TINY
+    card = read_card(path)
+    assert card["training_worlds"] == ["world_00001", "world_00002"]
+    assert card["settings"]["train"] == "worlds"
+    assert 0 <= card["validation"]["world_00001"]["fused"]["recall1"] <= 1
+    rows = list(csv.DictReader((tmp_path / "run" / "log.csv").open()))
+    assert [row["step"] for row in rows] == ["2", "4"]
+    assert float(rows[0]["recall1_fused"]) >= 0
+    assert load_training(tmp_path / "run" / "training.yaml") == settings
+    json.dumps(card, allow_nan=False)
+
+
+def test_a_run_repeats_itself_and_resumes_as_if_never_stopped(folder, tmp_path):
+    whole = train(settings_for(folder), tmp_path / "whole", False, silent)
+    again = train(settings_for(folder), tmp_path / "again", False, silent)
+    torch.testing.assert_close(weights_of(whole), weights_of(again))
+
+    class StoppedError(Exception):
+        pass
+
+    def stop(progress):
+        if progress.step == 3:
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        train(settings_for(folder), tmp_path / "halves", False, stop)
+    halves = train(settings_for(folder), tmp_path / "halves", True, silent)
+    torch.testing.assert_close(weights_of(whole), weights_of(halves))
+    other = train(settings_for(folder, seed=1), tmp_path / "other", False, silent)
+    assert not torch.allclose(weights_of(whole), weights_of(other))
+
+
+def test_training_lowers_the_loss(folder, tmp_path):
+    seen = []
+    settings = settings_for(folder, steps=30, epoch_steps=5, weight_local=0, weight_super=0, local_pairs=0, bank=0)
+    train(settings, tmp_path / "run", False, lambda progress: seen.append(progress.losses["fused"]))
+    assert seen[-1] < seen[4]
+
+
+def test_batches_grow_while_triplets_sleep(folder, tmp_path):
+    torch.manual_seed(0)
+    settings = settings_for(folder, loss="triplet", active_share=1.0, batch_limit=10, steps=4)
+    trainer = Trainer(UMF(TINY), settings, WorldFolder(folder).refresh, list, tmp_path, Team(0, 1, torch.device("cpu")))
+    trainer.progress.losses["active"] = 0
+    sizes = []
+    trainer.run(lambda progress: sizes.append(progress.batch), lambda *_: None)
+    assert sizes[0] == 8
+    assert trainer.progress.batch <= 10
+
+
+def test_early_stopping(folder, tmp_path):
+    settings = settings_for(folder, validation=str(folder), validate_epochs=1, patience=1, steps=40, learning_rate=1e-9)
+    steps = []
+    train(settings, tmp_path / "run", False, lambda progress: steps.append(progress.step))
+    assert len(steps) < 40
+
+
+def test_weights_of_another_image_size_can_start_a_run(folder, tmp_path):
+    first = train(settings_for(folder, steps=2), tmp_path / "a", False, silent)
+    second = train(settings_for(folder, steps=2, start=str(first), image_size=(32, 64)), tmp_path / "b", False, silent)
+    assert load_weights(second).config == replace(TINY, image_size=(32, 64))
+    with pytest.raises(ConfigError, match="is not a umf_mobile"):
+        train(settings_for(folder, preset="umf_mobile", start=str(first)), tmp_path / "c", False, silent)
+
+
+def test_recall_counts_true_places_only():
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, 0, 3] = [0, 30, 100]
+    references = np.eye(3, 4)
+    perfect = retrieve(references, poses, references, poses)
+    assert (perfect.recall1, perfect.recall1_5m, perfect.recall_at_precision1, perfect.queries) == (1, 1, 1, 3)
+    shifted = poses.copy()
+    shifted[:, 1, 3] = 8
+    assert retrieve(references, shifted, references, poses).recall1_5m == 0
+    wrong = retrieve(references[[1, 0, 2]], poses, references, poses)
+    assert wrong.recall1 == pytest.approx(1 / 3)
+    assert wrong.recall_at_precision1 == 0
+    away = poses.copy()
+    away[:, 0, 3] += 1000
+    assert retrieve(references, away, references, poses).queries == 0
+
+
+def test_validation_of_a_perfect_world(world):
+    found = validate(UMF(TINY), [world])[world.name]
+    # the passes of this world show the same images and scans
+    assert found["fused"].recall1 == found["image"].recall1 == found["cloud"].recall1 == 1
+
+
+def test_new_worlds_are_picked_up(folder):
+    worlds = WorldFolder(folder)
+    assert len(worlds.refresh()) == 2
+    write_world(folder / "world_00003.npz", 3)
+    assert [world.name for world in worlds.refresh()][-1] == "world_00003"
+
+
+@pytest.mark.parametrize(
+    ("content", "word"), [(b"", "cannot read"), (b"PK\x03\x04 half a file", "cannot read")], ids=["empty", "truncated"]
+)
+def test_damaged_shards(tmp_path, content, word):
+    path = tmp_path / "w.npz"
+    path.write_bytes(content)
+    with pytest.raises(UmfError, match=word):
+        SimulatedWorld(path)
+
+
+def test_foreign_shards(tmp_path):
+    np.savez(tmp_path / "w.npz", images=np.zeros(3))
+    with pytest.raises(UmfError, match="points"):
+        SimulatedWorld(tmp_path / "w.npz")
+    with pytest.raises(UmfError, match="does not exist"):
+        SimulatedWorld(tmp_path / "none.npz")
+    with pytest.raises(UmfError, match="not a folder"):
+        WorldFolder(tmp_path / "none")
+
+
+def test_wrong_settings_and_missing_data(folder, tmp_path):
+    with pytest.raises(ConfigError, match="learning_rate"):
+        load_training(None, train="x", learning_rate=-1)
+    with pytest.raises(ConfigError, match="extra"):
+        load_training(None, train="x", teh_steps=1)
+    with pytest.raises(ConfigError, match="unknown network"):
+        train(settings_for(folder, preset="umf_giant"), tmp_path / "run", False, silent)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match="no worlds"):
+        train(settings_for(tmp_path / "empty"), tmp_path / "run", False, silent)
+    with pytest.raises(WeightsError, match="resume"):
+        train(settings_for(folder), tmp_path / "fresh", True, silent)

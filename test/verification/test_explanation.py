@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from scenes import landscape, pose_at, take
+
+from umf_ros.commands.explain import _moment, _nearest
+from umf_ros.config import Verification
+from umf_ros.errors import BagError, OutputError
+from umf_ros.frames import Frame
+from umf_ros.verification.explanation import Explanation, draw, explain
+
+GROUND = landscape(20)
+
+
+def explained(same: bool) -> Explanation:
+    query = take(GROUND, pose_at(GROUND, -14.0, 1.2, 6.0), 100.0)
+    ground = GROUND if same else landscape(77)
+    return explain(query, take(ground, pose_at(ground, -15.0, 0.0, 0.0), 10.0), Verification())
+
+
+def test_same_place_is_explained_by_arguments_that_add_up() -> None:
+    found = explained(same=True)
+    assert found.verdict.startswith("accepted")
+    odds = sum(found.arguments.values())
+    assert found.probability == pytest.approx(1 / (1 + np.exp(-odds)))
+    assert found.arguments["bias"] < 0 < found.arguments["residual_like_noise"]
+    assert len(found.pixels) > 10
+
+
+def test_other_place_is_rejected_with_its_numbers() -> None:
+    found = explained(same=False)
+    assert found.verdict.startswith("rejected")
+    assert found.evidence is None or found.evidence.numbers["residual_m"] > 0.01
+
+
+def test_picture_is_written_with_and_without_images_and_pose(tmp_path: Path) -> None:
+    found = explained(same=True)
+    image = np.full((found.query.camera.height, found.query.camera.width), 120, np.uint8)
+    draw(found, image, None, tmp_path / "pair.png")
+    nothing = replace(found, evidence=None, probability=0.0, arguments={}, pixels=np.empty((0, 4), np.float32))
+    draw(nothing, None, None, tmp_path / "nothing.png")
+    for name in ("pair.png", "nothing.png"):
+        picture = cv2.imread(str(tmp_path / name))
+        assert picture is not None and picture.std() > 10
+    assert nothing.verdict == "rejected: no pose fits"
+
+
+def test_unwritable_picture_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="cannot write"):
+        draw(explained(same=True), None, None, tmp_path / "missing" / "pair.png")
+
+
+def frames(count: int) -> list[Frame]:
+    camera = take(GROUND, pose_at(GROUND, 0, 0, 0), 1.0).camera
+    return [Frame(1_700_000_000_000_000_000 + n * 250_000_000, camera, np.eye(4), np.eye(4)) for n in range(count)]
+
+
+def test_moments_are_stamps_or_seconds_from_the_start() -> None:
+    recording = frames(40)
+    late, early = _nearest(recording, [_moment("7.6"), _moment(str(recording[3].stamp_ns))])
+    assert late.stamp_ns == recording[30].stamp_ns
+    assert early.stamp_ns == recording[3].stamp_ns
+
+
+def test_moments_outside_the_recording_are_one_clear_error() -> None:
+    with pytest.raises(BagError, match="no frame within a second of 99"):
+        _nearest(frames(8), [99.0, 0.0])
+    with pytest.raises(BagError, match="has no frame"):
+        _nearest([], [1.0, 2.0])
+
+
+@pytest.mark.parametrize("text", ["soon", "-3", "nan"])
+def test_moments_that_are_none_are_refused(text: str) -> None:
+    with pytest.raises(typer.BadParameter):
+        _moment(text)

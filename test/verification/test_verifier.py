@@ -1,0 +1,185 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import landscape, pose_at, take, without_image, without_scan
+
+from umf_ros.config import Verification
+from umf_ros.frames import Candidate, Keyframe, Verdict
+from umf_ros.geometry import Array, make_pose, relative, rotation_angle
+from umf_ros.verification import Verifier
+
+GROUND, ELSEWHERE = landscape(20), landscape(99)
+HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
+TRUE = relative(THERE, HERE)
+
+
+def candidate(keyframe: Keyframe, index: int = 0, similarity: float = 0.7) -> tuple[Candidate, Keyframe]:
+    return Candidate(index, keyframe.stamp_ns, similarity), keyframe
+
+
+def others(count: int) -> list[tuple[Candidate, Keyframe]]:
+    """Candidates of another landscape."""
+    poses = [pose_at(ELSEWHERE, -20.0 + number, -15.0 + 5.0 * number, 20.0) for number in range(count)]
+    return [candidate(take(ELSEWHERE, pose, 20.0 + n), n + 1, 0.75) for n, pose in enumerate(poses)]
+
+
+def gap(verdict: Verdict) -> tuple[float, float]:
+    assert verdict.closure is not None
+    error = relative(TRUE, verdict.closure.match_T_query)
+    return float(np.linalg.norm(error[:3, 3])), float(np.degrees(rotation_angle(error)))
+
+
+def test_revisit_among_others_is_found_with_its_pose(verifier: Verifier) -> None:
+    query, match = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
+    verdicts = verifier.verify(query, [*others(5), candidate(match)])
+    assert len(verdicts) == 6
+    best = verdicts[0]
+    assert best.reason == "accepted"
+    assert best.candidate.stamp_ns == match.stamp_ns
+    assert gap(best)[0] < 0.05 and gap(best)[1] < 0.3
+    assert best.closure is not None and best.closure.query_stamp_ns == query.stamp_ns
+    assert best.closure.probability >= 0.9
+    assert [verdict.closure for verdict in verdicts[1:]] == [None] * 5
+
+
+def test_every_verdict_has_numbers_and_a_reason(verifier: Verifier) -> None:
+    verdicts = verifier.verify(take(GROUND, HERE, 100.0), [*others(7), candidate(take(GROUND, THERE, 10.0))])
+    assert all(verdict.reason and "similarity" in verdict.numbers for verdict in verdicts)
+    assert {"residual_m", "overlap", "probability", "inliers_image", "support"} <= set(verdicts[0].numbers)
+    pixels = verdicts[0].inlier_pixels
+    assert pixels.shape[1] == 4 and len(pixels) > 10
+
+
+def test_rejected_candidate_says_how_far_it_fell_short(verifier: Verifier) -> None:
+    verdicts = verifier.verify(take(GROUND, HERE, 100.0), others(3))
+    assert all(verdict.closure is None for verdict in verdicts)
+    for verdict in verdicts:
+        judged = "probability" in verdict.numbers
+        assert verdict.reason.startswith("probability 0." if judged else ("no pose", "less promising"))
+
+
+def test_covariance_covers_the_error(verifier: Verifier) -> None:
+    found = verifier.verify(take(GROUND, HERE, 100.0), [candidate(take(GROUND, THERE, 10.0))])[0]
+    assert found.closure is not None
+    covariance = found.closure.covariance
+    assert np.linalg.eigvalsh(covariance)[0] > 0
+    error = found.closure.match_T_query[:3, 3] - TRUE[:3, 3]
+    assert error @ np.linalg.solve(covariance[:3, :3], error) < 30
+
+
+def test_lidar_alone_is_enough(verifier: Verifier) -> None:
+    query, match = without_image(take(GROUND, HERE, 100.0)), without_image(take(GROUND, THERE, 10.0))
+    found = verifier.verify(query, [candidate(match)])[0]
+    assert gap(found)[0] < 0.05
+    assert len(found.inlier_pixels) == 0
+
+
+def test_camera_alone_gives_a_pose_and_says_how_sure_it_is(verifier: Verifier) -> None:
+    query, match = without_scan(take(GROUND, HERE, 100.0)), without_scan(take(GROUND, THERE, 10.0))
+    found = Verifier(Verification(min_probability=0.0)).verify(query, [candidate(match)])[0]
+    assert gap(found)[0] < 0.3 and gap(found)[1] < 2
+    wrong = take(landscape(21), pose_at(landscape(21), -15, 0, 0), 10.0)
+    rejected = verifier.verify(query, [candidate(without_scan(wrong))])[0]
+    assert rejected.closure is None
+
+
+def test_no_candidates_no_verdicts(verifier: Verifier) -> None:
+    assert verifier.verify(take(GROUND, HERE, 100.0), []) == []
+
+
+def test_threshold_is_the_one_knob() -> None:
+    query, match = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
+    assert Verifier(Verification(min_probability=1.0)).verify(query, [candidate(match)])[0].closure is None
+    assert Verifier(Verification(min_probability=0.5)).verify(query, [candidate(match)])[0].closure is not None
+
+
+def test_superfeatures_can_rerank_instead(verifier: Verifier) -> None:
+    chosen = Verifier(Verification(rerank="superfeatures"))
+    found = chosen.verify(take(GROUND, HERE, 100.0), [candidate(take(GROUND, THERE, 10.0))])[0]
+    assert found.numbers["superfeatures"] == 0 and found.numbers["inliers_image"] == 0
+    assert gap(found)[0] < 0.05
+
+
+@pytest.mark.parametrize("modalities", ["image", "cloud"])
+def test_one_modality_can_rerank_alone(modalities: str) -> None:
+    chosen = Verifier(Verification(modalities=modalities))
+    numbers = chosen.verify(take(GROUND, HERE, 100.0), [candidate(take(GROUND, THERE, 10.0))])[0].numbers
+    assert (numbers["inliers_image"] > 0) == (modalities == "image")
+    assert (numbers["inliers_cloud"] > 0) == (modalities == "cloud")
+
+
+def drive(shift: Array) -> list[tuple[Keyframe, Keyframe]]:
+    """Queries and matches of a few steps along a path, with odometry that drifted by `shift`."""
+    pairs = []
+    for step in range(3):
+        here, there = pose_at(GROUND, -14.0 + step, 1.2, 6.0), pose_at(GROUND, -15.0 + step, 0.0, 0.0)
+        pairs.append(
+            (take(GROUND, here, 100.0 + step, odom=shift @ here), take(GROUND, there, 10.0 + step, odom=there))
+        )
+    return pairs
+
+
+def test_neighbouring_keyframes_support_each_other_until_reset(verifier: Verifier) -> None:
+    support = []
+    for query, match in drive(make_pose(np.eye(3), [2.0, 1.0, 0.0])):
+        support.append(verifier.verify(query, [candidate(match)])[0].numbers["support"])
+    assert support == [0, 1, 2]
+    verifier.reset()
+    query, match = drive(np.eye(4))[2]
+    assert verifier.verify(query, [candidate(match)])[0].numbers["support"] == 0
+
+
+def test_expected_place_is_tested_before_better_looking_ones() -> None:
+    verifier = Verifier(Verification(refine_best=1))
+    first, second = drive(np.eye(4))[:2]
+    assert verifier.verify(first[0], [candidate(first[1])])[0].closure is not None
+    lookalikes = [(replace(found, similarity=0.99), keyframe) for found, keyframe in others(4)]
+    blind = replace(second[1], embedding=replace(second[1].embedding, image=None, cloud=None))
+    verdicts = verifier.verify(second[0], [*lookalikes, candidate(blind, similarity=0.1)])
+    assert verdicts[0].closure is not None and verdicts[0].candidate.stamp_ns == blind.stamp_ns
+
+
+PROBE = """
+import sys; sys.path[:0] = [{benchmarks!r}]
+from scenes import *; from umf_ros.config import Verification
+from umf_ros.frames import Candidate; from umf_ros.verification import Verifier
+ground = landscape(20); verifier = Verifier(Verification())
+for step in range(2):
+    query = take(ground, pose_at(ground, -14.0 + step, 1.2, 6.0), 100.0 + step)
+    matches = [take(ground, pose_at(ground, -15.0 + 3 * n, 4.0 * n, 20.0 * n), 10.0 + n) for n in range(4)]
+    for verdict in verifier.verify(query, [(Candidate(n, m.stamp_ns, 0.5), m) for n, m in enumerate(matches)]):
+        print(verdict.reason, sorted(verdict.numbers.items()))
+        found = verdict.closure
+        if found: print(found.match_T_query.tobytes().hex(), found.covariance.tobytes().hex())
+"""
+
+
+def test_same_bits_whatever_the_number_of_threads() -> None:
+    code = PROBE.format(benchmarks=str(Path(__file__).parents[2] / "benchmarks"))
+    outputs = set()
+    for threads in ("1", "4"):
+        limits = {"OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=os.environ | limits, capture_output=True, text=True, check=True
+        )
+        outputs.add(done.stdout)
+    assert len(outputs) == 1
+    assert "accepted" in outputs.pop()
+
+
+@pytest.mark.parametrize(
+    ("limits", "word"), [({"max_turn_deg": 3.0}, "turned by 6 deg"), ({"max_shift_m": 0.5}, "apart")]
+)
+def test_right_pose_of_another_view_is_no_closure(limits: dict[str, float], word: str) -> None:
+    verdict = Verifier(Verification(**limits)).verify(
+        take(GROUND, HERE, 100.0), [candidate(take(GROUND, THERE, 10.0))]
+    )[0]
+    assert verdict.closure is None and word in verdict.reason
+    assert verdict.numbers["probability"] > 0.9

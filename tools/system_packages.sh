@@ -1,0 +1,24 @@
+#!/usr/bin/env bash
+# Install the system libraries the wheels need but do not bring along: open3d loads libusb-1.0 and libGL.
+set -eu
+missing=()
+known=$(ldconfig -p 2>/dev/null || /sbin/ldconfig -p)
+grep -q 'libusb-1\.0\.so' <<<"$known" || missing+=(libusb-1.0-0)
+grep -q 'libGL\.so\.1' <<<"$known" || missing+=(libgl1)
+grep -q 'libEGL\.so\.1' <<<"$known" || missing+=(libegl1)
+grep -q 'libgomp\.so\.1' <<<"$known" || missing+=(libgomp1)
+grep -q 'libX11\.so\.6' <<<"$known" || missing+=(libx11-6)
+[ ${#missing[@]} -eq 0 ] && exit 0
+
+install="apt-get install -y --no-install-recommends ${missing[*]}"
+if ! command -v apt-get >/dev/null; then
+  echo "make: these system libraries are missing, install them and run make again: ${missing[*]}" >&2
+  exit 1
+fi
+if [ "$(id -u)" -eq 0 ]; then as_root=(); elif sudo -n true 2>/dev/null; then as_root=(sudo); else
+  echo "make: system libraries are missing; run this once, then make again:  sudo $install" >&2
+  exit 1
+fi
+echo "Installing system libraries: ${missing[*]}"
+# shellcheck disable=SC2086
+"${as_root[@]}" $install >/dev/null 2>&1 || { "${as_root[@]}" apt-get update -qq && "${as_root[@]}" $install >/dev/null; }

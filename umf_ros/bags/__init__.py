@@ -1,0 +1,1 @@
+"""Recorded sensor data, read and written without a ROS environment."""

@@ -1,0 +1,143 @@
+"""From a recording to synchronised frames, as the live node makes them from topics."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from umf_ros.bags.presets import topics_of
+from umf_ros.bags.reader import Bag, RawMessage, decode
+from umf_ros.bags.trajectories import Trajectory
+from umf_ros.config import Settings, Topics
+from umf_ros.errors import BagError, MessageError
+from umf_ros.frames import Frame
+from umf_ros.sensors.calibration import load_calibration
+from umf_ros.sensors.counters import InputCounter
+from umf_ros.sensors.intake import Intake, wanted_inputs
+from umf_ros.sensors.messages import stamp_ns
+from umf_ros.sensors.synchronizer import Input, Synchronizer
+
+_log = logging.getLogger(__name__)
+_TYPES = {
+    "left_image": "sensor_msgs/msg/Image",
+    "right_image": "sensor_msgs/msg/Image",
+    "left_info": "sensor_msgs/msg/CameraInfo",
+    "right_info": "sensor_msgs/msg/CameraInfo",
+    "cloud": "sensor_msgs/msg/PointCloud2",
+    "odometry": "nav_msgs/msg/Odometry",
+}
+
+
+class FrameReader:
+    """The frames of a recording, read once, and what became of its messages.
+
+    Messages that cannot be used are counted and skipped, the first of each kind with a warning. Inputs
+    for which the recording has no topic are not waited for.
+
+    Attributes:
+        progress: part of the recording that was read, 0 to 1.
+    """
+
+    def __init__(
+        self,
+        bag: Bag,
+        settings: Settings,
+        odometry: Trajectory | None = None,
+        warn: Callable[[str], None] = _log.warning,
+    ) -> None:
+        """Take the odometry from a trajectory instead of the recording's topic, if given.
+
+        Raises:
+            BagError: the recording has neither images nor scans on the topics of the settings, or messages
+                of another type there, or the trajectory is of another time.
+            CalibrationError: the calibration cannot be read.
+        """
+        topics = _present(topics_of(settings), bag)
+        if not topics.left_image and not topics.cloud:
+            raise BagError(
+                f"{bag.path} has neither images nor scans on the expected topics; see --dataset and --config"
+            )
+        inputs = wanted_inputs(topics)
+        if odometry is not None:
+            _check_overlap(odometry, bag)
+            topics = topics.model_copy(update={"odometry": ""})
+            inputs.add("odometry")
+        calibration = load_calibration(settings.calibration or settings.dataset)
+        self.progress = 0.0
+        self._bag = bag
+        self._odometry = odometry
+        self._synchronizer = Synchronizer(settings.sync, calibration, inputs)
+        self._intake = Intake(self._synchronizer, topics, warn)
+        if bag.warning:
+            warn(bag.warning)
+
+    @property
+    def counters(self) -> dict[Input, InputCounter]:
+        """What became of the messages of each input."""
+        return self._synchronizer.counters
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Frames in the order of their stamps."""
+        odometry = _Cursor(self._odometry) if self._odometry is not None else None
+        for raw in self._bag.raw_messages(self._intake.topics):
+            self._take(raw, odometry)
+            self.progress = (raw.log_ns - self._bag.start_ns) / max(1, self._bag.end_ns - self._bag.start_ns)
+            yield from self._synchronizer.pop()
+        yield from self._synchronizer.flush()
+
+    def _take(self, raw: RawMessage, odometry: _Cursor | None) -> None:
+        try:
+            message = decode(raw)
+        except MessageError as error:
+            self._intake.refuse(raw.topic, error)
+            return
+        if odometry is not None:
+            odometry.feed(self._synchronizer, message)
+        self._intake.take(raw.topic, message)
+
+
+class _Cursor:
+    """A trajectory, handed out in step with the recording."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self._trajectory = trajectory
+        self._next = 0
+
+    def feed(self, synchronizer: Synchronizer, message: Any) -> None:
+        """Add the poses up to the message's stamp that were not added before."""
+        try:
+            end_ns = stamp_ns(message)
+        except MessageError:
+            return  # the intake says what is wrong with it
+        stamps = self._trajectory.stamps_ns
+        while self._next < len(stamps) and stamps[self._next] <= end_ns:
+            synchronizer.add_odometry(int(stamps[self._next]), self._trajectory.poses[self._next])
+            self._next += 1
+
+
+def read_frames(bag: Bag, settings: Settings, odometry: Trajectory | None = None) -> Iterator[Frame]:
+    """Frames of a recording, without the book-keeping of `FrameReader`."""
+    return iter(FrameReader(bag, settings, odometry))
+
+
+def _present(topics: Topics, bag: Bag) -> Topics:
+    """The topics that the recording has messages of; the others empty.
+
+    Raises:
+        BagError: a topic is of another type than expected, as with compressed images.
+    """
+    for name, topic in topics.model_dump().items():
+        if topic in bag.topics and bag.topics[topic].type != _TYPES[name]:
+            raise BagError(f"{bag.path}: {topic} is of type {bag.topics[topic].type}, expected {_TYPES[name]}")
+    missing = [
+        name for name, topic in topics.model_dump().items() if topic not in bag.topics or not bag.topics[topic].count
+    ]
+    return topics.model_copy(update=dict.fromkeys(missing, ""))
+
+
+def _check_overlap(odometry: Trajectory, bag: Bag) -> None:
+    if odometry.stamps_ns[-1] < bag.start_ns or odometry.stamps_ns[0] > bag.end_ns:
+        seconds = " to ".join(f"{stamp * 1e-9:.1f}" for stamp in (odometry.stamps_ns[0], odometry.stamps_ns[-1]))
+        recorded = f"{bag.start_ns * 1e-9:.1f} to {bag.end_ns * 1e-9:.1f}"
+        raise BagError(f"the odometry file covers none of the recording: {seconds} s against {recorded} s")

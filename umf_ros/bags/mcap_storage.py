@@ -1,0 +1,137 @@
+"""mcap recordings, also those that break off."""
+
+from __future__ import annotations
+
+import heapq
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterator
+from itertools import chain
+from pathlib import Path
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import StreamReader
+from zstandard import ZstdError
+
+from umf_ros.bags.reader import RawMessage, TopicInfo
+from umf_ros.errors import BagError
+
+# what the mcap library and the decompressors raise on damaged data
+_DAMAGE = (McapError, struct.error, ZstdError, ValueError, RuntimeError, EOFError)
+
+SORTING_WINDOW_NS = 1_000_000_000
+"""Without an index, messages are put in order as far as they lie this close together."""
+
+
+class McapStorage:
+    """One or more mcap files written one after the other."""
+
+    def __init__(self, paths: list[Path]) -> None:
+        self._files = [_open(path) for path in paths]
+        counts: Counter[str] = Counter()
+        types: dict[str, str] = {}
+        for file in self._files:
+            counts.update(file.counts)
+            types |= file.types
+        self.topics = {topic: TopicInfo(types[topic], counts[topic]) for topic in sorted(types)}
+        filled = [file for file in self._files if file.counts.total()]
+        self.start_ns = min((file.start_ns for file in filled), default=0)
+        self.end_ns = max((file.end_ns for file in filled), default=0)
+        self.warning = "; ".join(file.warning for file in self._files if file.warning)
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Messages of some topics in the order of their recording."""
+        return chain.from_iterable(file.messages(topics) for file in self._files)
+
+
+def _open(path: Path) -> _IndexedFile | _BrokenFile:
+    try:
+        return _IndexedFile(path)
+    except (*_DAMAGE, OSError):  # too short to seek in
+        return _BrokenFile(path)
+
+
+class _IndexedFile:
+    """A complete file."""
+
+    warning = ""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        if summary is None or summary.statistics is None or not summary.chunk_indexes:
+            raise ValueError("no index")
+        channels = {key: channel for key, channel in summary.channels.items() if channel.message_encoding == "cdr"}
+        if summary.channels and not channels:
+            encodings = ", ".join(sorted({channel.message_encoding for channel in summary.channels.values()}))
+            raise BagError(f"{path} holds messages encoded as {encodings}; only those of ROS 2 (cdr) can be read")
+        self.types = {channel.topic: summary.schemas[channel.schema_id].name for channel in channels.values()}
+        self.counts: Counter[str] = Counter()
+        for key, count in summary.statistics.channel_message_counts.items():
+            if key in channels:
+                self.counts[channels[key].topic] += count
+        self.start_ns = summary.statistics.message_start_time
+        self.end_ns = summary.statistics.message_end_time
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        wanted = self.types.keys() & set(topics)
+        with self._path.open("rb") as stream:
+            try:
+                for schema, channel, message in make_reader(stream).iter_messages(wanted):
+                    if schema is not None:
+                        yield RawMessage(channel.topic, message.log_time, schema.name, message.data)
+            except _DAMAGE as error:
+                raise BagError(f"{self._path} is damaged: {error or type(error).__name__}") from None
+
+
+class _BrokenFile:
+    """A file without an index, as a recorder leaves it that was killed: read up to where it breaks off."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._fault = ""
+        self.types: dict[str, str] = {}
+        self.counts: Counter[str] = Counter()
+        self.start_ns, self.end_ns = 2**63, 0
+        for message in self._stream():
+            self.types[message.topic] = message.type
+            self.counts[message.topic] += 1
+            self.start_ns = min(self.start_ns, message.log_ns)
+            self.end_ns = max(self.end_ns, message.log_ns)
+        self.warning = ""
+        if self._fault:
+            seconds = max(0, self.end_ns - self.start_ns) * 1e-9
+            self.warning = f"{path} breaks off; its first {seconds:.1f} s ({self.counts.total()} messages) are readable"
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        waiting: list[tuple[int, int, RawMessage]] = []
+        for number, message in enumerate(self._stream()):
+            if message.topic not in topics:
+                continue
+            heapq.heappush(waiting, (message.log_ns, number, message))
+            while waiting[0][0] < message.log_ns - SORTING_WINDOW_NS:
+                yield heapq.heappop(waiting)[2]
+        while waiting:
+            yield heapq.heappop(waiting)[2]
+
+    def _stream(self) -> Iterator[RawMessage]:
+        """Messages as they lie in the file."""
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        with self._path.open("rb") as stream:
+            try:
+                for record in StreamReader(stream, record_size_limit=self._path.stat().st_size).records:
+                    if isinstance(record, Schema):
+                        schemas[record.id] = record
+                    elif isinstance(record, Channel):
+                        channels[record.id] = record
+                    elif isinstance(record, Message):
+                        channel = channels.get(record.channel_id)
+                        if channel and channel.message_encoding == "cdr" and channel.schema_id in schemas:
+                            type_name = schemas[channel.schema_id].name
+                            yield RawMessage(channel.topic, record.log_time, type_name, record.data)
+            except _DAMAGE as error:
+                self._fault = str(error) or type(error).__name__

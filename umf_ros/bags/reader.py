@@ -1,0 +1,140 @@
+"""Recordings of any format, read without a ROS environment."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
+
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from umf_ros.errors import BagError, MessageError
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    """A topic of a recording.
+
+    Attributes:
+        type: message type, as in `sensor_msgs/msg/Image`.
+        count: number of messages.
+    """
+
+    type: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class RawMessage:
+    """A recorded message.
+
+    Attributes:
+        topic: where.
+        log_ns: when it was recorded.
+        type: message type.
+        data: the message as ROS 2 serialises it (CDR), whatever the format of the recording.
+    """
+
+    topic: str
+    log_ns: int
+    type: str
+    data: bytes
+
+
+class Storage(Protocol):
+    """One recording in one format."""
+
+    topics: dict[str, TopicInfo]
+    start_ns: int
+    end_ns: int
+    warning: str
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Messages of some topics in the order of their recording."""
+        ...
+
+
+class Bag:
+    """A recording: what it holds, and its messages as often as wanted.
+
+    Attributes:
+        path: file or folder.
+        topics: what it holds, by topic.
+        start_ns, end_ns: when the first and the last message were recorded.
+        warning: one line when a part of the recording is unreadable, else empty.
+    """
+
+    def __init__(self, path: Path, storage: Storage) -> None:
+        self.path = path
+        self.topics = storage.topics
+        self.start_ns, self.end_ns = storage.start_ns, storage.end_ns
+        self.warning = storage.warning
+        self._storage = storage
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first to the last message."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    def raw_messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Serialised messages of some or all topics in the order of their recording."""
+        wanted = self.topics.keys() if topics is None else self.topics.keys() & set(topics)
+        return self._storage.messages(wanted)
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time of recording in ns and message, in the order of their recording.
+
+        Raises:
+            BagError: a message is not what its type says.
+        """
+        for raw in self.raw_messages(topics):
+            try:
+                yield raw.topic, raw.log_ns, decode(raw)
+            except MessageError as error:
+                raise BagError(f"{self.path}: {raw.topic}: {error}") from None
+
+
+def decode(raw: RawMessage) -> Any:
+    """The message, with attributes as in ROS.
+
+    Raises:
+        MessageError: of kind "undecodable" when the bytes are not a message of its type.
+    """
+    try:
+        return message_types().deserialize_cdr(raw.data, raw.type)
+    except (SerdeError, KeyError, ValueError, IndexError, struct.error) as error:
+        cause = " ".join(str(error).split())
+        raise MessageError("undecodable", f"message is not what its type {raw.type} says ({cause})") from None
+
+
+@cache
+def message_types() -> Typestore:
+    """The message definitions of ROS 2 Jazzy."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def open_bag(path: str | Path) -> Bag:
+    """Open an mcap file, a ROS 2 folder (mcap or db3), a db3 file or a ROS 1 `.bag`.
+
+    A recording that breaks off is opened as far as it goes; `Bag.warning` says so.
+
+    Raises:
+        BagError: there is no such recording, it is none, or it holds no message.
+    """
+    from umf_ros.bags.storages import open_storage
+
+    path = Path(path)
+    if not path.exists():
+        raise BagError(f"there is no recording {path}")
+    try:
+        storage = open_storage(path)
+    except OSError as error:
+        raise BagError(f"cannot read {path}: {error.strerror or error}") from None
+    if not any(topic.count for topic in storage.topics.values()):
+        raise BagError(f"{path} holds no message" + (f" ({storage.warning})" if storage.warning else ""))
+    return Bag(path, storage)

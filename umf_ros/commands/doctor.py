@@ -1,0 +1,31 @@
+"""`umf doctor`: whether everything that the package needs works here."""
+
+from __future__ import annotations
+
+import typer
+
+
+def command() -> None:
+    """Check this machine: packages, ROS 2, DDS, weights; says what helps where something is wrong."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from umf_ros import doctor
+
+    console = Console()
+    findings: list[doctor.Finding] = []
+    with console.status("") as status:
+        for name, check in doctor.checks():
+            status.update(f"Checking {name}")
+            findings.append(check())
+    table = Table("", "", "found", box=None, pad_edge=False, show_header=False)
+    for finding in findings:
+        table.add_row("[green]ok[/]" if finding.fine else "[bold red]problem[/]", finding.name, finding.found)
+    console.print(table)
+    problems = [finding for finding in findings if not finding.fine]
+    for problem in problems:
+        console.print(f"[bold]{problem.name}:[/] {problem.advice}", highlight=False)
+    if problems:
+        console.print(f"[bold red]{len(problems)} of {len(findings)} checks found a problem.")
+        raise typer.Exit(1)
+    console.print("[green]Everything works.")

@@ -1,0 +1,110 @@
+"""`umf explain`: one picture of why two places of a recording are, or are not, the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from umf_ros.frames import Frame
+
+Optional = typer.Option
+
+
+def command(
+    bag: Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")],
+    query: Annotated[str, typer.Argument(help="The later moment: stamp in ns, or seconds from the start.")],
+    match: Annotated[str, typer.Argument(help="The earlier moment, likewise.")],
+    out: Annotated[Path, Optional(help="Picture to write.")] = Path("explanation.png"),
+    config: Annotated[Path | None, Optional(help="Parameter file (YAML).")] = None,
+    dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
+    embedder: Annotated[str | None, Optional(help="umf, or a baseline.")] = None,
+    weights: Annotated[Path | None, Optional(help="Weights of the network; default: the shipped ones.")] = None,
+) -> None:
+    """Show both images with their matching features, both scans aligned, and the decision's numbers."""
+    from rich.console import Console
+
+    from umf_ros.bags.frames import FrameReader
+    from umf_ros.bags.presets import detect_dataset
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.config import load_settings
+    from umf_ros.frames import Keyframe
+    from umf_ros.loop_detector import make_detector_embedder
+    from umf_ros.verification import lift, thin_scan
+    from umf_ros.verification.explanation import draw, explain
+
+    console = Console()
+    moments = [_moment(text) for text in (query, match)]
+    recording = open_bag(bag)
+    settings = load_settings(
+        config,
+        dataset=None if dataset == "auto" else dataset,
+        embedding__method=embedder,
+        embedding__weights=str(weights) if weights else None,
+    )
+    if dataset == "auto" and not settings.model_fields_set & {"dataset", "topics"}:
+        settings = settings.model_copy(update={"dataset": detect_dataset(recording)})
+    network = make_detector_embedder(settings)
+    with console.status("looking for the two moments"):
+        frames = _nearest(FrameReader(recording, settings), moments)
+    keyframes = [
+        Keyframe(
+            frame.stamp_ns,
+            lift(frame, network.embed(frame)),
+            frame.camera,
+            frame.body_T_camera,
+            thin_scan(frame.points),
+            frame.odom_T_body,
+        )
+        for frame in frames
+    ]
+    explanation = explain(keyframes[0], keyframes[1], settings.verification)
+    draw(explanation, frames[0].left, frames[1].left, out)
+    console.print(explanation.verdict, highlight=False)
+    if explanation.evidence is not None:
+        for name, value in explanation.evidence.numbers.items():
+            console.print(f"  {name:22} {value:.4g}", highlight=False)
+    console.print(f"wrote {out}", highlight=False)
+
+
+def _moment(text: str) -> float:
+    """Nanoseconds since the epoch (16 digits or more), or seconds from the start of the recording."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is neither a stamp in ns nor seconds from the start") from None
+    if not value >= 0:
+        raise typer.BadParameter(f"{text!r} is before the start")
+    return value
+
+
+def _nearest(frames: Iterable[Frame], moments: list[float]) -> list[Frame]:
+    """The frame nearest to each moment.
+
+    Raises:
+        BagError: the recording has no frame, or none within a second of a moment.
+    """
+    from umf_ros.errors import BagError
+
+    best: list[Frame | None] = [None] * len(moments)
+    wanted: list[int] = []
+    for frame in frames:
+        if not wanted:
+            wanted = [int(moment) if moment >= 1e15 else frame.stamp_ns + round(1e9 * moment) for moment in moments]
+        for position, stamp in enumerate(wanted):
+            held = best[position]
+            if held is None or abs(frame.stamp_ns - stamp) < abs(held.stamp_ns - stamp):
+                best[position] = frame
+        if frame.stamp_ns > max(wanted) + 10**9:
+            break
+    found = [frame for frame in best if frame is not None]
+    if len(found) < len(moments):
+        raise BagError("the recording has no frame with an image or a scan")
+    for frame, stamp, moment in zip(found, wanted, moments, strict=True):
+        if abs(frame.stamp_ns - stamp) > 10**9:
+            raise BagError(f"no frame within a second of {moment:.15g}; the nearest is at {frame.stamp_ns} ns")
+    return found

@@ -1,0 +1,129 @@
+"""`umf graph`: the pose-graph back-end on any g2o file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from umf_ros.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from umf_ros.pose_graph.closures import ClosureVerdict
+    from umf_ros.pose_graph.graph import PoseGraph
+    from umf_ros.pose_graph.replay import Recording
+
+LAYERS = ("gate", "support", "gnc", "scale")
+MOST_ROWS = 20
+
+app = typer.Typer(help="Optimise and draw pose graphs in g2o files.", no_args_is_help=True)
+File = Annotated[Path, typer.Argument(help="g2o (or TORO) file, 2-D or 3-D.")]
+
+
+@app.command()
+def optimize(
+    file: File,
+    reject: Annotated[
+        str,
+        typer.Option(
+            help="Guards against wrong closures: all, none, or some of gate, support, gnc, scale (comma between)."
+        ),
+    ] = "all",
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the optimised graph here (g2o).")] = None,
+    verdicts: Annotated[Path | None, typer.Option(help="Write every closure's verdict here (CSV).")] = None,
+) -> None:
+    """Drive a graph file through the back-end as if it came live, and say which closures it rejects."""
+    layers = _layers(reject)
+
+    from rich.console import Console
+    from rich.progress import track
+
+    from umf_ros.config import PoseGraph as PoseGraphSettings
+    from umf_ros.errors import OutputError
+    from umf_ros.pose_graph.g2o import read_g2o
+    from umf_ros.pose_graph.graph import PoseGraph
+    from umf_ros.pose_graph.replay import as_recording, drive
+    from umf_ros.pose_graph.results import verdict_table
+
+    console, content = Console(), read_g2o(file)
+    for problem in content.problems[:MOST_ROWS]:
+        console.print(f"[yellow]skipped {problem}", highlight=False)
+    if len(content.problems) > MOST_ROWS:
+        console.print(f"[yellow]... and {len(content.problems) - MOST_ROWS} more lines")
+    recording = as_recording(content)
+    settings = PoseGraphSettings(
+        use_gate="gate" in layers,
+        use_support="support" in layers,
+        use_gnc="gnc" in layers,
+        estimate_scale="scale" in layers,
+    )
+    graph = PoseGraph(recording.settings(settings))
+    for _ in track(drive(graph, recording), "Optimising", console=console, transient=True):
+        pass
+    _report(console, graph, recording)
+    if output is not None:
+        graph.write_g2o(output, planar=content.planar)
+        console.print(f"optimised graph: {output}")
+    if verdicts is not None:
+        try:
+            verdicts.write_text(verdict_table(graph.closures()), encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"cannot write {verdicts}: {error.strerror}") from None
+
+
+@app.command()
+def plot(
+    file: File,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Picture to write.")] = Path("graph.png"),
+) -> None:
+    """Draw a graph file: odometry grey, closures green, from above and from the side."""
+    from umf_ros.pose_graph.g2o import read_g2o
+    from umf_ros.pose_graph.picture import draw
+
+    draw(read_g2o(file), output)
+    typer.echo(f"picture: {output}")
+
+
+def _layers(text: str) -> set[str]:
+    if text in ("all", "none"):
+        return set(LAYERS) if text == "all" else set()
+    layers = {word.strip() for word in text.split(",")}
+    if not layers <= set(LAYERS):
+        raise ConfigError(f"--reject {text}: expected all, none, or some of {', '.join(LAYERS)}")
+    return layers
+
+
+def _report(console: Console, graph: PoseGraph, recording: Recording) -> None:
+    from rich.table import Table
+
+    from umf_ros.pose_graph.closures import State
+
+    counts = graph.verdict_counts()
+    sessions = f" in {len(recording.chains)} chains" if len(recording.chains) > 1 else ""
+    console.print(f"{len(recording.ids)} poses{sessions}, {len(recording.closures)} closures: ", end="")
+    console.print(", ".join(f"{count} {state}" for state, count in sorted(counts.items())))
+    scale = graph.scale
+    if scale.odometry != 1 or scale.closures != 1:
+        console.print(
+            f"stated standard deviations are wrong: odometry x {scale.odometry:.3g}, closures x {scale.closures:.3g}"
+        )
+    bad = [verdict for verdict in graph.closures() if verdict.state is not State.ACCEPTED]
+    if not bad:
+        return
+    table = Table("from", "to", "verdict", "reason", "sigma", "m")
+    for verdict in bad[:MOST_ROWS]:
+        table.add_row(*_row(verdict, recording))
+    console.print(table)
+    if len(bad) > MOST_ROWS:
+        console.print(f"... and {len(bad) - MOST_ROWS} more (--verdicts FILE writes all)")
+
+
+def _row(verdict: ClosureVerdict, recording: Recording) -> list[str]:
+    from umf_ros.pose_graph.replay import PERIOD_NS
+
+    ends = (verdict.closure.match_stamp_ns, verdict.closure.query_stamp_ns)
+    names = [str(int(recording.ids[stamp // PERIOD_NS])) for stamp in ends]
+    return [*names, verdict.state, verdict.reason, f"{verdict.residual:.1f}", f"{verdict.residual_m:.2f}"]

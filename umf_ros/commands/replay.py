@@ -1,0 +1,71 @@
+"""`umf replay`: offline loop detection on a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Optional = typer.Option
+
+
+def command(
+    bag: Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")],
+    config: Annotated[Path | None, Optional(help="Parameter file (YAML).")] = None,
+    out: Annotated[Path, Optional(help="Where results/<timestamp> goes.")] = Path("results"),
+    dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
+    embedder: Annotated[str | None, Optional(help="umf, or a baseline.")] = None,
+    weights: Annotated[Path | None, Optional(help="Weights of the network; default: the shipped ones.")] = None,
+    odometry: Annotated[Path | None, Optional(help="Odometry as a TUM file, where the bag has none.")] = None,
+    odometry_frame: Annotated[
+        str, Optional(help="Whose poses --odometry holds: body, imu, camera or lidar (S3LI's Eval/BASALT: imu).")
+    ] = "body",
+    ground_truth: Annotated[Path | None, Optional(help="Truth as RTKLIB .pos or TUM file.")] = None,
+    min_probability: Annotated[float | None, Optional(min=0, max=1, help="Publish closures from here on.")] = None,
+) -> None:
+    """Find loop closures in a recording as fast as the machine goes.
+
+    Needs no ROS. Writes closures, trajectories, the pose graph and a report to a new folder.
+    Ctrl-C ends the run early and keeps what was found.
+    """
+    from rich.console import Console
+
+    from umf_ros.bags.frames import FrameReader
+    from umf_ros.bags.presets import detect_dataset
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.bags.trajectories import read_odometry
+    from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.config import load_settings
+    from umf_ros.loop_detector import make_detector_embedder
+    from umf_ros.replay import Replay
+    from umf_ros.results.folder import create_run_folder
+    from umf_ros.results.recorder import count_drops
+    from umf_ros.results.report import finish_run
+
+    console = Console()
+    recording = open_bag(bag)
+    settings = load_settings(
+        config,
+        dataset=None if dataset == "auto" else dataset,
+        embedding__method=embedder,
+        embedding__weights=str(weights) if weights else None,
+        verification__min_probability=min_probability,
+    )
+    if dataset == "auto" and not settings.model_fields_set & {"dataset", "topics"}:
+        settings = settings.model_copy(update={"dataset": detect_dataset(recording)})
+    path = read_odometry(odometry, odometry_frame, settings) if odometry else None
+    reader = FrameReader(recording, settings, path, warn=lambda text: console.print(f"[yellow]{text}", highlight=False))
+    folder = create_run_folder(out)
+    replay = Replay(folder, settings, make_detector_embedder(settings))
+    with stop_on_interrupt() as interrupted, FrameProgress(console) as progress:
+        for detection in replay.run(reader):
+            progress.show(reader.progress, detection)
+            if interrupted():
+                break
+    if interrupted():
+        console.print("[yellow]Interrupted: the results cover what was done so far.")
+    with undisturbed():
+        if not replay.finish(count_drops(reader.counters)):
+            console.print("No odometry: closures only, the pose graph is skipped (--odometry FILE.tum supplies it).")
+        finish_run(folder, recording, console, ground_truth)

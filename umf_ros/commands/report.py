@@ -1,0 +1,22 @@
+"""`umf report`: evaluate and draw a finished run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(
+    folder: Annotated[Path, typer.Argument(help="A run folder, such as results/latest.")],
+    bag: Annotated[Path, typer.Argument(help="The recording the run was made on.")],
+    ground_truth: Annotated[Path | None, typer.Option(help="Truth as RTKLIB .pos or TUM file.")] = None,
+) -> None:
+    """Judge a run against the truth, draw its matches and trajectory, and write report.html."""
+    from rich.console import Console
+
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.results.report import finish_run
+
+    finish_run(folder, open_bag(bag), Console(), ground_truth)

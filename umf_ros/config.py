@@ -1,0 +1,273 @@
+"""Every setting of the package: one source for node parameters, command line and documentation.
+
+Settings are nested; a node parameter's name is the path with dots, as in `keyframe.min_translation_m`.
+Numbers carry their unit in the name.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from umf_ros.errors import ConfigError
+
+
+class Group(BaseModel):
+    """A group of settings: unknown names are refused, whole numbers pass for floats."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+class Topics(Group):
+    """Names of the input topics; the defaults are S3LI Etna's."""
+
+    left_image: str = Field("/stereo/left/image_rect", description="left image, sensor_msgs/Image")
+    right_image: str = Field("/stereo/right/image_rect", description="right image; empty: no stereo")
+    left_info: str = Field("/stereo/left/camera_info", description="left camera_info; empty: use the calibration file")
+    right_info: str = Field("/stereo/right/camera_info", description="right camera_info, for the baseline")
+    cloud: str = Field("/bf_lidar/points_raw", description="LiDAR scan, sensor_msgs/PointCloud2")
+    odometry: str = Field("/odom", description="odometry, nav_msgs/Odometry; empty: none")
+
+
+class Qos(Group):
+    """Quality of service of the sensor subscriptions."""
+
+    reliability: Literal["best_effort", "reliable"] = Field(
+        "best_effort", description="best_effort matches every publisher"
+    )
+    depth: int = Field(50, ge=1, le=1000, description="messages kept per subscription: bridges a busy second")
+
+
+class Sync(Group):
+    """How messages become synchronised frames."""
+
+    slop_s: float = Field(0.05, gt=0, le=1, description="largest distance of an image's stamp from the scan's, s")
+    max_wait_s: float = Field(
+        1.0, gt=0, le=10, description="stream time after which a scan stops waiting for a late input, s"
+    )
+    queue_size: int = Field(60, ge=2, le=1000, description="at most this many messages buffered per input")
+    odometry_buffer_s: float = Field(10.0, gt=0, le=600, description="odometry kept for interpolation, s")
+    max_odometry_gap_s: float = Field(1.0, gt=0, le=60, description="no pose is interpolated across a longer gap, s")
+    require_image: bool = Field(False, description="drop scans without an image, rather than use the scan alone")
+
+
+class KeyframePolicy(Group):
+    """When a frame becomes a keyframe."""
+
+    min_translation_m: float = Field(0.5, ge=0, description="a keyframe after this much motion, m")
+    min_rotation_deg: float = Field(15.0, ge=0, le=180, description="or after this much rotation, deg")
+    min_period_s: float = Field(0.4, ge=0, description="but never sooner than this, s")
+    max_period_s: float = Field(5.0, gt=0, description="and at the latest after this if the rover moved at all, s")
+    untracked_period_s: float = Field(1.0, gt=0, description="without odometry: a keyframe every so often, s")
+
+
+class Embedding(Group):
+    """The network that turns a frame into a descriptor and local features."""
+
+    method: str = Field("umf", description="embedder by name: umf, or a baseline")
+    weights: str = Field("", description="safetensors file; empty: the shipped default")
+    runtime: Literal["auto", "torch", "openvino"] = Field("auto", description="what runs the network")
+    device: str = Field("cpu", description="torch device")
+    threads: int = Field(0, ge=0, le=64, description="threads of the network; 0: as many as there are cores")
+
+
+class Loop(Group):
+    """Which keyframes may be candidates for a loop closure."""
+
+    min_time_gap_s: float = Field(20.0, ge=0, description="a match is at least this much older, s")
+    min_travel_m: float = Field(15.0, ge=0, description="and lies at least this far back along the path, m")
+    top_k: int = Field(20, ge=1, le=200, description="candidates handed to verification")
+    min_similarity: float = Field(0.0, ge=-1, le=1, description="candidates below this cosine similarity are dropped")
+
+
+class Verification(Group):
+    """Reranking, metric pose and acceptance of candidates."""
+
+    min_probability: float = Field(0.9, ge=0, le=1, description="a closure is published from this probability on")
+    seed: int = Field(0, ge=0, description="seed of every RANSAC")
+    rerank: Literal["ransac", "superfeatures"] = Field(
+        "ransac", description="how local features reorder the candidates"
+    )
+    modalities: Literal["both", "image", "cloud"] = Field("both", description="local features that reranking uses")
+    rerank_features: int = Field(
+        200, ge=20, le=2000, description="strongest features per modality that reranking matches"
+    )
+    ransac_iterations: int = Field(100, ge=10, le=5000, description="hypotheses per RANSAC")
+    refine_best: int = Field(4, ge=1, le=50, description="best candidates that get a metric pose")
+    max_closures: int = Field(1, ge=1, le=50, description="closures published per keyframe at most")
+    max_turn_deg: float = Field(28.0, gt=0, le=180, description="views further turned are not the same place, deg")
+    max_shift_m: float = Field(11.5, gt=0, description="nor are positions further apart, m")
+    odometry_drift: float = Field(
+        0.05, gt=0, le=1, description="odometry error per distance driven, for the soft prior"
+    )
+    calibration: str = Field("", description="fitted acceptance model (JSON); empty: the shipped one")
+
+
+class PoseGraph(Group):
+    """The GTSAM back-end."""
+
+    keyframe_period_s: float = Field(0.5, gt=0, le=60, description="odometry is sampled this often, s")
+    keyframe_spacing_m: float = Field(0.25, gt=0, description="a pose of the graph after this much way, m")
+    max_gap_s: float = Field(2.0, gt=0, description="longest gap of the odometry that is interpolated, s")
+    odometry_sigma_m: float = Field(0.05, gt=0, description="odometry noise after one metre (grows with the root), m")
+    odometry_sigma_deg: float = Field(
+        0.5, gt=0, description="odometry noise after one metre (grows with the root), deg"
+    )
+    max_closure_m: float = Field(100.0, gt=0, description="a closure longer than this is refused as absurd, m")
+    max_correction_m: float = Field(0.0, ge=0, description="a closure that moves a pose further is refused, m; 0: off")
+    gate_chi2: float = Field(
+        27.9, gt=0, description="largest squared Mahalanobis distance to the map (6 degrees of freedom)"
+    )
+    pair_chi2: float = Field(33.6, gt=0, description="the same between two closures that shall agree")
+    alias_radius_m: float = Field(15.0, gt=0, description="wrong closures to similar places are expected this close, m")
+    max_chance: float = Field(
+        0.02, gt=0, le=1, description="a closure is accepted at once where a wrong one had at most this chance to agree"
+    )
+    min_support: float = Field(
+        8.0, ge=0, description="evidence from which closures that support each other are believed, nats"
+    )
+    place_m: float = Field(10.0, ge=0, description="closures this close along the path are one witness, m")
+    support_range_m: float = Field(80.0, gt=0, description="closures this close along the path are compared, m")
+    patience_m: float = Field(
+        60.0, ge=0, description="an uncertain closure nothing speaks against is believed after this way, m"
+    )
+    max_pending_s: float = Field(30.0, gt=0, description="a closure waits this long for its odometry, stream time, s")
+    use_gate: bool = Field(True, description="reject closures that contradict the map")
+    use_gnc: bool = Field(True, description="ask graduated non-convexity for a second opinion where closures conflict")
+    use_support: bool = Field(True, description="believe uncertain closures only when others support them")
+    estimate_scale: bool = Field(
+        False, description="estimate by how much the stated noise is wrong; not for odometry that drifts to one side"
+    )
+
+
+class Frames(Group):
+    """Names of the coordinate frames (REP-105)."""
+
+    map: str = Field("map", description="map frame")
+    odom: str = Field("odom", description="odometry frame")
+    base: str = Field("base_link", description="body frame")
+    publish_tf: bool = Field(False, description="publish map -> odom on /tf when tf2_ros is installed")
+
+
+class Database(Group):
+    """Where places are kept."""
+
+    path: str = Field("", description="file to keep places in, loaded when it exists; empty: a temporary file")
+    cached_keyframes: int = Field(400, ge=20, description="keyframes whose local features stay in memory")
+
+
+class Worker(Group):
+    """The thread that does the work of the live node."""
+
+    queue_size: int = Field(10, ge=1, le=1000, description="frames that may wait; the oldest is dropped and counted")
+
+
+class Settings(Group):
+    """All settings."""
+
+    dataset: Literal["simulated", "s3li-etna", "s3li-vulcano"] = Field(
+        "simulated", description="preset of calibration and topics"
+    )
+    calibration: str = Field("", description="calibration file (YAML); empty: the data set's")
+    topics: Topics = Topics()
+    qos: Qos = Qos()
+    sync: Sync = Sync()
+    keyframe: KeyframePolicy = KeyframePolicy()
+    embedding: Embedding = Embedding()
+    loop: Loop = Loop()
+    verification: Verification = Verification()
+    pose_graph: PoseGraph = PoseGraph()
+    frames: Frames = Frames()
+    database: Database = Database()
+    worker: Worker = Worker()
+
+
+def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:
+    """Settings from a YAML file, plain or a ROS parameter file (`/**: ros__parameters:`).
+
+    Args:
+        path: the file; None gives the defaults.
+        overrides: values by dotted name with `__` for the dot, as in `loop__top_k=10`; None is skipped.
+
+    Raises:
+        ConfigError: the file cannot be read, or a name, type or value is wrong.
+    """
+    values = _read_yaml(Path(path)) if path else {}
+    for name, value in overrides.items():
+        if value is not None:
+            _set(values, name.split("__"), value)
+    return parse_settings(values)
+
+
+def parse_settings(values: dict[str, Any]) -> Settings:
+    """Settings from a nested dictionary.
+
+    Raises:
+        ConfigError: names every wrong entry on one line.
+    """
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError("; ".join(_explain(problem) for problem in error.errors())) from None
+
+
+def dump_settings(settings: Settings) -> str:
+    """The effective settings as YAML that `load_settings` and a ROS node both read."""
+    body = {"/**": {"ros__parameters": settings.model_dump()}}
+    return yaml.safe_dump(body, sort_keys=False, allow_unicode=True)
+
+
+def nest(flat: dict[str, Any]) -> dict[str, Any]:
+    """`{"a.b": 1}` as `{"a": {"b": 1}}`."""
+    nested: dict[str, Any] = {}
+    for name, value in flat.items():
+        _set(nested, name.split("."), value)
+    return nested
+
+
+def _set(values: dict[str, Any], path: list[str], value: Any) -> None:
+    for part in path[:-1]:
+        values = values.setdefault(part, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"{part}: holds settings, not a value")
+    values[path[-1]] = value
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected names and values, found a {type(content).__name__}")
+    return _node_parameters(content, path)
+
+
+def _node_parameters(content: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Take the settings out of a ROS parameter file; a plain file is its own settings."""
+    blocks = [block for block in content.values() if isinstance(block, dict) and "ros__parameters" in block]
+    if not blocks:
+        return content
+    if len(blocks) != len(content):
+        raise ConfigError(f"{path}: mixes node parameters with plain settings")
+    flat: dict[str, Any] = {}
+    for block in blocks:
+        flat |= {name: value for name, value in (block["ros__parameters"] or {}).items() if name not in NODE_ONLY}
+    return nest(flat)
+
+
+NODE_ONLY = frozenset({"use_sim_time", "results_dir"})
+
+
+def _explain(problem: Any) -> str:
+    name = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        return f"unknown parameter {name}"
+    return f"{name}: {problem['msg'][0].lower()}{problem['msg'][1:]} (got {problem['input']!r})"

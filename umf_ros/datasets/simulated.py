@@ -1,0 +1,90 @@
+"""Simulated worlds as written by the simulator: one `.npz` shard per world."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from umf_ros.datasets.sample import Sample
+from umf_ros.errors import UmfError
+from umf_ros.frames import StereoCamera
+
+NUMBERS = ("fx", "fy", "cx", "cy")
+REQUIRED = ("images", "points", "world_T_body", "pass_index", "body_T_camera", *NUMBERS, "width", "height")
+
+
+class SimulatedWorld:
+    """All samples of one world; a `SampleSequence`.
+
+    Raises:
+        UmfError: the file is missing, damaged or not a shard.
+    """
+
+    def __init__(self, path: Path) -> None:
+        content = _read(path)
+        missing = [name for name in REQUIRED if name not in content]
+        if missing:
+            raise UmfError(f"{path} is not a shard of a simulated world: {', '.join(missing)} missing")
+        self.name = path.stem
+        self.place = path.stem
+        self.setting = str(content.get("setting", "hard"))
+        self.family = str(content.get("family", ""))
+        self.seed = int(content.get("seed", -1))
+        self.world_T_body = np.asarray(content["world_T_body"], float)
+        self.pass_index = np.asarray(content["pass_index"], int)
+        self._images, self._points = content["images"], content["points"]
+        self._depth = content.get("depth")
+        self._body_T_camera = np.asarray(content["body_T_camera"], float)
+        numbers = {name: float(content[name]) for name in NUMBERS}
+        self._camera = StereoCamera(int(content["width"]), int(content["height"]), **numbers, baseline=0.0)
+
+    def __len__(self) -> int:
+        return len(self.world_T_body)
+
+    def sample(self, index: int) -> Sample:
+        """The sample at `index`."""
+        points = self._points[index]
+        points = points[np.isfinite(points[:, 0])].astype(np.float32)
+        return Sample(
+            image=self._images[index],
+            points=points[:, :3],
+            intensity=points[:, 3],
+            world_T_body=self.world_T_body[index],
+            camera=self._camera,
+            body_T_camera=self._body_T_camera,
+            depth=None if self._depth is None else self._depth[index].astype(np.float32),
+        )
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path) as archive:
+            return {name: archive[name] for name in archive.files}
+    except FileNotFoundError:
+        raise UmfError(f"{path} does not exist") from None
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise UmfError(f"cannot read {path}: {' '.join(str(error).split())}") from None
+
+
+class WorldFolder:
+    """The worlds in a folder; new ones may appear while it is in use.
+
+    Raises:
+        UmfError: the folder does not exist.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise UmfError(f"{folder} is not a folder of simulated worlds")
+        self._folder = folder
+        self.worlds: list[SimulatedWorld] = []
+
+    def refresh(self) -> list[SimulatedWorld]:
+        """Read what is new, by name, and return all worlds."""
+        known = {world.name for world in self.worlds}
+        for path in sorted(self._folder.glob("*.npz")):
+            if path.stem not in known and not path.name.startswith("."):
+                self.worlds.append(SimulatedWorld(path))
+        return self.worlds

@@ -1,0 +1,61 @@
+"""The network in OpenVINO's own format: for other programs, and so that a node starts faster."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from umf_ros.errors import OutputError
+from umf_ros.networks.umf import NetworkInput
+
+
+def convert(flat: nn.Module, example: dict[str, Any]) -> Any:
+    """OpenVINO model of a network with tensors for arguments, at the shapes of the example (by input name)."""
+    import openvino
+
+    model = openvino.convert_model(flat, example_input=tuple(example.values()))
+    shapes = [tuple(tensor.shape) for tensor in example.values()]
+    model.reshape(dict(zip(model.inputs, shapes, strict=True)))
+    for port, name in zip(model.inputs, example, strict=True):
+        port.get_tensor().set_names({name})
+    return model
+
+
+def save(model: Any, path: Path) -> None:
+    """Write a model as `path` (.xml) and its weights beside it (.bin).
+
+    Raises:
+        OutputError: the files cannot be written.
+    """
+    import openvino
+
+    unfinished = path.with_name(f"{path.stem}.{os.getpid()}.xml")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        openvino.save_model(model, unfinished, compress_to_fp16=False)
+        unfinished.with_suffix(".bin").replace(path.with_suffix(".bin"))
+        unfinished.replace(path)
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"cannot write {path}: {' '.join(str(error).split())[:200]}") from None
+
+
+def cached(weights: Path, super_features: bool) -> Path:
+    """Where the converted model of a weights file is kept: a new file for new weights or a new OpenVINO."""
+    import openvino
+
+    digest = hashlib.sha256(weights.read_bytes())
+    digest.update(f"{openvino.__version__} {super_features} {FORMAT}".encode())
+    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(home) / "umf_ros" / f"{digest.hexdigest()[:20]}.xml"
+
+
+FORMAT = 1
+
+
+def inputs_by_name(batch: NetworkInput) -> dict[str, Any]:
+    """The tensors of a batch by name, in the order of the network's arguments."""
+    return {name: getattr(batch, name) for name in batch.__dataclass_fields__}

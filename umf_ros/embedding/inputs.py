@@ -1,0 +1,60 @@
+"""From preprocessed images and scans to the tensors the network reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from umf_ros.embedding.images import shrink, standardise
+from umf_ros.embedding.voxels import VoxelScan, voxelise
+from umf_ros.frames import Image, Points
+from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.umf import NetworkInput
+
+
+def pack(
+    images: Sequence[NDArray[np.float32] | None], scans: Sequence[VoxelScan], config: NetworkConfig, trim: bool = False
+) -> NetworkInput:
+    """Stack preprocessed frames.
+
+    Args:
+        images: (H, W) standardised, or None where there is none.
+        scans: voxelised, empty where there is none.
+        config: of the network.
+        trim: cut off padding that no scan of the batch needs; the result is the same, and cheaper.
+    """
+    blank = np.zeros(config.image_size, np.float32)
+    lengths: dict[str, int | None] = {"grid": None}
+    for level in ("coarse", "fine"):
+        longest = max(1, *(int(getattr(scan, f"{level}_mask").sum()) for scan in scans)) if trim else None
+        lengths |= {f"{level}_index": longest, f"{level}_mask": longest}
+
+    def gather(name: str) -> Tensor:
+        return torch.from_numpy(np.stack([getattr(scan, name)[: lengths[name]] for scan in scans]))
+
+    return NetworkInput(
+        image=torch.from_numpy(np.stack([blank if image is None else image for image in images]))[:, None],
+        image_present=torch.tensor([image is not None for image in images]),
+        **{name: gather(name) for name in lengths},
+    )
+
+
+def prepare_image(image: Image | None, config: NetworkConfig) -> NDArray[np.float32] | None:
+    """The image at the network's size, standardised."""
+    return None if image is None else standardise(shrink(image, config.image_size))
+
+
+def prepare_scan(points: Points | None, intensity: Points | None, config: NetworkConfig) -> VoxelScan:
+    """The scan (N, 3) in metres and its intensity (N,), voxelised; an empty one for None."""
+    if points is None:
+        points, intensity = np.empty((0, 3), np.float32), None
+    return voxelise(points, intensity, config.coarse_voxels, config.fine_voxels)
+
+
+def blank_input(config: NetworkConfig) -> NetworkInput:
+    """A batch of one frame without image and scan, for its shapes."""
+    return pack([None], [prepare_scan(None, None, config)], config)

@@ -1,0 +1,99 @@
+"""The UMF network as an embedder."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+
+from umf_ros.embedding.images import is_blank
+from umf_ros.embedding.inputs import pack, prepare_image, prepare_scan
+from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_salient
+from umf_ros.embedding.runtimes import Outputs, make_runtime
+from umf_ros.embedding.voxels import VoxelScan
+from umf_ros.frames import Embedding, Frame, LocalFeatures, Points, SuperFeatures
+from umf_ros.networks.weights import load_weights
+from umf_ros.resources import find
+
+DEFAULT_WEIGHTS = "models/umf_light.safetensors"
+KEYPOINTS = 400
+# of the fair share of attention; the cap decides in a rich view, this in a poor one
+MIN_SALIENCY = 0.01
+
+
+class UmfEmbedder:
+    """Descriptor and local features of a frame by the UMF network.
+
+    Image features lie at the centres of the fine cells, in pixels of the full-resolution image; cloud
+    features at the mean of the points of a voxel.
+
+    Args:
+        weights: safetensors file, or None for the shipped ones.
+        runtime: auto, torch or openvino.
+        device: torch device.
+        threads: of the network; 0: as many as there are cores.
+        super_features: whether to compute them.
+
+    Raises:
+        WeightsError: the weights cannot be used.
+        ConfigError: the runtime or the device cannot be used.
+    """
+
+    def __init__(
+        self,
+        weights: Path | None = None,
+        runtime: str = "auto",
+        device: str = "cpu",
+        threads: int = 0,
+        super_features: bool = False,
+    ) -> None:
+        path = weights or find(DEFAULT_WEIGHTS)
+        network = load_weights(path)
+        # descriptors of other weights are another language: the name tells them apart
+        self.name = f"{path.stem}-{hashlib.sha256(path.read_bytes()).hexdigest()[:8]}"
+        self._config = network.config
+        self.dimension = network.config.descriptor
+        self._super_features = super_features
+        rows, columns = (side // 4 for side in network.config.image_size)
+        self._regions = cell_regions(rows, columns)
+        self._runtime = make_runtime(runtime, network, path, device, threads, super_features)
+
+    def embed(self, frame: Frame) -> Embedding:
+        """Embed one frame; a black image and an empty scan count as missing."""
+        image = None if frame.left is None or is_blank(frame.left) else frame.left
+        scan = prepare_scan(frame.points, frame.intensity, self._config)
+        found = self._runtime.run(pack([prepare_image(image, self._config)], [scan], self._config))
+        supers = self._supers(found) if self._super_features else (None, None)
+        return Embedding(
+            descriptor=found["descriptor"],
+            image=None if image is None else self._image_features(found, image.shape[:2]),
+            cloud=self._cloud_features(found, scan) if scan.fine_mask.any() else None,
+            super_image=None if image is None else supers[0],
+            super_cloud=supers[1] if scan.fine_mask.any() else None,
+        )
+
+    def _image_features(self, found: Outputs, shape: tuple[int, int]) -> LocalFeatures:
+        saliency = found["image_saliency"]
+        chosen = select_salient(saliency, self._regions, MIN_SALIENCY, KEYPOINTS)
+        rows, columns = (side // 4 for side in self._config.image_size)
+        row, column = np.divmod(chosen, columns)
+        across, down = shape[1] / columns, shape[0] / rows
+        pixels = np.stack([(column + 0.5) * across - 0.5, (row + 0.5) * down - 0.5], axis=1).astype(np.float32)
+        return _features(pixels, np.full((len(chosen), 3), np.nan, np.float32), found["image"], saliency, chosen)
+
+    def _cloud_features(self, found: Outputs, scan: VoxelScan) -> LocalFeatures:
+        saliency = np.where(scan.fine_mask, found["cloud_saliency"], 0)
+        chosen = select_salient(saliency, ground_regions(scan.centroids), MIN_SALIENCY, KEYPOINTS)
+        points = scan.centroids[chosen]
+        return _features(points, points, found["cloud"], saliency, chosen)
+
+    def _supers(self, found: Outputs) -> tuple[SuperFeatures, SuperFeatures]:
+        image = SuperFeatures(found["super_image"].astype(np.float16), found["super_image_strength"])
+        return image, SuperFeatures(found["super_cloud"].astype(np.float16), found["super_cloud_strength"])
+
+
+def _features(
+    positions: Points, points: Points, descriptors: Points, saliency: Points, chosen: np.ndarray
+) -> LocalFeatures:
+    return LocalFeatures(positions, descriptors[chosen].astype(np.float16), saliency[chosen].astype(np.float32), points)

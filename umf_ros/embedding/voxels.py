@@ -1,0 +1,125 @@
+"""From a scan to the voxels the network reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.frames import Points
+
+ORIGIN_M = np.array([0.0, -20.0, -6.0], np.float32)
+VOXEL_M = np.array([1.0, 1.0, 0.3], np.float32)
+CELLS = 40
+FEATURES = 6
+MIN_POINTS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelScan:
+    """A voxelised scan: a box 0..40 m ahead, 20 m to either side, 6 m up and down the body frame.
+
+    Attributes:
+        grid: (20, 20, 20, 48) float32 features of the voxels, folded two by two by two into the last axis
+            (feature, then x y z within the parent cell). A voxel's six features are occupancy, mean offset
+            from its centre (x, y, z, in voxels), mean height over 6 m and mean standardised intensity; an
+            empty voxel's are zero.
+        coarse_index: (T,) int64 flat indices of the occupied cells of the 10^3 grid, padded with 0.
+        coarse_mask: (T,) bool, False for padding.
+        fine_index: (V,) int64 flat indices of the occupied voxels, padded with 0.
+        fine_mask: (V,) bool.
+        centroids: (V, 3) float32 mean of the points in each of those voxels, metres, body frame.
+    """
+
+    grid: NDArray[np.float32]
+    coarse_index: NDArray[np.int64]
+    coarse_mask: NDArray[np.bool_]
+    fine_index: NDArray[np.int64]
+    fine_mask: NDArray[np.bool_]
+    centroids: Points
+
+
+def voxelise(points: Points, intensity: Points | None, coarse_limit: int, fine_limit: int) -> VoxelScan:
+    """Voxelise a scan.
+
+    When more cells are occupied than fit, those with most points are kept, ties by index.
+
+    Args:
+        points: (N, 3) metres, body frame; rows that are not finite are ignored.
+        intensity: (N,) in the sensor's unit, or None.
+        coarse_limit: T, cells of the 10^3 grid.
+        fine_limit: V, voxels of the 40^3 grid.
+    """
+    cells = (np.asarray(points, np.float32) - ORIGIN_M) / VOXEL_M
+    inside = np.asarray((cells >= 0) & (cells < CELLS)).all(axis=1)  # False for NaN
+    cells = cells[inside]
+    whole = cells.astype(np.int64)
+    flat = (whole[:, 0] * CELLS + whole[:, 1]) * CELLS + whole[:, 2]
+    count = np.bincount(flat, minlength=CELLS**3)
+    occupied = np.flatnonzero(count)
+    if len(flat) < MIN_POINTS:
+        occupied = occupied[:0]
+    weight = count[occupied].astype(np.float32)
+    means = np.stack([_mean(flat, values, occupied, weight) for values in (*cells.T, _brightness(intensity, inside))])
+    grid = _fold(occupied, _features(occupied, means))
+    fine = _most(occupied, count[occupied], fine_limit)
+    coarse, points_in = np.unique(_coarse(occupied), return_inverse=True)
+    kept = _most(coarse, np.bincount(points_in, weights=weight, minlength=len(coarse)), coarse_limit)
+    centroids = np.zeros((fine_limit, 3), np.float32)
+    rows = np.searchsorted(occupied, fine)
+    centroids[: len(fine)] = means[:3, rows].T * VOXEL_M + ORIGIN_M
+    return VoxelScan(
+        grid,
+        *_pad(kept, coarse_limit),
+        *_pad(fine, fine_limit),
+        centroids,
+    )
+
+
+def _mean(flat: NDArray[np.int64], values: Points, occupied: NDArray[np.int64], weight: Points) -> Points:
+    total = np.bincount(flat, weights=values, minlength=CELLS**3)[occupied]
+    return (total / weight).astype(np.float32)
+
+
+def _brightness(intensity: Points | None, inside: Any) -> Points:
+    """Logarithm of the intensity, standardised within the scan: units differ between sensors."""
+    if intensity is None or not inside.any():
+        return np.zeros(int(inside.sum()), np.float32)
+    level = np.log1p(np.maximum(np.nan_to_num(np.asarray(intensity, np.float32)[inside]), 0))
+    return np.clip((level - level.mean()) / (level.std() + 0.1), -3, 3)
+
+
+def _features(occupied: NDArray[np.int64], means: Points) -> Points:
+    corner = np.stack([occupied // CELLS**2, occupied // CELLS % CELLS, occupied % CELLS])
+    offset = means[:3] - corner - 0.5
+    height = (means[2] * VOXEL_M[2] + ORIGIN_M[2]) / -ORIGIN_M[2]
+    return np.concatenate([np.ones((1, len(occupied))), offset, height[None], means[3:]]).astype(np.float32)
+
+
+def _fold(occupied: NDArray[np.int64], features: Points) -> Points:
+    half = CELLS // 2
+    x, y, z = occupied // CELLS**2, occupied // CELLS % CELLS, occupied % CELLS
+    parent = (x // 2 * half + y // 2) * half + z // 2
+    grid = np.zeros((half**3, FEATURES, 8), np.float32)
+    grid[parent, :, x % 2 * 4 + y % 2 * 2 + z % 2] = features.T
+    return grid.reshape(half, half, half, FEATURES * 8)
+
+
+def _coarse(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
+    quarter = CELLS // 4
+    x, y, z = voxels // CELLS**2, voxels // CELLS % CELLS, voxels % CELLS
+    return (x // 4 * quarter + y // 4) * quarter + z // 4
+
+
+def _most(cells: NDArray[np.int64], count: NDArray[Any], limit: int) -> NDArray[np.int64]:
+    if len(cells) <= limit:
+        return cells
+    return np.sort(cells[np.argsort(-count, kind="stable")[:limit]])
+
+
+def _pad(index: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    padded = np.zeros(size, np.int64)
+    padded[: len(index)] = index
+    return padded, np.arange(size) < len(index)

@@ -1,0 +1,37 @@
+"""The exceptions a user of the package can meet."""
+
+
+class UmfError(Exception):
+    """Base of every error the package raises on purpose; its text is one line for a person."""
+
+
+class MessageError(UmfError):
+    """A sensor message that cannot be used; `kind` groups equal causes for counting."""
+
+    def __init__(self, kind: str, text: str) -> None:
+        super().__init__(text)
+        self.kind = kind
+
+
+class BagError(UmfError):
+    """A recording that is missing, foreign or damaged beyond use."""
+
+
+class ConfigError(UmfError):
+    """A parameter that is unknown, of the wrong type or out of range."""
+
+
+class CalibrationError(UmfError):
+    """A calibration that is missing or contradicts the data."""
+
+
+class WeightsError(UmfError):
+    """Weights that are missing, damaged or of another architecture."""
+
+
+class OutputError(UmfError):
+    """A result that cannot be written."""
+
+
+class GraphError(UmfError):
+    """A pose graph that cannot be read or solved."""

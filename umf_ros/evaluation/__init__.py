@@ -1,0 +1,1 @@
+"""Retrieval and loop-closure metrics, plots and reports."""

@@ -1,0 +1,192 @@
+"""The nouns of the package: what flows from the sensors to a loop closure.
+
+Stamps are integer nanoseconds since the epoch. The body frame is REP-103 (x forward, y left,
+z up), the camera frame is optical (x right, y down, z forward). Poses follow `geometry`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.geometry import Array
+
+Image = NDArray[np.uint8]
+Points = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class StereoCamera:
+    """A rectified pinhole pair: pixels, and metres for the baseline (0 when there is no right camera).
+
+    Pixel (0, 0) is the centre of the upper left pixel, as in ROS and OpenCV.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    baseline: float
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One synchronised set of measurements; either modality may be missing, never both.
+
+    Attributes:
+        stamp_ns: time of the LiDAR scan (of the image where there is no scan); the frame's key.
+        camera: intrinsics of the left image.
+        body_T_camera: pose of the left camera at its exposure in the body frame at `stamp_ns`.
+        body_T_lidar: pose of the LiDAR in the body frame.
+        left: (H, W) uint8, rectified, or None.
+        right: (H, W) uint8, rectified, or None.
+        points: (N, 3) float32, metres, body frame at `stamp_ns` (motion removed), real returns
+            only, or None.
+        intensity: (N,) float32, the sensor's unit.
+        odom_T_body: odometry at `stamp_ns`, or None.
+        image_stamp_ns: exposure of the left image, or None.
+        session: counts the restarts of the recording's clock.
+    """
+
+    stamp_ns: int
+    camera: StereoCamera
+    body_T_camera: Array
+    body_T_lidar: Array
+    left: Image | None = None
+    right: Image | None = None
+    points: Points | None = None
+    intensity: Points | None = None
+    odom_T_body: Array | None = None
+    image_stamp_ns: int | None = None
+    session: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LocalFeatures:
+    """K salient local features of one modality (thesis 4.4), strongest first.
+
+    Attributes:
+        positions: (K, 2) float32 pixels of the left image, or (K, 3) float32 metres in the body frame.
+        descriptors: (K, D) float16, L2-normalised.
+        saliency: (K,) float32, larger is more salient.
+        points: (K, 3) float32 metres in the body frame, NaN where the depth is unknown.
+    """
+
+    positions: Points
+    descriptors: NDArray[np.float16]
+    saliency: Points
+    points: Points
+
+
+@dataclass(frozen=True, slots=True)
+class SuperFeatures:
+    """The ordered super-features of one modality (thesis 4.3); the row is the feature's ID.
+
+    Attributes:
+        descriptors: (N, D) float16, L2-normalised.
+        strength: (N,) float32, norm before the normalisation.
+    """
+
+    descriptors: NDArray[np.float16]
+    strength: Points
+
+
+@dataclass(frozen=True, slots=True)
+class Embedding:
+    """What the network says of one frame.
+
+    Attributes:
+        descriptor: (D,) float32, L2-normalised; similarity is the dot product.
+        image: local features of the left image, or None without an image.
+        cloud: local features of the scan, or None without a scan.
+        super_image: super-features of the image, or None.
+        super_cloud: super-features of the scan, or None.
+    """
+
+    descriptor: NDArray[np.float32]
+    image: LocalFeatures | None = None
+    cloud: LocalFeatures | None = None
+    super_image: SuperFeatures | None = None
+    super_cloud: SuperFeatures | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A remembered place: all that retrieval and verification need, and no more.
+
+    Attributes:
+        stamp_ns: the frame's key.
+        embedding: descriptor and local features, lifted to 3-D where a depth is known.
+        camera: intrinsics of the left image.
+        body_T_camera: pose of the left camera in the body frame.
+        points: (M, 3) float32 metres in the body frame: the scan, thinned for registration; may be empty.
+        odom_T_body: odometry at the stamp, or None.
+        travelled_m: metres driven since the start of the session, NaN without odometry.
+        session: session of the frame.
+    """
+
+    stamp_ns: int
+    embedding: Embedding
+    camera: StereoCamera
+    body_T_camera: Array
+    points: Points
+    odom_T_body: Array | None = None
+    travelled_m: float = float("nan")
+    session: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A keyframe of the database that looks like the query.
+
+    Attributes:
+        index: row in the database.
+        stamp_ns: key of the candidate keyframe.
+        similarity: cosine similarity of the global descriptors.
+    """
+
+    index: int
+    stamp_ns: int
+    similarity: float
+
+
+@dataclass(frozen=True, slots=True)
+class LoopClosure:
+    """A verified metric constraint between two keyframes: `x_query = x_match @ match_T_query`.
+
+    Attributes:
+        query_stamp_ns: key of the query keyframe, the later one.
+        match_stamp_ns: key of the matched keyframe.
+        match_T_query: pose of the query body in the match body frame.
+        covariance: (6, 6) in ROS order (x y z rx ry rz, axes of the match body), m^2 and rad^2.
+        probability: calibrated probability that the closure is right.
+    """
+
+    query_stamp_ns: int
+    match_stamp_ns: int
+    match_T_query: Array
+    covariance: Array
+    probability: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What verification found for one candidate.
+
+    Attributes:
+        candidate: the candidate that was tested.
+        reason: one word or a short phrase; "accepted" when there is a closure.
+        numbers: what was measured, by name (inliers_image, inliers_cloud, residual_m, overlap, ...).
+        closure: the loop closure, or None when rejected.
+        inlier_pixels: (K, 4) float32: u, v in the query image and u, v in the match image.
+    """
+
+    candidate: Candidate
+    reason: str
+    numbers: dict[str, float] = field(default_factory=dict)
+    closure: LoopClosure | None = None
+    inlier_pixels: Points = field(default_factory=lambda: np.empty((0, 4), np.float32))

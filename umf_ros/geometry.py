@@ -1,0 +1,108 @@
+"""Rigid transforms in 3-D.
+
+A pose `a_T_b` is a (4, 4) float64 homogeneous matrix: the pose of frame b in frame a, so that
+`p_a = a_T_b @ p_b`. Lengths in metres, angles in radians, quaternions as (x, y, z, w).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.floating[Any]]
+
+
+def make_pose(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """Pose from a (3, 3) rotation matrix and a (3,) translation."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = translation
+    return pose
+
+
+def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> Array:
+    """Pose from a (3,) translation and a quaternion (x, y, z, w).
+
+    Raises:
+        ValueError: the quaternion is not finite or its norm is further than 1 % from one.
+    """
+    quaternion = np.asarray(xyzw, dtype=float)
+    norm = float(np.linalg.norm(quaternion))
+    if not np.isfinite(norm) or abs(norm - 1.0) > 0.01:
+        raise ValueError(f"not a unit quaternion (norm {norm:.4g})")
+    return make_pose(Rotation.from_quat(quaternion).as_matrix(), translation)
+
+
+def to_quaternion(pose: ArrayLike) -> Array:
+    """Quaternion (x, y, z, w) with w >= 0 of a (4, 4) pose's or (3, 3) matrix's rotation."""
+    return Rotation.from_matrix(np.asarray(pose)[:3, :3]).as_quat(canonical=True)
+
+
+def invert(a_T_b: Array) -> Array:
+    """`b_T_a`."""
+    rotation = a_T_b[:3, :3].T
+    return make_pose(rotation, -rotation @ a_T_b[:3, 3])
+
+
+def relative(world_T_a: Array, world_T_b: Array) -> Array:
+    """`a_T_b` of two poses in one world."""
+    return invert(world_T_a) @ world_T_b
+
+
+def transform(a_T_b: Array, points_b: Array) -> Array:
+    """(N, 3) points of frame b in frame a; keeps the dtype of the points."""
+    return points_b @ a_T_b[:3, :3].T.astype(points_b.dtype) + a_T_b[:3, 3].astype(points_b.dtype)
+
+
+def rotation_angle(pose: ArrayLike) -> float:
+    """Angle of the pose's rotation in radians, 0 to pi."""
+    return float(Rotation.from_matrix(np.asarray(pose)[:3, :3]).magnitude())
+
+
+def heading(world_T_body: Array) -> float:
+    """Direction of the body's x axis in the world's x-y plane, radians from the x axis."""
+    return float(np.arctan2(world_T_body[1, 0], world_T_body[0, 0]))
+
+
+def wrap_angle(angle: Any) -> Any:
+    """Angle or array of angles in radians, wrapped to [-pi, pi)."""
+    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
+
+
+def interpolate(a: Array, b: Array, fraction: float) -> Array:
+    """Pose between `a` (fraction 0) and `b` (1): linear in translation, shortest arc in rotation.
+
+    Fractions outside [0, 1] extrapolate at the same rate.
+    """
+    turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
+    rotation = a[:3, :3] @ Rotation.from_rotvec(fraction * turn).as_matrix()
+    return make_pose(rotation, (1 - fraction) * a[:3, 3] + fraction * b[:3, 3])
+
+
+def ros_to_gtsam_covariance(covariance: ArrayLike, pose: Array) -> Array:
+    """Covariance of a relative pose, from the ROS to the GTSAM convention.
+
+    ROS (geometry_msgs/PoseWithCovariance) orders x y z rx ry rz about the *parent* axes; a GTSAM
+    `BetweenFactorPose3` wants rx ry rz x y z in the tangent space of the *child*.
+
+    Args:
+        covariance: (6, 6), or the 36 numbers of the message row by row.
+        pose: the pose `parent_T_child` the covariance belongs to.
+    """
+    turn = np.kron(np.eye(2), pose[:3, :3].T)
+    in_child = turn @ np.asarray(covariance, dtype=float).reshape(6, 6) @ turn.T
+    return _swap_blocks(in_child)
+
+
+def gtsam_to_ros_covariance(covariance: ArrayLike, pose: Array) -> Array:
+    """Inverse of `ros_to_gtsam_covariance`: (6, 6) in ROS order about the parent axes."""
+    turn = np.kron(np.eye(2), pose[:3, :3])
+    return turn @ _swap_blocks(np.asarray(covariance, dtype=float).reshape(6, 6)) @ turn.T
+
+
+def _swap_blocks(matrix: Array) -> Array:
+    order = [3, 4, 5, 0, 1, 2]
+    return matrix[np.ix_(order, order)]

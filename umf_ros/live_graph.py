@@ -1,0 +1,186 @@
+"""The live graph as processes: loop_closure_node, pose_graph_node and a bag player over DDS."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from umf_ros.errors import UmfError
+
+START_TIMEOUT_S = 180.0
+STOP_TIMEOUT_S = 60.0
+READY = "ready"
+# a recording on this machine must arrive whole, however busy the machine is
+PARAMETERS = ("use_sim_time:=true", "qos.reliability:=reliable", "qos.depth:=200")
+
+
+class NodeProcess:
+    """A node in a process of its own; its output goes to a log file and line by line to `on_line`.
+
+    It does not see the terminal's Ctrl-C: whoever started it decides the order in which nodes end.
+    """
+
+    def __init__(self, name: str, arguments: list[str], log: Path, on_line: Callable[[str], None]) -> None:
+        self.name = name
+        self.ready = threading.Event()
+        self._log = log.open("w", encoding="utf-8")
+        self._on_line = on_line
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", f"umf_ros.nodes.{name}", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=_environment(),
+            start_new_session=True,
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def exit_code(self) -> int | None:
+        """Exit status, or None while it runs."""
+        return self._process.poll()
+
+    def wait_ready(self) -> None:
+        """Wait until the node says it is ready.
+
+        Raises:
+            UmfError: it ended, or took too long.
+        """
+        deadline = time.monotonic() + START_TIMEOUT_S
+        while not self.ready.wait(0.1):
+            if self.exit_code is not None:
+                self._reader.join()
+                raise UmfError(f"{self.name} ended with status {self.exit_code}; see {self._log.name}")
+            if time.monotonic() > deadline:
+                raise UmfError(f"{self.name} was not ready after {START_TIMEOUT_S:.0f} s; see {self._log.name}")
+
+    def stop(self) -> bool:
+        """Ask the node to finish and wait; False when it had to be killed."""
+        finished = True
+        if self.exit_code is None:
+            self._process.send_signal(signal.SIGINT)
+            try:
+                self._process.wait(STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                finished = False
+        self._process.wait()
+        self._reader.join()
+        self._log.close()
+        return finished
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._log.write(line)
+            self._log.flush()
+            if line.strip() == READY:
+                self.ready.set()
+            else:
+                self._on_line(line.rstrip())
+
+
+class LiveGraph:
+    """Context manager: both nodes run inside, and write their results when it ends.
+
+    Args:
+        folder: run folder for results and logs.
+        console: where closures are shown as they come.
+    """
+
+    def __init__(self, folder: Path, console: Console) -> None:
+        self._folder = folder
+        self._console = console
+        self._nodes: list[NodeProcess] = []
+
+    def __enter__(self) -> LiveGraph:
+        (self._folder / "logs").mkdir(exist_ok=True)
+        try:
+            with self._console.status("Starting loop_closure_node and pose_graph_node"):
+                for name in ("loop_closure_node", "pose_graph_node"):
+                    own = [f"results_dir:={self._folder.resolve()}", *PARAMETERS]
+                    self._nodes.append(
+                        self._start(name, ["--ros-args", *(word for text in own for word in ("-p", text))])
+                    )
+                for node in self._nodes:
+                    node.wait_ready()
+        except BaseException:
+            self._stop_all()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        with self._console.status("Finishing"):
+            self._stop_all()
+        if kind is KeyboardInterrupt:
+            self._console.print("[yellow]Interrupted: the report covers what was done so far.")
+            return True
+        return False
+
+    def play(self, bag: Path, duration_s: float, rate: float) -> None:
+        """Play the bag to its end, showing progress and what the nodes say.
+
+        Raises:
+            UmfError: the player failed or a node died.
+        """
+        arguments = [str(bag.resolve()), "--rate", str(rate), "--wait-for-subscribers", "--quiet"]
+        player = self._start("bag_player_node", arguments)
+        try:
+            self._watch(player, duration_s / rate)
+        finally:
+            player.stop()
+        if player.exit_code:
+            raise UmfError(f"the bag player ended with status {player.exit_code}; see {self._folder / 'logs'}")
+
+    def _watch(self, player: NodeProcess, seconds: float) -> None:
+        columns = (TextColumn("[progress.description]{task.description}"), BarColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=self._console, transient=True) as progress:
+            task = progress.add_task("Playing to the live nodes", total=seconds)
+            start = time.monotonic()
+            while player.exit_code is None:
+                time.sleep(0.1)
+                progress.update(task, completed=min(time.monotonic() - start, seconds))
+                for node in self._nodes:
+                    if node.exit_code is not None:
+                        raise UmfError(f"{node.name} died with status {node.exit_code}; see {self._folder / 'logs'}")
+
+    def _start(self, name: str, arguments: list[str]) -> NodeProcess:
+        return NodeProcess(name, arguments, self._folder / "logs" / f"{name}.log", self._show)
+
+    def _show(self, line: str) -> None:
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    def _stop_all(self) -> None:
+        # the front-end first: its last closures still reach the back-end
+        for node in self._nodes:
+            if not node.stop():
+                self._console.print(f"[red]{node.name} did not finish and was killed; its results may be incomplete.")
+        self._nodes = []
+
+
+def _environment() -> dict[str, str]:
+    """A DDS domain of our own on this machine alone, and plain log lines."""
+    return {
+        **os.environ,
+        "ROS_DOMAIN_ID": os.environ.get("ROS_DOMAIN_ID", str(1 + os.getpid() % 100)),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "RCUTILS_CONSOLE_OUTPUT_FORMAT": "{message}",
+        "RCUTILS_LOGGING_USE_STDOUT": "1",
+        "RCUTILS_LOGGING_BUFFERED_STREAM": "0",
+        "RCUTILS_COLORIZED_OUTPUT": "0",
+        "PYTHONUNBUFFERED": "1",
+    }

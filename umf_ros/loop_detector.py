@@ -1,0 +1,126 @@
+"""From synchronised frames to verified loop closures: the method of the thesis on one screen."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from umf_ros.config import Settings
+from umf_ros.embedding import make_embedder
+from umf_ros.embedding.embedder import Embedder
+from umf_ros.frames import Frame, Keyframe, LoopClosure, Verdict
+from umf_ros.keyframes import KeyframeSelector
+from umf_ros.places.database import PlaceDatabase
+from umf_ros.verification import Verifier, lift, thin_scan
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """What became of one frame.
+
+    Attributes:
+        frame_stamp_ns: key of the frame.
+        keyframe: the keyframe it became, or None when it was passed over.
+        verdicts: one for every candidate that was tested, best first.
+        latency_ms: milliseconds of embed, query and verify, and of their total.
+    """
+
+    frame_stamp_ns: int
+    keyframe: Keyframe | None = None
+    verdicts: list[Verdict] = field(default_factory=list)
+    latency_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def closures(self) -> list[LoopClosure]:
+        """The verified loop closures."""
+        return [verdict.closure for verdict in self.verdicts if verdict.closure is not None]
+
+
+class LoopDetector:
+    """Finds loop closures in a stream of frames; the live node and the offline replay run this same class.
+
+    Args:
+        settings: all settings.
+        embedder: the network.
+
+    Raises:
+        UmfError: the place database of the settings belongs to another embedder.
+    """
+
+    def __init__(self, settings: Settings, embedder: Embedder) -> None:
+        self._rules = settings.loop
+        self._selector = KeyframeSelector(settings.keyframe)
+        self._embedder = embedder
+        self._verifier = Verifier(settings.verification)
+        self.database = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
+        self._first_session = self.database.next_session
+        self._session = 0
+
+    def process(self, frame: Frame) -> Detection:
+        """Take one frame, in order of stamps within a session."""
+        if frame.session != self._session:
+            self._start_session(frame)
+        if not self._selector.select(frame):
+            return Detection(frame.stamp_ns)
+        latency = Stopwatch()
+        with latency.measure("embed"):
+            keyframe = self._remember(frame)
+        with latency.measure("query"):
+            candidates = self.database.query(keyframe, self._rules)
+        with latency.measure("verify"):
+            verdicts = self._verifier.verify(keyframe, [(found, self.database[found.index]) for found in candidates])
+        self.database.add(keyframe)
+        return Detection(frame.stamp_ns, keyframe, verdicts, latency.milliseconds)
+
+    def reset(self) -> None:
+        """Forget all places."""
+        self.database.forget_from(-(2**62))
+        self._selector.reset()
+        self._verifier.reset()
+
+    def _remember(self, frame: Frame) -> Keyframe:
+        return Keyframe(
+            stamp_ns=frame.stamp_ns,
+            embedding=lift(frame, self._embedder.embed(frame)),
+            camera=frame.camera,
+            body_T_camera=frame.body_T_camera,
+            points=thin_scan(frame.points),
+            odom_T_body=frame.odom_T_body,
+            travelled_m=self._selector.travelled_m(frame),
+            session=self._first_session + frame.session,
+        )
+
+    def _start_session(self, frame: Frame) -> None:
+        """The clock jumped back (a looped bag): what was recorded from here on lies in the future now."""
+        self._session = frame.session
+        self.database.forget_from(frame.stamp_ns)
+        self._selector.reset()
+        self._verifier.reset()
+
+
+def make_detector_embedder(settings: Settings) -> Embedder:
+    """The embedder the settings name, with super-features where the reranking asks for them.
+
+    Raises:
+        ConfigError: unknown method, runtime or device.
+        WeightsError: the weights cannot be used.
+    """
+    return make_embedder(settings.embedding, super_features=settings.verification.rerank == "superfeatures")
+
+
+class Stopwatch:
+    """Wall-clock milliseconds by name, with their total."""
+
+    def __init__(self) -> None:
+        self.milliseconds: dict[str, float] = {"total": 0.0}
+
+    @contextmanager
+    def measure(self, name: str) -> Iterator[None]:
+        """Time the block."""
+        start = time.perf_counter()
+        yield
+        elapsed = 1e3 * (time.perf_counter() - start)
+        self.milliseconds[name] = elapsed
+        self.milliseconds["total"] += elapsed

@@ -1,0 +1,1 @@
+"""The UMF network and its parts: pure torch, no ROS."""

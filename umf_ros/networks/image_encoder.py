@@ -1,0 +1,136 @@
+"""Image encoders and their feature pyramid (thesis 4, figure 4.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from umf_ros.networks.presets import NetworkConfig
+
+RESNET_DEPTHS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3), "resnet50": (3, 4, 6, 3)}
+
+
+def conv_norm(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
+    """Convolution without bias, and batch normalisation."""
+    conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False)
+    return nn.Sequential(conv, nn.BatchNorm2d(outputs))
+
+
+class ResidualBlock(nn.Module):
+    """Residual block of ResNet: basic (two 3x3), or a bottleneck (1x1, 3x3, 1x1 with four times the width)."""
+
+    def __init__(self, inputs: int, width: int, stride: int, bottleneck: bool) -> None:
+        super().__init__()
+        outputs = 4 * width if bottleneck else width
+        if bottleneck:
+            layers = [conv_norm(inputs, width, 1), conv_norm(width, width, 3, stride), conv_norm(width, outputs, 1)]
+        else:
+            layers = [conv_norm(inputs, width, 3, stride), conv_norm(width, width, 3)]
+        self.layers = nn.ModuleList(layers)
+        same = stride == 1 and inputs == outputs
+        self.shortcut = nn.Identity() if same else conv_norm(inputs, outputs, 1, stride)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, C', H / stride, W / stride)."""
+        y = x
+        for number, layer in enumerate(self.layers):
+            y = layer(y)
+            if number < len(self.layers) - 1:
+                y = F.relu(y)
+        return F.relu(y + self.shortcut(x))
+
+
+class InvertedBlock(nn.Module):
+    """Inverted residual of the mobile networks: widen, depth-wise 3x3, narrow."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, expansion: int = 4) -> None:
+        super().__init__()
+        hidden = inputs * expansion
+        self.layers = nn.Sequential(
+            conv_norm(inputs, hidden, 1),
+            nn.Hardswish(),
+            conv_norm(hidden, hidden, 3, stride, groups=hidden),
+            nn.Hardswish(),
+            conv_norm(hidden, outputs, 1),
+        )
+        self.residual = stride == 1 and inputs == outputs
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, C', H / stride, W / stride)."""
+        y = self.layers(x)
+        return x + y if self.residual else y
+
+
+class Backbone(nn.Module):
+    """A stem and four stages at strides 4, 8, 16 and 32."""
+
+    def __init__(self, name: str, width: int) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(conv_norm(1, width, 7, 2), nn.ReLU(), nn.MaxPool2d(3, 2, 1))
+        self.channels: list[int] = []
+        stages = []
+        inputs = width
+        for level in range(4):
+            stage, inputs = _stage(name, inputs, width * 2**level, level)
+            stages.append(stage)
+            self.channels.append(inputs)
+        self.stages = nn.ModuleList(stages)
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """(B, 1, H, W) to the maps of the four stages, finest first."""
+        x = self.stem(image)
+        maps = []
+        for stage in self.stages:
+            x = stage(x)
+            maps.append(x)
+        return maps
+
+
+def _stage(name: str, inputs: int, width: int, level: int) -> tuple[nn.Sequential, int]:
+    stride = 1 if level == 0 else 2
+    blocks: list[nn.Module] = []
+    if name == "mobile":
+        for number in range(3):
+            blocks.append(InvertedBlock(inputs, width, stride if number == 0 else 1))
+            inputs = width
+        return nn.Sequential(*blocks), inputs
+    bottleneck = name == "resnet50"
+    for number in range(RESNET_DEPTHS[name][level]):
+        blocks.append(ResidualBlock(inputs, width, stride if number == 0 else 1, bottleneck))
+        inputs = 4 * width if bottleneck else width
+    return nn.Sequential(*blocks), inputs
+
+
+class FeaturePyramid(nn.Module):
+    """Top-down pyramid over a backbone's stages: a coarse map for fusion, a fine one for local features."""
+
+    def __init__(self, channels: Sequence[int], pyramid: int, coarse: int, fine: int) -> None:
+        super().__init__()
+        self.laterals = nn.ModuleList(nn.Conv2d(count, pyramid, 1) for count in channels)
+        self.coarse = nn.Conv2d(pyramid, coarse, 3, padding=1)
+        self.fine = nn.Conv2d(pyramid, fine, 3, padding=1)
+
+    def forward(self, maps: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Coarse map (B, coarse, H/16, W/16) and fine map (B, fine, H/4, W/4)."""
+        top = self.laterals[3](maps[3])
+        merged = []
+        for level in (2, 1, 0):
+            up = F.interpolate(top, scale_factor=2.0, mode="bilinear", align_corners=False)
+            top = self.laterals[level](maps[level]) + up
+            merged.append(top)
+        return self.coarse(merged[0]), self.fine(merged[2])
+
+
+class ImageEncoder(nn.Module):
+    """Backbone and pyramid."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.backbone = Backbone(config.backbone, config.width)
+        self.pyramid = FeaturePyramid(self.backbone.channels, config.pyramid, config.tokens, config.local)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Coarse (B, tokens, H/16, W/16) and fine (B, local, H/4, W/4) maps of an image (B, 1, H, W)."""
+        return self.pyramid(self.backbone(image))

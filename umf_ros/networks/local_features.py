@@ -1,0 +1,102 @@
+"""RANSAC local features (thesis 4.4): two transformer layers whose attention says what is salient."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from umf_ros.networks.attention import Block, received
+from umf_ros.networks.positions import image_positions, sine_encoding
+from umf_ros.networks.presets import NetworkConfig
+
+WINDOW = 8
+HEADS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class LocalMap:
+    """Local features of one modality.
+
+    Attributes:
+        tokens: (B, N, C) features after the transformer layers.
+        descriptors: (B, N, D) float32, L2-normalised.
+        saliency: (B, N) float32, attention received averaged over the layers; 1 is the fair share.
+        mask: (B, N) bool, False where there is no feature.
+    """
+
+    tokens: Tensor
+    descriptors: Tensor
+    saliency: Tensor
+    mask: Tensor
+
+
+class ImageLocal(nn.Module):
+    """Attention within windows, then between the windows at equal places: local detail, global context."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.positions: Tensor
+        self.rows, self.columns = config.image_size[0] // 4, config.image_size[1] // 4
+        width = config.local
+        positions = sine_encoding(image_positions(self.rows, self.columns), width)
+        self.register_buffer("positions", positions.view(self.rows, self.columns, width), persistent=False)
+        self.near, self.far = Block(width, HEADS, 2 * width), Block(width, HEADS, 2 * width)
+        self.norm = nn.LayerNorm(width)
+        self.descriptor = nn.Linear(width, config.image_local)
+
+    def forward(self, fine: Tensor) -> LocalMap:
+        """Local features of a fine map (B, C, H/4, W/4); N = H/4 * W/4, row by row."""
+        batch, width = fine.shape[:2]
+        tokens = fine.permute(0, 2, 3, 1) + self.positions.to(fine.dtype)
+        windows = tokens.view(batch, self.rows // WINDOW, WINDOW, self.columns // WINDOW, WINDOW, width)
+        windows = windows.transpose(2, 3)
+        within = windows.reshape(-1, WINDOW * WINDOW, width)
+        within, near_map = self.near(within)
+        count = self.rows * self.columns // WINDOW**2
+        across = within.view(batch, count, WINDOW * WINDOW, width).transpose(1, 2).reshape(-1, count, width)
+        across, far_map = self.far(across)
+        near = received(near_map).view(batch, count, WINDOW * WINDOW)
+        far = received(far_map).view(batch, WINDOW * WINDOW, count).transpose(1, 2)
+        tokens = self._unfold(across.view(batch, WINDOW * WINDOW, count, width).transpose(1, 2))
+        saliency = self._unfold(((near + far) / 2).unsqueeze(-1)).squeeze(-1)
+        mask = torch.ones_like(saliency, dtype=torch.bool)
+        return LocalMap(tokens, _describe(self, tokens), saliency, mask)
+
+    def _unfold(self, windows: Tensor) -> Tensor:
+        """(B, windows, cells, C) back to (B, N, C), row by row."""
+        batch, channels = windows.shape[0], windows.shape[-1]
+        grid = windows.reshape(batch, self.rows // WINDOW, self.columns // WINDOW, WINDOW, WINDOW, channels)
+        return grid.transpose(2, 3).reshape(batch, self.rows * self.columns, channels)
+
+
+class CloudLocal(nn.Module):
+    """Two layers of attention among the occupied voxels."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        width = config.local
+        self.blocks = nn.ModuleList(Block(width, HEADS, 2 * width) for _ in range(2))
+        self.norm = nn.LayerNorm(width)
+        self.descriptor = nn.Linear(width, config.cloud_local)
+
+    def forward(self, fine: Tensor, positions: Tensor, mask: Tensor) -> LocalMap:
+        """Local features of occupied voxels.
+
+        Args:
+            fine: (B, V, C) features.
+            positions: (B, V, C) encodings of the voxels' places.
+            mask: (B, V) bool, False beyond the voxels of a scan.
+        """
+        tokens = fine + positions.to(fine.dtype)
+        shares = []
+        for block in self.blocks:
+            tokens, weights = block(tokens, mask=mask)
+            shares.append(received(weights, mask, mask))
+        saliency = (shares[0] + shares[1]) / 2 * mask.float()
+        return LocalMap(tokens, _describe(self, tokens), saliency, mask)
+
+
+def _describe(head: ImageLocal | CloudLocal, tokens: Tensor) -> Tensor:
+    return nn.functional.normalize(head.descriptor(head.norm(tokens)).float(), dim=-1)

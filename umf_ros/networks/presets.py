@@ -1,0 +1,97 @@
+"""The sizes of a UMF network and the presets that are known by name."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from umf_ros.errors import WeightsError
+
+Backbone = Literal["resnet18", "resnet34", "resnet50", "mobile"]
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """What has to be known to build the network that a weights file belongs to.
+
+    Attributes:
+        backbone: image encoder.
+        width: channels of its first stage (64 is the published ResNet).
+        image_size: height and width of the network's input, multiples of 32.
+        pyramid: channels of the image feature pyramid.
+        voxel_channels: channels of the voxel encoder at 20^3, 10^3 and 5^3 cells.
+        tokens: width of the fusion transformer.
+        heads, layers, feedforward: of the fusion transformer.
+        descriptor: length of the global descriptor.
+        coarse_voxels, fine_voxels: most occupied voxels kept for fusion and for local features.
+        local: width of the two local transformer layers.
+        image_local, cloud_local: lengths of the local descriptors.
+        super_iterations: rounds of the iterative attention of the super-features.
+        image_supers, cloud_supers: number of super-features and their length.
+    """
+
+    backbone: Backbone = "resnet18"
+    width: int = 32
+    image_size: tuple[int, int] = (96, 128)
+    pyramid: int = 96
+    voxel_channels: tuple[int, int, int] = (24, 64, 128)
+    tokens: int = 128
+    heads: int = 4
+    layers: int = 1
+    feedforward: int = 256
+    descriptor: int = 256
+    coarse_voxels: int = 160
+    fine_voxels: int = 512
+    local: int = 64
+    image_local: int = 64
+    cloud_local: int = 32
+    super_iterations: int = 3
+    image_supers: tuple[int, int] = (64, 64)
+    cloud_supers: tuple[int, int] = (64, 32)
+
+    def __post_init__(self) -> None:
+        if any(side % 32 or side <= 0 for side in self.image_size):
+            raise ValueError(f"image_size must be multiples of 32, not {self.image_size}")
+        if self.tokens % self.heads or self.local % 4:
+            raise ValueError("the width of a transformer must be a multiple of its heads")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for a JSON card."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
+        """Inverse of `as_dict`.
+
+        Raises:
+            WeightsError: a name or a value does not describe this architecture.
+        """
+        try:
+            fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+            return cls(**fields)
+        except (TypeError, ValueError) as error:
+            raise WeightsError(f"weights of another architecture: {error}") from None
+
+
+PRESETS: dict[str, NetworkConfig] = {
+    "umf_light": NetworkConfig(),
+    "umf_mobile": NetworkConfig(backbone="mobile", width=24),
+    "umf_resnet50": NetworkConfig(
+        backbone="resnet50",
+        width=64,
+        image_size=(224, 224),
+        pyramid=256,
+        voxel_channels=(48, 128, 256),
+        tokens=256,
+        heads=8,
+        layers=3,
+        coarse_voxels=256,
+        feedforward=1024,
+        local=128,
+        image_local=128,
+        cloud_local=32,
+        super_iterations=6,
+        image_supers=(64, 128),
+        cloud_supers=(128, 32),
+    ),
+}

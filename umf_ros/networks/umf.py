@@ -1,0 +1,157 @@
+"""UMF: unifying local and global multimodal features (thesis 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import torch
+from torch import Tensor, nn
+
+from umf_ros.networks.fusion import AbsentToken, Fused, Fusion, Tokens
+from umf_ros.networks.image_encoder import ImageEncoder
+from umf_ros.networks.local_features import CloudLocal, ImageLocal, LocalMap
+from umf_ros.networks.positions import image_positions, sine_encoding, voxel_positions
+from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.superfeatures import IterativeAttention, SuperMap
+from umf_ros.networks.voxel_encoder import CELLS, VoxelEncoder
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkInput:
+    """A batch of preprocessed frames.
+
+    Attributes:
+        image: (B, 1, H, W) float32, normalised.
+        image_present: (B,) bool.
+        grid: (B, 20, 20, 20, 48) float32 features of the voxels, folded (`VoxelScan`).
+        coarse_index: (B, T) int64 flat indices of occupied cells of the 10^3 grid.
+        coarse_mask: (B, T) bool; a row without True is a frame without a scan.
+        fine_index: (B, V) int64 flat indices of occupied voxels of the 40^3 grid.
+        fine_mask: (B, V) bool.
+    """
+
+    image: Tensor
+    image_present: Tensor
+    grid: Tensor
+    coarse_index: Tensor
+    coarse_mask: Tensor
+    fine_index: Tensor
+    fine_mask: Tensor
+
+
+def to_device(batch: NetworkInput, device: torch.device) -> NetworkInput:
+    """The batch on another device."""
+    return NetworkInput(**{field.name: getattr(batch, field.name).to(device) for field in fields(batch)})
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """What the encoders saw, before fusion.
+
+    Attributes:
+        image, cloud: tokens for fusion, positions included.
+        fine_image: (B, C, H/4, W/4).
+        fine_cloud: (B, V, C).
+    """
+
+    image: Tokens
+    cloud: Tokens
+    fine_image: Tensor
+    fine_cloud: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkOutput:
+    """What the network says of a batch.
+
+    Attributes:
+        descriptor: (B, D) float32, L2-normalised.
+        image, cloud: local features.
+        super_image, super_cloud: super-features, when asked for.
+        attention: maps of every fusion layer by name, when asked for.
+    """
+
+    descriptor: Tensor
+    image: LocalMap
+    cloud: LocalMap
+    super_image: SuperMap | None = None
+    super_cloud: SuperMap | None = None
+    attention: list[dict[str, Tensor]] = field(default_factory=list)
+
+
+class UMF(nn.Module):
+    """Two encoders, a fusion transformer for the global descriptor, heads for local and super-features."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.image_encoder = ImageEncoder(config)
+        self.voxel_encoder = VoxelEncoder(config)
+        # content and position on one scale, or one of them drowns
+        self.image_tokens, self.cloud_tokens = nn.LayerNorm(config.tokens), nn.LayerNorm(config.tokens)
+        self.fusion = Fusion(config)
+        self.absent_image, self.absent_cloud = AbsentToken(config.tokens), AbsentToken(config.tokens)
+        self.image_local, self.cloud_local = ImageLocal(config), CloudLocal(config)
+        self.super_image = IterativeAttention(config.local, *config.image_supers, config.super_iterations)
+        self.super_cloud = IterativeAttention(config.local, *config.cloud_supers, config.super_iterations)
+        self.cells: Tensor
+        self.coarse_voxels: Tensor
+        self.voxels: Tensor
+        self._add_positions(config)
+
+    def _add_positions(self, config: NetworkConfig) -> None:
+        height, width = config.image_size
+        cells = image_positions(height // 16, width // 16)
+        quarter = CELLS // 4
+        self.register_buffer("cells", sine_encoding(cells, config.tokens), persistent=False)
+        coarse = sine_encoding(voxel_positions((quarter, quarter, quarter)), config.tokens)
+        fine = sine_encoding(voxel_positions((CELLS, CELLS, CELLS)), config.local)
+        self.register_buffer("coarse_voxels", coarse, persistent=False)
+        self.register_buffer("voxels", fine, persistent=False)
+
+    def encode(self, batch: NetworkInput) -> Features:
+        """Run both encoders and add the positions to the tokens."""
+        coarse, fine_image = self.image_encoder(batch.image)
+        image = self.image_tokens(coarse.flatten(2).transpose(1, 2))
+        image = image + self.cells.to(image.dtype)
+        everywhere = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device)
+        cloud, fine_cloud = self.voxel_encoder(batch.grid, batch.coarse_index, batch.fine_index)
+        cloud = self.cloud_tokens(cloud)
+        cloud = cloud + self.coarse_voxels[batch.coarse_index].to(cloud.dtype)
+        return Features(Tokens(image, everywhere), Tokens(cloud, batch.coarse_mask), fine_image, fine_cloud)
+
+    def fuse(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> Fused:
+        """Descriptors and attention maps, with the modalities that are present (B,) bool."""
+        image = self.absent_image(features.image, image_present)
+        cloud = self.absent_cloud(features.cloud, cloud_present)
+        return self.fusion(image, cloud, image_present, cloud_present)
+
+    def describe_local(self, features: Features, batch: NetworkInput) -> tuple[LocalMap, LocalMap]:
+        """Local features of the images and of the scans."""
+        positions = self.voxels[batch.fine_index]
+        cloud = self.cloud_local(features.fine_cloud, positions, batch.fine_mask)
+        return self.image_local(features.fine_image), cloud
+
+    def forward(self, batch: NetworkInput, super_features: bool = False, attention: bool = False) -> NetworkOutput:
+        """Everything the network says of a batch."""
+        features = self.encode(batch)
+        fused = self.fuse(features, batch.image_present, batch.coarse_mask.any(1))
+        image, cloud = self.describe_local(features, batch)
+        supers: tuple[SuperMap | None, SuperMap | None] = (None, None)
+        if super_features:
+            supers = self.super_image(image.tokens, image.mask), self.super_cloud(cloud.tokens, cloud.mask)
+        return NetworkOutput(fused.descriptor, image, cloud, *supers, attention=fused.attention if attention else [])
+
+
+def count_parameters(network: nn.Module) -> int:
+    """Number of trainable parameters."""
+    return sum(parameter.numel() for parameter in network.parameters())
+
+
+def channels_last(network: nn.Module) -> None:
+    """Order the weights of the convolutions as a CPU likes them (twice as fast in half precision)."""
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            module.weight.data = module.weight.data.contiguous(memory_format=torch.channels_last)
+        elif isinstance(module, nn.Conv3d):
+            module.weight.data = module.weight.data.contiguous(memory_format=torch.channels_last_3d)

@@ -1,0 +1,98 @@
+"""Weights on disk: a safetensors file in half precision, and a JSON card beside it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from umf_ros.errors import OutputError, WeightsError
+from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.umf import UMF, channels_last
+
+
+def save_weights(network: UMF, path: Path, card: dict[str, Any]) -> None:
+    """Write the weights, rounded to half precision, and `<name>.json` with the card and the architecture.
+
+    Raises:
+        OutputError: the files cannot be written.
+    """
+    architecture = network.config.as_dict()
+    tensors = {name: _halve(value) for name, value in network.state_dict().items()}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_file(tensors, path, metadata={"architecture": json.dumps(architecture)})
+        path.chmod(0o644)
+        text = json.dumps(card | {"architecture": architecture}, indent=2, ensure_ascii=False)
+        path.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+    except (OSError, SafetensorError) as error:
+        raise OutputError(f"cannot write {path}: {error}") from None
+
+
+def load_weights(path: Path) -> UMF:
+    """The network of a weights file, in single precision and ready to evaluate.
+
+    Raises:
+        WeightsError: missing, truncated or foreign file, not finite, or of another architecture.
+    """
+    architecture, tensors = _read(path)
+    network = UMF(NetworkConfig.from_dict(architecture))
+    fill(network, tensors, path)
+    channels_last(network)
+    return network.eval()
+
+
+def fill(network: UMF, tensors: dict[str, Tensor], path: Path) -> None:
+    """Put tensors into a network of the same architecture.
+
+    Raises:
+        WeightsError: a tensor is missing, surplus, of another shape or not finite.
+    """
+    wanted = network.state_dict()
+    differing = sorted(wanted.keys() ^ tensors.keys())
+    differing += [name for name in wanted.keys() & tensors.keys() if wanted[name].shape != tensors[name].shape]
+    if differing:
+        raise WeightsError(
+            f"{path} holds weights of another architecture: {differing[0]} and {len(differing) - 1} more"
+        )
+    bad = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
+    if bad:
+        raise WeightsError(f"{path} is damaged: {bad[0]} holds values that are not finite")
+    network.load_state_dict({name: value.to(wanted[name].dtype) for name, value in tensors.items()})
+
+
+def read_card(path: Path) -> dict[str, Any]:
+    """The JSON card beside a weights file.
+
+    Raises:
+        WeightsError: the card is missing or not JSON.
+    """
+    card = path.with_suffix(".json")
+    try:
+        content = json.loads(card.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise WeightsError(f"cannot read the card {card}: {' '.join(str(error).split())}") from None
+    return dict(content)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    if not path.is_file():
+        raise WeightsError(f"weights {path} do not exist")
+    try:
+        with safe_open(path, framework="pt") as stream:
+            metadata = stream.metadata() or {}
+            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise WeightsError(f"{path} is truncated or not a safetensors file: {' '.join(str(error).split())}") from None
+    if "architecture" not in metadata:
+        raise WeightsError(f"{path} holds weights of another architecture: it does not say which")
+    return json.loads(metadata["architecture"]), tensors
+
+
+def _halve(value: Tensor) -> Tensor:
+    return value.detach().cpu().half().contiguous() if value.is_floating_point() else value.detach().cpu().contiguous()

@@ -1,0 +1,93 @@
+"""Publishes what the detector found."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from visualization_msgs.msg import Marker, MarkerArray
+
+from umf_ros.config import Frames
+from umf_ros.frames import Keyframe, Verdict
+from umf_ros.loop_detector import Detection
+from umf_ros.nodes import conversions
+from umf_ros.nodes.diagnostics import OK, WARN, status
+from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS
+
+# RViz redraws every line it is sent: a rover that runs for days shows its latest ones
+MAX_LINES = 500
+
+
+class Announcer:
+    """Loop closures, keyframes, tested candidates and markers of one node.
+
+    `/loop_closures` carries verified closures only; `~/candidates` everything that was tested.
+    """
+
+    def __init__(self, node: Node, frames: Frames) -> None:
+        self._node = node
+        self._frames = frames
+        self._closures = node.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS)
+        self._keyframes = node.create_publisher(PoseStamped, "~/keyframes", 10)
+        self._candidates = node.create_publisher(DiagnosticArray, "~/candidates", 10)
+        self._markers = node.create_publisher(MarkerArray, "~/markers", LATCHED_QOS)
+        self._accepted: deque[list] = deque(maxlen=MAX_LINES)
+        self._rejected: deque[list] = deque(maxlen=MAX_LINES)
+
+    def announce(self, detection: Detection, matches: dict[int, Keyframe]) -> None:
+        """Publish one detection.
+
+        Args:
+            detection: what became of a frame.
+            matches: the matched keyframes by stamp, for the markers.
+        """
+        keyframe = detection.keyframe
+        if keyframe is None:
+            return
+        for closure in detection.closures:
+            self._closures.publish(conversions.closure_to_message(closure))
+        if keyframe.odom_T_body is not None:
+            pose = conversions.to_pose_stamped(keyframe.stamp_ns, self._frames.odom, keyframe.odom_T_body)
+            self._keyframes.publish(pose)
+        if detection.verdicts:
+            self._candidates.publish(self._report(keyframe, detection.verdicts))
+            self._draw(keyframe, detection.verdicts, matches)
+
+    def _report(self, keyframe: Keyframe, verdicts: list[Verdict]) -> DiagnosticArray:
+        message = DiagnosticArray(status=[_describe(keyframe, verdict) for verdict in verdicts])
+        message.header.stamp = conversions.to_time(keyframe.stamp_ns)
+        return message
+
+    def _draw(self, keyframe: Keyframe, verdicts: list[Verdict], matches: dict[int, Keyframe]) -> None:
+        if keyframe.odom_T_body is None:
+            return
+        here = conversions.to_point(keyframe.odom_T_body[:3, 3])
+        for verdict in verdicts:
+            match = matches.get(verdict.candidate.stamp_ns)
+            if match is None or match.odom_T_body is None or match.session != keyframe.session:
+                continue
+            lines = self._rejected if verdict.closure is None else self._accepted
+            lines.append([conversions.to_point(match.odom_T_body[:3, 3]), here])
+        accepted = self._line_list(0, "accepted", self._accepted, keyframe.stamp_ns)
+        rejected = self._line_list(1, "rejected", self._rejected, keyframe.stamp_ns)
+        self._markers.publish(MarkerArray(markers=[accepted, rejected]))
+
+    def _line_list(self, number: int, name: str, lines: deque[list], stamp_ns: int) -> Marker:
+        marker = Marker(ns=name, id=number, type=Marker.LINE_LIST, action=Marker.ADD)
+        marker.header.frame_id = self._frames.odom
+        marker.header.stamp = conversions.to_time(stamp_ns)
+        marker.pose.orientation.w = 1.0
+        marker.scale.x = 0.05
+        marker.color = conversions.GREEN if name == "accepted" else conversions.RED
+        marker.points = [point for line in lines for point in line]
+        return marker
+
+
+def _describe(keyframe: Keyframe, verdict: Verdict) -> DiagnosticStatus:
+    accepted = verdict.closure is not None
+    name = f"{conversions.keyframe_frame(verdict.candidate.stamp_ns)} -> {keyframe.stamp_ns}"
+    numbers = {"similarity": verdict.candidate.similarity, **verdict.numbers}
+    return status(OK if accepted else WARN, name, verdict.reason, numbers)

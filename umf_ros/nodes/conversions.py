@@ -1,0 +1,105 @@
+"""The nouns of the package as ROS messages, and back."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from nav_msgs.msg import Odometry
+from std_msgs.msg import ColorRGBA
+
+from umf_ros.errors import MessageError
+from umf_ros.frames import LoopClosure
+from umf_ros.geometry import Array, from_quaternion, to_quaternion
+
+GREEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
+RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.5)
+KEYFRAME_FRAME = re.compile(r"keyframe/(\d+)")
+
+
+def to_time(stamp_ns: int) -> Time:
+    """Stamp as a message."""
+    return Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+
+
+def from_time(stamp: Time) -> int:
+    """Nanoseconds of a stamp."""
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def to_point(position: Array) -> Point:
+    """(3,) metres as a message."""
+    x, y, z = (float(number) for number in position)
+    return Point(x=x, y=y, z=z)
+
+
+def to_pose(pose: Array) -> Pose:
+    """(4, 4) pose as a message."""
+    x, y, z, w = (float(number) for number in to_quaternion(pose))
+    return Pose(position=to_point(pose[:3, 3]), orientation=Quaternion(x=x, y=y, z=z, w=w))
+
+
+def from_pose(message: Pose) -> Array:
+    """(4, 4) pose of a message.
+
+    Raises:
+        MessageError: not finite, or no unit quaternion.
+    """
+    p, q = message.position, message.orientation
+    if not np.isfinite([p.x, p.y, p.z]).all():
+        raise MessageError("pose_not_finite", "pose with a position that is not finite")
+    try:
+        return from_quaternion([p.x, p.y, p.z], [q.x, q.y, q.z, q.w])
+    except ValueError as error:
+        raise MessageError("pose_not_a_rotation", f"pose with {error}") from None
+
+
+def to_pose_stamped(stamp_ns: int, frame: str, pose: Array) -> PoseStamped:
+    """Pose in `frame` with its stamp."""
+    message = PoseStamped(pose=to_pose(pose))
+    message.header.stamp = to_time(stamp_ns)
+    message.header.frame_id = frame
+    return message
+
+
+def keyframe_frame(stamp_ns: int) -> str:
+    """Frame name of a keyframe: its key is its sensor stamp."""
+    return f"keyframe/{stamp_ns}"
+
+
+def closure_to_message(closure: LoopClosure) -> Odometry:
+    """A loop closure as odometry between two keyframes that are not consecutive.
+
+    `header.frame_id` is the match, `child_frame_id` the query, `pose` is `match_T_query`, its
+    covariance is in ROS order about the axes of the match body. The twist is unused.
+    """
+    message = Odometry(child_frame_id=keyframe_frame(closure.query_stamp_ns))
+    message.header.stamp = to_time(closure.query_stamp_ns)
+    message.header.frame_id = keyframe_frame(closure.match_stamp_ns)
+    message.pose.pose = to_pose(closure.match_T_query)
+    message.pose.covariance = np.asarray(closure.covariance, dtype=float).ravel()
+    message.twist.covariance[0] = -1.0
+    return message
+
+
+def closure_from_message(message: Odometry) -> LoopClosure:
+    """The loop closure in a message of `/loop_closures`.
+
+    Raises:
+        MessageError: the frames name no keyframes, or the pose is no pose.
+    """
+    return LoopClosure(
+        query_stamp_ns=_keyframe_stamp(message.child_frame_id),
+        match_stamp_ns=_keyframe_stamp(message.header.frame_id),
+        match_T_query=from_pose(message.pose.pose),
+        covariance=np.asarray(message.pose.covariance, dtype=float).reshape(6, 6),
+    )
+
+
+def _keyframe_stamp(frame: str) -> int:
+    found = KEYFRAME_FRAME.fullmatch(frame)
+    if found is None:
+        raise MessageError("closure_frame", f"loop closure with frame '{frame}', expected keyframe/<stamp in ns>")
+    return int(found[1])

@@ -1,0 +1,92 @@
+"""What a node says of its health."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from rclpy.qos import QoSReliabilityPolicy
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+def status(level: bytes, name: str, message: str, values: Mapping[str, object]) -> DiagnosticStatus:
+    """One line of a DiagnosticArray."""
+    pairs = [KeyValue(key=key, value=_text(value)) for key, value in values.items()]
+    return DiagnosticStatus(level=level, name=name, message=message, values=pairs)
+
+
+def memory_mb() -> float:
+    """Resident memory of this process now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
+class InputWatch:
+    """Counts the messages of one input topic and says why none arrive."""
+
+    def __init__(self, node: Node, name: str, topic: str, silent_after_s: float = 5.0) -> None:
+        self._node = node
+        self._silent_after_s = silent_after_s
+        self.name = name
+        self.topic = topic
+        self.received = 0
+        self.lost = 0
+        self.warning = ""
+        self.last_stamp_ns: int | None = None
+        self._last_seen_s: float | None = None
+        self._born_s = self._now_s()
+        self._window: tuple[float, int] = (self._born_s, 0)
+
+    def saw(self, stamp_ns: int) -> None:
+        """Count one message."""
+        self.received += 1
+        self.last_stamp_ns = stamp_ns
+        self._last_seen_s = self._now_s()
+
+    def status(self) -> DiagnosticStatus:
+        """Rate since the last call, and the reason when the topic is silent."""
+        now_s = self._now_s()
+        since_s, count = self._window
+        rate = (self.received - count) / max(now_s - since_s, 1e-9)
+        self._window = (now_s, self.received)
+        values = {
+            "topic": self.topic,
+            "rate_hz": round(rate, 2),
+            "received": self.received,
+            "lost_on_the_wire": self.lost,
+            "last_stamp_ns": "none" if self.last_stamp_ns is None else self.last_stamp_ns,
+        }
+        silent_s = None if self._last_seen_s is None else now_s - self._last_seen_s
+        self.warning = ""
+        if silent_s is not None and silent_s < self._silent_after_s:
+            return status(OK, f"input {self.name}", f"{rate:.1f} Hz", values)
+        publishers = self._node.get_publishers_info_by_topic(self.topic)
+        values["publishers"] = len(publishers)
+        values["publisher_qos"] = ", ".join(
+            "reliable" if info.qos_profile.reliability == QoSReliabilityPolicy.RELIABLE else "best effort"
+            for info in publishers
+        )
+        reason = self._reason(len(publishers), silent_s)
+        if now_s - self._born_s > self._silent_after_s:
+            self.warning = f"{self.name}: {reason}"
+        return status(WARN, f"input {self.name}", reason, values)
+
+    def _reason(self, publishers: int, silent_s: float | None) -> str:
+        if publishers == 0:
+            return f"nothing received: no publisher on {self.topic}"
+        if silent_s is None:
+            return f"nothing received from {publishers} publisher(s) on {self.topic}: see their QoS"
+        return f"silent for {silent_s:.0f} s: {publishers} publisher(s) on {self.topic}"
+
+    def _now_s(self) -> float:
+        # the machine's clock, not the bag's: silence is silence even when /clock stands still
+        return time.monotonic()
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,255 @@
+"""The live back-end: odometry and loop closures in, map pose and path out. Thin: every decision is the core's."""
+
+from __future__ import annotations
+
+import re
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.node import Node
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from umf_ros.bags.presets import topics_of
+from umf_ros.errors import MessageError, UmfError
+from umf_ros.geometry import Array
+from umf_ros.nodes import pose_graph_messages as messages
+from umf_ros.nodes.conversions import closure_from_message, from_pose, from_time
+from umf_ros.nodes.diagnostics import OK, WARN, InputWatch, status
+from umf_ros.nodes.parameters import declare
+from umf_ros.nodes.process import run
+from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
+from umf_ros.pose_graph.closures import ClosureVerdict, State
+from umf_ros.pose_graph.graph import PoseGraph
+from umf_ros.pose_graph.results import write_results
+from umf_ros.worker import Worker
+
+ODOMETRY_DEPTH = 200
+# minutes of fast odometry: nothing is lost while the optimiser works
+QUEUE = 100_000
+NEW_SESSION_AFTER_NS = 5_000_000_000
+"""Odometry this much older than the newest is not late: the clock has been set back."""
+REJECT = re.compile(r"\s*keyframe/(\d+)\s+keyframe/(\d+)\s*")
+
+
+class PoseGraphNode(Node):
+    """Keeps a pose graph in a thread of its own and publishes the pose in the map at the odometry's rate."""
+
+    def __init__(self) -> None:
+        super().__init__("pose_graph_node", automatically_declare_parameters_from_overrides=True)
+        self._settings, own = declare(self, results_dir="folder for trajectories, graph and verdicts; empty: none")
+        self._results = own["results_dir"]
+        self._frames = self._settings.frames
+        self._lock = threading.Lock()
+        self._begin()
+        self._make_publishers()
+        self._worker: Worker[Callable[[], None]] = Worker(self._run, self._complain, QUEUE)
+        odometry_topic = topics_of(self._settings).odometry
+        self._watches = [InputWatch(self, "odometry", odometry_topic), InputWatch(self, "closures", "/loop_closures")]
+        if odometry_topic:
+            qos = sensor_qos(self._settings.qos, ODOMETRY_DEPTH)
+            self.create_subscription(Odometry, odometry_topic, self._on_odometry, qos)
+        self.create_subscription(Odometry, "/loop_closures", self._on_closure, CLOSURES_QOS)
+        self.create_subscription(String, "~/reject_edge", self._on_reject, 10)
+        self.create_service(Trigger, "~/reject_last", self._reject_last)
+        self.create_service(Trigger, "~/save", self._save)
+        self.create_service(Trigger, "~/reset", self._reset)
+        self.create_timer(1.0, self._tick)
+        self.get_logger().info("ready")
+
+    def close(self) -> None:
+        """Take in what is queued, settle the graph and write the results."""
+        self._worker.close(timeout_s=60.0)
+        if self._results:
+            write_results(self._graph, self._results)
+
+    def _begin(self) -> None:
+        self._graph = PoseGraph(self._settings.pose_graph)
+        self._refused: Counter[str] = Counter()
+        self._newest_ns = -1
+        self._map_T_odom: Array = np.eye(4)
+        self._covariance: Array = np.zeros((6, 6))
+        self._drawn = -1
+
+    def _make_publishers(self) -> None:
+        self._path_publisher = self.create_publisher(Path, "~/path", LATCHED_QOS)
+        self._pose_publisher = self.create_publisher(PoseWithCovarianceStamped, "~/pose", 50)
+        self._marker_publisher = self.create_publisher(MarkerArray, "~/markers", LATCHED_QOS)
+        self._verdict_publisher = self.create_publisher(DiagnosticArray, "~/verdicts", CLOSURES_QOS)
+        self._transform_publisher = self.create_publisher(TransformStamped, "~/map_to_odom", 50)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._broadcast = _broadcaster(self) if self._frames.publish_tf else None
+
+    def _on_odometry(self, message: Odometry) -> None:
+        stamp_ns = from_time(message.header.stamp)
+        self._watches[0].saw(stamp_ns)
+        try:
+            odom_T_body = from_pose(message.pose.pose)
+        except MessageError as error:
+            return self._refuse(error)
+        self._worker.submit(lambda: self._add_odometry(stamp_ns, odom_T_body))
+        # the newest correction, not the next: the pose never waits for the optimiser
+        map_T_odom = self._map_T_odom
+        pose = messages.pose(stamp_ns, map_T_odom @ odom_T_body, self._covariance, self._frames)
+        self._pose_publisher.publish(pose)
+        transform = messages.transform(stamp_ns, map_T_odom, self._frames)
+        self._transform_publisher.publish(transform)
+        if self._broadcast is not None:
+            self._broadcast(transform)
+
+    def _on_closure(self, message: Odometry) -> None:
+        self._watches[1].saw(from_time(message.header.stamp))
+        try:
+            closure = closure_from_message(message)
+        except MessageError as error:
+            return self._refuse(error)
+        self._worker.submit(lambda: self._announce(self._graph.add_closure(closure)))
+
+    def _on_reject(self, message: String) -> None:
+        found = REJECT.fullmatch(message.data)
+        if found is None:
+            text = f"'{message.data}' on ~/reject_edge, expected 'keyframe/<match ns> keyframe/<query ns>'"
+            return self._refuse(MessageError("reject_edge", text))
+        match, query = int(found[1]), int(found[2])
+        self._worker.submit(lambda: self._announce(self._graph.revoke(match, query)))
+
+    def _run(self, step: Callable[[], None]) -> None:
+        with self._lock:
+            step()
+
+    def _add_odometry(self, stamp_ns: int, odom_T_body: Any) -> None:
+        if self._newest_ns - stamp_ns > NEW_SESSION_AFTER_NS:
+            self.get_logger().warning("the odometry's clock went back: a new session begins")
+            self._graph.begin_session()
+            self._newest_ns = -1
+        self._newest_ns = max(self._newest_ns, stamp_ns)
+        self._graph.add_odometry(stamp_ns, odom_T_body)
+
+    def _announce(self, verdicts: list[ClosureVerdict]) -> None:
+        if not verdicts:
+            return
+        self._correct()
+        for verdict in verdicts:
+            # what is accepted the front-end has told already, what is undecided will be
+            quiet = verdict.state in (State.ACCEPTED, State.UNDECIDED, State.WAITING)
+            log = self.get_logger().debug if quiet else self.get_logger().info
+            log(describe(verdict))
+        report = DiagnosticArray(status=[_as_status(verdict) for verdict in verdicts])
+        report.header.stamp = self.get_clock().now().to_msg()
+        self._verdict_publisher.publish(report)
+        self._draw()
+
+    def _correct(self) -> None:
+        self._map_T_odom = self._graph.map_T_odom()
+        self._covariance = self._graph.covariance()
+
+    def _draw(self) -> None:
+        stamps, poses = self._graph.trajectory()
+        self._drawn = len(stamps)
+        self._path_publisher.publish(messages.path(stamps, poses, self._frames))
+        verdicts, lines = self._graph.closure_lines()
+        self._marker_publisher.publish(messages.markers(verdicts, lines, max(self._newest_ns, 0), self._frames))
+
+    def _tick(self) -> None:
+        self._worker.submit(self._keep_up)
+        report = DiagnosticArray(status=[self._own_status(), *(watch.status() for watch in self._watches)])
+        report.header.stamp = self.get_clock().now().to_msg()
+        for line in report.status:
+            line.name = f"{self.get_name()}: {line.name}"
+        self._diagnostics.publish(report)
+
+    def _keep_up(self) -> None:
+        """Decide about closures that waited for odometry, and show what has grown."""
+        self._announce(self._graph.update())
+        self._correct()
+        if len(self._graph.trajectory()[0]) != self._drawn:
+            self._draw()
+
+    def _own_status(self) -> DiagnosticStatus:
+        values: dict[str, object] = {**self._graph.counts, **self._refused, "queue_dropped": self._worker.dropped}
+        values |= {state.value: count for state, count in self._graph.verdict_counts().items()}
+        trouble = self._worker.dropped or any(name.startswith("optimiser") for name in self._graph.counts)
+        level = WARN if trouble or self._refused else OK
+        return status(level, "pose graph", f"{values.get('accepted', 0)} closures accepted", values)
+
+    def _refuse(self, error: MessageError) -> None:
+        self._refused[error.kind] += 1
+        if self._refused[error.kind] == 1:
+            self.get_logger().warning(f"skipped: {error}")
+
+    def _complain(self, error: Exception) -> None:
+        self.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=10.0)
+
+    def _reject_last(self, _: Any, response: Any) -> Any:
+        with self._lock:
+            accepted = [v.closure for v in self._graph.closures() if v.state is State.ACCEPTED]
+            if accepted:
+                self._announce(self._graph.revoke(accepted[-1].match_stamp_ns, accepted[-1].query_stamp_ns))
+        response.success = bool(accepted)
+        response.message = f"closure {_name(accepted[-1])} revoked" if accepted else "no closure is accepted"
+        return response
+
+    def _save(self, _: Any, response: Any) -> Any:
+        folder = self._results or "pose_graph_results"
+        try:
+            self._worker.drain(10.0)
+            with self._lock:
+                write_results(self._graph, folder)
+            response.success, response.message = True, f"results written to {folder}"
+        except UmfError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    def _reset(self, _: Any, response: Any) -> Any:
+        with self._lock:
+            self._begin()
+        response.success, response.message = True, "graph forgotten"
+        return response
+
+
+def describe(verdict: ClosureVerdict) -> str:
+    """One line about a verdict for a person."""
+    numbers = "" if np.isnan(verdict.residual) else f" ({verdict.residual:.1f} sigma, {verdict.residual_m:.2f} m)"
+    seconds = (verdict.closure.query_stamp_ns - verdict.closure.match_stamp_ns) * 1e-9
+    return f"graph: closure {seconds:.1f} s back {verdict.state.value}: {verdict.reason}{numbers}"
+
+
+def _as_status(verdict: ClosureVerdict) -> DiagnosticStatus:
+    level = OK if verdict.state is State.ACCEPTED else WARN
+    values = {
+        "verdict": verdict.state.value,
+        "mahalanobis": verdict.residual,
+        "misfit_m": verdict.residual_m,
+        "probability": verdict.closure.probability,
+    }
+    return status(level, _name(verdict.closure), verdict.reason, values)
+
+
+def _name(closure: Any) -> str:
+    return f"keyframe/{closure.match_stamp_ns} keyframe/{closure.query_stamp_ns}"
+
+
+def _broadcaster(node: Node) -> Callable[[TransformStamped], None] | None:
+    try:
+        from tf2_ros import TransformBroadcaster
+    except ImportError:
+        node.get_logger().warning("tf2_ros is not installed: map -> odom goes out on ~/map_to_odom only")
+        return None
+    return TransformBroadcaster(node).sendTransform
+
+
+def main() -> None:
+    """Entry point of `ros2 run umf_ros pose_graph_node`."""
+    sys.exit(run(PoseGraphNode))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The growing database of places seen."""

@@ -1,0 +1,100 @@
+"""The growing memory of places."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.config import Database, Loop
+from umf_ros.frames import Candidate, Keyframe
+from umf_ros.places.index import DescriptorIndex, Mask
+from umf_ros.places.store import KeyframeStore
+
+
+class PlaceDatabase:
+    """Keyframes by index: descriptors in memory for exact search, everything else on disk.
+
+    Args:
+        settings: where to keep the keyframes.
+        embedder: name of the embedder; a stored database of another one is refused.
+        dimension: numbers per descriptor.
+
+    Raises:
+        UmfError: the file is no place database, or belongs to another embedder.
+    """
+
+    def __init__(self, settings: Database, embedder: str, dimension: int) -> None:
+        path = Path(settings.path) if settings.path else None
+        identity = {"embedder": embedder, "dimension": str(dimension)}
+        self._store = KeyframeStore(path, identity, settings.cached_keyframes)
+        self._index = DescriptorIndex(dimension)
+        self._stamps: list[int] = []
+        self._travelled: list[float] = []
+        self._sessions: list[int] = []
+        for index in range(len(self._store)):
+            self._register(self._store[index])
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def __getitem__(self, index: int) -> Keyframe:
+        return self._store[index]
+
+    @property
+    def next_session(self) -> int:
+        """A session number no stored keyframe has."""
+        return max(self._sessions, default=-1) + 1
+
+    def add(self, keyframe: Keyframe) -> int:
+        """Remember a keyframe and return its index."""
+        self._store.add(keyframe)
+        return self._register(keyframe)
+
+    def query(self, keyframe: Keyframe, rules: Loop) -> list[Candidate]:
+        """The most similar earlier places, best first, by exhaustive search.
+
+        Keyframes of the same session must be older than `min_time_gap_s` and further back along
+        the path than `min_travel_m`; where either path length is unknown, time alone decides.
+        """
+        found = self._index.search(keyframe.embedding.descriptor, rules.top_k, self._admissible(keyframe, rules))
+        return [
+            Candidate(i, self._stamps[i], similarity) for i, similarity in found if similarity >= rules.min_similarity
+        ]
+
+    def forget_from(self, stamp_ns: int) -> int:
+        """Forget keyframes from `stamp_ns` on, as when a recording starts over; returns how many."""
+        keep = np.array(self._stamps, np.int64) < stamp_ns
+        kept = np.flatnonzero(keep).tolist()
+        forgotten = len(self) - len(kept)
+        if forgotten:
+            self._store.keep(kept)
+            self._index.keep(keep)
+            self._stamps = [self._stamps[i] for i in kept]
+            self._travelled = [self._travelled[i] for i in kept]
+            self._sessions = [self._sessions[i] for i in kept]
+        return forgotten
+
+    def save(self, path: Path) -> None:
+        """Write a copy of the database to `path`."""
+        self._store.save(path)
+
+    def close(self) -> None:
+        """Release the file."""
+        self._store.close()
+
+    def _register(self, keyframe: Keyframe) -> int:
+        self._stamps.append(keyframe.stamp_ns)
+        self._travelled.append(keyframe.travelled_m)
+        self._sessions.append(keyframe.session)
+        return self._index.add(keyframe.embedding.descriptor)
+
+    def _admissible(self, keyframe: Keyframe, rules: Loop) -> Mask:
+        stamps = np.array(self._stamps, np.int64)
+        travelled: NDArray[np.float64] = np.array(self._travelled, np.float64)
+        old = keyframe.stamp_ns - stamps >= round(rules.min_time_gap_s * 1e9)
+        # comparisons with NaN are False: an unknown path length never excludes
+        near = keyframe.travelled_m - travelled < rules.min_travel_m
+        foreign = np.array(self._sessions, np.int64) != keyframe.session
+        return foreign | (old & ~near)

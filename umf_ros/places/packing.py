@@ -1,0 +1,63 @@
+"""A keyframe as bytes and back, without loss: safetensors holds the arrays."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, fields
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import load, save
+
+from umf_ros.frames import Embedding, Keyframe, LocalFeatures, StereoCamera, SuperFeatures
+
+FEATURES: dict[str, type[LocalFeatures] | type[SuperFeatures]] = {
+    "image": LocalFeatures,
+    "cloud": LocalFeatures,
+    "super_image": SuperFeatures,
+    "super_cloud": SuperFeatures,
+}
+
+
+def pack(keyframe: Keyframe) -> bytes:
+    """All of a keyframe in one safetensors blob."""
+    embedding = keyframe.embedding
+    arrays: dict[str, Any] = {
+        "stamp_session": np.array([keyframe.stamp_ns, keyframe.session], np.int64),
+        "camera": np.array(astuple(keyframe.camera), np.float64),
+        "body_T_camera": keyframe.body_T_camera,
+        "points": keyframe.points,
+        "travelled_m": np.array([keyframe.travelled_m]),
+        "descriptor": embedding.descriptor,
+    }
+    if keyframe.odom_T_body is not None:
+        arrays["odom_T_body"] = keyframe.odom_T_body
+    for group, kind in FEATURES.items():
+        features = getattr(embedding, group)
+        if features is not None:
+            arrays |= {f"{group}.{item.name}": getattr(features, item.name) for item in fields(kind)}
+    return save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
+
+
+def unpack(blob: bytes) -> Keyframe:
+    """The keyframe that `pack` was given."""
+    arrays = load(blob)
+    stamp_ns, session = (int(number) for number in arrays["stamp_session"])
+    width, height, *rest = (float(number) for number in arrays["camera"])
+    features = {group: _features(arrays, group, kind) for group, kind in FEATURES.items()}
+    return Keyframe(
+        stamp_ns=stamp_ns,
+        embedding=Embedding(arrays["descriptor"], **features),
+        camera=StereoCamera(int(width), int(height), *rest),
+        body_T_camera=arrays["body_T_camera"],
+        points=arrays["points"],
+        odom_T_body=arrays.get("odom_T_body"),
+        travelled_m=float(arrays["travelled_m"][0]),
+        session=session,
+    )
+
+
+def _features(arrays: dict[str, Any], group: str, kind: Any) -> Any:
+    names = [item.name for item in fields(kind)]
+    if f"{group}.{names[0]}" not in arrays:
+        return None
+    return kind(**{name: arrays[f"{group}.{name}"] for name in names})

@@ -1,0 +1,1 @@
+"""Odometry and loop closures bent into one trajectory."""

@@ -1,0 +1,284 @@
+"""PoseGraph: odometry and loop closures in, one trustworthy trajectory out."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from umf_ros.config import PoseGraph as PoseGraphSettings
+from umf_ros.errors import GraphError
+from umf_ros.frames import LoopClosure
+from umf_ros.geometry import Array, gtsam_to_ros_covariance
+from umf_ros.pose_graph import lie
+from umf_ros.pose_graph.closures import (
+    ClosureVerdict,
+    State,
+    TrackedClosure,
+    check_closure,
+    check_covariance,
+    check_pose,
+)
+from umf_ros.pose_graph.condensed import Edge, Edges, odometry_edges
+from umf_ros.pose_graph.ends import Scale
+from umf_ros.pose_graph.g2o import write_g2o
+from umf_ros.pose_graph.judge import Judge
+from umf_ros.pose_graph.odometry import Stamps
+from umf_ros.pose_graph.sessions import Sessions
+from umf_ros.pose_graph.shape import Shape
+from umf_ros.pose_graph.trajectory_files import write_tum, write_vertex_table
+
+logger = logging.getLogger(__name__)
+_NO_ODOMETRY_YET = "its odometry has not arrived"
+
+
+@dataclass
+class _Waiting:
+    """A closure without odometry, the newest stamp when it came, and whether that was said."""
+
+    closure: LoopClosure
+    since_ns: int
+    announced: bool = False
+
+
+class PoseGraph:
+    """Takes odometry and loop closures in any order and keeps the best trajectory they allow.
+
+    Nothing that arrives can break it: what is unusable is refused with a reason and counted.
+    """
+
+    def __init__(self, settings: PoseGraphSettings | None = None) -> None:
+        self._settings = settings or PoseGraphSettings()
+        self._sessions = Sessions(self._settings)
+        self._judge = Judge(self._settings, self._sessions)
+        self._waiting: list[_Waiting] = []
+        self._seen: set[tuple[int, int]] = set()
+        self._late = False
+        self._refused: list[ClosureVerdict] = []
+        self.counts: Counter[str] = Counter()
+
+    def begin_session(self) -> None:
+        """Start a new odometry chain with its own gauge; later odometry belongs to it."""
+        self._sessions.begin()
+
+    def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
+        """Take one odometry message; any order, a second message of one stamp is dropped.
+
+        Args:
+            stamp_ns: its stamp.
+            odom_T_body: (4, 4) pose.
+            covariance: (6, 6) in ROS order of the motion since the previous message, axes of the
+                previous body; None: the settings' odometry model.
+
+        Returns:
+            False when the message was refused and counted.
+        """
+        try:
+            check_pose(odom_T_body)
+            if covariance is not None:
+                check_covariance(covariance)
+        except GraphError as error:
+            self.counts[f"odometry refused: {error}"] += 1
+            return False
+        self.counts["odometry"] += 1
+        self._sessions.chains[-1].add(int(stamp_ns), np.asarray(odom_T_body, float), covariance)
+        return True
+
+    def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
+        """Take one closure; returns every verdict that it brought about or changed."""
+        return self.add_closures([closure])
+
+    def add_closures(self, closures: list[LoopClosure]) -> list[ClosureVerdict]:
+        """Take several closures with a single optimisation; see `add_closure`."""
+        self._refresh()
+        verdicts = [verdict for closure in closures if (verdict := self._receive(closure))]
+        return verdicts + self.update()
+
+    def update(self) -> list[ClosureVerdict]:
+        """Take in odometry that has arrived and decide about closures that waited for it; returns new verdicts."""
+        self._refresh()
+        verdicts, arrived = self._take_waiting()
+        return verdicts + self._attempt(lambda: self._judge.consider(arrived))
+
+    def settle(self) -> list[ClosureVerdict]:
+        """Come to the final decision and the exact optimum, as at the end of a mission.
+
+        Closures that could not be judged are accepted if nothing speaks against them. When odometry
+        came late, all closures are decided anew in order of their stamps, so that the order of
+        arrival leaves no trace.
+        """
+        verdicts = self.update()
+        if self._late:
+            verdicts += self._attempt(self._replay)
+        return verdicts + self._attempt(self._judge.settle)
+
+    def _refresh(self) -> None:
+        if self._sessions.update():
+            self.counts["odometry out of order"] += 1
+            self._late = True
+            self._attempt(self._judge.renew)
+
+    def _attempt(self, step: Callable[[], list[ClosureVerdict]]) -> list[ClosureVerdict]:
+        """Run a step that solves; a failure of the optimiser is counted and the last trajectory stays."""
+        try:
+            return step()
+        except GraphError as error:
+            self.counts[f"optimiser: {error}"] += 1
+            logger.warning("%s; the last trajectory stays", error)
+            return []
+
+    def revoke(self, match_stamp_ns: int, query_stamp_ns: int) -> list[ClosureVerdict]:
+        """Take a closure out for good.
+
+        Raises:
+            GraphError: there is no such closure, or the graph cannot be solved without it.
+        """
+        for row, tracked in enumerate(self._judge.closures):
+            if (tracked.closure.match_stamp_ns, tracked.closure.query_stamp_ns) == (match_stamp_ns, query_stamp_ns):
+                return self._judge.veto(row)
+        raise GraphError(f"no closure between keyframes {match_stamp_ns} and {query_stamp_ns}")
+
+    def _receive(self, closure: LoopClosure) -> ClosureVerdict | None:
+        try:
+            check_closure(closure, self._settings.max_closure_m)
+        except GraphError as error:
+            return self._refuse(closure, str(error))
+        ends = (closure.match_stamp_ns, closure.query_stamp_ns)
+        if ends in self._seen:
+            self.counts["closure twice"] += 1
+            return None
+        self._seen.add(ends)
+        self._waiting.append(_Waiting(closure, self._sessions.newest_ns))
+        return None
+
+    def _refuse(self, closure: LoopClosure, reason: str) -> ClosureVerdict:
+        self.counts[f"closure refused: {reason}"] += 1
+        self._refused.append(ClosureVerdict(closure, State.REFUSED, reason))
+        return self._refused[-1]
+
+    def _take_waiting(self) -> tuple[list[ClosureVerdict], list[TrackedClosure]]:
+        """Closures whose odometry is there, and verdicts about the others."""
+        verdicts, arrived, waiting = [], [], []
+        for entry in self._waiting:
+            tracked = self._locate(entry.closure)
+            if tracked is not None:
+                arrived.append(tracked)
+            elif self._sessions.newest_ns - entry.since_ns > self._settings.max_pending_s * 1e9:
+                verdicts.append(self._refuse(entry.closure, "no odometry at its keyframes"))
+            else:
+                if not entry.announced:
+                    entry.announced = True
+                    verdicts.append(ClosureVerdict(entry.closure, State.WAITING, _NO_ODOMETRY_YET))
+                waiting.append(entry)
+        self._waiting = waiting
+        return verdicts, arrived
+
+    def _locate(self, closure: LoopClosure) -> TrackedClosure | None:
+        query = self._sessions.find(closure.query_stamp_ns)
+        match = self._sessions.find(closure.match_stamp_ns, before=query)
+        if query is None or match is None:
+            return None
+        covariance = check_closure(closure, self._settings.max_closure_m)
+        return TrackedClosure(match, query, ClosureVerdict(closure, State.UNDECIDED, "new"), covariance)
+
+    def _replay(self) -> list[ClosureVerdict]:
+        before = {id(c.closure): c.verdict.state for c in self._judge.closures}
+        order = sorted(self._judge.closures, key=lambda c: (c.closure.query_stamp_ns, c.closure.match_stamp_ns))
+        vetoed = self._judge.vetoed
+        self._sessions.forget()
+        self._judge = Judge(self._settings, self._sessions)
+        for tracked in order:
+            tracked.decide(State.UNDECIDED, "new", float("nan"), float("nan"))
+            self._judge.consider([tracked])
+        for closure in vetoed:
+            self.revoke(closure.match_stamp_ns, closure.query_stamp_ns)
+        self._late = False
+        return [c.verdict for c in self._judge.closures if before[id(c.closure)] is not c.verdict.state]
+
+    def closures(self) -> list[ClosureVerdict]:
+        """The latest verdict of every closure, in order of arrival."""
+        waiting = [ClosureVerdict(w.closure, State.WAITING, _NO_ODOMETRY_YET) for w in self._waiting]
+        return [tracked.verdict for tracked in self._judge.closures] + waiting + self._refused
+
+    @property
+    def scale(self) -> Scale:
+        """By how much the true standard deviations are estimated to exceed the stated ones."""
+        return self._judge.scale
+
+    def verdict_counts(self) -> Counter[State]:
+        """How many closures have which verdict."""
+        return Counter(verdict.state for verdict in self.closures())
+
+    def trajectory(self) -> tuple[Stamps, Array]:
+        """Stamps (N,) in ns and `map_T_body` (N, 4, 4) of every keyframe that is joined to the map."""
+        self._refresh()
+        stamps: list[Stamps] = [np.empty(0, np.int64)]
+        poses: list[Array] = [np.empty((0, 4, 4))]
+        for session, chain in enumerate(self._sessions.chains):
+            if len(chain.stamps) and self._sessions.parts[session] == 0:
+                stamps.append(chain.stamps.copy())
+                poses.append(self._sessions.at(session, chain.stamps))
+        return np.concatenate(stamps), np.concatenate(poses)
+
+    def odometry(self) -> tuple[Stamps, Array]:
+        """Stamps (N,) in ns and `odom_T_body` (N, 4, 4) of the same keyframes as `trajectory`."""
+        self._refresh()
+        joined = [c for c, part in zip(self._sessions.chains, self._sessions.parts, strict=True) if part == 0]
+        return np.concatenate([c.stamps for c in joined]), np.concatenate([c.poses for c in joined])
+
+    def map_T_odom(self) -> Array:
+        """(4, 4) pose of the newest session's odometry frame in the map: where its newest pose went."""
+        self._refresh()
+        chain = self._sessions.chains[-1]
+        if not len(chain.stamps):
+            return np.eye(4)
+        last = chain.log.stamps[-1:]
+        return self._sessions.at(len(self._sessions.chains) - 1, last)[0] @ lie.invert(chain.poses_at(last)[0])
+
+    def covariance(self) -> Array:
+        """(6, 6) marginal covariance of the newest pose in ROS order about the map's axes; zero without odometry."""
+        self._refresh()
+        session = len(self._sessions.chains) - 1
+        last = self._sessions.chains[session].log.stamps[-1:]
+        if not len(last):
+            return np.zeros((6, 6))
+        covariance = self._sessions.covariance(session, int(last[0]), self._judge.scale)
+        return gtsam_to_ros_covariance(covariance, self._sessions.at(session, last)[0])
+
+    def write_tum(self, path: str | Path, optimized: bool = True) -> None:
+        """Write the trajectory, or the odometry, as a TUM file."""
+        write_tum(path, *(self.trajectory() if optimized else self.odometry()))
+
+    def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
+        """Verdicts of the N closures with known ends, and (N, 2, 3) map positions of match and query."""
+        self._refresh()
+        return [tracked.verdict for tracked in self._judge.closures], self._judge.positions()
+
+    def write_g2o(self, path: str | Path, planar: bool = False) -> None:
+        """Write keyframes, odometry and accepted closures, and `<name>.csv` with vertex, session and stamp.
+
+        Raises:
+            OutputError: a file cannot be written.
+        """
+        self._refresh()
+        poses: list[Array] = []
+        parts: list[Edges] = []
+        vertices: dict[tuple[int, int], int] = {}
+        for session, chain in enumerate(self._sessions.chains):
+            stamps = np.union1d(chain.stamps, self._judge.ends_of(session))
+            if len(stamps):
+                parts.append(odometry_edges(Shape(chain).at(stamps), len(poses), self._judge.scale.odometry))
+                vertices |= {(session, stamp): len(poses) + row for row, stamp in enumerate(stamps.tolist())}
+                poses += list(self._sessions.at(session, stamps))
+        edges = [part[row] for part in parts for row in range(len(part))]
+        for c in self._judge.closures:
+            if c.accepted:
+                match = vertices[c.match, c.closure.match_stamp_ns]
+                query = vertices[c.query, c.closure.query_stamp_ns]
+                edges.append(Edge(match, query, c.closure.match_T_query, c.covariance))
+        write_g2o(path, poses, edges, planar)
+        write_vertex_table(Path(path).with_suffix(".csv"), vertices)

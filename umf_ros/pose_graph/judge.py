@@ -1,0 +1,290 @@
+"""Judge: which closures shape the map.
+
+A closure that agrees with the map where disagreement would have shown is accepted at once. One
+that the map cannot judge, or that contradicts it, needs others that say the same of other places.
+Nothing is decided for good: when the map moves, what was rejected is looked at again, and what was
+accepted can be revoked by a better supported contradiction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.config import PoseGraph as PoseGraphSettings
+from umf_ros.errors import GraphError
+from umf_ros.frames import LoopClosure
+from umf_ros.geometry import Array
+from umf_ros.pose_graph import lie
+from umf_ros.pose_graph.agreement import Agreement, chance_to_agree
+from umf_ros.pose_graph.certainty import Certainty
+from umf_ros.pose_graph.closures import ClosureVerdict, State, TrackedClosure
+from umf_ros.pose_graph.ends import ClosureEnds, Cycles, Scale, Side
+from umf_ros.pose_graph.odometry import Stamps
+from umf_ros.pose_graph.scale import ScaleEstimator
+from umf_ros.pose_graph.sessions import Sessions
+
+_LOOPS_PER_CLOSURE = 3
+_MOST_ROUNDS = 4
+# a closure this far from the map (m) is not looked at again before the map moves
+_CLOSE_M = 2.0
+_AGREES = "agrees with the map"
+_SUPPORTED = "supported by other places"
+_UNOPPOSED = "nothing speaks against it"
+_UNSURE = "needs support from another place"
+_CONTRADICTS = "contradicts the map"
+_OUTVOTED = "revoked: more places contradict it"
+_BY_HAND = "revoked by hand"
+
+
+class Judge:
+    """Decides about closures and keeps the map solved accordingly."""
+
+    def __init__(self, settings: PoseGraphSettings, sessions: Sessions) -> None:
+        self._settings = settings
+        self._sessions = sessions
+        self._ends = ClosureEnds()
+        self._agreement = Agreement(self._ends, settings)
+        self._estimator = ScaleEstimator()
+        self._certainty: Certainty | None = None
+        self._changed: set[int] = set()
+        self._vetoed: set[int] = set()
+        self._too_far: set[int] = set()
+        self._contests: dict[int, int] = {}
+        self.scale = Scale()
+        self.closures: list[TrackedClosure] = []
+
+    def consider(self, arrived: list[TrackedClosure]) -> list[ClosureVerdict]:
+        """Take closures in; returns the verdicts that are new or changed."""
+        rows = [self._take(tracked) for tracked in arrived]
+        self._changed = set(rows)
+        if self._rescale() or (self._certainty is None and rows):
+            self._solve()
+            rows = list(range(len(self.closures)))
+        self._decide_all(rows)
+        return self._verdicts()
+
+    def settle(self) -> list[ClosureVerdict]:
+        """Decide what can wait no longer and bring the map to its exact optimum; returns changed verdicts."""
+        self._changed = set()
+        if self._certainty is None:
+            return []
+        self._decide_all(range(len(self.closures)))
+        self._accept(self._unopposed(0.0), _UNOPPOSED)
+        self._decide_all(range(len(self.closures)))
+        self._ask_again()
+        for _ in range(_MOST_ROUNDS):
+            self._sessions.reshape()
+            self._solve()
+        return self._verdicts()
+
+    def renew(self) -> list[ClosureVerdict]:
+        """Solve again after the odometry's past changed; no verdict changes by that."""
+        self._ends.renew(self._sessions.chains)
+        if self._certainty is not None:
+            self._solve()
+        return []
+
+    def veto(self, row: int) -> list[ClosureVerdict]:
+        """Revoke a closure for good."""
+        self._changed = set()
+        self._vetoed.add(row)
+        was_accepted = self.closures[row].accepted
+        self._decide(row, State.REJECTED, _BY_HAND)
+        if was_accepted:
+            self._solve()
+        return self._verdicts()
+
+    @property
+    def vetoed(self) -> list[LoopClosure]:
+        """Closures that were revoked for good."""
+        return [self.closures[row].closure for row in sorted(self._vetoed)]
+
+    def ends_of(self, session: int) -> Stamps:
+        """Stamps of all closure ends in a session."""
+        sides = (self._ends.match, self._ends.query)
+        return np.concatenate([side.stamp.view[side.session.view == session] for side in sides])
+
+    def positions(self) -> Array:
+        """(N, 2, 3) map positions of the match and query ends of all closures."""
+        rows = np.arange(len(self.closures))
+        ends = [self._poses(side, rows)[:, :3, 3] for side in (self._ends.match, self._ends.query)]
+        return np.stack(ends, axis=1)
+
+    def _decide_all(self, rows: Iterable[int]) -> None:
+        rows = list(rows)
+        for _ in range(_MOST_ROUNDS):
+            agreed = self._gate(rows)
+            believed = self._believe(rows) - agreed
+            patient = self._unopposed(self._settings.patience_m) - agreed - believed
+            challengers = self._challengers(rows)
+            if not (agreed or believed or patient or challengers):
+                return
+            self._accept(agreed, _AGREES)
+            self._accept(believed, _SUPPORTED)
+            self._accept(patient, _UNOPPOSED)
+            self._accept(challengers, _SUPPORTED)
+            rows = self._worth_another_look()
+
+    def _take(self, tracked: TrackedClosure) -> int:
+        row = len(self.closures)
+        self.closures.append(tracked)
+        self._ends.append(self._sessions.chains, tracked)
+        loops = self._agreement.add(row, self.scale)
+        keep = slice(-_LOOPS_PER_CLOSURE, None)
+        self._estimator.add(Cycles(loops.residuals[keep], loops.odometry_noise[keep], loops.closure_noise[keep]))
+        return row
+
+    def _rescale(self) -> bool:
+        """Adopt a new scale of the covariances; True when it changed."""
+        scale = self._estimator.scale if self._settings.estimate_scale else Scale()
+        if scale == self.scale:
+            return False
+        self.scale = scale
+        self._agreement.renew(scale)
+        return True
+
+    def _gate(self, rows: Iterable[int]) -> set[int]:
+        """Compare closures with the map; returns those whose agreement suffices."""
+        agreed = set()
+        for row in rows:
+            if self.closures[row].accepted or row in self._vetoed:
+                continue
+            distance, misfit_m, chance = self._compare(row)
+            self._too_far.discard(row)
+            if self._settings.use_gate and distance > self._settings.gate_chi2:
+                self._decide(row, State.REJECTED, _CONTRADICTS, distance, misfit_m)
+            elif self._settings.max_correction_m and misfit_m > self._settings.max_correction_m:
+                self._too_far.add(row)
+                self._decide(row, State.REJECTED, f"moves the pose by {misfit_m:.1f} m", distance, misfit_m)
+            else:
+                self._decide(row, State.UNDECIDED, _UNSURE, distance, misfit_m)
+                if chance <= self._settings.max_chance or not self._settings.use_support:
+                    agreed.add(row)
+        return agreed
+
+    def _compare(self, row: int) -> tuple[float, float, float]:
+        """Squared Mahalanobis distance and metres from the map, and the chance of a wrong closure to agree so well."""
+        tracked = self.closures[row]
+        assert self._certainty is not None
+        predicted = self._certainty.predict(
+            tracked.match, tracked.closure.match_stamp_ns, tracked.query, tracked.closure.query_stamp_ns
+        )
+        misfit = lie.invert(tracked.closure.match_T_query) @ predicted.pose
+        if predicted.covariance is None:
+            return 0.0, 0.0, 1.0
+        covariance = predicted.covariance + self.scale.closures**2 * tracked.covariance
+        distance = float(lie.mahalanobis(lie.log(misfit[None]), covariance[None])[0])
+        return distance, float(np.linalg.norm(misfit[:3, 3])), float(chance_to_agree(covariance, self._settings))
+
+    def _believe(self, rows: Iterable[int]) -> set[int]:
+        """Groups around `rows` that no chance explains and that the map does not contradict."""
+        return {member for group in self._groups(rows, State.UNDECIDED) for member in group}
+
+    def _groups(self, rows: Iterable[int], state: State) -> list[list[int]]:
+        """Well supported groups among the closures of one state, each with a closure of `rows`."""
+        members = np.array([c.verdict.state is state for c in self.closures])
+        members[list(self._vetoed | self._too_far)] = False
+        groups: list[list[int]] = []
+        for row in rows:
+            if members[row] and not any(row in group for group in groups):
+                group, evidence = self._agreement.group(row, members)
+                if evidence >= self._settings.min_support:
+                    groups.append(group)
+        return groups
+
+    def _unopposed(self, patience_m: float) -> set[int]:
+        """Undecided closures that have waited long enough without contradiction."""
+        undecided = [row for row, c in enumerate(self.closures) if c.verdict.state is State.UNDECIDED]
+        against = np.array([c.verdict.state is not State.REJECTED for c in self.closures])
+        waited = [row for row in undecided if self._waited(row) >= patience_m]
+        return {row for row in waited if not self._agreement.contested(row, against)}
+
+    def _waited(self, row: int) -> float:
+        travel = self._ends.query.travel.view
+        if self.closures[row].query != self.closures[-1].query:
+            return float("inf")
+        return float(travel[-1] - travel[row])
+
+    def _challengers(self, rows: Iterable[int]) -> set[int]:
+        """A group that the map contradicts and that wins against what it contradicts in turn."""
+        if not self._settings.use_gnc:
+            return set()
+        for group in self._groups(rows, State.REJECTED):
+            places = self._agreement.places(group)
+            if places <= max(self._contests.get(row, 0) for row in group):
+                continue
+            self._contests |= dict.fromkeys(group, places)
+            losers = self._contradicted_by(group)
+            if losers is not None and self._agreement.places(losers) < places:
+                for row in losers:
+                    self._decide(row, State.REJECTED, _OUTVOTED)
+                return set(group)
+        return set()
+
+    def _contradicted_by(self, group: list[int]) -> list[int] | None:
+        """Accepted closures that cannot be right when the group is; None if that cannot be told."""
+        accepted = [row for row, c in enumerate(self.closures) if c.accepted]
+        try:
+            doubtful = self._sessions.doubtful(self._pick(group), self._pick(accepted), self.scale)
+        except GraphError:
+            return None
+        return [accepted[k] for k in doubtful]
+
+    def _ask_again(self) -> None:
+        """Let graduated non-convexity look at all accepted closures, and the gate at those it doubts."""
+        accepted = [row for row, c in enumerate(self.closures) if c.accepted]
+        if not self._settings.use_gnc or not accepted:
+            return
+        try:
+            doubtful = [accepted[k] for k in self._sessions.doubtful([], self._pick(accepted), self.scale)]
+        except GraphError:
+            return
+        if doubtful and self._agreement.places(doubtful) < self._agreement.places(accepted) / 2:
+            for row in doubtful:
+                self._decide(row, State.REJECTED, _OUTVOTED)
+            self._solve()
+            self._accept(self._gate(doubtful), _AGREES)
+
+    def _accept(self, rows: set[int], reason: str) -> None:
+        if rows:
+            for row in rows:
+                verdict = self.closures[row].verdict
+                self._decide(row, State.ACCEPTED, reason, verdict.residual**2, verdict.residual_m)
+            self._solve()
+
+    def _solve(self) -> None:
+        self._sessions.solve([c for c in self.closures if c.accepted], self.scale)
+        self._certainty = Certainty(self._sessions, self.scale)
+
+    def _worth_another_look(self) -> list[int]:
+        """Closures not accepted that the moved map now comes close to."""
+        rows = np.array([row for row, c in enumerate(self.closures) if not c.accepted], np.int64)
+        if not len(rows):
+            return []
+        ways = lie.invert(self._poses(self._ends.match, rows)) @ self._poses(self._ends.query, rows)
+        misfits = lie.invert(self._ends.pose.view[rows]) @ ways
+        return rows[np.linalg.norm(misfits[:, :3, 3], axis=1) < _CLOSE_M].tolist()
+
+    def _poses(self, side: Side, rows: NDArray[np.int64]) -> Array:
+        poses = np.zeros((len(rows), 4, 4))
+        for session in np.unique(side.session.view[rows]):
+            mine = side.session.view[rows] == session
+            poses[mine] = self._sessions.at(int(session), side.stamp.view[rows][mine])
+        return poses
+
+    def _pick(self, rows: list[int]) -> list[TrackedClosure]:
+        return [self.closures[row] for row in rows]
+
+    def _decide(
+        self, row: int, state: State, reason: str, squared: float = float("nan"), metres: float = float("nan")
+    ) -> None:
+        before = self.closures[row].verdict
+        self.closures[row].decide(state, reason, float(np.sqrt(squared)), metres)
+        if before.state is not state:
+            self._changed.add(row)
+
+    def _verdicts(self) -> list[ClosureVerdict]:
+        return [self.closures[row].verdict for row in sorted(self._changed)]

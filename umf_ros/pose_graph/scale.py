@@ -1,0 +1,72 @@
+"""How wrong the stated covariances are: estimated from loops that hardly depend on the map.
+
+Two closures close to each other and the odometry between their ends form a loop. What it misses
+closing by must fit the stated covariances; over many loops the factor by which it does not is
+found by maximum likelihood. Loops with a wrong closure are outliers of that likelihood, and wrong
+closures that agree with each other do no harm: they agree through the same true odometry.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from umf_ros.geometry import Array
+from umf_ros.pose_graph.ends import Cycles, Scale
+
+_GRID = np.exp(np.linspace(np.log(1 / 64), np.log(64), 33))
+# what a loop with a wrong closure misses by: aliases close by, and anything at all
+_ALIAS_SIGMAS = np.array([[0.5] * 3 + [5.0] * 3, [1.5] * 3 + [50.0] * 3])
+_OUTLIERS = 0.5
+_NATS_PER_FACTOR = 5.0
+_FEWEST_LOOPS = 10
+_TOLERANCE = np.log(1.8)
+
+
+class ScaleEstimator:
+    """Adds up the likelihood of both factors on a grid, loop by loop."""
+
+    def __init__(self) -> None:
+        logs = np.log(_GRID)
+        # one decade off is two sigmas: a few loops cannot move a stated covariance
+        self._likelihood = -0.5 * ((logs[:, None] / 1.15) ** 2 + (logs[None, :] / 1.15) ** 2)
+        self.loops = 0
+
+    def add(self, cycles: Cycles) -> None:
+        """Take N loops in."""
+        if not len(cycles.residuals):
+            return
+        self._likelihood = self._likelihood + _likelihoods(cycles).sum(axis=0)
+        self.loops += len(cycles.residuals)
+
+    @property
+    def scale(self) -> Scale:
+        """The factors, exactly 1 unless the loops contradict the stated covariances clearly."""
+        if self.loops < _FEWEST_LOOPS:
+            return Scale()
+        likelihood, one = self._likelihood, len(_GRID) // 2
+        odometry, closures = int(np.argmax(likelihood[:, one])), int(np.argmax(likelihood[one]))
+        both = np.unravel_index(np.argmax(likelihood), likelihood.shape)
+        # a factor has to earn its freedom, else noise in few loops would be taken for a wrong scale
+        choices = [(0, one, one), (1, odometry, one), (1, one, closures), (2, int(both[0]), int(both[1]))]
+        _, row, column = max(choices, key=lambda c: likelihood[c[1], c[2]] - _NATS_PER_FACTOR * c[0])
+        return Scale(_settle(float(_GRID[row])), _settle(float(_GRID[column])))
+
+
+def _settle(factor: float) -> float:
+    return factor if abs(np.log(factor)) > _TOLERANCE else 1.0
+
+
+def _likelihoods(cycles: Cycles) -> Array:
+    """(N, G, G) log-likelihood of each loop over the grids of odometry and closure factors."""
+    # whiten by the closures' noise, then turn the odometry's to its axes: both become diagonal
+    lower = np.linalg.cholesky(cycles.closure_noise)
+    white = np.linalg.solve(lower, np.swapaxes(np.linalg.solve(lower, cycles.odometry_noise), -1, -2))
+    gains, axes = np.linalg.eigh(0.5 * (white + np.swapaxes(white, -1, -2)))
+    turned = np.swapaxes(axes, -1, -2) @ np.linalg.solve(lower, cycles.residuals[..., None])
+    spread = _GRID[:, None, None] ** 2 * np.maximum(gains, 0)[:, None, None, :] + _GRID[None, :, None] ** 2
+    determinant = 2 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
+    inlier = -0.5 * ((turned[..., 0] ** 2)[:, None, None, :] / spread + np.log(spread)).sum(axis=-1)
+    inlier -= 0.5 * determinant[:, None, None]
+    deviations = cycles.residuals[:, None, :] / _ALIAS_SIGMAS
+    outlier = np.logaddexp.reduce(-0.5 * (deviations**2).sum(axis=-1) - np.log(_ALIAS_SIGMAS).sum(axis=-1), axis=-1)
+    return np.logaddexp(np.log(1 - _OUTLIERS) + inlier, np.log(_OUTLIERS / 2) + outlier[:, None, None])

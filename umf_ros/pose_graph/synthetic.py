@@ -1,0 +1,215 @@
+"""Pose graphs made on purpose: known truth, drifting odometry, right closures and wrong ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from umf_ros.frames import LoopClosure
+from umf_ros.geometry import Array, gtsam_to_ros_covariance, relative
+from umf_ros.pose_graph import lie
+
+Kind = Literal["random", "groups", "near"]
+PERIOD_NS = 1_000_000_000
+_ODOMETRY_SIGMAS = np.array([*np.deg2rad([0.2] * 3), 0.02, 0.02, 0.02])
+_LEAST_WRONG_M = 3.0
+_CLOSURE_SIGMAS = np.array([*np.deg2rad([0.5] * 3), 0.05, 0.05, 0.05])
+
+
+class WorldClosure(NamedTuple):
+    """A closure between poses `first` < `second`; covariance (6, 6) in GTSAM's order; whether it is right."""
+
+    first: int
+    second: int
+    pose: Array
+    covariance: Array
+    right: bool
+
+
+@dataclass(frozen=True)
+class World:
+    """A graph with its truth.
+
+    Attributes:
+        truth: (N, 4, 4) true poses.
+        odometry: (N, 4, 4) drifting poses; pose 0 is the true one.
+        step_covariances: (N, 6, 6) in GTSAM's order of the step that ends at each pose; row 0 is unused.
+        closures: sorted by their second pose.
+        chains: first pose of every odometry chain.
+    """
+
+    truth: Array
+    odometry: Array
+    step_covariances: Array
+    closures: list[WorldClosure]
+    chains: tuple[int, ...] = (0,)
+
+    def message(self, row: int) -> LoopClosure:
+        """Closure `row` as it comes over the wire; the stamp of pose k is k seconds."""
+        closure = self.closures[row]
+        covariance = gtsam_to_ros_covariance(closure.covariance, closure.pose)
+        return LoopClosure(closure.second * PERIOD_NS, closure.first * PERIOD_NS, closure.pose, covariance)
+
+    def step_covariance(self, row: int) -> Array | None:
+        """Covariance of odometry step `row` in ROS order, None where a chain begins."""
+        if row in self.chains:
+            return None
+        step = relative(self.odometry[row - 1], self.odometry[row])
+        return gtsam_to_ros_covariance(self.step_covariances[row], step)
+
+
+def rover_loops(size: int, seed: int) -> World:
+    """A rover that drives circuits of 80 to 250 m about its lander, each twice, a pose per metre."""
+    rng = np.random.default_rng(seed)
+    points: list[Array] = []
+    while sum(map(len, points)) < size:
+        points.append(_circuit(rng))
+    return _drive(np.concatenate(points)[:size], rng, spacing=8)
+
+
+def sphere(size: int, seed: int) -> World:
+    """Rings of 60 poses about a ball, 4 m apart or nearer, with closures to the ring before."""
+    rng = np.random.default_rng(seed)
+    height = np.pi * (0.05 + 0.9 * np.arange(size) / size)
+    around = 2 * np.pi * np.arange(size) / 60
+    radius = min(25.0, size / 42)
+    ring = np.stack([np.sin(height) * np.cos(around), np.sin(height) * np.sin(around), np.cos(height)], axis=1)
+    return _drive(radius * ring, rng, spacing=5, reach_m=6.0)
+
+
+def garage(size: int, seed: int) -> World:
+    """Five floors of 40 x 25 m, 3 m apart, driven round, up, and down again."""
+    rng = np.random.default_rng(seed)
+    corners = np.array([[0, 0], [40, 0], [40, 25], [0, 25], [0, 0]], float)
+    lap = _resample(corners, 1.0)
+    laps = int(np.ceil(size / len(lap)))
+    floors = np.abs((np.arange(laps * len(lap)) / len(lap) / 2 + 4.999) % 10 - 5)
+    level = 3.0 * (np.floor(floors) + np.clip((floors % 1 - 0.75) * 4, 0, 1))
+    plan = np.tile(lap, (laps, 1)) + np.repeat(rng.normal(0, 0.4, (laps, 2)), len(lap), axis=0)
+    return _drive(np.column_stack([plan, level])[:size], rng, spacing=6)
+
+
+WORLDS: dict[str, Callable[[int, int], World]] = {"rover": rover_loops, "sphere": sphere, "garage": garage}
+
+
+def with_wrong_closures(world: World, share: float, kind: Kind, seed: int) -> World:
+    """The world with as many wrong closures that they are `share` of all.
+
+    `random`: between places far apart. `groups`: five to eight in a row that agree with each other.
+    `near`: such groups between places 3 to 15 m apart that are passed in the same direction.
+    """
+    rng = np.random.default_rng(seed)
+    wanted = round(share / (1 - share) * len(world.closures))
+    wrong: list[WorldClosure] = []
+    pairs = _near_pairs(world, 3.0, 15.0) if kind == "near" else None
+    while len(wrong) < wanted:
+        length = 1 if kind == "random" else int(rng.integers(5, 9))
+        i, j = _far_pair(world, rng) if pairs is None else pairs[rng.integers(len(pairs))]
+        wrong += _alias(world, int(i), int(j), min(length, wanted - len(wrong)), rng)
+    order = sorted(world.closures + wrong, key=lambda closure: (closure.second, closure.first))
+    return replace(world, closures=order)
+
+
+def _alias(world: World, i: int, j: int, length: int, rng: np.random.Generator) -> list[WorldClosure]:
+    """Closures that all say place j is place i: one wrong shift of the world for the whole group."""
+    claimed = lie.exp(rng.normal(0, [0, 0, 0.05, 0.7, 0.7, 0.1])[None])[0]
+    wrong_by = np.linalg.norm((world.truth[i] @ claimed)[:3, 3] - world.truth[j][:3, 3])
+    if wrong_by < _LEAST_WRONG_M:
+        return []
+    shift = world.truth[i] @ claimed @ lie.invert(world.truth[j])
+    covariance = world.closures[int(rng.integers(len(world.closures)))].covariance
+    lower = np.linalg.cholesky(covariance)
+    group = []
+    for k in range(length):
+        if i + k < j and j + k < len(world.truth):
+            noise = lie.exp((lower @ rng.normal(size=6))[None])[0]
+            pose = lie.invert(world.truth[i + k]) @ shift @ world.truth[j + k] @ noise
+            group.append(WorldClosure(i + k, j + k, pose, covariance, False))
+    return group
+
+
+def _far_pair(world: World, rng: np.random.Generator) -> tuple[int, int]:
+    # a small world has no places 20 m apart: half its extent is far there
+    far_m = min(20.0, 0.5 * float(np.linalg.norm(np.ptp(world.truth[:, :3, 3], axis=0))))
+    while True:
+        i, j = sorted(rng.integers(len(world.truth), size=2))
+        if j - i > 40 and np.linalg.norm(world.truth[i][:3, 3] - world.truth[j][:3, 3]) > far_m:
+            return i, j
+
+
+def _near_pairs(world: World, closest_m: float, farthest_m: float) -> NDArray[np.int64]:
+    """(M, 2) pairs of poses passed in the same direction within 30 deg, at least 40 poses apart."""
+    positions = world.truth[:, :3, 3]
+    pairs = cKDTree(positions).query_pairs(farthest_m, output_type="ndarray")
+    pairs = pairs[np.diff(pairs, axis=1)[:, 0] > 40]
+    apart = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
+    pairs = pairs[apart >= closest_m]
+    turns = np.swapaxes(world.truth[pairs[:, 0], :3, :3], 1, 2) @ world.truth[pairs[:, 1], :3, :3]
+    return pairs[Rotation.from_matrix(turns).magnitude() < np.deg2rad(30)]
+
+
+def _circuit(rng: np.random.Generator) -> Array:
+    """(N, 3) points a metre apart: two laps of a bent closed loop from the origin, a little beside each other."""
+    length = rng.uniform(80, 250)
+    angles = np.linspace(0, 2 * np.pi, 400)
+    radius = 1 + sum(rng.uniform(-0.25, 0.25) * np.cos(k * angles + rng.uniform(0, 6.3)) for k in (2, 3, 4))
+    loop = np.stack([radius * np.cos(angles), radius * np.sin(angles)], axis=1)
+    loop = (loop - loop[0]) @ Rotation.from_euler("z", rng.uniform(0, 6.3)).as_matrix()[:2, :2]
+    loop *= length / np.linalg.norm(np.diff(loop, axis=0), axis=1).sum()
+    lap = _resample(loop, 1.0)[:-1]
+    second = lap + rng.normal(0, 0.5, 2)
+    plan = np.concatenate([lap, second])
+    hills = 2 * np.sin(plan[:, 0] / 40) + 1.5 * np.cos(plan[:, 1] / 30) - 1.5
+    return np.column_stack([plan, hills])
+
+
+def _resample(corners: Array, step: float) -> Array:
+    """Points every `step` along a polyline."""
+    way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    at = np.arange(0, way[-1], step)
+    return np.stack([np.interp(at, way, corners[:, k]) for k in range(corners.shape[1])], axis=1)
+
+
+def _drive(points: Array, rng: np.random.Generator, spacing: int, reach_m: float = 2.5) -> World:
+    """Look along the way, drift, and close a loop about every `spacing` poses where a place is passed again."""
+    forward = np.gradient(points, axis=0)
+    yaw = np.arctan2(forward[:, 1], forward[:, 0])
+    pitch = -np.arctan2(forward[:, 2], np.linalg.norm(forward[:, :2], axis=1))
+    truth = np.tile(np.eye(4), (len(points), 1, 1))
+    truth[:, :3, :3] = Rotation.from_euler("ZY", np.stack([yaw, pitch], axis=1)).as_matrix()
+    truth[:, :3, 3] = points
+    odometry, covariances = _drift(truth, rng)
+    world = World(truth, odometry, covariances, [])
+    return replace(world, closures=_true_closures(world, rng, spacing, reach_m))
+
+
+def _drift(truth: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    steps = lie.invert(truth[:-1]) @ truth[1:]
+    lengths = np.maximum(np.linalg.norm(steps[:, :3, 3], axis=1), 0.05)
+    sigmas = np.sqrt(lengths)[:, None] * _ODOMETRY_SIGMAS
+    steps = steps @ lie.exp(rng.normal(size=sigmas.shape) * sigmas)
+    odometry = [truth[0]]
+    for step in steps:
+        odometry.append(odometry[-1] @ step)
+    covariances = np.zeros((len(truth), 6, 6))
+    covariances[1:] = sigmas[:, :, None] ** 2 * np.eye(6)
+    return np.array(odometry), covariances
+
+
+def _true_closures(world: World, rng: np.random.Generator, spacing: int, reach_m: float) -> list[WorldClosure]:
+    pairs = _near_pairs(world, 0.0, reach_m)
+    covariance = np.diag(_CLOSURE_SIGMAS**2)
+    closures = []
+    for j in np.unique(pairs[:, 1]):
+        if rng.random() < 1 / spacing:
+            i = int(rng.choice(pairs[pairs[:, 1] == j, 0]))
+            noise = lie.exp((rng.normal(size=6) * _CLOSURE_SIGMAS)[None])[0]
+            pose = relative(world.truth[i], world.truth[j]) @ noise
+            closures.append(WorldClosure(i, int(j), pose, covariance, True))
+    return closures

@@ -1,0 +1,60 @@
+"""Offline loop detection on a recording, by the same detector as the live node."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from umf_ros.config import Settings
+from umf_ros.embedding.embedder import Embedder
+from umf_ros.frames import Frame
+from umf_ros.loop_detector import Detection, LoopDetector
+from umf_ros.pose_graph.graph import PoseGraph
+from umf_ros.pose_graph.results import write_results
+from umf_ros.results.recorder import RunRecorder
+
+
+class Replay:
+    """Feeds frames to the detector and the pose graph and fills a run folder.
+
+    Args:
+        folder: run folder.
+        settings: all settings.
+        embedder: the network.
+    """
+
+    def __init__(self, folder: Path, settings: Settings, embedder: Embedder) -> None:
+        self._folder = folder
+        self._detector = LoopDetector(settings, embedder)
+        self._graph = PoseGraph(settings.pose_graph)
+        self._recorder = RunRecorder(folder, settings, embedder.name)
+        self._has_odometry = False
+        self._session = 0
+
+    def run(self, frames: Iterable[Frame]) -> Iterator[Detection]:
+        """Process frame by frame, yielding what became of each; stop iterating to stop the run."""
+        for frame in frames:
+            detection = self._detector.process(frame)
+            self._recorder.record(frame, detection)
+            self._extend_graph(frame, detection)
+            yield detection
+
+    def finish(self, drops: Mapping[str, int]) -> bool:
+        """Write the summary, and trajectories and graph where there was odometry; returns whether there was."""
+        self._recorder.write_summary(drops)
+        self._recorder.close()
+        self._detector.database.close()
+        if self._has_odometry:
+            write_results(self._graph, self._folder)
+        return self._has_odometry
+
+    def _extend_graph(self, frame: Frame, detection: Detection) -> None:
+        if frame.odom_T_body is None:
+            return
+        if frame.session != self._session:
+            self._session = frame.session
+            self._graph.begin_session()
+        self._has_odometry = True
+        self._graph.add_odometry(frame.stamp_ns, frame.odom_T_body)
+        if detection.closures:
+            self._graph.add_closures(detection.closures)

@@ -1,0 +1,86 @@
+"""The CSV tables of a run, appended row by row so that an interrupted run keeps what it found."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from umf_ros.errors import OutputError
+from umf_ros.frames import LoopClosure, Verdict
+from umf_ros.geometry import from_quaternion, to_quaternion
+
+POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
+SIGMA = ["sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"]
+CLOSURES = ["query_stamp_ns", "match_stamp_ns", *POSE, *SIGMA, "probability", "similarity"]
+CANDIDATES = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "numbers"]
+KEYFRAMES = ["stamp_ns", "session", "travelled_m"]
+INLIERS = ["query_stamp_ns", "match_stamp_ns", "query_u", "query_v", "match_u", "match_v"]
+
+
+class Table:
+    """A CSV file with a header, flushed after every block of rows."""
+
+    def __init__(self, path: Path, columns: list[str]) -> None:
+        try:
+            self._file: TextIO = path.open("w", newline="", encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"cannot write {path}: {error.strerror}") from None
+        self._path = path
+        self._writer = csv.writer(self._file)
+        self.append([columns])
+
+    def append(self, rows: list[Any]) -> None:
+        """Write rows and hand them to the operating system."""
+        try:
+            self._writer.writerows(rows)
+            self._file.flush()
+        except OSError as error:
+            raise OutputError(f"cannot write {self._path}: {error.strerror}") from None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:
+    """Row of `closures.csv`: `match_T_query`, one sigma per axis of the match body, probability."""
+    pose = closure.match_T_query
+    sigma = np.sqrt(np.diag(closure.covariance))
+    numbers = [*pose[:3, 3], *to_quaternion(pose), *sigma, closure.probability, similarity]
+    return [closure.query_stamp_ns, closure.match_stamp_ns, *(f"{number:.9g}" for number in numbers)]
+
+
+def candidate_row(query_stamp_ns: int, verdict: Verdict) -> list[Any]:
+    """Row of `candidates.csv`: everything that was measured, as JSON."""
+    numbers = json.dumps({name: float(f"{value:.6g}") for name, value in verdict.numbers.items()})
+    candidate = verdict.candidate
+    return [query_stamp_ns, candidate.stamp_ns, f"{candidate.similarity:.6f}", verdict.reason, numbers]
+
+
+def inlier_rows(query_stamp_ns: int, verdict: Verdict) -> list[list[Any]]:
+    """Rows of `inliers.csv`: pixels of both left images that see the same point."""
+    return [
+        [query_stamp_ns, verdict.candidate.stamp_ns, *(f"{value:.1f}" for value in pixels)]
+        for pixels in verdict.inlier_pixels.tolist()
+    ]
+
+
+def read_closures(path: Path) -> list[LoopClosure]:
+    """The closures of a `closures.csv`, with a diagonal covariance."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return [_closure(row) for row in csv.DictReader(file)]
+
+
+def _closure(row: dict[str, str]) -> LoopClosure:
+    numbers = [float(row[name]) for name in CLOSURES[2:16]]
+    return LoopClosure(
+        query_stamp_ns=int(row["query_stamp_ns"]),
+        match_stamp_ns=int(row["match_stamp_ns"]),
+        match_T_query=from_quaternion(numbers[:3], numbers[3:7]),
+        covariance=np.diag(np.square(numbers[7:13])),
+        probability=numbers[13],
+    )

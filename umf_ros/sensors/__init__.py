@@ -1,0 +1,1 @@
+"""Sensor messages, their calibration and their synchronisation."""

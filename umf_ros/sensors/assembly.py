@@ -1,0 +1,112 @@
+"""The parts of a frame, put together in one body frame at one time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from umf_ros.frames import Frame, Image, Points
+from umf_ros.geometry import Array, relative, transform
+from umf_ros.sensors.buffers import OdometryBuffer, StampedImage
+from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.motion import deskew
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """What a frame is built around: a scan, or an image where there is no LiDAR.
+
+    Attributes:
+        stamp_ns: key of the frame.
+        measured_ns: stamp of the message; the points' time offsets count from here.
+        cloud: the scan in the LiDAR frame, or None.
+    """
+
+    stamp_ns: int
+    measured_ns: int
+    cloud: Cloud | None = None
+
+    def span_ns(self) -> tuple[int, int]:
+        """When the first and the last point were measured; the key where the driver does not tell."""
+        if self.cloud is None or self.cloud.time_offset_ns is None or not len(self.cloud.points):
+            return self.stamp_ns, self.stamp_ns
+        offsets = self.cloud.time_offset_ns
+        return self.measured_ns + int(offsets.min()), self.measured_ns + int(offsets.max())
+
+
+def filter_cloud(cloud: Cloud, calibration: Calibration) -> Cloud:
+    """Drop weak returns and those far above or below the LiDAR."""
+    keep = np.abs(cloud.points[:, 2]) <= calibration.max_height_m
+    if cloud.intensity is not None:
+        keep &= cloud.intensity > calibration.min_intensity
+    return Cloud(
+        cloud.points[keep],
+        None if cloud.intensity is None else cloud.intensity[keep],
+        None if cloud.time_offset_ns is None else cloud.time_offset_ns[keep],
+    )
+
+
+def assemble(
+    anchor: Anchor,
+    left: StampedImage | None,
+    right: StampedImage | None,
+    odometry: OdometryBuffer,
+    calibration: Calibration,
+    session: int,
+) -> Frame:
+    """Build the frame at `anchor.stamp_ns`: images rectified, motion between the measurements removed."""
+    odom_T_body = odometry.at(anchor.stamp_ns)
+    points, intensity = _scan(anchor, odometry, calibration, odom_T_body)
+    left_image, right_image = _rectified(left, right, calibration)
+    return Frame(
+        stamp_ns=anchor.stamp_ns,
+        camera=calibration.camera,
+        body_T_camera=_camera_pose(left, odometry, calibration, odom_T_body),
+        body_T_lidar=calibration.body_T_lidar,
+        left=left_image,
+        right=right_image,
+        points=points,
+        intensity=intensity,
+        odom_T_body=odom_T_body,
+        image_stamp_ns=left.stamp_ns if left else None,
+        session=session,
+    )
+
+
+def _rectified(
+    left: StampedImage | None, right: StampedImage | None, calibration: Calibration
+) -> tuple[Image | None, Image | None]:
+    images = left.image if left else None, right.image if right else None
+    rectifier = calibration.rectifier
+    if rectifier is None:
+        return images
+    return (
+        None if images[0] is None else rectifier.left(images[0]),
+        None if images[1] is None else rectifier.right(images[1]),
+    )
+
+
+def _camera_pose(
+    left: StampedImage | None, odometry: OdometryBuffer, calibration: Calibration, odom_T_body: Array | None
+) -> Array:
+    """Pose of the camera at its exposure in the body frame at the frame's stamp."""
+    exposed = odometry.at(left.stamp_ns) if left else None
+    if exposed is None or odom_T_body is None:
+        return calibration.body_T_camera
+    return relative(odom_T_body, exposed) @ calibration.body_T_camera
+
+
+def _scan(
+    anchor: Anchor, odometry: OdometryBuffer, calibration: Calibration, odom_T_body: Array | None
+) -> tuple[Points | None, Points | None]:
+    cloud = anchor.cloud
+    if cloud is None or not len(cloud.points):
+        return None, None
+    points = transform(calibration.body_T_lidar, cloud.points)
+    if odom_T_body is not None and cloud.time_offset_ns is not None:
+        path = odometry.path(*anchor.span_ns())
+        if path[1]:
+            points = deskew(points, anchor.measured_ns + cloud.time_offset_ns, path, odom_T_body)
+    return points, cloud.intensity

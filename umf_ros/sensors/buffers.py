@@ -1,0 +1,134 @@
+"""Bounded memories of the inputs."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.frames import Image
+from umf_ros.geometry import Array, interpolate
+from umf_ros.sensors.counters import SURPLUS, InputCounter
+
+
+@dataclass(slots=True)
+class StampedImage:
+    """An image of the stream.
+
+    Attributes:
+        stamp_ns: exposure.
+        image: (H, W) uint8.
+        late: whether a scan that might have wanted it was given up before it came.
+        used: whether a frame has taken it.
+    """
+
+    stamp_ns: int
+    image: Image
+    late: bool = False
+    used: bool = False
+
+
+class ImageBuffer:
+    """The latest images of one camera, in the order of their stamps."""
+
+    def __init__(self, size: int, counter: InputCounter) -> None:
+        self._size = size
+        self._counter = counter
+        self._images: deque[StampedImage] = deque()
+        self.newest_ns: int | None = None
+
+    def add(self, stamp_ns: int, image: Image, late: bool = False) -> None:
+        """Append an image; the oldest leaves a full buffer."""
+        if len(self._images) == self._size:
+            self._forget("queue full")
+        self._images.append(StampedImage(stamp_ns, image, late))
+        self.newest_ns = stamp_ns
+
+    def passed(self, stamp_ns: int) -> bool:
+        """Whether no image to come can be nearer to the stamp than those that came."""
+        return self.newest_ns is not None and self.newest_ns >= stamp_ns
+
+    def nearest(self, stamp_ns: int, slop_ns: int) -> StampedImage | None:
+        """The image nearest to a stamp, or None when it is further than the slop; the earlier of two equals."""
+        nearest = min(self._images, key=lambda image: abs(image.stamp_ns - stamp_ns), default=None)
+        return nearest if nearest and abs(nearest.stamp_ns - stamp_ns) <= slop_ns else None
+
+    def use(self, image: StampedImage | None) -> None:
+        """Count an image as used, the first time."""
+        if image is not None and not image.used:
+            image.used = True
+            self._counter.used += 1
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Let go of older images."""
+        while self._images and self._images[0].stamp_ns < stamp_ns:
+            self._forget(SURPLUS)
+
+    def clear(self) -> None:
+        """Let go of everything."""
+        while self._images:
+            self._forget(SURPLUS)
+        self.newest_ns = None
+
+    def _forget(self, reason: str) -> None:
+        image = self._images.popleft()
+        if not image.used:
+            self._counter.dropped["late" if image.late else reason] += 1
+
+
+class OdometryBuffer:
+    """The latest poses of the odometry, interpolated.
+
+    Args:
+        length_ns: how far back poses are kept.
+        max_gap_ns: no pose is interpolated across a longer gap.
+    """
+
+    def __init__(self, length_ns: int, max_gap_ns: int) -> None:
+        self._length_ns = length_ns
+        self._max_gap_ns = max_gap_ns
+        self._stamps: list[int] = []
+        self._poses: list[Array] = []
+
+    def add(self, stamp_ns: int, odom_T_body: Array) -> None:
+        """Append a pose, later than all before."""
+        self._stamps.append(stamp_ns)
+        self._poses.append(odom_T_body)
+        # lists are cut rarely and in bulk; bisection wants lists
+        if self._stamps[0] < stamp_ns - 2 * self._length_ns:
+            old = bisect_left(self._stamps, stamp_ns - self._length_ns)
+            del self._stamps[:old], self._poses[:old]
+
+    def passed(self, stamp_ns: int) -> bool:
+        """Whether the odometry has reached a stamp."""
+        return bool(self._stamps) and self._stamps[-1] >= stamp_ns
+
+    def at(self, stamp_ns: int) -> Array | None:
+        """`odom_T_body` at a stamp, or None outside of what is known."""
+        after = bisect_left(self._stamps, stamp_ns)
+        if after == len(self._stamps):
+            return None
+        if self._stamps[after] == stamp_ns:
+            return self._poses[after]
+        if after == 0:
+            return None
+        before_ns, after_ns = self._stamps[after - 1], self._stamps[after]
+        if after_ns - before_ns > self._max_gap_ns:
+            return None
+        fraction = (stamp_ns - before_ns) / (after_ns - before_ns)
+        return interpolate(self._poses[after - 1], self._poses[after], fraction)
+
+    def path(self, start_ns: int, end_ns: int) -> tuple[NDArray[np.int64], list[Array]]:
+        """Stamps and poses from start to end, both interpolated, as far as they are known."""
+        first, last = bisect_left(self._stamps, start_ns), bisect_left(self._stamps, end_ns)
+        stamps = sorted({start_ns, *self._stamps[first:last], end_ns})
+        known = [(stamp, pose) for stamp in stamps if (pose := self.at(stamp)) is not None]
+        return np.array([stamp for stamp, _ in known], np.int64), [pose for _, pose in known]
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._stamps.clear()
+        self._poses.clear()

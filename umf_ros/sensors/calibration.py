@@ -1,0 +1,194 @@
+"""Intrinsics and mounting of the sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from umf_ros.config import Group
+from umf_ros.errors import CalibrationError
+from umf_ros.frames import StereoCamera
+from umf_ros.geometry import Array, from_quaternion
+from umf_ros.resources import find
+from umf_ros.sensors.rectification import RawCamera, StereoRectifier
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """How the sensors are built and mounted; poses are in the body frame (REP-103).
+
+    Attributes:
+        camera: the rectified stereo pair.
+        body_T_camera: pose of the (rectified) left optical frame.
+        body_T_lidar: pose of the LiDAR (Cube-1: x right, y forward, z up).
+        body_T_imu: pose of the IMU.
+        lidar_time_offset_s: seconds to add to the stamp of a scan.
+        min_intensity: returns up to this intensity are dropped.
+        max_height_m: returns further than this from the LiDAR's horizontal plane are dropped.
+        rectifier: makes the pair of `camera` from raw images; None where they arrive rectified.
+    """
+
+    camera: StereoCamera
+    body_T_camera: Array
+    body_T_lidar: Array
+    body_T_imu: Array = field(default_factory=lambda: np.eye(4))
+    lidar_time_offset_s: float = 0.0
+    min_intensity: float = 15.0
+    max_height_m: float = 7.0
+    rectifier: StereoRectifier | None = None
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the images that arrive."""
+        return self.rectifier.raw_size if self.rectifier else (self.camera.width, self.camera.height)
+
+    def with_camera(self, camera: StereoCamera) -> Calibration:
+        """Return this calibration with the intrinsics of a camera_info.
+
+        A baseline of 0 (no right camera_info) keeps the one known here. The camera_info of raw images
+        describes other pixels than `camera` and is not used.
+        """
+        if self.rectifier is not None:
+            return self
+        return replace(self, camera=replace(camera, baseline=camera.baseline or self.camera.baseline))
+
+
+def load_calibration(source: str | Path) -> Calibration:
+    """Calibration from a YAML file, or of a data set by its name, as in `s3li-etna`.
+
+    Raises:
+        CalibrationError: the file cannot be read, or a key is missing, unknown or wrong; names the key.
+    """
+    path = _path_of(source)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+    try:
+        return _File.model_validate(content).calibration()
+    except ValidationError as error:
+        raise CalibrationError(f"{path}: {'; '.join(_explain(problem) for problem in error.errors())}") from None
+
+
+def _path_of(source: str | Path) -> Path:
+    if isinstance(source, str) and source in ("simulated", "s3li-etna", "s3li-vulcano"):
+        return find(f"config/calibration/{source.replace('-', '_')}.yaml")
+    return Path(source)
+
+
+def _explain(problem: Any) -> str:
+    name = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        return f"unknown key {name}"
+    if problem["type"] == "missing":
+        return f"{name} is missing"
+    return f"{name or 'the file'}: {problem['msg'][0].lower()}{problem['msg'][1:]}"
+
+
+class _Pose(Group):
+    """A pose in the file: metres, and a quaternion x y z w."""
+
+    translation: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+
+    @field_validator("quaternion")
+    @classmethod
+    def _of_unit_length(cls, quaternion: tuple[float, ...]) -> tuple[float, ...]:
+        from_quaternion((0, 0, 0), quaternion)
+        return quaternion
+
+    def matrix(self) -> Array:
+        return from_quaternion(self.translation, self.quaternion)
+
+
+class _Pinhole(Group):
+    """Pixels."""
+
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+
+
+class _Camera(_Pinhole):
+    """A rectified pair."""
+
+    baseline: float = Field(ge=0)
+
+
+class _RawCamera(_Pinhole):
+    """One camera whose images arrive as they were taken."""
+
+    distortion: list[float]
+
+    @field_validator("distortion")
+    @classmethod
+    def _in_opencv_order(cls, distortion: list[float]) -> list[float]:
+        if len(distortion) not in (0, 4, 5, 8):
+            raise ValueError("expected 0, 4, 5 or 8 coefficients: k1 k2 p1 p2 k3 k4 k5 k6")
+        return distortion
+
+    def raw(self) -> RawCamera:
+        return RawCamera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, tuple(self.distortion))
+
+
+class _RawPair(Group):
+    """A pair to rectify, and the size of the result."""
+
+    left: _RawCamera
+    right: _RawCamera
+    left_T_right: _Pose
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+
+    def rectifier(self) -> StereoRectifier:
+        return StereoRectifier(
+            self.left.raw(), self.right.raw(), self.left_T_right.matrix(), size=(self.width, self.height)
+        )
+
+
+class _File(Group):
+    """What a calibration file holds."""
+
+    camera: _Camera | None = None
+    raw_camera: _RawPair | None = None
+    body_T_camera: _Pose
+    body_T_lidar: _Pose
+    body_T_imu: _Pose
+    lidar_time_offset_s: float
+    min_intensity: float = Field(ge=0)
+    max_height_m: float = Field(gt=0)
+
+    @model_validator(mode="after")
+    def _one_camera(self) -> _File:
+        if (self.camera is None) == (self.raw_camera is None):
+            raise ValueError("expected either camera (rectified images) or raw_camera")
+        return self
+
+    def calibration(self) -> Calibration:
+        body_T_camera = self.body_T_camera.matrix()
+        rectifier = self.raw_camera.rectifier() if self.raw_camera else None
+        if rectifier is not None:
+            camera, body_T_camera = rectifier.camera, body_T_camera @ rectifier.raw_T_rectified
+        else:
+            assert self.camera is not None
+            camera = StereoCamera(**self.camera.model_dump())
+        return Calibration(
+            camera,
+            body_T_camera,
+            self.body_T_lidar.matrix(),
+            self.body_T_imu.matrix(),
+            self.lidar_time_offset_s,
+            self.min_intensity,
+            self.max_height_m,
+            rectifier,
+        )

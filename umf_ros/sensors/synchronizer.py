@@ -1,0 +1,228 @@
+"""From single measurements to synchronised frames."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection
+from typing import Literal
+
+from umf_ros.config import Sync
+from umf_ros.errors import MessageError
+from umf_ros.frames import Frame, Image, StereoCamera
+from umf_ros.geometry import Array
+from umf_ros.sensors.assembly import Anchor, assemble, filter_cloud
+from umf_ros.sensors.buffers import ImageBuffer, OdometryBuffer, StampedImage
+from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.clock import StreamClock
+from umf_ros.sensors.counters import InputCounter
+from umf_ros.sensors.messages import Cloud
+
+Input = Literal["left", "right", "cloud", "odometry", "camera_info"]
+INPUTS: tuple[Input, ...] = ("left", "right", "cloud", "odometry")
+
+STEREO_SLOP_NS = 17_000_000
+"""Exposures of a pair carry the same stamp; half a period at 30 Hz tells a pair from the neighbouring one."""
+
+
+SILENCE_NS = 5_000_000_000
+"""An input of which nothing has come in this much stream time is taken to be absent."""
+
+
+class Synchronizer:
+    """Builds one frame per scan from the image nearest to it and the odometry; without a LiDAR one per image.
+
+    Add measurements as they come, input by input in the order of their stamps, and `pop` what is
+    complete. A frame is complete when every input has passed it. Only stamps decide, never the time of
+    arrival: as long as no input lags behind another by more than `max_wait_s`, the same measurements
+    give the same frames however their arrivals interleave. A frame that has waited longer is completed
+    with what is there; an input that has been silent for long is not waited for until it speaks.
+
+    When stamps jump back (the recording starts again), the waiting frames are completed with what is
+    there, the buffers are emptied and a new session begins.
+
+    Not for several threads at once.
+
+    Attributes:
+        counters: what became of the messages of each input.
+    """
+
+    def __init__(self, settings: Sync, calibration: Calibration, inputs: Collection[Input] = INPUTS) -> None:
+        """Wait for `inputs` only; "camera_info" among them: frames also wait for `use_camera`."""
+        self.counters: dict[Input, InputCounter] = {name: InputCounter() for name in INPUTS}
+        self._settings = settings
+        self._calibration = calibration
+        self._inputs = set(inputs)
+        self._absent: set[Input] = set()
+        self._slop_ns = round(settings.slop_s * 1e9)
+        self._max_wait_ns = round(settings.max_wait_s * 1e9)
+        self._clock = StreamClock()
+        self._left = ImageBuffer(settings.queue_size, self.counters["left"])
+        self._right = ImageBuffer(settings.queue_size, self.counters["right"])
+        self._odometry = OdometryBuffer(
+            round(settings.odometry_buffer_s * 1e9), round(settings.max_odometry_gap_s * 1e9)
+        )
+        self._anchors: deque[Anchor] = deque()
+        self._frames: list[Frame] = []
+        self._given_up_ns = -1  # images up to here come too late
+
+    @property
+    def session(self) -> int:
+        """How often the recording has started again."""
+        return self._clock.session
+
+    @property
+    def waiting(self) -> int:
+        """Scans (images without a LiDAR) that wait for other inputs."""
+        return len(self._anchors)
+
+    def use_camera(self, camera: StereoCamera) -> None:
+        """Replace the intrinsics by those of a camera_info."""
+        self._calibration = self._calibration.with_camera(camera)
+        self._absent.add("camera_info")  # comes no second time
+
+    def add_left(self, stamp_ns: int, image: Image) -> None:
+        """Add a left image, (H, W) uint8, as the camera sends it.
+
+        Raises:
+            MessageError: of kind "size" when the calibration is for other images.
+        """
+        self._check_size(image)
+        if self._accept("left", stamp_ns):
+            self._left.add(stamp_ns, image, late=stamp_ns <= self._given_up_ns)
+            if "cloud" not in self._inputs:
+                self._anchors.append(Anchor(stamp_ns, stamp_ns))
+            self._build()
+
+    def add_right(self, stamp_ns: int, image: Image) -> None:
+        """Add a right image, (H, W) uint8, as the camera sends it.
+
+        Raises:
+            MessageError: of kind "size" when the calibration is for other images.
+        """
+        self._check_size(image)
+        if self._accept("right", stamp_ns):
+            self._right.add(stamp_ns, image, late=stamp_ns <= self._given_up_ns)
+            self._build()
+
+    def add_cloud(self, stamp_ns: int, cloud: Cloud) -> None:
+        """Add a scan by the stamp of its message, the start of the scan."""
+        if self._accept("cloud", stamp_ns):
+            key = stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
+            self._anchors.append(Anchor(key, stamp_ns, filter_cloud(cloud, self._calibration)))
+            self._build()
+
+    def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
+        """Add a (4, 4) pose of the odometry."""
+        if self._accept("odometry", stamp_ns):
+            self._odometry.add(stamp_ns, odom_T_body)
+            self.counters["odometry"].used += 1
+            self._build()
+
+    def reject(self, name: Input, reason: str) -> None:
+        """Count a message that could not be used at all; a camera_info like that is not waited for again."""
+        if name in self.counters:
+            self.counters[name].received += 1
+            self.counters[name].dropped[reason] += 1
+        else:
+            self._absent.add(name)
+
+    def pop(self) -> list[Frame]:
+        """Frames completed since the last call, in the order of their stamps."""
+        frames, self._frames = self._frames, []
+        return frames
+
+    def flush(self) -> list[Frame]:
+        """Complete the waiting frames with what is there, at the end of the stream, and pop them."""
+        self._clear()
+        return self.pop()
+
+    def _accept(self, name: Input, stamp_ns: int) -> bool:
+        if self._clock.restarts(name, stamp_ns):
+            self._clear()
+            self._clock.restart()
+        counter = self.counters[name]
+        counter.received += 1
+        fault = self._clock.fault(name, stamp_ns)
+        if fault:
+            counter.dropped[fault] += 1
+            return False
+        self._clock.advance(name, stamp_ns)
+        self._absent.discard(name)
+        return True
+
+    def _check_size(self, image: Image) -> None:
+        height, width = image.shape
+        expected = self._calibration.image_size
+        if (width, height) != expected:
+            raise MessageError(
+                "size", f"image of {width} x {height} pixels, the calibration is for {expected[0]} x {expected[1]}"
+            )
+
+    def _clear(self) -> None:
+        while self._anchors:
+            self._complete(self._anchors.popleft())
+        self._left.clear()
+        self._right.clear()
+        self._odometry.clear()
+        self._given_up_ns = -1
+
+    def _build(self) -> None:
+        """Complete the frames that wait for nothing more, in order."""
+        while self._anchors and self._is_complete(self._anchors[0]):
+            anchor = self._anchors.popleft()
+            self._complete(anchor)
+            self._forget_before(anchor.stamp_ns)  # the scans to come are later than this one
+        if self._clock.now_ns is not None:
+            self._forget_before(self._clock.now_ns - self._max_wait_ns)
+
+    def _forget_before(self, key_ns: int) -> None:
+        """Let go of the images that are too old for a frame at this key."""
+        self._left.forget_before(key_ns - self._slop_ns)
+        self._right.forget_before(key_ns - self._slop_ns - STEREO_SLOP_NS)
+
+    def _is_complete(self, anchor: Anchor) -> bool:
+        if self._clock.now_ns is not None and self._clock.now_ns > anchor.stamp_ns + self._max_wait_ns:
+            self._note_absent()
+            return True
+        if len(self._anchors) >= self._settings.queue_size:
+            return True
+        if self._awaits("camera_info") or (self._awaits("left") and not self._left.passed(anchor.stamp_ns)):
+            return False
+        left = self._left.nearest(anchor.stamp_ns, self._slop_ns)
+        if left and self._awaits("right") and not self._right.passed(left.stamp_ns):
+            return False
+        last_ns = max(anchor.stamp_ns, anchor.span_ns()[1], left.stamp_ns if left else 0)
+        return not self._awaits("odometry") or self._odometry.passed(last_ns)
+
+    def _awaits(self, name: Input) -> bool:
+        return name in self._inputs and name not in self._absent
+
+    def _note_absent(self) -> None:
+        """Wait no longer for inputs that have been silent since the start, until they speak."""
+        if self._clock.elapsed_ns > SILENCE_NS:
+            self._absent |= {name for name in self._inputs if not self._clock.has_heard(name)}
+
+    def _complete(self, anchor: Anchor) -> None:
+        left = self._left.nearest(anchor.stamp_ns, self._slop_ns)
+        right = self._right.nearest(left.stamp_ns, STEREO_SLOP_NS) if left else None
+        if left is None and not self._left.passed(anchor.stamp_ns):
+            self._given_up_ns = anchor.stamp_ns + self._slop_ns
+        if anchor.cloud is not None and not self._count_scan(anchor.cloud, left):
+            return
+        if anchor.cloud is None and left is None:
+            return
+        self._left.use(left)
+        self._right.use(right)
+        self._frames.append(assemble(anchor, left, right, self._odometry, self._calibration, self.session))
+
+    def _count_scan(self, cloud: Cloud, left: StampedImage | None) -> bool:
+        """Settle the fate of a scan: whether there will be a frame."""
+        counter = self.counters["cloud"]
+        without_image = left is None and (self._settings.require_image or not len(cloud.points))
+        if not len(cloud.points):
+            counter.dropped["empty"] += 1
+        elif without_image:
+            counter.dropped["no image"] += 1
+        else:
+            counter.used += 1
+        return not without_image

@@ -1,0 +1,1 @@
+"""Planetary worlds and the S3LI sensors inside them."""

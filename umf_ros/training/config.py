@@ -1,0 +1,72 @@
+"""Settings of a training run, written beside its weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import yaml
+from pydantic import Field, ValidationError
+
+from umf_ros.config import Group
+from umf_ros.errors import ConfigError
+
+
+class TrainingSettings(Group):
+    """Metric learning of one network."""
+
+    preset: str = Field("umf_light", description="network, by name")
+    image_size: tuple[int, int] | None = Field(None, description="height and width of the input; null: the preset's")
+    train: str = Field(description="folder of training worlds")
+    validation: str = Field("", description="folder of validation worlds; empty: no validation, no early stopping")
+    steps: int = Field(4000, ge=1, description="optimiser steps in all")
+    epoch_steps: int = Field(150, ge=1, description="steps between checkpoints; new worlds are picked up there")
+    validate_epochs: int = Field(3, ge=1, description="epochs between validations")
+    validation_stride: int = Field(2, ge=1, description="every how many frames are used in the validations on the way")
+    patience: int = Field(0, ge=0, description="validations without progress before stopping; 0: never")
+    seed: int = Field(0, ge=0, description="of weights, batches and augmentation")
+    loss: Literal["multi_similarity", "triplet"] = Field("multi_similarity", description="on the descriptors")
+    batch: int = Field(32, ge=4, description="frames per step and process, half of them positives of the others")
+    batch_limit: int = Field(88, ge=4, description="largest batch of the triplet loss's growing batches")
+    batch_growth: float = Field(1.4, ge=1, description="factor when too few triplets are active")
+    active_share: float = Field(0.5, ge=0, le=1, description="share of active triplets below which the batch grows")
+    learning_rate: float = Field(1e-3, gt=0, description="peak of the cosine schedule")
+    weight_decay: float = Field(1e-4, ge=0, description="of AdamW")
+    warmup_steps: int = Field(100, ge=0, description="linear warm-up")
+    bank: int = Field(512, ge=0, description="descriptors of past batches that serve as references")
+    bank_from_step: int = Field(400, ge=0, description="first step that uses them")
+    weight_image: float = Field(0.5, ge=0, description="loss of the images alone, relative to the fused one")
+    weight_cloud: float = Field(0.5, ge=0, description="loss of the scans alone")
+    weight_graded: float = Field(0.5, ge=0, description="loss that orders places by distance")
+    weight_local: float = Field(0.3, ge=0, description="correspondence losses of the local features")
+    weight_super: float = Field(0.1, ge=0, description="super-feature losses; 0: heads are left alone")
+    local_gradient: float = Field(
+        0.2, ge=0, le=1, description="share of the local losses' gradient that reaches the encoders"
+    )
+    clip: float = Field(10.0, gt=0, description="largest norm of the gradient")
+    local_pairs: int = Field(4, ge=0, description="pairs of a batch that train local and super-features")
+    local_matches: int = Field(192, ge=1, description="correspondences used per pair")
+    modality_dropout: float = Field(
+        0.15, ge=0, le=0.5, description="chance of losing the image, and of losing the scan"
+    )
+    freeze_encoders: bool = Field(False, description="train fusion and heads only (thesis 4.6)")
+    start: str = Field("", description="weights to start from")
+    half: bool = Field(True, description="bfloat16 mixed precision")
+    threads: int = Field(1, ge=1, description="threads per process")
+    device: str = Field("auto", description="torch device; auto: a GPU when there is one")
+
+
+def load_training(path: Path | None, **overrides: object) -> TrainingSettings:
+    """Training settings from a YAML file and overrides; None is skipped.
+
+    Raises:
+        ConfigError: unreadable file, unknown name or wrong value.
+    """
+    try:
+        values = yaml.safe_load(path.read_text()) or {} if path else {}
+        return TrainingSettings(**values | {name: value for name, value in overrides.items() if value is not None})
+    except (OSError, yaml.YAMLError, TypeError) as error:
+        raise ConfigError(f"cannot read {path}: {' '.join(str(error).split())}") from None
+    except ValidationError as error:
+        problems = [f"{'.'.join(map(str, item['loc']))}: {item['msg'].lower()}" for item in error.errors()]
+        raise ConfigError("; ".join(problems)) from None

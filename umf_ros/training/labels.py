@@ -1,0 +1,60 @@
+"""What is the same place, and what is not (thesis 4.5.2 and 5.1.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.geometry import Array, wrap_angle
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """Distances in metres, headings in degrees; what is neither positive nor negative is neutral.
+
+    The thesis takes every pair beyond 30 deg for different. Two views 40 deg apart still share half of
+    their field, so in training the band up to `negative_deg` stays neutral.
+    """
+
+    positive_m: float = 12.0
+    positive_deg: float = 30.0
+    negative_m: float = 60.0
+    negative_deg: float = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where a batch was taken.
+
+    Attributes:
+        world: (B,) int, places of different worlds are different.
+        position: (B, 2) metres.
+        heading: (B,) radians.
+    """
+
+    world: NDArray[np.int64]
+    position: Array
+    heading: Array
+
+
+def places_of(world: int, world_T_body: Array) -> Places:
+    """Places of (N, 4, 4) poses in one world."""
+    heading = np.arctan2(world_T_body[:, 1, 0], world_T_body[:, 0, 0])
+    return Places(np.full(len(world_T_body), world), world_T_body[:, :2, 3], heading)
+
+
+def distances(a: Places, b: Places) -> tuple[Array, Array]:
+    """(A, B) metres, infinite between worlds, and (A, B) radians between headings."""
+    metres = np.linalg.norm(a.position[:, None] - b.position[None], axis=-1)
+    metres = np.where(a.world[:, None] == b.world[None], metres, np.inf)
+    return metres, np.abs(wrap_angle(a.heading[:, None] - b.heading[None]))
+
+
+def label(a: Places, b: Places, rule: Rule) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(A, B) positive and (A, B) negative pairs."""
+    metres, turn = distances(a, b)
+    positive = (metres < rule.positive_m) & (turn < np.radians(rule.positive_deg))
+    negative = (metres > rule.negative_m) | (turn > np.radians(rule.negative_deg))
+    return positive, negative

@@ -1,0 +1,163 @@
+"""The loop of a pretraining run."""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from umf_ros.datasets.sample import SampleSequence
+from umf_ros.errors import ConfigError
+from umf_ros.networks.umf import UMF
+from umf_ros.training.checkpoint import load_checkpoint, save_checkpoint
+from umf_ros.training.pretraining.settings import PretrainingSettings
+from umf_ros.training.pretraining.tasks import make_task
+from umf_ros.training.views import Augmentation, View, ViewMaker
+
+EXAMPLES = 4
+TRIES = 1000
+
+
+@dataclass
+class Progress:
+    """Where a run stands.
+
+    Attributes:
+        step: steps done.
+        seconds: time they took.
+        loss: mean of the epoch so far.
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+    loss: float = float("nan")
+
+
+class Pretrainer:
+    """Trains one encoder of a network without labels.
+
+    Everything random in an epoch follows from the seed and the epoch, and checkpoints are taken
+    between epochs: a resumed run repeats an uninterrupted one.
+
+    Args:
+        network: its encoder is trained in place.
+        settings: of the run.
+        sequences: gives the data; asked again at every epoch.
+        folder: gets `checkpoint.pt`, `log.csv` and `reconstructions_<step>.png`.
+        device: what to compute on.
+    """
+
+    def __init__(
+        self,
+        network: UMF,
+        settings: PretrainingSettings,
+        sequences: Callable[[], Sequence[SampleSequence]],
+        folder: Path,
+        device: torch.device,
+    ) -> None:
+        self.progress = Progress()
+        self._settings, self._folder, self._sequences = settings, folder, sequences
+        self._task = make_task(network, settings)
+        self._device = device
+        self._task.model.to(device)
+        self._views = ViewMaker(network.config, Augmentation(erase=0.0))  # nothing to be learned from blanks
+        self._optimiser = torch.optim.AdamW(
+            self._task.model.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
+        )
+
+    def run(self, report: Callable[[Progress], None]) -> None:
+        """Train until the steps are done; `report` is called after every step."""
+        while self.progress.step < self._settings.steps:
+            self._epoch(report)
+            self._log()
+            self._draw()
+            save_checkpoint(self._folder / "checkpoint.pt", self._state())
+
+    def resume(self) -> None:
+        """Go on from the checkpoint in the run's folder.
+
+        Raises:
+            WeightsError: there is none, or it is damaged.
+        """
+        state = load_checkpoint(self._folder / "checkpoint.pt")
+        self._task.model.load_state_dict(state["model"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self.progress = Progress(**state["progress"])
+
+    def _epoch(self, report: Callable[[Progress], None]) -> None:
+        settings, progress = self._settings, self.progress
+        epoch = progress.step // settings.epoch_steps
+        rng = np.random.default_rng([settings.seed, epoch])
+        sequences = self._sequences()
+        losses: list[float] = []
+        while progress.step < min((epoch + 1) * settings.epoch_steps, settings.steps):
+            started = time.perf_counter()
+            losses.append(self._step(self._take(sequences, settings.batch, rng), rng))
+            progress.loss = float(np.mean(losses))
+            progress.seconds += time.perf_counter() - started
+            progress.step += 1
+            report(progress)
+
+    def _take(self, sequences: Sequence[SampleSequence], count: int, rng: np.random.Generator) -> list[View]:
+        """Augmented views of samples drawn from everywhere."""
+        ends = np.cumsum([len(sequence) for sequence in sequences])
+        views: list[View] = []
+        for _ in range(TRIES * count):
+            row = int(rng.integers(ends[-1]))
+            which = int(np.searchsorted(ends, row, side="right"))
+            part = self._task.part(sequences[which].sample(row - int(ends[which])))
+            if part is not None:
+                views.append(self._views.varied(part, rng, mirror=rng.random() < 0.5))
+            if len(views) == count:
+                return views
+        raise ConfigError(f"data: next to no sample has what {self._settings.modality} pretraining needs")
+
+    def _step(self, views: Sequence[View], rng: np.random.Generator) -> float:
+        model, settings = self._task.model.train(), self._settings
+        for group in self._optimiser.param_groups:
+            group["lr"] = self._learning_rate()
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=settings.half):
+            loss = self._task.loss(views, rng)
+        self._optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(model.parameters(), 5.0)
+        self._optimiser.step()
+        return float(loss.detach())
+
+    def _learning_rate(self) -> float:
+        settings, step = self._settings, self.progress.step
+        warm = min(1.0, (step + 1) / max(settings.warmup_steps, 1))
+        return settings.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
+
+    def _draw(self) -> None:
+        """The same examples under the same masks every time, so that progress can be seen."""
+        rng = np.random.default_rng([self._settings.seed, 2**31])
+        views = self._take(self._sequences(), EXAMPLES, rng)
+        self._task.model.eval()
+        with torch.inference_mode():
+            self._task.draw(views, rng, self._folder / f"reconstructions_{self.progress.step:06d}.png")
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            "model": self._task.model.state_dict(),
+            "optimiser": self._optimiser.state_dict(),
+            "progress": asdict(self.progress),
+        }
+
+    def _log(self) -> None:
+        path = self._folder / "log.csv"
+        new = not path.exists()
+        with path.open("a", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            if new:
+                writer.writerow(["step", "seconds", "loss", "learning_rate"])
+            progress = self.progress
+            writer.writerow([progress.step, f"{progress.seconds:.1f}", f"{progress.loss:.5f}", self._learning_rate()])

@@ -1,0 +1,86 @@
+"""Which samples meet in a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from umf_ros.datasets.sample import SampleSequence
+from umf_ros.training.labels import Places, Rule, label, places_of
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """One sample of a batch: sequence, index in it, and whether it is mirrored."""
+
+    sequence: int
+    index: int
+    mirror: bool
+
+
+class PairSampler:
+    """Anchor-positive pairs: half of a batch along one stretch of one world, the rest from everywhere.
+
+    Neighbours along a stretch are what a place is most easily taken for; other worlds keep the
+    descriptors apart. Hard worlds are drawn twice as often as easy ones. Positives come from another
+    pass where there is one.
+    """
+
+    def __init__(self, sequences: Sequence[SampleSequence], rule: Rule, mirror: float = 0.5) -> None:
+        self._sequences = sequences
+        self._mirror = mirror
+        self._positives = [_positives(sequence, rule) for sequence in sequences]
+        self._usable = [np.flatnonzero([len(row) > 0 for row in rows]) for rows in self._positives]
+        weight = np.array([0.0 if not len(self._usable[k]) else _weight(s) for k, s in enumerate(sequences)])
+        self._chance = weight / weight.sum() if weight.sum() else weight
+
+    @property
+    def sequences(self) -> int:
+        """Number of sequences that have revisits."""
+        return int((self._chance > 0).sum())
+
+    def draw(self, pairs: int, rng: np.random.Generator) -> list[tuple[Draw, Draw]]:
+        """`pairs` anchor-positive pairs."""
+        world = int(rng.choice(len(self._chance), p=self._chance))
+        mirror = bool(rng.random() < self._mirror)
+        drawn = [self._pair(world, index, mirror, rng) for index in self._stretch(world, pairs // 2, rng)]
+        while len(drawn) < pairs:
+            other = int(rng.choice(len(self._chance), p=self._chance))
+            index = int(rng.choice(self._usable[other]))
+            drawn.append(self._pair(other, index, bool(rng.random() < self._mirror), rng))
+        return drawn
+
+    def _stretch(self, world: int, count: int, rng: np.random.Generator) -> list[int]:
+        """Half of them within 80 m of a random place, half anywhere in the world."""
+        usable = self._usable[world]
+        position = self._sequences[world].world_T_body[usable, :2, 3]
+        near = usable[np.linalg.norm(position - position[rng.integers(len(usable))], axis=1) < 80]
+        close = rng.choice(near, count // 2, replace=len(near) < count // 2)
+        return [*map(int, close), *map(int, rng.choice(usable, count - count // 2))]
+
+    def _pair(self, world: int, index: int, mirror: bool, rng: np.random.Generator) -> tuple[Draw, Draw]:
+        positive = int(rng.choice(self._positives[world][index]))
+        return Draw(world, index, mirror), Draw(world, positive, mirror)
+
+
+def _weight(sequence: SampleSequence) -> float:
+    return 1.0 if sequence.setting == "easy" else 2.0
+
+
+def _positives(sequence: SampleSequence, rule: Rule) -> list[np.ndarray]:
+    places = places_of(0, np.asarray(sequence.world_T_body))
+    positive, _ = label(places, places, rule)
+    other_pass = positive & (sequence.pass_index[:, None] != sequence.pass_index[None])
+    return [np.flatnonzero(row) for row in other_pass]
+
+
+def places_drawn(draws: Sequence[Draw], sequences: Sequence[SampleSequence]) -> Places:
+    """Places of a batch; a mirrored world is another world."""
+    poses = np.stack([sequences[draw.sequence].world_T_body[draw.index] for draw in draws])
+    flip = np.array([-1.0 if draw.mirror else 1.0 for draw in draws])
+    places = places_of(0, poses)
+    world = np.array([2 * draw.sequence + draw.mirror for draw in draws])
+    position = places.position * np.stack([np.ones_like(flip), flip], axis=1)
+    return Places(world, position, places.heading * flip)

@@ -1,0 +1,238 @@
+"""Metric learning of a UMF network (thesis 4.5.2)."""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from umf_ros.datasets.sample import SampleSequence
+from umf_ros.networks.umf import UMF, to_device
+from umf_ros.training.batches import BatchMaker, TrainingBatch
+from umf_ros.training.checkpoint import load_checkpoint, save_checkpoint
+from umf_ros.training.config import TrainingSettings
+from umf_ros.training.distributed import Team
+from umf_ros.training.labels import Rule
+from umf_ros.training.objective import Bank, Objective
+from umf_ros.training.sampler import PairSampler
+from umf_ros.training.validation import MODES, Retrieval, mean_of, validate
+from umf_ros.training.views import Augmentation, ViewMaker
+
+Worlds = Callable[[], Sequence[SampleSequence]]
+
+
+@dataclass
+class Progress:
+    """Where a run stands; what the progress bar and the log show."""
+
+    step: int = 0
+    batch: int = 32
+    seconds: float = 0.0
+    losses: dict[str, float] = field(default_factory=dict)
+    recall: float = float("nan")
+    best: float = -1.0
+    stale: int = 0
+
+
+class Trainer:
+    """Trains a network on simulated or recorded worlds.
+
+    Everything random in an epoch follows from the seed, the epoch and the rank, and checkpoints are
+    taken between epochs: a resumed run repeats an uninterrupted one.
+
+    Args:
+        network: trained in place.
+        settings: of the run.
+        training: gives the training sequences; asked again at every epoch.
+        validation: gives the sequences for recall, none at first if they are still being made.
+        folder: gets `checkpoint.pt` and `log.csv`.
+        team: this process among the others.
+    """
+
+    def __init__(
+        self,
+        network: UMF,
+        settings: TrainingSettings,
+        training: Worlds,
+        validation: Worlds,
+        folder: Path,
+        team: Team,
+    ) -> None:
+        self.progress = Progress(batch=settings.batch)
+        self.results: dict[str, dict[str, Retrieval]] = {}
+        self._settings, self._team, self._folder = settings, team, folder
+        self._training, self._validation = training, validation
+        self._network = network.to(team.device)
+        self._rule = Rule()
+        self._bank = Bank(settings.bank, network.config.descriptor)
+        objective: nn.Module = Objective(self._network, settings, self._rule).to(team.device)
+        self._trained = _choose_parameters(network, settings)
+        if team.size > 1:
+            objective = nn.parallel.DistributedDataParallel(objective)
+        self._objective = objective
+        self._optimiser = torch.optim.AdamW(self._trained, settings.learning_rate, weight_decay=settings.weight_decay)
+
+    def run(self, report: Callable[[Progress], None], keep: Callable[[UMF, dict[str, Any]], None]) -> None:
+        """Train until the steps are done or validation stops climbing.
+
+        Args:
+            report: called after every step.
+            keep: called by the leader with the network when it is the best so far, and the validation's summary.
+        """
+        settings = self._settings
+        while self.progress.step < settings.steps and not self._exhausted():
+            self._epoch(report)
+            epoch = math.ceil(self.progress.step / settings.epoch_steps)
+            last = self.progress.step >= settings.steps
+            if self._team.leads and (last or epoch % settings.validate_epochs == 0):
+                self._validate(keep)
+            self._share_verdict()
+            if self._team.leads:
+                self._log()
+                save_checkpoint(self._folder / "checkpoint.pt", self._state())
+
+    def resume(self) -> None:
+        """Go on from the checkpoint in the run's folder.
+
+        Raises:
+            WeightsError: there is none, or it is damaged.
+        """
+        state = load_checkpoint(self._folder / "checkpoint.pt")
+        self._network.load_state_dict(state["network"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._bank.restore(state["bank"])
+        self.progress = Progress(**state["progress"])
+
+    def _epoch(self, report: Callable[[Progress], None]) -> None:
+        settings, progress = self._settings, self.progress
+        epoch = progress.step // settings.epoch_steps
+        rng = np.random.default_rng([settings.seed, epoch, self._team.rank])
+        sequences = self._training()
+        augmentation = Augmentation()
+        sampler = PairSampler(sequences, self._rule, augmentation.mirror)
+        maker = BatchMaker(
+            sequences, ViewMaker(self._network.config, augmentation), settings.local_pairs, settings.local_matches
+        )
+        sums: dict[str, list[float]] = {}
+        end = min((epoch + 1) * settings.epoch_steps, settings.steps)
+        while progress.step < end:
+            started = time.perf_counter()
+            losses = self._step(maker.make(sampler.draw(progress.batch // 2, rng), rng), rng)
+            for name, value in losses.items():
+                sums.setdefault(name, []).append(value)
+            progress.losses = {name: float(np.mean(values[-50:])) for name, values in sums.items()}
+            progress.seconds += time.perf_counter() - started
+            progress.step += 1
+            report(progress)
+        if settings.loss == "triplet" and progress.losses["active"] < settings.active_share:
+            progress.batch = min(int(progress.batch * settings.batch_growth) // 2 * 2, settings.batch_limit)
+
+    def _step(self, batch: TrainingBatch, rng: np.random.Generator) -> dict[str, float]:
+        self._network.train()
+        for group in self._optimiser.param_groups:
+            group["lr"] = self._learning_rate()
+        device = self._team.device
+        batch = _move(batch, device)
+        present = self._drop(batch, rng)
+        bank = self._bank if self.progress.step >= self._settings.bank_from_step else Bank(0, self._bank_width())
+        with torch.autocast(device.type, torch.bfloat16, enabled=self._settings.half):
+            losses, fused = self._objective(batch, *present, bank)
+        self._optimiser.zero_grad()
+        losses["total"].backward()
+        nn.utils.clip_grad_norm_(self._trained, self._settings.clip)
+        self._optimiser.step()
+        self._bank.add(fused, batch.places)
+        return {name: float(value.detach()) for name, value in losses.items()}
+
+    def _bank_width(self) -> int:
+        return self._network.config.descriptor
+
+    def _learning_rate(self) -> float:
+        settings, step = self._settings, self.progress.step
+        warm = min(1.0, (step + 1) / max(settings.warmup_steps, 1))
+        return settings.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
+
+    def _drop(self, batch: TrainingBatch, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+        """Modality dropout: which rows keep their image and which their scan, never losing both."""
+        luck = torch.from_numpy(rng.random(len(batch.places.world))).to(self._team.device)
+        chance = self._settings.modality_dropout
+        image, cloud = batch.input.image_present, batch.input.coarse_mask.any(1)
+        return image & ((luck >= chance) | ~cloud), cloud & ((luck < 1 - chance) | ~image)
+
+    def _validate(self, keep: Callable[[UMF, dict[str, Any]], None]) -> None:
+        progress = self.progress
+        summary: dict[str, Any] = {"steps": progress.step}
+        sequences = self._validation()
+        if not sequences:
+            keep(self._network, summary)
+            return
+        self.results = validate(self._network, sequences, self._settings.validation_stride)
+        progress.recall = mean_of(self.results, "fused", "recall1")
+        score = progress.recall + mean_of(self.results, "fused", "recall1_5m")
+        progress.stale = 0 if score > progress.best else progress.stale + 1
+        if score > progress.best:
+            progress.best = score
+            keep(self._network, summary)
+
+    def _exhausted(self) -> bool:
+        return bool(self._settings.patience) and self.progress.stale >= self._settings.patience
+
+    def _share_verdict(self) -> None:
+        if self._team.size > 1:
+            stale = torch.tensor(self.progress.stale, device=self._team.device)
+            torch.distributed.broadcast(stale, 0)
+            self.progress.stale = int(stale)
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            "network": self._network.state_dict(),
+            "optimiser": self._optimiser.state_dict(),
+            "bank": self._bank.state(),
+            "progress": {name: getattr(self.progress, name) for name in self.progress.__dataclass_fields__},
+        }
+
+    def _log(self) -> None:
+        """One line per epoch; recalls only where there was a validation since the last line."""
+        row: dict[str, Any] = {"step": self.progress.step, "seconds": round(self.progress.seconds, 1)}
+        row |= {name: round(value, 5) for name, value in self.progress.losses.items()}
+        row |= {f"recall1_{mode}": round(mean_of(self.results, mode, "recall1"), 4) for mode in MODES}
+        row["recall1_5m"] = round(mean_of(self.results, "fused", "recall1_5m"), 4)
+        row["recall_at_precision1"] = round(mean_of(self.results, "fused", "recall_at_precision1"), 4)
+        row["learning_rate"], row["batch"] = round(self._learning_rate(), 7), self.progress.batch
+        path = self._folder / "log.csv"
+        new = not path.exists()
+        with path.open("a", newline="") as stream:
+            writer = csv.DictWriter(stream, list(row))
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+        self.results = {}
+
+
+def _choose_parameters(network: UMF, settings: TrainingSettings) -> list[nn.Parameter]:
+    """What the optimiser sees; the rest is switched off, so that nothing is silently left at random."""
+    frozen: list[nn.Module] = []
+    if settings.freeze_encoders:
+        frozen += [network.image_encoder, network.voxel_encoder]
+    if not settings.weight_super or not settings.local_pairs:
+        frozen += [network.super_image, network.super_cloud]
+    if not settings.local_pairs:
+        frozen += [network.image_local, network.cloud_local]
+    for module in frozen:
+        module.requires_grad_(False)
+    return [parameter for parameter in network.parameters() if parameter.requires_grad]
+
+
+def _move(batch: TrainingBatch, device: torch.device) -> TrainingBatch:
+    names = ("local_rows", "cells", "voxels", "useful_cells")
+    return replace(
+        batch, input=to_device(batch.input, device), **{name: getattr(batch, name).to(device) for name in names}
+    )

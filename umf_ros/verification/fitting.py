@@ -1,0 +1,102 @@
+"""Fitting the acceptance model and the covariance's size to closures whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from umf_ros.geometry import Array
+from umf_ros.verification.acceptance import MEASURES, Logistic, Numbers, measure
+from umf_ros.verification.covariance import Spread, covariance_of
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """One refined pose and whether it was right.
+
+    Attributes:
+        numbers: what verification measured.
+        kind: kind of evidence, "scan" or "image".
+        right: whether the pose was.
+    """
+
+    numbers: Numbers
+    kind: str
+    right: bool
+
+
+def fit_logistic(examples: list[Example], kind: str, ridge: float = 0.003) -> Logistic:
+    """Weights >= 0 of one kind of evidence by penalised maximum likelihood.
+
+    A measure that would argue against itself gets the weight 0: a decision that punishes a better
+    overlap because of a quirk of the fitted worlds would not carry over to others.
+
+    Args:
+        examples: all kinds; those of another kind are ignored.
+        kind: "scan" or "image".
+        ridge: penalty per example on the squared weights.
+
+    Raises:
+        ValueError: only right or only wrong examples.
+    """
+    mine = [example for example in examples if example.kind == kind]
+    right = np.array([example.right for example in mine], bool)
+    if right.all() or not right.any():
+        raise ValueError(f"need right and wrong examples of kind {kind}, got {int(right.sum())} right of {len(right)}")
+    rows = [measure(example.numbers, kind) for example in mine]
+    names = list(MEASURES[kind])
+    design = np.array([[1.0, *(row[name] for name in names)] for row in rows])
+    bounds = [(None, None)] + [(0.0, None)] * len(names)
+    start = np.concatenate([[-1.0], np.ones(len(names))])
+    solution = minimize(_loss, start, args=(design, right, ridge), jac=True, method="L-BFGS-B", bounds=bounds)
+    return Logistic(float(solution.x[0]), dict(zip(names, map(float, solution.x[1:]), strict=True)))
+
+
+def inside_ellipsoid(errors: Array, covariances: Array, confidence: float = 0.95) -> float:
+    """Share of the errors (N, 6) inside the confidence ellipsoid of their covariances (N, 6, 6)."""
+    return float(np.mean(_squared_distances(errors, covariances) < chi2.ppf(confidence, 6)))
+
+
+def _loss(parameters: Array, design: Array, right: NDArray[np.bool_], ridge: float) -> tuple[float, Array]:
+    """Mean negative log-likelihood with its penalty, and the gradient."""
+    odds = design @ parameters
+    sign = np.where(right, 1.0, -1.0)
+    likelihood = np.logaddexp(0.0, -sign * odds)
+    slope = -sign / (1.0 + np.exp(np.clip(sign * odds, -60, 60)))
+    penalty = np.concatenate([[0.0], parameters[1:]])
+    loss = likelihood.mean() + 0.5 * ridge * float(penalty @ penalty) / len(parameters)
+    return float(loss), design.T @ slope / len(right) + ridge * penalty / len(parameters)
+
+
+def fit_spread(errors: Array, informations: Array) -> Spread:
+    """The spread under which the errors are most likely, scaled so that 95 % lie inside their 95 % ellipsoid.
+
+    Args:
+        errors: (N, 6) of right closures, ROS order.
+        informations: (N, 6, 6) of their residuals.
+    """
+
+    def surprise(logarithms: Array) -> float:
+        covariances = covariance_of(informations, _spread(logarithms))
+        squared = _squared_distances(errors, covariances)
+        # a heavy tail, so that a few bad fits do not widen all others
+        return float(np.mean(np.linalg.slogdet(covariances)[1] + 16 * np.log1p(squared / 10)))
+
+    found = minimize(surprise, np.log([10.0, 0.01, 0.05]), method="Nelder-Mead", options={"maxiter": 300}).x
+    squared = _squared_distances(errors, covariance_of(informations, _spread(found)))
+    scale = float(np.quantile(squared, 0.95)) / float(chi2.ppf(0.95, 6))
+    return _spread(found + np.log(scale) * np.array([1.0, 0.5, 0.5]))
+
+
+def _spread(logarithms: Array) -> Spread:
+    inflation, floor_m, floor_deg = np.exp(np.clip(logarithms, np.log([0.1, 2e-3, 1e-2]), np.log([1e4, 0.5, 5.0])))
+    return Spread(float(inflation), float(floor_m), float(floor_deg))
+
+
+def _squared_distances(errors: Array, covariances: Array) -> Array:
+    distances: Array = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    return distances
