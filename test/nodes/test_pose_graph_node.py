@@ -103,7 +103,13 @@ def rig(ros_context: None) -> Iterator[Rig]:
 
 @pytest.fixture
 def process(tmp_path: Path) -> Iterator[Process]:
-    started = Process(MODULE, tmp_path / "node.log", f"results_dir:={tmp_path / 'results'}", "pose_graph.max_gap_s:=3")
+    started = Process(
+        MODULE,
+        tmp_path / "node.log",
+        f"results_dir:={tmp_path / 'results'}",
+        "pose_graph.max_gap_s:=3",
+        "pose_graph.estimate_scale:=true",
+    )
     started.wait_for("ready")
     yield started
     started.kill()
