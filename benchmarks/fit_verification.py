@@ -23,11 +23,12 @@ from umf_ros.config import Database, Loop, Verification
 from umf_ros.config import Embedding as EmbeddingSettings
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.frames import Candidate, Frame, Keyframe
+from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array
+from umf_ros.loop_detector import make_keyframe
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.simulation.seeds import VALIDATION
-from umf_ros.verification import Verifier, lift, thin_scan
+from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import Calibration, load_calibration, save_calibration
 from umf_ros.verification.covariance import covariance_of
 from umf_ros.verification.evidence import Evidence
@@ -96,7 +97,7 @@ def _examine(
     travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(drive.truth[:, :3, 3], axis=0), axis=1))])
     frames = track(drive.frames, f"world {drive.name}", transient=True)
     for query, (frame, distance) in enumerate(zip(frames, travelled, strict=True)):
-        keyframe = remember(frame, embedder, float(distance))
+        keyframe = make_keyframe(frame, embedder, float(distance))
         candidates = database.query(keyframe, rules)
         if candidates and query % stride == 0:
             chosen = _choose(drive, query, candidates, rng)
@@ -112,15 +113,6 @@ def _examine(
                 yield evidence, error, right, strength == 0 or evidence.kind == "image"
         database.add(keyframe)
     database.close()
-
-
-def remember(frame: Frame, embedder: Embedder, travelled_m: float) -> Keyframe:
-    """The keyframe that the loop detector would make of a frame."""
-    embedding = lift(frame, embedder.embed(frame))
-    points = thin_scan(frame.points)
-    return Keyframe(
-        frame.stamp_ns, embedding, frame.camera, frame.body_T_camera, points, frame.odom_T_body, travelled_m
-    )
 
 
 def _choose(drive: Drive, query: int, candidates: list[Candidate], rng: np.random.Generator) -> list[Candidate]:

@@ -19,7 +19,6 @@ from typing import Annotated
 import numpy as np
 import typer
 from drives import Drive, simulate, test_worlds
-from fit_verification import remember
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -31,6 +30,7 @@ from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.geometry import Array, heading, wrap_angle
+from umf_ros.loop_detector import make_keyframe
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
 from umf_ros.verification.fitting import inside_ellipsoid
@@ -109,7 +109,7 @@ def _replay(drive: Drive, embedder: Embedder) -> tuple[World, list[Query]]:
     verifier = Verifier(Verification())
     travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(drive.truth[:, :3, 3], axis=0), axis=1))])
     for query, frame in enumerate(track(drive.frames, f"world {drive.name}", transient=True)):
-        keyframe = remember(frame, embedder, float(travelled[query]))
+        keyframe = make_keyframe(frame, embedder, float(travelled[query]))
         found = [(one, database[one.index]) for one in database.query(keyframe, rules)]
         verdicts = verifier.verify(keyframe, found)
         closures = [verdict.closure for verdict in verdicts if verdict.closure is not None]

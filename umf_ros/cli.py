@@ -78,7 +78,7 @@ def main() -> NoReturn:
 
 
 def _fail(text: str, code: int) -> NoReturn:
-    print(f"umf: {text}", file=sys.stderr)
+    typer.echo(f"umf: {text}", err=True)
     sys.exit(code)
 
 

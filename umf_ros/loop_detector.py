@@ -66,7 +66,8 @@ class LoopDetector:
             return Detection(frame.stamp_ns)
         latency = Stopwatch()
         with latency.measure("embed"):
-            keyframe = self._remember(frame)
+            travelled_m = self._selector.travelled_m(frame)
+            keyframe = make_keyframe(frame, self._embedder, travelled_m, self._first_session)
         with latency.measure("query"):
             candidates = self.database.query(keyframe, self._rules)
         with latency.measure("verify"):
@@ -80,24 +81,35 @@ class LoopDetector:
         self._selector.reset()
         self._verifier.reset()
 
-    def _remember(self, frame: Frame) -> Keyframe:
-        return Keyframe(
-            stamp_ns=frame.stamp_ns,
-            embedding=lift(frame, self._embedder.embed(frame)),
-            camera=frame.camera,
-            body_T_camera=frame.body_T_camera,
-            points=thin_scan(frame.points),
-            odom_T_body=frame.odom_T_body,
-            travelled_m=self._selector.travelled_m(frame),
-            session=self._first_session + frame.session,
-        )
-
     def _start_session(self, frame: Frame) -> None:
         """The clock jumped back (a looped bag): what was recorded from here on lies in the future now."""
         self._session = frame.session
         self.database.forget_from(frame.stamp_ns)
         self._selector.reset()
         self._verifier.reset()
+
+
+def make_keyframe(
+    frame: Frame, embedder: Embedder, travelled_m: float = float("nan"), first_session: int = 0
+) -> Keyframe:
+    """The keyframe that a frame becomes: embedded, its features lifted to 3-D, its scan thinned.
+
+    Args:
+        frame: synchronised measurements.
+        embedder: the network.
+        travelled_m: metres driven since the start of the session, NaN when unknown.
+        first_session: number of the session that the frame counts as 0.
+    """
+    return Keyframe(
+        stamp_ns=frame.stamp_ns,
+        embedding=lift(frame, embedder.embed(frame)),
+        camera=frame.camera,
+        body_T_camera=frame.body_T_camera,
+        points=thin_scan(frame.points),
+        odom_T_body=frame.odom_T_body,
+        travelled_m=travelled_m,
+        session=first_session + frame.session,
+    )
 
 
 def make_detector_embedder(settings: Settings) -> Embedder:

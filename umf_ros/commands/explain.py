@@ -32,9 +32,7 @@ def command(
     from umf_ros.bags.presets import detect_dataset
     from umf_ros.bags.reader import open_bag
     from umf_ros.config import load_settings
-    from umf_ros.frames import Keyframe
-    from umf_ros.loop_detector import make_detector_embedder
-    from umf_ros.verification import lift, thin_scan
+    from umf_ros.loop_detector import make_detector_embedder, make_keyframe
     from umf_ros.verification.explanation import draw, explain
 
     console = Console()
@@ -51,18 +49,8 @@ def command(
     network = make_detector_embedder(settings)
     with console.status("looking for the two moments"):
         frames = _nearest(FrameReader(recording, settings), moments)
-    keyframes = [
-        Keyframe(
-            frame.stamp_ns,
-            lift(frame, network.embed(frame)),
-            frame.camera,
-            frame.body_T_camera,
-            thin_scan(frame.points),
-            frame.odom_T_body,
-        )
-        for frame in frames
-    ]
-    explanation = explain(keyframes[0], keyframes[1], settings.verification)
+    query_keyframe, match_keyframe = (make_keyframe(frame, network) for frame in frames)
+    explanation = explain(query_keyframe, match_keyframe, settings.verification)
     draw(explanation, frames[0].left, frames[1].left, out)
     console.print(explanation.verdict, highlight=False)
     if explanation.evidence is not None:

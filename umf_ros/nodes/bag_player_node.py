@@ -24,6 +24,7 @@ from rosgraph_msgs.msg import Clock
 
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.errors import BagError, UmfError
+from umf_ros.nodes.process import complain
 
 CLOCK_PERIOD_NS = 10_000_000
 SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
@@ -188,7 +189,7 @@ def main() -> None:
     except KeyboardInterrupt:
         pass
     except UmfError as error:
-        print(f"umf: {error}", file=sys.stderr)
+        complain(error)
         status = 1
     finally:
         rclpy.try_shutdown()

@@ -11,6 +11,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from rich.console import Console
 from sensor_msgs.msg import Image
 
 TIMEOUT_S = 15.0
@@ -54,13 +55,12 @@ def exchange() -> str:
 
 
 def main() -> None:
-    """Print one line; 0 when an image arrived."""
+    """One line on stdout and 0 when an image arrived, on stderr and 1 when none did."""
     started = time.monotonic()
     fault = exchange()
     if fault:
-        print(f"{fault} within {TIMEOUT_S:.0f} s")
-        sys.exit(1)
-    print(f"an image arrived after {time.monotonic() - started:.1f} s")
+        sys.exit(f"{fault} within {TIMEOUT_S:.0f} s")
+    Console().print(f"an image arrived after {time.monotonic() - started:.1f} s")
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     try:
         node = make_node()
     except UmfError as error:
-        print(f"umf: {error}", file=sys.stderr)
+        complain(error)
         rclpy.try_shutdown()
         return 1
     executor = SingleThreadedExecutor()
@@ -52,6 +52,11 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
         node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def complain(error: UmfError) -> None:
+    """Tell an error as the command line does: one line on stderr."""
+    sys.stderr.write(f"umf: {error}\n")
 
 
 class _StopRequest:
