@@ -25,7 +25,7 @@ from umf_ros.training.objective import Bank, Objective
 from umf_ros.training.run import train
 from umf_ros.training.sampler import PairSampler, places_drawn
 from umf_ros.training.trainer import Trainer
-from umf_ros.training.validation import retrieve, validate
+from umf_ros.training.validation import validate
 from umf_ros.training.views import Augmentation, ViewMaker
 
 RULE = Rule(positive_m=5)
@@ -181,23 +181,6 @@ def test_weights_of_another_image_size_can_start_a_run(folder, tmp_path):
     assert load_weights(second).config == replace(TINY, image_size=(32, 64))
     with pytest.raises(ConfigError, match="is not a umf_mobile"):
         train(settings_for(folder, preset="umf_mobile", start=str(first)), tmp_path / "c", False, silent)
-
-
-def test_recall_counts_true_places_only():
-    poses = np.stack([np.eye(4)] * 3)
-    poses[:, 0, 3] = [0, 30, 100]
-    references = np.eye(3, 4)
-    perfect = retrieve(references, poses, references, poses)
-    assert (perfect.recall1, perfect.recall1_5m, perfect.recall_at_precision1, perfect.queries) == (1, 1, 1, 3)
-    shifted = poses.copy()
-    shifted[:, 1, 3] = 8
-    assert retrieve(references, shifted, references, poses).recall1_5m == 0
-    wrong = retrieve(references[[1, 0, 2]], poses, references, poses)
-    assert wrong.recall1 == pytest.approx(1 / 3)
-    assert wrong.recall_at_precision1 == 0
-    away = poses.copy()
-    away[:, 0, 3] += 1000
-    assert retrieve(references, away, references, poses).queries == 0
 
 
 def test_validation_of_a_perfect_world(world):

@@ -3,86 +3,56 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
+
+from umf_ros.commands.train import step_bar
 
 app = typer.Typer(
     help="Pretrain an encoder without labels, by hiding a part of the data and predicting it.", no_args_is_help=True
 )
-
-Data = Annotated[Path, typer.Argument(help="Folder of worlds (.npz shards); no revisits or poses are needed.")]
-Out = Annotated[Path, typer.Option(help="Folder of the run: weights, card, log, pictures, checkpoint.")]
-Preset = Annotated[str | None, typer.Option(help="Network: umf_light, umf_mobile or umf_resnet50.")]
-Start = Annotated[str | None, typer.Option(help="Weights to start from, as of the other encoder's pretraining.")]
-Steps = Annotated[int | None, typer.Option(help="Optimiser steps in all.")]
-Batch = Annotated[int | None, typer.Option(help="Frames per step.")]
-Seed = Annotated[int | None, typer.Option(help="Seed of weights, batches and masks.")]
-Threads = Annotated[int | None, typer.Option(help="Threads.")]
-Device = Annotated[str | None, typer.Option(help="torch device, or auto.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")]
+_AFTERWARDS = "\n\n`umf train --start` begins with the weights that result."
+_IMAGE = f"Pretrain the image encoder: paint hidden patches (SparK).{_AFTERWARDS}"
+_LIDAR = f"Pretrain the voxel encoder: guess hidden voxels, most of them near the rover (Voxel-MAE).{_AFTERWARDS}"
 
 
-@app.command("image")
-def image(
-    data: Data,
-    out: Out = Path("runs/pretrain_image"),
-    preset: Preset = None,
-    mask_ratio: Annotated[float | None, typer.Option(help="Share of the patches that is hidden.")] = None,
-    start: Start = None,
-    steps: Steps = None,
-    batch: Batch = None,
-    seed: Seed = None,
-    threads: Threads = None,
-    device: Device = None,
-    resume: Resume = False,
+@app.command("image", help=_IMAGE)
+@app.command(
+    "lidar", help=f"Pretrain the voxel encoder: guess hidden voxels, most of them near (Voxel-MAE).{_AFTERWARDS}"
+)
+def command(
+    context: typer.Context,
+    data: Annotated[Path, typer.Argument(help="Folder of worlds (.npz shards); no revisits or poses are needed.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the run: weights, card, log, pictures, checkpoint; default: runs/pretrain_NAME."),
+    ] = None,
+    preset: Annotated[str | None, typer.Option(help="Network: umf_light, umf_mobile or umf_resnet50.")] = None,
+    mask_ratio: Annotated[float | None, typer.Option(help="Share of an image's patches that is hidden.")] = None,
+    start: Annotated[
+        str | None, typer.Option(help="Weights to start from, as of the other encoder's pretraining.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Optimiser steps in all.")] = None,
+    batch: Annotated[int | None, typer.Option(help="Frames per step.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of weights, batches and masks.")] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads.")] = None,
+    device: Annotated[str | None, typer.Option(help="torch device, or auto.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
 ) -> None:
-    """Pretrain the image encoder: paint hidden patches (SparK).
-
-    `umf train --start` begins with the weights that result.
-    """
-    chosen = {"preset": preset, "start": start, "steps": steps, "batch": batch, "seed": seed, "threads": threads}
-    _run("image", data, out, resume, device=device, mask_ratio=mask_ratio, **chosen)
-
-
-@app.command("lidar")
-def lidar(
-    data: Data,
-    out: Out = Path("runs/pretrain_lidar"),
-    preset: Preset = None,
-    start: Start = None,
-    steps: Steps = None,
-    batch: Batch = None,
-    seed: Seed = None,
-    threads: Threads = None,
-    device: Device = None,
-    resume: Resume = False,
-) -> None:
-    """Pretrain the voxel encoder: guess hidden voxels, most of them near the rover (Voxel-MAE).
-
-    `umf train --start` begins with the weights that result.
-    """
-    chosen = {"preset": preset, "start": start, "steps": steps, "batch": batch, "seed": seed, "threads": threads}
-    _run("lidar", data, out, resume, device=device, **chosen)
-
-
-def _run(modality: str, data: Path, out: Path, resume: bool, **chosen: Any) -> None:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bars
-
+    """Pretrain the encoder that the subcommand names."""
     from umf_ros.training.pretraining.pretrainer import Progress
     from umf_ros.training.pretraining.run import pretrain
     from umf_ros.training.pretraining.settings import make_settings
 
-    settings = make_settings(modality, data, **chosen)
-    console = Console()
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Bars(*columns, console=console) as bars:
-        bar = bars.add_task("pretraining", total=settings.steps)
+    modality = str(context.info_name)
+    out = out or Path(f"runs/pretrain_{modality}")
+    chosen = {"preset": preset, "mask_ratio": mask_ratio, "start": start, "steps": steps, "batch": batch}
+    settings = make_settings(modality, data, **chosen, seed=seed, threads=threads, device=device)
+    with step_bar("pretraining", settings.steps) as show:
 
         def report(progress: Progress) -> None:
-            bars.update(bar, completed=progress.step, description=f"loss {progress.loss:.4f}")
+            show(progress.step, f"loss {progress.loss:.4f}")
 
         weights = pretrain(settings, out, resume, report)
-    console.print(f"weights: {weights}\npictures: {out}/reconstructions_*.png")
+    typer.echo(f"weights: {weights}\npictures: {out}/reconstructions_*.png")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -23,10 +25,6 @@ def command(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
 ) -> None:
     """Train a network; under torchrun, on several processes or GPUs."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bars
-
     from umf_ros.training.config import load_training
     from umf_ros.training.run import train as run
     from umf_ros.training.trainer import Progress
@@ -34,14 +32,21 @@ def command(
     chosen = {"preset": preset, "steps": steps, "seed": seed, "loss": loss, "start": start}
     chosen |= {"threads": threads, "device": device, "validation": validation, "train": train}
     settings = load_training(config, **chosen)
-    console = Console()
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Bars(*columns, console=console) as bars:
-        bar = bars.add_task("training", total=settings.steps)
+    with step_bar("training", settings.steps) as show:
 
         def report(progress: Progress) -> None:
-            text = f"loss {progress.losses['total']:.3f}  recall@1 {progress.recall:.3f}"
-            bars.update(bar, completed=progress.step, description=text)
+            show(progress.step, f"loss {progress.losses['total']:.3f}  recall@1 {progress.recall:.3f}")
 
         weights = run(settings, out, resume, report)
-    console.print(f"weights: {weights}")
+    typer.echo(f"weights: {weights}")
+
+
+@contextmanager
+def step_bar(title: str, steps: int) -> Iterator[Callable[[int, str], None]]:
+    """A bar over the steps of a run; gives a function that shows how many are done, and a text before the bar."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns) as bars:
+        bar = bars.add_task(title, total=steps)
+        yield lambda done, text: bars.update(bar, completed=done, description=text)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +23,25 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
         torch.save(state, unfinished)
         unfinished.replace(path)
     except (OSError, RuntimeError) as error:
-        raise OutputError(f"cannot write {path}: {' '.join(str(error).split())}") from None
+        raise OutputError(f"cannot write {path}: {_one_line(error)}") from None
 
 
-def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint.
+@contextmanager
+def resuming(path: Path) -> Iterator[dict[str, Any]]:
+    """Read a checkpoint, to be taken over inside the block.
 
     Raises:
-        WeightsError: missing or damaged.
+        WeightsError: missing, damaged, or of a run that differs.
     """
     try:
-        return dict(torch.load(path, map_location="cpu", weights_only=True))
+        state = dict(torch.load(path, map_location="cpu", weights_only=True))
     except Exception as error:  # torch.load raises whatever the damaged bytes provoke
-        raise WeightsError(f"cannot resume from {path}: {' '.join(str(error).split())[:200]}") from None
+        raise WeightsError(f"cannot resume from {path}: {_one_line(error)}") from None
+    try:
+        yield state
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise WeightsError(f"cannot resume from {path}, which is of another run: {_one_line(error)}") from None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import yaml
 from pydantic import Field, ValidationError
@@ -62,11 +62,25 @@ def load_training(path: Path | None, **overrides: object) -> TrainingSettings:
     Raises:
         ConfigError: unreadable file, unknown name or wrong value.
     """
+    values = _read_yaml(path) if path else {}
+    values |= {name: value for name, value in overrides.items() if value is not None}
     try:
-        values = yaml.safe_load(path.read_text()) or {} if path else {}
-        return TrainingSettings(**values | {name: value for name, value in overrides.items() if value is not None})
-    except (OSError, yaml.YAMLError, TypeError) as error:
-        raise ConfigError(f"cannot read {path}: {' '.join(str(error).split())}") from None
+        return TrainingSettings.model_validate(values)
     except ValidationError as error:
-        problems = [f"{'.'.join(map(str, item['loc']))}: {item['msg'].lower()}" for item in error.errors()]
-        raise ConfigError("; ".join(problems)) from None
+        raise ConfigError(problems(error)) from None
+
+
+def problems(error: ValidationError) -> str:
+    """Every wrong setting and what is wrong with it, on one line."""
+    found = [(".".join(map(str, item["loc"])), item["msg"].lower()) for item in error.errors()]
+    return "; ".join(f"{name}: {text}" if name else text for name, text in found)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read {path}: {' '.join(str(error).split())}") from None
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: expected names and values, found a {type(values).__name__}")
+    return values

@@ -32,6 +32,11 @@ class Team:
         return self.rank == 0
 
 
+def choose_device(device: str) -> str:
+    """Name of a torch device; for "auto" a GPU's where there is one."""
+    return device if device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+
+
 @contextmanager
 def join_team(device: str) -> Iterator[Team]:
     """The team that `torchrun` started, or a team of one.
@@ -41,7 +46,7 @@ def join_team(device: str) -> Iterator[Team]:
     """
     size = int(os.environ.get("WORLD_SIZE", "1"))
     rank, local = int(os.environ.get("RANK", "0")), int(os.environ.get("LOCAL_RANK", "0"))
-    chosen = device if device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+    chosen = choose_device(device)
     target = torch.device(f"{chosen}:{local}" if chosen == "cuda" and size > 1 else chosen)
     if size == 1:
         yield Team(0, 1, target)

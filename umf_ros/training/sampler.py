@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from umf_ros.datasets.sample import SampleSequence
+from umf_ros.errors import ConfigError
 from umf_ros.training.labels import Places, Rule, label, places_of
 
 
@@ -26,6 +27,9 @@ class PairSampler:
     Neighbours along a stretch are what a place is most easily taken for; other worlds keep the
     descriptors apart. Hard worlds are drawn twice as often as easy ones. Positives come from another
     pass where there is one.
+
+    Raises:
+        ConfigError: no sequence has a revisit.
     """
 
     def __init__(self, sequences: Sequence[SampleSequence], rule: Rule, mirror: float = 0.5) -> None:
@@ -34,12 +38,9 @@ class PairSampler:
         self._positives = [_positives(sequence, rule) for sequence in sequences]
         self._usable = [np.flatnonzero([len(row) > 0 for row in rows]) for rows in self._positives]
         weight = np.array([0.0 if not len(self._usable[k]) else _weight(s) for k, s in enumerate(sequences)])
-        self._chance = weight / weight.sum() if weight.sum() else weight
-
-    @property
-    def sequences(self) -> int:
-        """Number of sequences that have revisits."""
-        return int((self._chance > 0).sum())
+        if not weight.any():
+            raise ConfigError("train: no place of these worlds is visited twice")
+        self._chance = weight / weight.sum()
 
     def draw(self, pairs: int, rng: np.random.Generator) -> list[tuple[Draw, Draw]]:
         """`pairs` anchor-positive pairs."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -15,15 +14,17 @@ import torch
 from torch import Tensor, nn
 
 from umf_ros.datasets.sample import SampleSequence
+from umf_ros.evaluation.scores import Scores
 from umf_ros.networks.umf import UMF, to_device
 from umf_ros.training.batches import BatchMaker, TrainingBatch
-from umf_ros.training.checkpoint import load_checkpoint, save_checkpoint
+from umf_ros.training.checkpoint import resuming, save_checkpoint
 from umf_ros.training.config import TrainingSettings
 from umf_ros.training.distributed import Team
 from umf_ros.training.labels import Rule
 from umf_ros.training.objective import Bank, Objective
 from umf_ros.training.sampler import PairSampler
-from umf_ros.training.validation import MODES, Retrieval, mean_of, validate
+from umf_ros.training.schedule import append_row, learning_rate
+from umf_ros.training.validation import MODES, mean_of, validate
 from umf_ros.training.views import Augmentation, ViewMaker
 
 Worlds = Callable[[], Sequence[SampleSequence]]
@@ -67,7 +68,7 @@ class Trainer:
         team: Team,
     ) -> None:
         self.progress = Progress(batch=settings.batch)
-        self.results: dict[str, dict[str, Retrieval]] = {}
+        self.results: dict[str, dict[str, Scores]] = {}
         self._settings, self._team, self._folder = settings, team, folder
         self._training, self._validation = training, validation
         self._network = network.to(team.device)
@@ -103,13 +104,13 @@ class Trainer:
         """Go on from the checkpoint in the run's folder.
 
         Raises:
-            WeightsError: there is none, or it is damaged.
+            WeightsError: there is none, it is damaged, or of another network.
         """
-        state = load_checkpoint(self._folder / "checkpoint.pt")
-        self._network.load_state_dict(state["network"])
-        self._optimiser.load_state_dict(state["optimiser"])
-        self._bank.restore(state["bank"])
-        self.progress = Progress(**state["progress"])
+        with resuming(self._folder / "checkpoint.pt") as state:
+            self._network.load_state_dict(state["network"])
+            self._optimiser.load_state_dict(state["optimiser"])
+            self._bank.restore(state["bank"])
+            self.progress = Progress(**state["progress"])
 
     def _epoch(self, report: Callable[[Progress], None]) -> None:
         settings, progress = self._settings, self.progress
@@ -156,9 +157,8 @@ class Trainer:
         return self._network.config.descriptor
 
     def _learning_rate(self) -> float:
-        settings, step = self._settings, self.progress.step
-        warm = min(1.0, (step + 1) / max(settings.warmup_steps, 1))
-        return settings.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
+        settings = self._settings
+        return learning_rate(settings.learning_rate, settings.warmup_steps, self.progress.step, settings.steps)
 
     def _drop(self, batch: TrainingBatch, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
         """Modality dropout: which rows keep their image and which their scan, never losing both."""
@@ -170,13 +170,12 @@ class Trainer:
     def _validate(self, keep: Callable[[UMF, dict[str, Any]], None]) -> None:
         progress = self.progress
         summary: dict[str, Any] = {"steps": progress.step}
-        sequences = self._validation()
-        if not sequences:
-            keep(self._network, summary)
+        self.results = validate(self._network, self._validation(), self._settings.validation_stride)
+        if not any(found.queries for by_mode in self.results.values() for found in by_mode.values()):
+            keep(self._network, summary)  # nothing to compare by: the latest is the best
             return
-        self.results = validate(self._network, sequences, self._settings.validation_stride)
         progress.recall = mean_of(self.results, "fused", "recall1")
-        score = progress.recall + mean_of(self.results, "fused", "recall1_5m")
+        score = progress.recall + mean_of(self.results, "fused", "recall1_within_5m")
         progress.stale = 0 if score > progress.best else progress.stale + 1
         if score > progress.best:
             progress.best = score
@@ -204,16 +203,10 @@ class Trainer:
         row: dict[str, Any] = {"step": self.progress.step, "seconds": round(self.progress.seconds, 1)}
         row |= {name: round(value, 5) for name, value in self.progress.losses.items()}
         row |= {f"recall1_{mode}": round(mean_of(self.results, mode, "recall1"), 4) for mode in MODES}
-        row["recall1_5m"] = round(mean_of(self.results, "fused", "recall1_5m"), 4)
+        row["recall1_5m"] = round(mean_of(self.results, "fused", "recall1_within_5m"), 4)
         row["recall_at_precision1"] = round(mean_of(self.results, "fused", "recall_at_precision1"), 4)
         row["learning_rate"], row["batch"] = round(self._learning_rate(), 7), self.progress.batch
-        path = self._folder / "log.csv"
-        new = not path.exists()
-        with path.open("a", newline="") as stream:
-            writer = csv.DictWriter(stream, list(row))
-            if new:
-                writer.writeheader()
-            writer.writerow(row)
+        append_row(self._folder / "log.csv", row)
         self.results = {}
 
 

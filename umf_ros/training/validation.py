@@ -2,66 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from umf_ros.datasets.sample import SampleSequence
-from umf_ros.geometry import Array
+from umf_ros.evaluation.protocol import place_recognition
+from umf_ros.evaluation.retrieval import rank
+from umf_ros.evaluation.scores import Scores, score
 from umf_ros.networks.umf import UMF, to_device
 from umf_ros.training.batches import stack_views
-from umf_ros.training.labels import distances, places_of
 from umf_ros.training.views import ViewMaker
 
 MODES = ("fused", "image", "cloud")
 
 
-@dataclass(frozen=True, slots=True)
-class Retrieval:
-    """How well the best match of each query is a true one.
-
-    Attributes:
-        recall1: share of queries whose best match lies within 12 m and 30 deg.
-        recall5: share with such a match among the best five.
-        recall1_5m: share whose best match lies within 5 m and 30 deg.
-        recall_at_precision1: share of queries found above the similarity of the best wrong match.
-        queries: queries that have a true match.
-    """
-
-    recall1: float
-    recall5: float
-    recall1_5m: float
-    recall_at_precision1: float
-    queries: int
-
-
-def retrieve(
-    queries: Array, query_poses: Array, references: Array, reference_poses: Array, radius_m: float = 12.0
-) -> Retrieval:
-    """Score queries (Q, D) against references (R, D); poses (Q, 4, 4) and (R, 4, 4) of one world."""
-    metres, turn = distances(places_of(0, query_poses), places_of(0, reference_poses))
-    alike = turn < np.radians(30)
-    true = (metres < radius_m) & alike
-    answerable = true.any(1)
-    if not answerable.any():
-        unknown = float("nan")
-        return Retrieval(unknown, unknown, unknown, unknown, 0)
-    true, near = true[answerable], ((metres < 5) & alike)[answerable]
-    similarity = queries[answerable] @ references.T
-    order = np.argsort(-similarity, axis=1, kind="stable")[:, :5]
-    hits = np.take_along_axis(true, order, 1)
-    best = np.take_along_axis(similarity, order[:, :1], 1)[:, 0]
-    wrong = best[~hits[:, 0]].max(initial=-np.inf)
-    return Retrieval(
-        recall1=float(hits[:, 0].mean()),
-        recall5=float(hits.any(1).mean()),
-        recall1_5m=float(np.take_along_axis(near, order[:, :1], 1).mean()),
-        recall_at_precision1=float((hits[:, 0] & (best > wrong)).mean()),
-        queries=int(answerable.sum()),
-    )
+_FIGURES = ("queries", "recall1", "recall5", "recall1_within_5m", "recall_at_precision1")
 
 
 def describe(
@@ -87,7 +46,7 @@ def describe(
     return {mode: np.concatenate(parts) for mode, parts in found.items()}
 
 
-def validate(network: UMF, sequences: Sequence[SampleSequence], stride: int = 1) -> dict[str, dict[str, Retrieval]]:
+def validate(network: UMF, sequences: Sequence[SampleSequence], stride: int = 1) -> dict[str, dict[str, Scores]]:
     """Retrieval by sequence and mode; every `stride`-th sample is used.
 
     Queries of a pass in the opposite direction have no true match and do not count.
@@ -95,17 +54,21 @@ def validate(network: UMF, sequences: Sequence[SampleSequence], stride: int = 1)
     results = {}
     for sequence in sequences:
         rows = np.arange(0, len(sequence), stride)
-        first = np.asarray(sequence.pass_index)[rows] == 0
-        poses = np.asarray(sequence.world_T_body)[rows]
-        descriptors = describe(network, sequence, rows)
+        task = place_recognition(np.asarray(sequence.world_T_body)[rows], np.asarray(sequence.pass_index)[rows])
         results[sequence.name] = {
-            mode: retrieve(found[~first], poses[~first], found[first], poses[first])
-            for mode, found in descriptors.items()
+            mode: score(task, rank(found[task.queries] @ found[task.references].T))
+            for mode, found in describe(network, sequence, rows).items()
         }
     return results
 
 
-def mean_of(results: dict[str, dict[str, Retrieval]], mode: str, name: str) -> float:
+def figures(found: Scores) -> dict[str, float | None]:
+    """The figures that a card keeps, by name; None for what could not be measured."""
+    values = {name: getattr(found, name) for name in _FIGURES}
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+def mean_of(results: dict[str, dict[str, Scores]], mode: str, name: str) -> float:
     """Mean over the worlds of one number of one mode."""
     values = [getattr(by_mode[mode], name) for by_mode in results.values() if by_mode[mode].queries]
     return float(np.mean(values)) if values else float("nan")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -17,9 +15,10 @@ from torch import nn
 from umf_ros.datasets.sample import SampleSequence
 from umf_ros.errors import ConfigError
 from umf_ros.networks.umf import UMF
-from umf_ros.training.checkpoint import load_checkpoint, save_checkpoint
+from umf_ros.training.checkpoint import resuming, save_checkpoint
 from umf_ros.training.pretraining.settings import PretrainingSettings
 from umf_ros.training.pretraining.tasks import make_task
+from umf_ros.training.schedule import append_row, learning_rate
 from umf_ros.training.views import Augmentation, View, ViewMaker
 
 EXAMPLES = 4
@@ -85,12 +84,12 @@ class Pretrainer:
         """Go on from the checkpoint in the run's folder.
 
         Raises:
-            WeightsError: there is none, or it is damaged.
+            WeightsError: there is none, it is damaged, or of another network or modality.
         """
-        state = load_checkpoint(self._folder / "checkpoint.pt")
-        self._task.model.load_state_dict(state["model"])
-        self._optimiser.load_state_dict(state["optimiser"])
-        self.progress = Progress(**state["progress"])
+        with resuming(self._folder / "checkpoint.pt") as state:
+            self._task.model.load_state_dict(state["model"])
+            self._optimiser.load_state_dict(state["optimiser"])
+            self.progress = Progress(**state["progress"])
 
     def _epoch(self, report: Callable[[Progress], None]) -> None:
         settings, progress = self._settings, self.progress
@@ -133,9 +132,8 @@ class Pretrainer:
         return float(loss.detach())
 
     def _learning_rate(self) -> float:
-        settings, step = self._settings, self.progress.step
-        warm = min(1.0, (step + 1) / max(settings.warmup_steps, 1))
-        return settings.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
+        settings = self._settings
+        return learning_rate(settings.learning_rate, settings.warmup_steps, self.progress.step, settings.steps)
 
     def _draw(self) -> None:
         """The same examples under the same masks every time, so that progress can be seen."""
@@ -153,11 +151,6 @@ class Pretrainer:
         }
 
     def _log(self) -> None:
-        path = self._folder / "log.csv"
-        new = not path.exists()
-        with path.open("a", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream)
-            if new:
-                writer.writerow(["step", "seconds", "loss", "learning_rate"])
-            progress = self.progress
-            writer.writerow([progress.step, f"{progress.seconds:.1f}", f"{progress.loss:.5f}", self._learning_rate()])
+        step, seconds, loss = self.progress.step, self.progress.seconds, self.progress.loss
+        row = {"step": step, "seconds": round(seconds, 1), "loss": round(loss, 5)}
+        append_row(self._folder / "log.csv", row | {"learning_rate": self._learning_rate()})

@@ -9,6 +9,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from umf_ros.config import Group
 from umf_ros.errors import ConfigError
+from umf_ros.training.config import problems
 
 
 class PretrainingSettings(Group):
@@ -41,6 +42,12 @@ class PretrainingSettings(Group):
             raise ValueError("ring_ratios must not grow with distance and lie between 0 and 1")
         return self
 
+    @model_validator(mode="after")
+    def _patches_are_of_images(self) -> PretrainingSettings:
+        if self.modality == "lidar" and "mask_ratio" in self.model_fields_set:
+            raise ValueError("mask_ratio is of images; ring_ratios say what is hidden of a scan")
+        return self
+
 
 def make_settings(modality: str, data: Path, **chosen: Any) -> PretrainingSettings:
     """Settings from what the command line names; None is skipped.
@@ -52,5 +59,4 @@ def make_settings(modality: str, data: Path, **chosen: Any) -> PretrainingSettin
     try:
         return PretrainingSettings.model_validate({"modality": modality, "data": str(data)} | values)
     except ValidationError as error:
-        problems = [f"{'.'.join(map(str, item['loc']))}: {item['msg'].lower()}" for item in error.errors()]
-        raise ConfigError("; ".join(problems)) from None
+        raise ConfigError(problems(error)) from None

@@ -1,0 +1,101 @@
+"""What runs of metric learning and of pretraining have in common: their data, their network, their card."""
+
+from __future__ import annotations
+
+import platform
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from pydantic import BaseModel
+
+from umf_ros.datasets.sample import SampleSequence
+from umf_ros.datasets.simulated import WorldFolder
+from umf_ros.errors import ConfigError, OutputError
+from umf_ros.networks.presets import PRESETS
+from umf_ros.networks.umf import UMF, channels_last, count_parameters
+from umf_ros.networks.weights import load_weights
+
+
+def check_preset(name: str) -> None:
+    """Refuse a network that is not known by name.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if name not in PRESETS:
+        raise ConfigError(f"preset: unknown network {name}; known: {', '.join(PRESETS)}")
+
+
+def open_worlds(folder: str, setting: str) -> WorldFolder:
+    """The worlds to learn from.
+
+    Args:
+        folder: where they are.
+        setting: which setting names the folder.
+
+    Raises:
+        ConfigError: there are none in it.
+        UmfError: it is no folder, or a world in it is damaged.
+    """
+    worlds = WorldFolder(Path(folder))
+    if not worlds.refresh():
+        raise ConfigError(f"{setting}: there are no worlds in {folder}")
+    return worlds
+
+
+def make_network(preset: str, start: str, image_size: tuple[int, int] | None = None) -> UMF:
+    """A fresh network to train, or one that starts from weights, perhaps trained at another image size.
+
+    Args:
+        preset: its name.
+        start: weights file; empty: none.
+        image_size: height and width of the input; None: the preset's.
+
+    Raises:
+        ConfigError: the weights are those of another preset.
+        WeightsError: they cannot be read.
+    """
+    config = PRESETS[preset]
+    if image_size:
+        config = replace(config, image_size=image_size)
+    network = UMF(config)
+    if start:
+        trained = load_weights(Path(start))
+        if replace(trained.config, image_size=config.image_size) != config:
+            raise ConfigError(f"start: {start} is not a {preset}")
+        network.load_state_dict(trained.state_dict())
+    channels_last(network)
+    return network.train()
+
+
+def write_settings(settings: BaseModel, path: Path) -> None:
+    """Write settings as YAML, making the folder they belong to.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(yaml.safe_dump(settings.model_dump(), sort_keys=False))
+    except OSError as error:
+        raise OutputError(f"cannot write to {path.parent}: {error.strerror}") from None
+
+
+def common_card(name: str, network: UMF, worlds: Sequence[SampleSequence], seconds: float) -> dict[str, Any]:
+    """What every card says: the network, the data, the command without its folders, and how long it took."""
+    words = [re.sub(r"[^=]*/", "", word.rstrip("/")) for word in sys.argv[1:]]
+    return {
+        "name": name,
+        "parameters": count_parameters(network),
+        "command": " ".join(["umf", *words]),
+        "training_hours": round(seconds / 3600, 3),
+        "training_worlds": [world.name for world in worlds],
+        "torch": torch.__version__,
+        "machine": platform.processor() or platform.machine(),
+    }
