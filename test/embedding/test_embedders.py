@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import CAMERA
-from networks.conftest import TINY, some_scan
+from tiny_worlds import TINY, some_scan
 
 from umf_ros.config import Embedding as EmbeddingSettings
 from umf_ros.embedding import make_embedder

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from networks.conftest import some_scan
+from tiny_worlds import some_scan
 
 from umf_ros.embedding.images import is_blank, shrink, standardise
 from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_salient

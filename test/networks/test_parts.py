@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import torch
-from networks.conftest import TINY
+from tiny_worlds import TINY
 
 from umf_ros.networks.attention import Attention, received
 from umf_ros.networks.fusion import GeneralisedMean, Tokens

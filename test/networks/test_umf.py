@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from networks.conftest import TINY, some_input
+from tiny_worlds import TINY, some_input
 
 from umf_ros.networks.presets import PRESETS, NetworkConfig
 from umf_ros.networks.umf import UMF, channels_last, count_parameters

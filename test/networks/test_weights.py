@@ -4,8 +4,8 @@ import json
 
 import pytest
 import torch
-from networks.conftest import TINY, some_input
 from safetensors.torch import load_file, save_file
+from tiny_worlds import TINY, some_input
 
 from umf_ros.errors import OutputError, WeightsError
 from umf_ros.networks.presets import NetworkConfig

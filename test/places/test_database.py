@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import weakref
 from dataclasses import fields
 from pathlib import Path
 
@@ -80,12 +81,15 @@ def test_best_match_comes_first_and_weak_ones_can_be_cut() -> None:
 
 def test_memory_is_bounded_and_the_disk_remembers() -> None:
     places = database(cached=20)
-    keyframes = [make_keyframe(i, seed=i) for i in range(100)]
-    for keyframe in keyframes:
+    scans: list[weakref.ref[np.ndarray]] = []
+    for i in range(100):
+        keyframe = make_keyframe(i, seed=i)
+        scans.append(weakref.ref(keyframe.points))
         places.add(keyframe)
-    assert len(places._store._cache) == 20
+    del keyframe
+    assert [scan() is not None for scan in scans] == [False] * 80 + [True] * 20
     for index in (0, 57, 99):
-        assert_same(places[index], keyframes[index])
+        assert_same(places[index], make_keyframe(index, seed=index))
 
 
 def test_a_stored_database_is_found_again(tmp_path: Path) -> None:

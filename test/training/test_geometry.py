@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from networks.conftest import TINY
-from training.conftest import CAMERA, flat_sample, plain_view, pose_at
+from tiny_worlds import CAMERA, TINY, pose_at
+from training.conftest import flat_sample, plain_view
 
 from umf_ros.geometry import transform
 from umf_ros.training.correspondences import cell_points, match_cells, match_voxels

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from training.conftest import pose_at
+from tiny_worlds import pose_at
 
 from umf_ros.networks.local_features import LocalMap
 from umf_ros.networks.superfeatures import SuperMap

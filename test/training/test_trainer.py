@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from networks.conftest import TINY
+from tiny_worlds import TINY
 from training.conftest import write_world
 
 from umf_ros.datasets.simulated import SimulatedWorld, WorldFolder

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from umf_ros.config import Database, Loop
 from umf_ros.frames import Candidate, Keyframe
 from umf_ros.places.index import DescriptorIndex, Mask
-from umf_ros.places.store import KeyframeStore
+from umf_ros.places.store import Entry, KeyframeStore
 
 
 class PlaceDatabase:
@@ -33,8 +33,8 @@ class PlaceDatabase:
         self._stamps: list[int] = []
         self._travelled: list[float] = []
         self._sessions: list[int] = []
-        for index in range(len(self._store)):
-            self._register(self._store[index])
+        for entry in self._store.entries():
+            self._register(entry)
 
     def __len__(self) -> int:
         return len(self._index)
@@ -50,7 +50,7 @@ class PlaceDatabase:
     def add(self, keyframe: Keyframe) -> int:
         """Remember a keyframe and return its index."""
         self._store.add(keyframe)
-        return self._register(keyframe)
+        return self._register(Entry.of(keyframe))
 
     def query(self, keyframe: Keyframe, rules: Loop) -> list[Candidate]:
         """The most similar earlier places, best first, by exhaustive search.
@@ -84,11 +84,11 @@ class PlaceDatabase:
         """Release the file."""
         self._store.close()
 
-    def _register(self, keyframe: Keyframe) -> int:
-        self._stamps.append(keyframe.stamp_ns)
-        self._travelled.append(keyframe.travelled_m)
-        self._sessions.append(keyframe.session)
-        return self._index.add(keyframe.embedding.descriptor)
+    def _register(self, entry: Entry) -> int:
+        self._stamps.append(entry.stamp_ns)
+        self._travelled.append(entry.travelled_m)
+        self._sessions.append(entry.session)
+        return self._index.add(entry.descriptor)
 
     def _admissible(self, keyframe: Keyframe, rules: Loop) -> Mask:
         stamps = np.array(self._stamps, np.int64)

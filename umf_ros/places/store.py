@@ -7,14 +7,48 @@ import sqlite3
 import tempfile
 import threading
 from collections import OrderedDict
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
 
 from umf_ros.errors import OutputError, UmfError
 from umf_ros.frames import Keyframe
 from umf_ros.places.packing import pack, unpack
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+_TABLES = (
+    "CREATE TABLE about (content TEXT NOT NULL)",
+    # the blob comes last: whoever wants the columns before it does not read it
+    "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, stamp_ns INTEGER NOT NULL, session INTEGER NOT NULL, "
+    "travelled_m REAL, descriptor BLOB NOT NULL, data BLOB NOT NULL)",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What retrieval needs of a keyframe.
+
+    Attributes:
+        stamp_ns: key of the keyframe.
+        session: its session.
+        travelled_m: metres driven since the start of the session, NaN without odometry.
+        descriptor: (D,) float32, L2-normalised.
+    """
+
+    stamp_ns: int
+    session: int
+    travelled_m: float
+    descriptor: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, keyframe: Keyframe) -> Entry:
+        """The entry of a keyframe."""
+        return cls(keyframe.stamp_ns, keyframe.session, keyframe.travelled_m, keyframe.embedding.descriptor)
 
 
 class KeyframeStore:
@@ -39,40 +73,67 @@ class KeyframeStore:
         self._cached = cached
         self._folder = tempfile.TemporaryDirectory(prefix="umf_places_") if path is None else None
         self.path = path if path is not None else Path(self._folder.name) / "places.sqlite"  # type: ignore[union-attr]
-        self._connection = self._open(identity)
-        self._rows = [row for (row,) in self._connection.execute("SELECT id FROM keyframe ORDER BY id")]
+        self._rows: list[int] = []
+        self._connection = self._open({"schema": str(SCHEMA_VERSION), **identity})
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def __getitem__(self, index: int) -> Keyframe:
+        """The keyframe of an index.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
         with self._lock:
             row = self._rows[index]
             if row not in self._cache:
-                (blob,) = self._connection.execute("SELECT data FROM keyframe WHERE id = ?", (row,)).fetchone()
-                self._remember(row, unpack(blob))
+                self._remember(row, self._read(row))
             self._cache.move_to_end(row)
             return self._cache[row]
 
+    def entries(self) -> Iterator[Entry]:
+        """What retrieval needs of every keyframe, in their order; the keyframes themselves stay on disk.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        columns = "SELECT stamp_ns, session, travelled_m, descriptor FROM keyframe ORDER BY id"
+        try:
+            for stamp_ns, session, travelled_m, descriptor in self._connection.execute(columns):
+                # SQLite keeps a NaN as NULL
+                metres = float("nan") if travelled_m is None else travelled_m
+                yield Entry(stamp_ns, session, metres, np.frombuffer(descriptor, np.float32))
+        except sqlite3.Error as error:
+            raise UmfError(f"{self.path} is damaged: {error}") from None
+
     def add(self, keyframe: Keyframe) -> int:
-        """Append a keyframe and return its index."""
+        """Append a keyframe and return its index.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
         with self._lock:
             row = self._rows[-1] + 1 if self._rows else 1
-            try:
-                with self._connection:
-                    self._connection.execute("INSERT INTO keyframe VALUES (?, ?)", (row, pack(keyframe)))
-            except sqlite3.Error as error:
-                raise OutputError(f"cannot write {self.path}: {error}") from None
+            entry = Entry.of(keyframe)
+            descriptor = np.ascontiguousarray(entry.descriptor, np.float32).tobytes()
+            values = (row, entry.stamp_ns, entry.session, entry.travelled_m, descriptor, pack(keyframe))
+            with self._changing():
+                self._connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?, ?)", values)
             self._rows.append(row)
             self._remember(row, keyframe)
             return len(self._rows) - 1
 
     def keep(self, indices: list[int]) -> None:
-        """Forget every keyframe whose index is not listed."""
+        """Forget every keyframe whose index is not listed.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
         with self._lock:
             kept = [self._rows[index] for index in indices]
             gone = set(self._rows) - set(kept)
-            with self._connection:
+            with self._changing():
                 self._connection.executemany("DELETE FROM keyframe WHERE id = ?", [(row,) for row in gone])
             self._rows = kept
             for row in gone:
@@ -87,10 +148,8 @@ class KeyframeStore:
         part = path.with_name(path.name + ".part")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with self._lock:
-                target = sqlite3.connect(part)
+            with self._lock, closing(sqlite3.connect(part)) as target:
                 self._connection.backup(target)
-                target.close()
             part.replace(path)
         except (OSError, sqlite3.Error) as error:
             with suppress(OSError):
@@ -109,29 +168,61 @@ class KeyframeStore:
         while len(self._cache) > self._cached:
             self._cache.popitem(last=False)
 
+    def _read(self, row: int) -> Keyframe:
+        try:
+            (blob,) = self._connection.execute("SELECT data FROM keyframe WHERE id = ?", (row,)).fetchone()
+            return unpack(blob)
+        except (sqlite3.Error, SafetensorError) as error:
+            raise UmfError(f"{self.path} is damaged at its keyframe {row}: {error}") from None
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """All of the block is written, or nothing."""
+        try:
+            with self._connection:
+                yield
+        except sqlite3.Error as error:
+            raise OutputError(f"cannot write {self.path}: {error}") from None
+
     def _open(self, identity: dict[str, str]) -> sqlite3.Connection:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             connection = sqlite3.connect(self.path, check_same_thread=False)
-            # WAL without a sync per keyframe: safe against a crash of the process
-            connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute("PRAGMA synchronous = NORMAL")
-            with connection:
-                connection.execute("CREATE TABLE IF NOT EXISTS about (content TEXT NOT NULL)")
-                connection.execute("CREATE TABLE IF NOT EXISTS keyframe (id INTEGER PRIMARY KEY, data BLOB NOT NULL)")
-                self._check_identity(connection, {"schema": str(SCHEMA_VERSION), **identity})
-        except sqlite3.DatabaseError as error:
+        except (OSError, sqlite3.Error) as error:
+            raise OutputError(f"cannot write {self.path}: {error}") from None
+        try:
+            self._prepare(connection, identity)
+            self._rows = [row for (row,) in connection.execute("SELECT id FROM keyframe ORDER BY id")]
+        except UmfError:
+            connection.close()
+            raise
+        except sqlite3.Error as error:
+            connection.close()
             raise UmfError(f"{self.path} cannot be used as a place database: {error}") from None
-        except OSError as error:
-            raise OutputError(f"cannot write {self.path}: {error.strerror}") from None
         return connection
 
+    def _prepare(self, connection: sqlite3.Connection, identity: dict[str, str]) -> None:
+        """Make an empty file a place database, and look at what others are before anything is changed."""
+        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if tables:
+            if not {"about", "keyframe"} <= tables:
+                raise UmfError(f"{self.path} is no place database, but another one with {', '.join(sorted(tables))}")
+            self._check_identity(connection, identity)
+        # WAL without a sync per keyframe: safe against a crash of the process
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        if not tables:
+            with connection:
+                connection.execute("BEGIN")
+                for table in _TABLES:
+                    connection.execute(table)
+                connection.execute("INSERT INTO about VALUES (?)", (json.dumps(identity),))
+
     def _check_identity(self, connection: sqlite3.Connection, identity: dict[str, str]) -> None:
-        found = connection.execute("SELECT content FROM about").fetchone()
-        if found is None:
-            connection.execute("INSERT INTO about VALUES (?)", (json.dumps(identity),))
-            return
-        stored = json.loads(found[0])
+        about = connection.execute("SELECT content FROM about").fetchone()
+        stored = json.loads(about[0]) if about else {}
+        if stored.get("schema") != identity["schema"]:
+            raise UmfError(f"{self.path} was written by another version of umf_ros; name a new file (database.path)")
         wrong = [
             f"{name} {stored.get(name)}, not {value}" for name, value in identity.items() if stored.get(name) != value
         ]

@@ -56,14 +56,15 @@ class Agreement:
         """
         friends = [other for other in self._friends[row] if members[other]]
         friends.sort(key=lambda other: -sum(1 for third in friends if third in self._friends[other]))
-        group, evidence = [row], 0.0
+        group, witnesses, evidence = [row], [row], 0.0
         for other in friends:
             if any(other in self._enemies[member] for member in group):
                 continue
-            chances = [self._friends[other][m] for m in group if m in self._friends[other]]
-            if not self._same_place(other, group):
-                evidence -= float(np.log(max(min(chances), 1e-6)))
             group.append(other)
+            if not self._same_place(other, witnesses):
+                chance = min(self._friends[other][w] for w in witnesses if w in self._friends[other])
+                evidence -= float(np.log(max(chance, 1e-6)))
+                witnesses.append(other)
         return group, evidence
 
     def contested(self, row: int, members: NDArray[np.bool_]) -> bool:

@@ -53,17 +53,21 @@ class Judge:
         self._vetoed: set[int] = set()
         self._too_far: set[int] = set()
         self._contests: dict[int, int] = {}
+        self._brought_close: list[int] = []
         self.scale = Scale()
         self.closures: list[TrackedClosure] = []
 
     def consider(self, arrived: list[TrackedClosure]) -> list[ClosureVerdict]:
-        """Take closures in; returns the verdicts that are new or changed."""
+        """Take closures in; returns the verdicts that are new or changed.
+
+        The map is solved once at most: what the moved map comes close to is looked at with the next call.
+        """
         rows = [self._take(tracked) for tracked in arrived]
         self._changed = set(rows)
         if self._rescale() or (self._certainty is None and rows):
             self._solve()
             rows = list(range(len(self.closures)))
-        self._decide_all(rows)
+        self._decide({*rows, *self._brought_close})
         return self._verdicts()
 
     def settle(self) -> list[ClosureVerdict]:
@@ -71,9 +75,9 @@ class Judge:
         self._changed = set()
         if self._certainty is None:
             return []
-        self._decide_all(range(len(self.closures)))
-        self._accept(self._unopposed(0.0), _UNOPPOSED)
-        self._decide_all(range(len(self.closures)))
+        self._decide_all()
+        self._accept(dict.fromkeys(self._unopposed(0.0), _UNOPPOSED))
+        self._decide_all()
         self._ask_again()
         for _ in range(_MOST_ROUNDS):
             self._sessions.reshape()
@@ -92,7 +96,7 @@ class Judge:
         self._changed = set()
         self._vetoed.add(row)
         was_accepted = self.closures[row].accepted
-        self._decide(row, State.REJECTED, _BY_HAND)
+        self._note(row, State.REJECTED, _BY_HAND)
         if was_accepted:
             self._solve()
         return self._verdicts()
@@ -113,20 +117,24 @@ class Judge:
         ends = [self._poses(side, rows)[:, :3, 3] for side in (self._ends.match, self._ends.query)]
         return np.stack(ends, axis=1)
 
-    def _decide_all(self, rows: Iterable[int]) -> None:
-        rows = list(rows)
+    def _decide_all(self) -> None:
+        rows: Iterable[int] = range(len(self.closures))
         for _ in range(_MOST_ROUNDS):
-            agreed = self._gate(rows)
-            believed = self._believe(rows) - agreed
-            patient = self._unopposed(self._settings.patience_m) - agreed - believed
-            challengers = self._challengers(rows)
-            if not (agreed or believed or patient or challengers):
+            if not self._decide(rows):
                 return
-            self._accept(agreed, _AGREES)
-            self._accept(believed, _SUPPORTED)
-            self._accept(patient, _UNOPPOSED)
-            self._accept(challengers, _SUPPORTED)
-            rows = self._worth_another_look()
+            rows = self._brought_close
+
+    def _decide(self, rows: Iterable[int]) -> bool:
+        """Look at closures and solve the map for those that are accepted; False without any."""
+        rows = sorted(rows)
+        agreed = self._gate(rows)
+        believed = self._believe(rows)
+        reasons = dict.fromkeys(self._challengers(rows), _SUPPORTED)
+        reasons |= dict.fromkeys(self._unopposed(self._settings.patience_m), _UNOPPOSED)
+        reasons |= dict.fromkeys(believed, _SUPPORTED) | dict.fromkeys(agreed, _AGREES)
+        self._accept(reasons)
+        self._brought_close = self._worth_another_look() if reasons else []
+        return bool(reasons)
 
     def _take(self, tracked: TrackedClosure) -> int:
         row = len(self.closures)
@@ -155,12 +163,12 @@ class Judge:
             distance, misfit_m, chance = self._compare(row)
             self._too_far.discard(row)
             if self._settings.use_gate and distance > self._settings.gate_chi2:
-                self._decide(row, State.REJECTED, _CONTRADICTS, distance, misfit_m)
+                self._note(row, State.REJECTED, _CONTRADICTS, distance, misfit_m)
             elif self._settings.max_correction_m and misfit_m > self._settings.max_correction_m:
                 self._too_far.add(row)
-                self._decide(row, State.REJECTED, f"moves the pose by {misfit_m:.1f} m", distance, misfit_m)
+                self._note(row, State.REJECTED, f"moves the pose by {misfit_m:.1f} m", distance, misfit_m)
             else:
-                self._decide(row, State.UNDECIDED, _UNSURE, distance, misfit_m)
+                self._note(row, State.UNDECIDED, _UNSURE, distance, misfit_m)
                 if chance <= self._settings.max_chance or not self._settings.use_support:
                     agreed.add(row)
         return agreed
@@ -220,7 +228,7 @@ class Judge:
             losers = self._contradicted_by(group)
             if losers is not None and self._agreement.places(losers) < places:
                 for row in losers:
-                    self._decide(row, State.REJECTED, _OUTVOTED)
+                    self._note(row, State.REJECTED, _OUTVOTED)
                 return set(group)
         return set()
 
@@ -244,15 +252,15 @@ class Judge:
             return
         if doubtful and self._agreement.places(doubtful) < self._agreement.places(accepted) / 2:
             for row in doubtful:
-                self._decide(row, State.REJECTED, _OUTVOTED)
+                self._note(row, State.REJECTED, _OUTVOTED)
             self._solve()
-            self._accept(self._gate(doubtful), _AGREES)
+            self._accept(dict.fromkeys(self._gate(doubtful), _AGREES))
 
-    def _accept(self, rows: set[int], reason: str) -> None:
-        if rows:
-            for row in rows:
+    def _accept(self, reasons: dict[int, str]) -> None:
+        if reasons:
+            for row, reason in reasons.items():
                 verdict = self.closures[row].verdict
-                self._decide(row, State.ACCEPTED, reason, verdict.residual**2, verdict.residual_m)
+                self._note(row, State.ACCEPTED, reason, verdict.residual**2, verdict.residual_m)
             self._solve()
 
     def _solve(self) -> None:
@@ -278,7 +286,7 @@ class Judge:
     def _pick(self, rows: list[int]) -> list[TrackedClosure]:
         return [self.closures[row] for row in rows]
 
-    def _decide(
+    def _note(
         self, row: int, state: State, reason: str, squared: float = float("nan"), metres: float = float("nan")
     ) -> None:
         before = self.closures[row].verdict

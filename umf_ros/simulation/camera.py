@@ -19,7 +19,7 @@ from umf_ros.simulation.world import ROCK, World
 SKY = 255
 TRAINING_SIZE = (224, 224)
 """Width and height of the images a network is trained on."""
-BAND_ROWS = 64
+BAND_ROWS = 128
 
 
 def resized(camera: StereoCamera, width: int, height: int) -> StereoCamera:
@@ -83,7 +83,8 @@ class Camera:
             smear_px: (2,) how far the picture moves across columns and rows while the shutter is open.
         """
         rotation, origin = world_T_camera[:3, :3].astype(np.float32), world_T_camera[:3, 3]
-        directions = self._directions @ rotation.T
+        # not a matrix product: its library would wake threads that then spin beside the other renderers
+        directions = cv2.transform(self._directions[None], rotation)[0]
         hits = cast(self.world, origin, directions)
         pixel_rad = 2 / (self.intrinsics.fx + self.intrinsics.fy)
         shader, (rows, columns) = Shader(self.world, sun), self._shape

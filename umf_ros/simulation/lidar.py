@@ -97,7 +97,7 @@ class Lidar:
     def _swept(self, world_T_start: Array, world_T_end: Array | None) -> tuple[Field, Field]:
         """Origins and directions in the world, the LiDAR's motion taken line by line."""
         if world_T_end is None:
-            directions = self._directions @ world_T_start[:3, :3].T.astype(np.float32)
+            directions = np.einsum("ij,nj->ni", world_T_start[:3, :3].astype(np.float32), self._directions)
             return np.broadcast_to(world_T_start[:3, 3].astype(np.float32), directions.shape), directions
         rotation, shift = _line_poses(invert(world_T_start) @ world_T_end)
         rotation = (world_T_start[:3, :3] @ rotation).astype(np.float32)

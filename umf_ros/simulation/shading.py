@@ -80,7 +80,7 @@ class Shader:
         """
         seen = np.isfinite(hits.distance)
         if not seen.any():
-            return self._sky(directions[:, 2], directions @ self.sun).reshape(shape)
+            return self._sky(directions[:, 2], np.einsum("ij,j->i", directions, self.sun)).reshape(shape)
         distance = np.where(seen, hits.distance, np.float32(0))
         dx, dy, dz = (np.ascontiguousarray(directions[:, axis]) for axis in range(3))
         x, y, z = (np.float32(o) + d * distance for o, d in zip(origin, (dx, dy, dz), strict=True))
@@ -197,7 +197,7 @@ class Shader:
         rays = np.empty((len(where), 6), np.float32)
         normal = hits.normal[where]
         # off the surface, or it would shade itself
-        lift = (0.012 + 3e-4 * distance[where]) * np.sign(normal @ self.sun)
+        lift = (0.012 + 3e-4 * distance[where]) * np.sign(np.einsum("ij,j->i", normal, self.sun))
         for axis in range(3):
             rays[:, axis] = place[axis][where] + normal[:, axis] * lift
         rays[:, 3:] = self.sun
