@@ -1,0 +1,240 @@
+"""The file of a place database: found again, copied, foreign, old and damaged."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import threading
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import make_keyframe
+from recordings import traverse, write_db3
+
+from umf_ros.config import Database, Loop
+from umf_ros.errors import OutputError, UmfError
+from umf_ros.places.database import PlaceDatabase
+from umf_ros.places.store import KeyframeStore
+
+IDENTITY = {"embedder": "test", "dimension": "16"}
+RULES = Loop(min_similarity=-1, min_time_gap_s=20, min_travel_m=15, top_k=50)
+
+
+def store(path: Path | None = None, cached: int = 20) -> KeyframeStore:
+    return KeyframeStore(path, IDENTITY, cached)
+
+
+def database(path: Path) -> PlaceDatabase:
+    return PlaceDatabase(Database(path=str(path)), "test", 16)
+
+
+def filled(path: Path, count: int = 5) -> Path:
+    """A closed database of `count` keyframes, one per second and 4 m, the last one without odometry."""
+    places = database(path)
+    for i in range(count):
+        places.add(make_keyframe(i, float("nan") if i == count - 1 else 4.0 * i, seed=i, session=i // 3))
+    places.close()
+    return path
+
+
+def change(path: Path, statement: str, *values: object) -> None:
+    connection = sqlite3.connect(path)
+    with connection:
+        connection.execute(statement, values)
+    connection.close()
+
+
+def test_entries_say_what_the_keyframes_say(tmp_path: Path) -> None:
+    path = filled(tmp_path / "map.sqlite")
+    opened = store(path)
+    entries = list(opened.entries())
+    assert len(entries) == len(opened) == 5
+    for i, entry in enumerate(entries):
+        keyframe = opened[i]
+        assert (entry.stamp_ns, entry.session) == (keyframe.stamp_ns, keyframe.session)
+        np.testing.assert_array_equal(entry.travelled_m, keyframe.travelled_m)
+        np.testing.assert_array_equal(entry.descriptor, keyframe.embedding.descriptor)
+        assert entry.descriptor.dtype == np.float32
+
+
+def test_opening_does_not_read_the_keyframes_themselves(tmp_path: Path) -> None:
+    path = filled(tmp_path / "map.sqlite")
+    change(path, "UPDATE keyframe SET data = ?", b"no keyframe")
+    places = database(path)
+    assert len(places) == 5
+    found = places.query(make_keyframe(100, 100, seed=3, session=1), RULES)
+    assert found[0].stamp_ns == 3 * 10**9 and found[0].similarity == pytest.approx(1, abs=1e-6)
+
+
+def test_a_reopened_database_answers_like_the_one_that_was_closed(tmp_path: Path) -> None:
+    query = make_keyframe(24.5, 30, seed=77, session=0)
+    places = database(tmp_path / "map.sqlite")
+    for i in range(30):
+        places.add(make_keyframe(i, 1.0 * i, seed=i, session=0))
+    before = places.query(query, RULES)
+    places.close()
+    assert database(tmp_path / "map.sqlite").query(query, RULES) == before
+    # at 24.5 s and 30 m: at least 20 s older leaves 0 to 4 s, and those lie 26 m back or more
+    assert sorted(candidate.index for candidate in before) == [0, 1, 2, 3, 4]
+
+
+def test_places_added_after_reopening_come_after_the_old_ones(tmp_path: Path) -> None:
+    path = filled(tmp_path / "map.sqlite")
+    places = database(path)
+    assert places.next_session == 2
+    assert places.add(make_keyframe(50, seed=50, session=places.next_session)) == 5
+    places.close()
+    again = database(path)
+    assert [again[i].stamp_ns for i in range(6)] == [0, 10**9, 2 * 10**9, 3 * 10**9, 4 * 10**9, 50 * 10**9]
+    assert again.next_session == 3
+
+
+def test_what_was_forgotten_stays_forgotten(tmp_path: Path) -> None:
+    path = filled(tmp_path / "map.sqlite")
+    places = database(path)
+    assert places.forget_from(3 * 10**9) == 2
+    places.close()
+    assert [keyframe.stamp_ns for keyframe in map(database(path).__getitem__, range(3))] == [0, 10**9, 2 * 10**9]
+
+
+def test_the_keyframe_used_longest_ago_leaves_the_memory_first() -> None:
+    opened = store(cached=3)
+    alive: list[weakref.ref[np.ndarray]] = []
+    for i in range(3):
+        keyframe = make_keyframe(i, seed=i)
+        alive.append(weakref.ref(keyframe.points))
+        opened.add(keyframe)
+    del keyframe
+    assert opened[0].stamp_ns == 0  # the oldest is used again: now the second is the one to go
+    opened.add(make_keyframe(9, seed=9))
+    assert [reference() is not None for reference in alive] == [True, False, True]
+    assert opened[1].stamp_ns == 10**9
+
+
+def test_a_temporary_file_is_gone_after_closing() -> None:
+    opened = store()
+    opened.add(make_keyframe(1))
+    folder = opened.path.parent
+    assert opened.path.is_file()
+    opened.close()
+    assert not folder.exists()
+
+
+def test_several_threads_read_while_one_writes() -> None:
+    opened = store(cached=20)
+    for i in range(60):
+        opened.add(make_keyframe(i, seed=i))
+    wrong: list[object] = []
+
+    def read(start: int) -> None:
+        try:
+            wrong.extend(i for i in range(start, 60, 3) if opened[i].stamp_ns != i * 10**9)
+        except Exception as error:
+            wrong.append(error)
+
+    readers = [threading.Thread(target=read, args=(start,)) for start in range(3)]
+    for reader in readers:
+        reader.start()
+    for i in range(60, 80):
+        opened.add(make_keyframe(i, seed=i))
+    for reader in readers:
+        reader.join()
+    assert wrong == [] and len(opened) == 80
+
+
+def test_an_older_file_is_refused_in_one_line_and_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "old.sqlite"
+    change(path, "CREATE TABLE about (content TEXT NOT NULL)")
+    change(path, "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, data BLOB NOT NULL)")
+    change(path, "INSERT INTO about VALUES (?)", '{"schema": "1", "embedder": "test", "dimension": "16"}')
+    before = path.read_bytes()
+    with pytest.raises(UmfError, match=r"old\.sqlite was written by another version of umf_ros") as caught:
+        database(path)
+    assert "\n" not in str(caught.value) and "database.path" in str(caught.value)
+    assert path.read_bytes() == before and [file.name for file in tmp_path.iterdir()] == ["old.sqlite"]
+
+
+def test_somebody_elses_database_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (bag,) = write_db3(tmp_path / "bag", traverse(0.3)).glob("*.db3")
+    before = bag.read_bytes()
+    with pytest.raises(UmfError, match=r"is no place database, but another one with .*messages"):
+        database(bag)
+    assert bag.read_bytes() == before and not list(bag.parent.glob("*-wal"))
+
+
+def test_an_empty_file_becomes_a_database(tmp_path: Path) -> None:
+    path = tmp_path / "new.sqlite"
+    path.touch()
+    assert len(database(path)) == 0
+    filled(path, 2)
+    assert len(database(path)) == 2
+
+
+@pytest.mark.parametrize("change_to", ["dimension", "embedder"])
+def test_another_network_is_named_with_what_was_and_what_is(tmp_path: Path, change_to: str) -> None:
+    path = filled(tmp_path / "map.sqlite", 1)
+    with pytest.raises(UmfError, match=rf"map\.sqlite was made with {change_to} (16|test), not 99$"):
+        KeyframeStore(path, IDENTITY | {change_to: "99"}, 20)
+
+
+def test_a_damaged_keyframe_is_named_and_the_others_are_read(tmp_path: Path) -> None:
+    path = filled(tmp_path / "map.sqlite")
+    change(path, "UPDATE keyframe SET data = ? WHERE id = 3", b"\x00\x01")
+    places = database(path)
+    with pytest.raises(UmfError, match=r"map\.sqlite is damaged at its keyframe 3") as caught:
+        places[2]
+    assert "\n" not in str(caught.value)
+    assert places[3].stamp_ns == 3 * 10**9
+
+
+@pytest.mark.parametrize("start", [4096, 20_000])
+def test_a_damaged_file_is_one_clear_line(tmp_path: Path, start: int) -> None:
+    path = filled(tmp_path / "map.sqlite", 40)
+    content = bytearray(path.read_bytes())
+    content[start:] = bytes(len(content) - start)
+    path.write_bytes(content)
+    with pytest.raises(UmfError, match=r"map\.sqlite (is damaged|cannot be used)") as caught:
+        places = database(path)
+        for i in range(len(places)):
+            places[i]
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_whose_end_is_missing_is_one_clear_line(tmp_path: Path) -> None:
+    path = filled(tmp_path / "map.sqlite", 40)
+    path.write_bytes(path.read_bytes()[:9000])
+    with pytest.raises(UmfError, match=r"map\.sqlite (is damaged|cannot be used)"):
+        database(path)
+
+
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(UmfError, match="cannot write"):
+        database(tmp_path)
+
+
+def test_a_path_below_a_file_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=r"cannot write .*file/map\.sqlite"):
+        database(tmp_path / "file" / "map.sqlite")
+
+
+def test_a_copy_is_complete_although_the_log_was_not_written_back(tmp_path: Path) -> None:
+    places = database(tmp_path / "map.sqlite")
+    for i in range(7):
+        places.add(make_keyframe(i, seed=i))
+    places.save(tmp_path / "copy.sqlite")
+    # one file is all of it: no log beside it is needed
+    shutil.move(tmp_path / "copy.sqlite", tmp_path / "elsewhere.sqlite")
+    copied = database(tmp_path / "elsewhere.sqlite")
+    assert [copied[i].stamp_ns for i in range(7)] == [i * 10**9 for i in range(7)]
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_copy_replaces_an_older_one(tmp_path: Path) -> None:
+    target = filled(tmp_path / "copy.sqlite", 9)
+    places = database(tmp_path / "map.sqlite")
+    places.add(make_keyframe(1))
+    places.save(target)
+    assert len(database(target)) == 1
