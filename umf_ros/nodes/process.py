@@ -42,7 +42,7 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
-        while not stop.requested:
+        while not stop.requested and rclpy.ok():
             executor.spin_once(timeout_sec=0.2)
     except ExternalShutdownException:
         pass
