@@ -181,3 +181,89 @@ def test_frames_without_a_true_pose_are_refused():
     )
     with pytest.raises(UmfError, match=r"within 0\.1 s"):
         embedder.embed(replace(some_frame(), stamp_ns=5 * 10**9))
+
+
+@pytest.mark.parametrize("metres", [2.0, 5.0, 9.0])
+def test_true_descriptors_fall_as_promised(metres):
+    here, there = make_pose(np.eye(3), [10, -4, 1]), make_pose(np.eye(3), [10 + metres, -4, 1])
+    embedder = GroundTruthEmbedder({0: here, 10**9: there}, scale_m=6.0, dimension=2048)
+    one, two = (embedder.embed(replace(some_frame(), stamp_ns=stamp)).descriptor for stamp in (0, 10**9))
+    assert one @ two == pytest.approx(np.exp(-(metres**2) / 72), abs=0.1)
+
+
+def test_without_any_pose_every_frame_is_refused():
+    with pytest.raises(UmfError, match="no true pose"):
+        GroundTruthEmbedder({}).embed(some_frame())
+
+
+def test_the_name_tells_weights_apart(weights, tmp_path):
+    other = tmp_path / weights.name
+    torch.manual_seed(1)
+    save_weights(UMF(TINY), other, {})
+    names = [UmfEmbedder(path, "torch", threads=1).name for path in (weights, other, weights)]
+    assert names[0] == names[2] != names[1]
+    assert all(name.startswith("tiny-") for name in names)
+
+
+@pytest.mark.parametrize(
+    "left", [np.full((512, 688), 255, np.uint8), np.full((512, 688), 90, np.uint8)], ids=["dazzled", "covered"]
+)
+def test_an_image_that_shows_nothing_is_missing(embedder, left):
+    found, wanted = embedder.embed(some_frame(left=left)), embedder.embed(some_frame(left=None))
+    assert found.image is None and found.super_image is None
+    np.testing.assert_array_equal(found.descriptor, wanted.descriptor)
+
+
+def test_a_scan_of_a_few_points_is_missing(embedder):
+    few = some_frame(points=some_scan(0)[:10], intensity=np.full(10, 50, np.float32))
+    wanted = embedder.embed(some_frame(points=None, intensity=None))
+    found = embedder.embed(few)
+    assert found.cloud is None
+    np.testing.assert_array_equal(found.descriptor, wanted.descriptor)
+
+
+def test_points_that_are_no_numbers_are_ignored(embedder):
+    frame = some_frame()
+    dirty = np.concatenate([frame.points, np.full((30, 3), np.nan, np.float32)])
+    intensity = np.concatenate([frame.intensity, np.zeros(30, np.float32)])
+    found, wanted = embedder.embed(replace(frame, points=dirty, intensity=intensity)), embedder.embed(frame)
+    np.testing.assert_allclose(found.descriptor, wanted.descriptor, atol=1e-6)
+
+
+def test_a_scan_without_intensities_is_used(embedder):
+    whole, plain = embedder.embed(some_frame()), embedder.embed(some_frame(intensity=None))
+    assert plain.cloud is not None and len(plain.cloud.positions) == len(whole.cloud.positions)
+
+
+def test_key_points_cover_the_whole_image(embedder):
+    positions = embedder.embed(some_frame()).image.positions
+    cells = set(map(tuple, (positions // (688 / 6, 512 / 4)).astype(int).tolist()))
+    assert len(cells) == 24
+    # the centres of the fine cells, in pixels of the full image: (cell + 1/2) cell widths, less half a pixel
+    across = (positions[:, 0] + 0.5) / (688 / 24) - 0.5
+    np.testing.assert_allclose(across, across.round(), atol=1e-3)
+
+
+def test_scan_context_keeps_the_highest_return_of_every_cell():
+    """A pillar raises its own cell; what is beyond the range or beside the view changes nothing."""
+    ground = np.array([[r, r * np.tan(a), 0.0] for r in np.arange(3, 50, 1.5) for a in np.linspace(-0.55, 0.55, 40)])
+    pillar = np.array([[20.0, 5.0, 3.0], [20.0, 5.0, 1.0]])
+    outside = np.array([[70.0, 0.0, 9.0], [5.0, 20.0, 9.0], [-10.0, 0.0, 9.0]])
+
+    def code(*parts: np.ndarray) -> np.ndarray:
+        frame = some_frame(points=np.concatenate(parts).astype(np.float32), intensity=None)
+        return ScanContextEmbedder().embed(frame).descriptor
+
+    plain, raised = code(ground), code(ground, pillar)
+    np.testing.assert_array_equal(plain, code(ground, outside))
+    np.testing.assert_array_equal(raised, code(ground, pillar[:1]))
+    change = np.abs(raised - plain)[: 20 * 24].reshape(20, 24)
+    ring, sector = np.unravel_index(change.argmax(), change.shape)
+    assert (ring, sector) == (int(np.hypot(20, 5) / 3), int((np.arctan2(5, 20) + 0.61) / 1.22 * 24))
+
+
+def test_the_thumbnail_is_blind_to_exposure_and_not_to_the_view():
+    image = some_frame().left // 2
+    codes = [ThumbnailEmbedder().embed(some_frame(left=left)).descriptor for left in (image, image * 2, image[:, ::-1])]
+    assert codes[0] @ codes[1] > 0.99
+    assert codes[0] @ codes[2] < 0.6

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -121,3 +122,48 @@ def test_the_thesis_network_has_about_39_million_parameters():
 def test_impossible_sizes_are_refused(wrong):
     with pytest.raises(ValueError, match="multiple"):
         NetworkConfig(**wrong)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_survives_its_own_card(name):
+    assert NetworkConfig.from_dict(json.loads(json.dumps(PRESETS[name].as_dict()))) == PRESETS[name]
+
+
+def test_the_default_networks_fit_a_rover():
+    """Less than ten megabytes in half precision; the mobile one is smaller still, and both describe alike."""
+    light, mobile = UMF(PRESETS["umf_light"]), UMF(PRESETS["umf_mobile"])
+    assert 3.0e6 < count_parameters(light) < 5.0e6
+    assert count_parameters(mobile) < 0.7 * count_parameters(light)
+    assert light.config.descriptor == mobile.config.descriptor == 256
+
+
+def test_the_heads_do_not_depend_on_the_input_size(network):
+    """Weights trained at one image size serve another."""
+    larger = UMF(replace(TINY, image_size=(96, 128))).eval()
+    larger.load_state_dict(network.state_dict())
+    found = larger(some_input(larger.config), super_features=True)
+    assert found.image.descriptors.shape == (2, 24 * 32, 8)
+    assert found.descriptor.shape == (2, 16) and found.super_image.descriptors.shape == (2, 6, 8)
+
+
+def test_half_precision_says_nearly_the_same(network):
+    batch = some_input(TINY)
+    whole = network(batch)
+    with torch.autocast("cpu", torch.bfloat16):
+        half = network(batch)
+    assert (whole.descriptor * half.descriptor).sum(1).min() > 0.99
+    assert half.descriptor.dtype == half.image.descriptors.dtype == torch.float32
+
+
+def test_super_features_and_maps_are_only_made_when_asked_for(network):
+    found = network(some_input(TINY))
+    assert found.super_image is None and found.super_cloud is None and found.attention == []
+
+
+def test_cells_are_told_apart_by_their_place_where_nothing_else_differs(network):
+    batch = some_input(TINY, 1)
+    empty = replace(batch, grid=torch.zeros_like(batch.grid), image=torch.zeros_like(batch.image))
+    features = network.encode(empty)
+    assert torch.equal(features.cloud.mask, batch.coarse_mask) and features.image.mask.all()
+    assert torch.pdist(features.image.values[0].detach()).min() > 0.05
+    assert torch.pdist(features.cloud.values[0, batch.coarse_mask[0]].detach()).min() > 0.05

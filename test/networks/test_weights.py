@@ -96,3 +96,59 @@ def test_nowhere_to_write(network, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         save_weights(network, tmp_path / "file" / "w.safetensors", {})
+
+
+@pytest.mark.parametrize("word", ["{not json", "[1, 2]", "7"])
+def test_a_garbled_word_about_the_architecture(weights, word):
+    save_file(load_file(weights), weights, metadata={"architecture": word})
+    with pytest.raises(WeightsError, match="another architecture"):
+        load_weights(weights)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"backbone": "vgg16"}, {"heads": 0}, {"tokens": "many"}, {"image_size": [100, 128]}, {"local": 18}],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_an_architecture_that_cannot_be_built(weights, changes):
+    rewrite(weights, architecture=TINY.as_dict() | changes)
+    with pytest.raises(WeightsError, match="another architecture") as raised:
+        load_weights(weights)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1, 2]", "3"])
+def test_a_card_that_is_none(weights, content):
+    weights.with_suffix(".json").write_text(content)
+    with pytest.raises(WeightsError, match="cannot read the card"):
+        read_card(weights)
+
+
+def test_statistics_of_the_normalisation_come_back_too(network, tmp_path):
+    """A network whose running means were lost would still load, and be useless."""
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_mean.uniform_(-1, 1)
+            module.num_batches_tracked.fill_(70_000)  # no half holds that many
+    save_weights(network, tmp_path / "a.safetensors", {})
+    before, after = network.state_dict(), load_weights(tmp_path / "a.safetensors").state_dict()
+    for name, value in before.items():
+        if value.is_floating_point():
+            torch.testing.assert_close(after[name], value, atol=1e-3, rtol=1e-3)
+        else:
+            assert torch.equal(after[name], value)
+
+
+def test_new_weights_replace_old_ones_and_words_stay_readable(network, weights):
+    with torch.no_grad():
+        network.fusion.image_head.bias.fill_(0.25)
+    save_weights(network, weights, {"name": "tiny", "note": "Ätna, 20°"})
+    assert load_weights(weights).fusion.image_head.bias.unique().tolist() == [0.25]
+    assert read_card(weights)["note"] == "Ätna, 20°"
+    assert "Ätna" in weights.with_suffix(".json").read_text(encoding="utf-8")
+
+
+def test_loaded_weights_are_ready_to_use(weights):
+    found = load_weights(weights)
+    assert not found.training
+    assert {value.dtype for value in found.parameters()} == {torch.float32}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,19 @@ def save(model: Any, path: Path) -> None:
         unfinished.replace(path)
     except (OSError, RuntimeError) as error:
         raise OutputError(f"cannot write {path}: {' '.join(str(error).split())[:200]}") from None
+
+
+def kept_or_made(path: Path, make: Callable[[], Any]) -> Any:
+    """The model kept at `path`; where there is none, or a damaged one, a new one, which is then kept there."""
+    import openvino
+
+    if path.is_file():
+        with suppress(RuntimeError):
+            return openvino.Core().read_model(path)
+    model = make()
+    with suppress(OutputError):  # a read-only home only costs time
+        save(model, path)
+    return model
 
 
 def cached(weights: Path, super_features: bool) -> Path:

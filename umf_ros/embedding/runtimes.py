@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from umf_ros.embedding.export import cached, convert, inputs_by_name, save
+from umf_ros.embedding.export import cached, convert, inputs_by_name, kept_or_made
 from umf_ros.embedding.inputs import blank_input
-from umf_ros.errors import ConfigError, OutputError
+from umf_ros.errors import ConfigError
 from umf_ros.networks.umf import UMF, NetworkInput, NetworkOutput, to_device
 
 Outputs = dict[str, NDArray[np.float32]]
@@ -88,18 +87,14 @@ class OpenVinoRuntime:
     def __init__(self, network: UMF, weights: Path, threads: int, super_features: bool) -> None:
         import openvino
 
-        core = openvino.Core()
-        kept = cached(weights, super_features)
-        if kept.is_file():
-            model = core.read_model(kept)
-        else:
-            model = convert(Flat(network.eval(), super_features), inputs_by_name(blank_input(network.config)))
-            with suppress(OutputError):  # a read-only home only costs time
-                save(model, kept)
+        model = kept_or_made(
+            cached(weights, super_features),
+            lambda: convert(Flat(network.eval(), super_features), inputs_by_name(blank_input(network.config))),
+        )
         # single precision: half of it moves similarities by more than a threshold can bear
         options: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": threads}
         options |= {"NUM_STREAMS": 1, "PERFORMANCE_HINT": "LATENCY"}
-        self._model = core.compile_model(model, "CPU", options)
+        self._model = openvino.Core().compile_model(model, "CPU", options)
 
     def run(self, batch: NetworkInput) -> Outputs:
         """Outputs by name."""

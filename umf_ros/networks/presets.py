@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from umf_ros.errors import WeightsError
 
@@ -50,6 +50,8 @@ class NetworkConfig:
     cloud_supers: tuple[int, int] = (64, 32)
 
     def __post_init__(self) -> None:
+        if self.backbone not in get_args(Backbone):
+            raise ValueError(f"backbone must be one of {', '.join(get_args(Backbone))}, not {self.backbone}")
         if any(side % 32 or side <= 0 for side in self.image_size):
             raise ValueError(f"image_size must be multiples of 32, not {self.image_size}")
         if self.tokens % self.heads or self.local % 4:
@@ -69,7 +71,7 @@ class NetworkConfig:
         try:
             fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
             return cls(**fields)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, ArithmeticError) as error:
             raise WeightsError(f"weights of another architecture: {error}") from None
 
 

@@ -74,10 +74,9 @@ def read_card(path: Path) -> dict[str, Any]:
     """
     card = path.with_suffix(".json")
     try:
-        content = json.loads(card.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return dict(json.loads(card.read_text(encoding="utf-8")))
+    except (OSError, TypeError, ValueError) as error:
         raise WeightsError(f"cannot read the card {card}: {' '.join(str(error).split())}") from None
-    return dict(content)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -91,7 +90,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         raise WeightsError(f"{path} is truncated or not a safetensors file: {' '.join(str(error).split())}") from None
     if "architecture" not in metadata:
         raise WeightsError(f"{path} holds weights of another architecture: it does not say which")
-    return json.loads(metadata["architecture"]), tensors
+    try:
+        return dict(json.loads(metadata["architecture"])), tensors
+    except (TypeError, ValueError):
+        raise WeightsError(f"{path} holds weights of another architecture: it does not say which clearly") from None
 
 
 def _halve(value: Tensor) -> Tensor:

@@ -1,0 +1,112 @@
+"""What runs the network, and where a converted one is kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import openvino
+import pytest
+import torch
+from tiny_worlds import TINY, some_input
+from torch import Tensor, nn
+
+from umf_ros.embedding.export import cached, convert, inputs_by_name, kept_or_made, save
+from umf_ros.embedding.inputs import blank_input
+from umf_ros.embedding.runtimes import OUTPUTS, SUPERS, TorchRuntime, make_runtime
+from umf_ros.errors import ConfigError, OutputError
+from umf_ros.networks.umf import UMF
+
+
+class Scale(nn.Module):
+    def __init__(self, factor: float) -> None:
+        super().__init__()
+        self.factor = factor
+
+    def forward(self, values: Tensor, offset: Tensor) -> Tensor:
+        return self.factor * values + offset
+
+
+EXAMPLE = {"values": torch.zeros(1, 3), "offset": torch.zeros(1, 3)}
+
+
+def answer(model: object) -> list[float]:
+    run = openvino.Core().compile_model(model, "CPU", {"INFERENCE_NUM_THREADS": 1})
+    return run({"values": np.ones((1, 3), np.float32), "offset": np.full((1, 3), 0.5, np.float32)})[0][0].tolist()
+
+
+@pytest.fixture
+def network() -> UMF:
+    torch.manual_seed(0)
+    return UMF(TINY)
+
+
+def test_torch_says_by_name_what_the_network_says(network):
+    batch = some_input(TINY, 1)
+    found = TorchRuntime(network, "cpu", 1, super_features=True).run(batch)
+    wanted = network.eval()(batch, super_features=True)
+    assert set(found) == {*OUTPUTS, *SUPERS}
+    np.testing.assert_allclose(found["descriptor"], wanted.descriptor[0].detach(), atol=1e-6)
+    np.testing.assert_allclose(found["cloud_saliency"], wanted.cloud.saliency[0].detach(), atol=1e-6)
+    np.testing.assert_allclose(found["super_image_strength"], wanted.super_image.strength[0].detach(), atol=1e-5)
+    assert {values.dtype for values in found.values()} == {np.dtype(np.float32)}
+
+
+def test_super_features_are_left_out_unless_wanted(network):
+    assert set(TorchRuntime(network, "cpu", 1, False).run(blank_input(TINY))) == set(OUTPUTS)
+
+
+def test_inputs_keep_the_order_of_the_networks_arguments():
+    batch = some_input(TINY, 1)
+    assert list(inputs_by_name(batch)) == list(type(batch).__dataclass_fields__)
+    assert inputs_by_name(replace(batch, image=batch.image + 1))["image"] is not batch.image
+
+
+@pytest.mark.parametrize(("runtime", "device"), [("openvino", "cuda"), ("torch", "abacus"), ("auto", "abacus")])
+def test_what_cannot_run_is_refused_in_one_line(network, runtime, device):
+    with pytest.raises(ConfigError, match="embedding") as raised:
+        make_runtime(runtime, network, Path("none"), device, 1, False)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_converted_model_has_named_inputs_of_fixed_size():
+    model = convert(Scale(2.0), EXAMPLE)
+    assert [port.any_name for port in model.inputs] == ["values", "offset"]
+    assert [tuple(port.shape) for port in model.inputs] == [(1, 3), (1, 3)]
+    assert answer(model) == [2.5] * 3
+
+
+def test_a_model_is_made_once_and_then_kept(tmp_path):
+    path = tmp_path / "cache" / "model.xml"
+    assert answer(kept_or_made(path, lambda: convert(Scale(2.0), EXAMPLE))) == [2.5] * 3
+    assert sorted(file.name for file in path.parent.iterdir()) == ["model.bin", "model.xml"]
+    assert answer(kept_or_made(path, lambda: pytest.fail("made again"))) == [2.5] * 3
+
+
+@pytest.mark.parametrize("part", [".xml", ".bin"])
+def test_a_damaged_model_is_made_anew(tmp_path, part):
+    path = tmp_path / "model.xml"
+    save(convert(Scale(2.0), EXAMPLE), path)
+    path.with_suffix(part).write_bytes(b"<net" if part == ".xml" else b"")
+    assert answer(kept_or_made(path, lambda: convert(Scale(3.0), EXAMPLE))) == [3.5] * 3
+    assert answer(kept_or_made(path, lambda: pytest.fail("made again"))) == [3.5] * 3
+
+
+def test_where_nothing_can_be_kept_it_still_runs(tmp_path):
+    (tmp_path / "file").write_text("")
+    path = tmp_path / "file" / "model.xml"
+    assert answer(kept_or_made(path, lambda: convert(Scale(2.0), EXAMPLE))) == [2.5] * 3
+    with pytest.raises(OutputError, match="cannot write"):
+        save(convert(Scale(2.0), EXAMPLE), path)
+
+
+def test_new_weights_and_other_outputs_are_kept_apart(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    one, other = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
+    one.write_bytes(b"one")
+    other.write_bytes(b"other")
+    paths = {cached(one, False), cached(one, True), cached(other, False)}
+    assert len(paths) == 3 and {path.parent for path in paths} == {tmp_path / "cache" / "umf_ros"}
+    other.write_bytes(b"one")
+    assert cached(other, False) == cached(one, False)  # the content counts, not the name
