@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from umf_ros.networks.fusion import Fused
 from umf_ros.networks.umf import UMF, Features
 from umf_ros.training.batches import TrainingBatch
 from umf_ros.training.config import TrainingSettings
@@ -112,12 +111,12 @@ class Objective(nn.Module):
             bank: past descriptors; none are used while it is empty.
         """
         features = self.network.encode(batch.input)
-        found = self.network.fuse(features, image_present, cloud_present)
-        fused = found.descriptor
+        fused = self.network.fuse(features, image_present, cloud_present).descriptor
         relations = relate(batch.places, bank.places, self._rule, fused.device)
+        alone = self._alone(features, batch)
         # similarities need all their digits: at first they differ in the third
         with torch.autocast(fused.device.type, enabled=False):
-            losses, active = self._global(found, (image_present, cloud_present), bank, relations)
+            losses, active = self._global(fused, (image_present, cloud_present), alone, bank, relations)
         if len(batch.local_rows):
             losses |= self._local(features, batch, relations.negative[:, : len(fused)])
         weights = self._weights()
@@ -137,18 +136,39 @@ class Objective(nn.Module):
             "super": s.weight_super,
         }
 
+    def _alone(self, features: Features, batch: TrainingBatch) -> dict[str, tuple[Tensor, Tensor]]:
+        """Descriptors (B, D) of each modality without the other, and which frames (B,) have it.
+
+        The other modality's tokens must not be there: what is learned with them at hand is not the image's own.
+        """
+        images, clouds = batch.input.image_present, batch.input.coarse_mask.any(1)
+        nothing = torch.zeros_like(images)
+        return {
+            "image": (self.network.fuse(features, images, nothing).descriptor, images),
+            "cloud": (self.network.fuse(features, nothing, clouds).descriptor, clouds),
+        }
+
     def _global(
-        self, found: Fused, present: tuple[Tensor, Tensor], bank: Bank, relations: Relations
+        self,
+        fused: Tensor,
+        present: tuple[Tensor, Tensor],
+        alone: dict[str, tuple[Tensor, Tensor]],
+        bank: Bank,
+        relations: Relations,
     ) -> tuple[dict[str, Tensor], Tensor]:
-        count = len(found.descriptor)
-        similarity = found.descriptor @ torch.cat([found.descriptor, bank.descriptors.to(found.descriptor.device)]).T
+        count = len(fused)
+        similarity = fused @ torch.cat([fused, bank.descriptors.to(fused.device)]).T
+        # an image and a scan alone have nothing in common: no pair to learn from
+        shared = torch.ones_like(relations.positive)
+        images, clouds = (there[:, None] & there[None] for there in present)
+        shared[:, :count] = images | clouds
         losses: dict[str, Tensor] = {}
-        losses["fused"], active = self._metric(similarity, relations.positive, relations.negative)
+        losses["fused"], active = self._metric(similarity, relations.positive & shared, relations.negative & shared)
         losses["graded"] = graded(similarity[:, :count], relations.metres, relations.comparable)
-        for name, half, there in zip(("image", "cloud"), (found.image, found.cloud), present, strict=True):
+        for name, (descriptor, there) in alone.items():
             both = there[:, None] & there[None]
             positive, negative = relations.positive[:, :count] & both, relations.negative[:, :count] & both
-            losses[name], share = self._metric(half @ half.T, positive, negative)
+            losses[name], share = self._metric(descriptor @ descriptor.T, positive, negative)
             active = torch.maximum(active, share)
         return losses, active
 
