@@ -207,7 +207,7 @@ class Shader:
         """Share of the sunlight sent to the camera: matt, mixed with the Lommel-Seeliger law of dusty planets."""
         dusty = np.float32(0.35 * self.traits.backscatter + 0.1)
         # tan of half the phase angle between sun and camera; the surge peaks where they align
-        half = np.sqrt((1 + toward_sun) / np.maximum(1 - toward_sun, np.float32(1e-3)))
+        half = np.sqrt(np.maximum(1 + toward_sun, 0) / np.maximum(1 - toward_sun, np.float32(1e-3)))
         surge = 1 + np.float32(0.6) / (1 + half / np.float32(0.12))
         return dusty * 2 * incidence / (incidence + facing) * surge + (1 - dusty) * incidence
 
