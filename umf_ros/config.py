@@ -138,9 +138,7 @@ class PoseGraph(Group):
     use_gate: bool = Field(True, description="reject closures that contradict the map")
     use_gnc: bool = Field(True, description="ask graduated non-convexity for a second opinion where closures conflict")
     use_support: bool = Field(True, description="believe uncertain closures only when others support them")
-    estimate_scale: bool = Field(
-        False, description="estimate by how much the stated noise is wrong; not for odometry that drifts to one side"
-    )
+    estimate_scale: bool = Field(True, description="estimate by how much the stated noise is wrong")
 
 
 class Frames(Group):

@@ -107,11 +107,16 @@ def with_wrong_closures(world: World, share: float, kind: Kind, seed: int) -> Wo
     rng = np.random.default_rng(seed)
     wanted = round(share / (1 - share) * len(world.closures))
     wrong: list[WorldClosure] = []
+    taken = {(closure.first, closure.second) for closure in world.closures}
     pairs = _near_pairs(world, 3.0, 15.0) if kind == "near" else None
     while len(wrong) < wanted:
         length = 1 if kind == "random" else int(rng.integers(5, 9))
         i, j = _far_pair(world, rng) if pairs is None else pairs[rng.integers(len(pairs))]
-        wrong += _alias(world, int(i), int(j), min(length, wanted - len(wrong)), rng)
+        for closure in _alias(world, int(i), int(j), length, rng):
+            # two poses have one closure: a second one would only be a duplicate
+            if (closure.first, closure.second) not in taken and len(wrong) < wanted:
+                taken.add((closure.first, closure.second))
+                wrong.append(closure)
     order = sorted(world.closures + wrong, key=lambda closure: (closure.second, closure.first))
     return replace(world, closures=order)
 
