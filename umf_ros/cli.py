@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from typing import Annotated, NoReturn
 
@@ -66,20 +65,14 @@ def options(version: Version = False) -> None:
 def main() -> NoReturn:
     """Run the command line; 0 for success, 1 for an error, 2 for wrong arguments, 130 after Ctrl-C."""
     try:
-        sys.exit(app())
+        sys.exit(app(prog_name="umf"))  # also when it is run as a module
     except UmfError as error:
-        _fail(str(error), 1)
-    except KeyboardInterrupt:
-        _fail("interrupted", 128 + signal.SIGINT)
+        typer.echo(f"umf: {error}", err=True)
+        sys.exit(1)
     except BrokenPipeError:
         # the reader of our output went away, as with `umf ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
-
-
-def _fail(text: str, code: int) -> NoReturn:
-    typer.echo(f"umf: {text}", err=True)
-    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -58,6 +58,11 @@ class LoopDetector:
         self._first_session = self.database.next_session
         self._session = 0
 
+    @property
+    def embedder_name(self) -> str:
+        """Name of the network."""
+        return self._embedder.name
+
     def process(self, frame: Frame) -> Detection:
         """Take one frame, in order of stamps within a session."""
         if frame.session != self._session:

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from umf_ros.config import Settings
-from umf_ros.embedding.embedder import Embedder
 from umf_ros.frames import Frame
 from umf_ros.loop_detector import Detection, LoopDetector
 from umf_ros.pose_graph.graph import PoseGraph
@@ -20,14 +19,14 @@ class Replay:
     Args:
         folder: run folder.
         settings: all settings.
-        embedder: the network.
+        detector: made with these settings.
     """
 
-    def __init__(self, folder: Path, settings: Settings, embedder: Embedder) -> None:
+    def __init__(self, folder: Path, settings: Settings, detector: LoopDetector) -> None:
         self._folder = folder
-        self._detector = LoopDetector(settings, embedder)
+        self._detector = detector
         self._graph = PoseGraph(settings.pose_graph)
-        self._recorder = RunRecorder(folder, settings, embedder.name)
+        self._recorder = RunRecorder(folder, settings, detector.embedder_name)
         self._has_odometry = False
         self._session = 0
 

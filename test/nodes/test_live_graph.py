@@ -16,7 +16,7 @@ from processes import Process
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.config import load_settings
-from umf_ros.loop_detector import make_detector_embedder
+from umf_ros.loop_detector import LoopDetector, make_detector_embedder
 from umf_ros.replay import Replay
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "slam_subscriber.py"
@@ -64,7 +64,7 @@ def live(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFac
 def offline(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("offline")
     settings = load_settings(mini_config)
-    replay = Replay(folder, settings, make_detector_embedder(settings))
+    replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
     for _ in replay.run(FrameReader(open_bag(mini_bag), settings)):
         pass
     replay.finish({})

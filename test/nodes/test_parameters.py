@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import rclpy
+from rcl_interfaces.msg import ParameterType
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from umf_ros.config import Settings, load_settings
 from umf_ros.errors import ConfigError
@@ -65,11 +69,65 @@ def test_a_parameter_file_reads_like_for_the_command_line(tmp_path) -> None:
         ("loop.top_k:=many", r"loop\.top_k: .*got 'many'"),
         ("loop.min_travel_m:=-1.0", r"loop\.min_travel_m: .*greater than or equal to 0"),
         ("results_dir:=5", "results_dir: expected text, got 5"),
+        ("loop.top_k:=2.5", r"loop\.top_k: .*got 2\.5"),
+        ("loop.min_travel_m:=.nan", r"loop\.min_travel_m: .*got nan"),
+        ("topics.cloud:=5", r"topics\.cloud: .*string.*got 5"),
+        ("qos.reliability:=sometimes", r"qos\.reliability: .*'best_effort' or 'reliable'.*got 'sometimes'"),
+        ("pose_graph.use_gate:=perhaps", r"pose_graph\.use_gate: .*boolean.*got 'perhaps'"),
+        ("loop.top_k:=[1, 2]", r"loop\.top_k: .*integer"),
+        ("loop:=5", r"loop: .*got 5"),
+        ("dataset:=kitti", r"dataset: .*got 'kitti'"),
     ],
 )
 def test_what_is_wrong_is_named(override: str, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(ConfigError, match=message) as caught:
         declare(make_node(override), results_dir="somewhere")
+    assert "\n" not in str(caught.value)
+
+
+def test_everything_that_is_wrong_is_named_at_once() -> None:
+    with pytest.raises(ConfigError) as caught:
+        declare(make_node("loop.topk:=7", "loop.top_k:=0", "keyframe.min_period:=1.0"))
+    told = str(caught.value)
+    assert "unknown parameter loop.topk" in told and "unknown parameter keyframe.min_period" in told
+    assert "loop.top_k: " in told and "\n" not in told
+
+
+def test_every_parameter_is_described_typed_and_read_only() -> None:
+    node = make_node("verification.max_shift_m:=11", "pose_graph.max_gap_s:=3")
+    declare(node, results_dir="where results go")
+    described = {name: node.describe_parameter(name) for name in documented_names()}
+    assert [name for name, found in described.items() if not found.description or not found.read_only] == []
+    doubles = ["verification.max_shift_m", "pose_graph.max_gap_s", "loop.min_travel_m"]
+    assert [described[name].type for name in doubles] == [ParameterType.PARAMETER_DOUBLE] * 3
+    assert described["loop.top_k"].type == ParameterType.PARAMETER_INTEGER
+    assert described["pose_graph.use_gate"].type == ParameterType.PARAMETER_BOOL
+
+
+def documented_names() -> list[str]:
+    """Every parameter that the documentation lists."""
+    text = (Path(__file__).parents[2] / "docs" / "parameters.md").read_text()
+    names = re.findall(r"^\| `([a-z_.]+)`", text, re.M)
+    assert len(names) > 60
+    return names
+
+
+def test_a_running_node_keeps_its_parameters() -> None:
+    node = make_node()
+    declare(node)
+    (answer,) = node.set_parameters([Parameter("loop.top_k", value=3)])
+    assert not answer.successful and "read-only" in answer.reason
+    assert node.get_parameter("loop.top_k").value == 20
+
+
+def test_a_topic_can_be_switched_off_with_an_empty_name() -> None:
+    settings, _ = declare(make_node("topics.odometry:=''"))
+    assert settings.topics.odometry == ""
+
+
+def test_qos_overrides_of_ros_are_left_to_ros() -> None:
+    settings, _ = declare(make_node("qos_overrides./odom.subscription.depth:=3"))
+    assert settings == Settings()
 
 
 def test_a_node_has_parameters_of_its_own() -> None:

@@ -87,7 +87,7 @@ def _on_worlds(
         run.write(summary, folder, notes)
     for title, table in summary.tables().items():
         print_table(console, title, table)
-    console.print(f"report: {folder}/evaluation.md")
+    console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
     return {**summary.flat()}
 
 
@@ -107,6 +107,7 @@ def _on_recording(
     from umf_ros.bags.presets import detect_dataset
     from umf_ros.bags.reader import open_bag
     from umf_ros.bags.trajectories import read_ground_truth, read_tum
+    from umf_ros.commands.progress import WARNING
     from umf_ros.config import load_settings
     from umf_ros.embedding import make_embedder
     from umf_ros.evaluation.bag_run import BagEvaluation, write_bag_result
@@ -125,7 +126,8 @@ def _on_recording(
     truth = read_ground_truth(recording, ground_truth)
     if truth is None:
         raise ConfigError(f"{bag} holds no ground truth; name a file with --ground-truth")
-    frames = FrameReader(recording, settings, read_tum(odometry) if odometry else None, warn=console.print)
+    path = read_tum(odometry) if odometry else None
+    frames = FrameReader(recording, settings, path, warn=lambda text: console.print(text, **WARNING))
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, super_features=True))
     folder = create_run_folder(out)
     with _bar(console) as bar:
@@ -150,8 +152,8 @@ def _on_recording(
     write_bag_result(folder, result, notes)
     print_table(console, "Loop-closure protocol", result.table())
     for note in notes:
-        console.print(note)
-    console.print(f"report: {folder}/evaluation.md")
+        console.print(note, markup=False)
+    console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
     return result.flat()
 
 

@@ -56,11 +56,13 @@ def command(
     if explanation.evidence is not None:
         for name, value in explanation.evidence.numbers.items():
             console.print(f"  {name:22} {value:.4g}", highlight=False)
-    console.print(f"wrote {out}", highlight=False)
+    console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _moment(text: str) -> float:
+def _moment(text: str) -> int | float:
     """Nanoseconds since the epoch (16 digits or more), or seconds from the start of the recording."""
+    if text.isdigit() and len(text) >= 16:
+        return int(text)
     try:
         value = float(text)
     except ValueError:
@@ -70,7 +72,7 @@ def _moment(text: str) -> float:
     return value
 
 
-def _nearest(frames: Iterable[Frame], moments: list[float]) -> list[Frame]:
+def _nearest(frames: Iterable[Frame], moments: list[int | float]) -> list[Frame]:
     """The frame nearest to each moment.
 
     Raises:
@@ -82,7 +84,7 @@ def _nearest(frames: Iterable[Frame], moments: list[float]) -> list[Frame]:
     wanted: list[int] = []
     for frame in frames:
         if not wanted:
-            wanted = [int(moment) if moment >= 1e15 else frame.stamp_ns + round(1e9 * moment) for moment in moments]
+            wanted = [one if isinstance(one, int) else frame.stamp_ns + round(1e9 * one) for one in moments]
         for position, stamp in enumerate(wanted):
             held = best[position]
             if held is None or abs(frame.stamp_ns - stamp) < abs(held.stamp_ns - stamp):
@@ -94,5 +96,5 @@ def _nearest(frames: Iterable[Frame], moments: list[float]) -> list[Frame]:
         raise BagError("the recording has no frame with an image or a scan")
     for frame, stamp, moment in zip(found, wanted, moments, strict=True):
         if abs(frame.stamp_ns - stamp) > 10**9:
-            raise BagError(f"no frame within a second of {moment:.15g}; the nearest is at {frame.stamp_ns} ns")
+            raise BagError(f"no frame within a second of {moment}; the nearest is at {frame.stamp_ns} ns")
     return found

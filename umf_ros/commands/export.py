@@ -30,4 +30,5 @@ def command(
     model = convert(Flat(network, super_features), inputs_by_name(blank_input(network.config)))
     save(model, out)
     megabytes = out.with_suffix(".bin").stat().st_size / 1e6
-    Console().print(f"{out}: {len(model.inputs)} inputs, {len(model.outputs)} outputs, {megabytes:.1f} MB of weights")
+    sizes = f"{len(model.inputs)} inputs, {len(model.outputs)} outputs, {megabytes:.1f} MB of weights"
+    Console().print(f"{out}: {sizes}", markup=False, soft_wrap=True)

@@ -6,11 +6,15 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from umf_ros.loop_detector import Detection
+
+WARNING: dict[str, Any] = {"style": "yellow", "markup": False, "highlight": False, "soft_wrap": True}
+"""How a console prints a warning: names of files keep their brackets, and lines their length."""
 
 
 class FrameProgress:

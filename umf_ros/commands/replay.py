@@ -34,10 +34,10 @@ def command(
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.presets import detect_dataset
     from umf_ros.bags.reader import open_bag
-    from umf_ros.bags.trajectories import read_odometry
-    from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.bags.trajectories import read_ground_truth, read_odometry
+    from umf_ros.commands.progress import WARNING, FrameProgress, stop_on_interrupt, undisturbed
     from umf_ros.config import load_settings
-    from umf_ros.loop_detector import make_detector_embedder
+    from umf_ros.loop_detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
     from umf_ros.results.folder import create_run_folder
     from umf_ros.results.recorder import count_drops
@@ -55,9 +55,12 @@ def command(
     if dataset == "auto" and not settings.model_fields_set & {"dataset", "topics"}:
         settings = settings.model_copy(update={"dataset": detect_dataset(recording)})
     path = read_odometry(odometry, odometry_frame, settings) if odometry else None
-    reader = FrameReader(recording, settings, path, warn=lambda text: console.print(f"[yellow]{text}", highlight=False))
+    reader = FrameReader(recording, settings, path, warn=lambda text: console.print(text, **WARNING))
+    if ground_truth is not None:
+        read_ground_truth(recording, ground_truth)  # what is wrong with it is said now, not after the run
+    detector = LoopDetector(settings, make_detector_embedder(settings))
     folder = create_run_folder(out)
-    replay = Replay(folder, settings, make_detector_embedder(settings))
+    replay = Replay(folder, settings, detector)
     with stop_on_interrupt() as interrupted, FrameProgress(console) as progress:
         for detection in replay.run(reader):
             progress.show(reader.progress, detection)

@@ -85,7 +85,8 @@ def _write_bag(
         record(simulator, bag, workers, truth, lambda done: progress.update(task, completed=done))
     write_side_files(simulator, out)
     size = out.stat().st_size / 1e6
-    console.print(f"{out}: {simulator.duration_s:.0f} s, {len(simulator.scan_stamps_ns)} scans, {size:.0f} MB")
+    scans = len(simulator.scan_stamps_ns)
+    console.print(f"{out}: {simulator.duration_s:.0f} s, {scans} scans, {size:.0f} MB", markup=False, soft_wrap=True)
 
 
 def _write_shards(folder: Path, worlds: str, sequences: str, seed: int, workers: int, console: Console) -> None:
@@ -119,7 +120,8 @@ def _write_contact_sheet(path: Path, seed: int, family: str, console: Console) -
 
     with console.status(f"drawing {family} {seed}"):
         contact_sheet(survey_world(seed, family, "hard"), path)
-    console.print(f"{path}: frames of the first pass above those of the revisit, then scans from ahead and from above")
+    what = "frames of the first pass above those of the revisit, then scans from ahead and from above"
+    console.print(f"{path}: {what}", markup=False, soft_wrap=True)
 
 
 def _progress(console: Console) -> Progress:

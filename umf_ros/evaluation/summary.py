@@ -50,7 +50,7 @@ class WorldsSummary:
         fused = [result.scores["fused"].recall1 for result in self.results]
         figures = {
             "recall1_fused_mean": _mean(fused),
-            "recall1_fused_worst": min(fused),
+            "recall1_fused_worst": _worst(fused),
             "recall1_image_mean": self.mean("image"),
             "recall1_lidar_mean": self.mean("lidar"),
             "recall1_superfeatures_mean": self.mean("superfeatures both"),
@@ -89,7 +89,7 @@ class WorldsSummary:
         for name in names:
             figures = ["recall1", "recall5", "recall_top_percent", "recall1_within_5m", "auc_pr"]
             values = [self.mean(name, figure) for figure in [*figures, "recall_at_precision1"]]
-            worst = min(result.scores[name].recall1 for result in self.results)
+            worst = _worst([result.scores[name].recall1 for result in self.results])
             row = [name, *map(percent, [values[0], worst, *values[1:]])]
             rows.append([*row, f"{REFERENCE[name][0]:.1f}"] if reference else row)
         return ([*head, "thesis, Etna"] if reference else head), rows
@@ -141,6 +141,10 @@ class WorldsSummary:
 def percent(share: float) -> str:
     """A share in per cent, or a dash."""
     return f"{100 * share:.1f}" if math.isfinite(share) else "-"
+
+
+def _worst(values: Sequence[float]) -> float:
+    return min((value for value in values if math.isfinite(value)), default=math.nan)
 
 
 def _mean(values: Sequence[float]) -> float:

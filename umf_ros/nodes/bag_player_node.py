@@ -154,9 +154,9 @@ def _play(options: argparse.Namespace) -> None:
     player = BagPlayer(bag, options.rate)
     console = Console(stderr=True)
     if bag.warning:
-        console.print(f"[yellow]{bag.warning}", highlight=False)
+        console.print(bag.warning, style="yellow", markup=False, highlight=False, soft_wrap=True)
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.completed:.0f} s"),
         TimeRemainingColumn(),

@@ -14,6 +14,7 @@ import numpy as np
 
 from umf_ros import __version__
 from umf_ros.config import Settings, dump_settings
+from umf_ros.errors import UmfError
 from umf_ros.frames import Frame
 from umf_ros.loop_detector import Detection
 from umf_ros.results import tables
@@ -121,8 +122,20 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> None:
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """Read the folder's `summary.json`."""
-    content: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    """Read the folder's `summary.json`.
+
+    Raises:
+        UmfError: it is missing, or not what a run writes.
+    """
+    path = folder / "summary.json"
+    if not path.is_file():
+        raise UmfError(f"{folder} holds no finished run: summary.json is missing")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        content = None
+    if not isinstance(content, dict) or "closures_published" not in content:
+        raise UmfError(f"{path} is not the summary of a run")
     return content
 
 

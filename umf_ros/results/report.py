@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -16,14 +15,13 @@ from umf_ros.bags.images import read_left_images
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import Trajectory, read_ground_truth, read_tum
 from umf_ros.config import Settings, load_settings
-from umf_ros.errors import UmfError
 from umf_ros.evaluation import html
 from umf_ros.evaluation.plots import ODOMETRY, OPTIMISED, TRUTH, draw_match, plot_trajectories
 from umf_ros.evaluation.trajectory import align_rigidly
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, relative, rotation_angle, transform
 from umf_ros.results.recorder import read_summary, write_summary
-from umf_ros.results.tables import read_closures
+from umf_ros.results.tables import INLIERS, read_closures, read_table
 from umf_ros.results.truth import Judged, judge_run
 
 MAX_PICTURES = 40
@@ -55,8 +53,7 @@ class RunReport:
     """A run folder turned into something to look at; the methods are called in order."""
 
     def __init__(self, folder: Path, bag: Bag, ground_truth: Path | None) -> None:
-        if not (folder / "summary.json").is_file():
-            raise UmfError(f"{folder} holds no finished run: summary.json is missing")
+        self.summary = read_summary(folder)
         self._folder = folder
         self._bag = bag
         self._settings: Settings = load_settings(folder / "config.yaml")
@@ -65,7 +62,6 @@ class RunReport:
         self._optimized = _trajectory(folder / "trajectory_optimized.tum")
         self._closures = read_closures(folder / "closures.csv")
         self._judged = Judged()
-        self.summary = read_summary(folder)
 
     def judge(self) -> None:
         """Fill in the summary's ground truth."""
@@ -125,7 +121,7 @@ class RunReport:
         text, mark = self._verdict()
         console.print(table)
         console.print(f"[{'green' if mark == 'good' else 'red' if mark == 'bad' else 'default'}]{text}")
-        console.print(f"Report: {self._folder / 'report.html'}", highlight=False)
+        console.print(f"Report: {self._folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
     def _verdict(self) -> tuple[str, str]:
         truth = self.summary["ground_truth"]
@@ -234,7 +230,11 @@ def _size(closure: LoopClosure) -> tuple[float, float]:
 
 def _read_inliers(path: Path) -> dict[tuple[int, int], Array]:
     lines: dict[tuple[int, int], list[list[float]]] = defaultdict(list)
-    with path.open(newline="", encoding="utf-8") as file:
-        for query, match, *pixels in list(csv.reader(file))[1:]:
-            lines[int(query), int(match)].append([float(pixel) for pixel in pixels])
+    for ends, pixels in read_table(path, _inlier):
+        lines[ends].append(pixels)
     return {ends: np.array(rows) for ends, rows in lines.items()}
+
+
+def _inlier(row: dict[str, str]) -> tuple[tuple[int, int], list[float]]:
+    query, match, *pixels = (row[name] for name in INLIERS)
+    return (int(query), int(match)), [float(pixel) for pixel in pixels]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
-from umf_ros.errors import OutputError
+from umf_ros.errors import OutputError, UmfError
 from umf_ros.frames import LoopClosure, Verdict
 from umf_ros.geometry import from_quaternion, to_quaternion
 
@@ -19,6 +20,7 @@ CLOSURES = ["query_stamp_ns", "match_stamp_ns", *POSE, *SIGMA, "probability", "s
 CANDIDATES = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "numbers"]
 KEYFRAMES = ["stamp_ns", "session", "travelled_m"]
 INLIERS = ["query_stamp_ns", "match_stamp_ns", "query_u", "query_v", "match_u", "match_v"]
+Row = TypeVar("Row")
 
 
 class Table:
@@ -69,10 +71,32 @@ def inlier_rows(query_stamp_ns: int, verdict: Verdict) -> list[list[Any]]:
     ]
 
 
+def read_table(path: Path, parse: Callable[[dict[str, str]], Row]) -> list[Row]:
+    """What `parse` makes of every row, given by column.
+
+    Raises:
+        UmfError: the file cannot be read; names the line that is damaged.
+    """
+    rows: list[Row] = []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            for row in reader:
+                rows.append(parse(row))
+    except OSError as error:
+        raise UmfError(f"cannot read {path}: {error.strerror}") from None
+    except (KeyError, TypeError, ValueError, csv.Error):
+        raise UmfError(f"{path}, line {reader.line_num}: not a row of this table") from None
+    return rows
+
+
 def read_closures(path: Path) -> list[LoopClosure]:
-    """The closures of a `closures.csv`, with a diagonal covariance."""
-    with path.open(newline="", encoding="utf-8") as file:
-        return [_closure(row) for row in csv.DictReader(file)]
+    """The closures of a `closures.csv`, with a diagonal covariance.
+
+    Raises:
+        UmfError: the file cannot be read; names the line that is damaged.
+    """
+    return read_table(path, _closure)
 
 
 def _closure(row: dict[str, str]) -> LoopClosure:

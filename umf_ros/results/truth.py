@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from umf_ros.config import Loop
 from umf_ros.evaluation.loops import Judgement, count_revisits, judge
 from umf_ros.evaluation.trajectory import absolute_trajectory_error
 from umf_ros.frames import LoopClosure
+from umf_ros.results.tables import read_table
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +86,7 @@ def _judge_closures(closures: list[LoopClosure], truth: Trajectory) -> list[Judg
 
 
 def _read_keyframes(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = [(int(row["stamp_ns"]), float(row["travelled_m"])) for row in csv.DictReader(file)]
+    rows = read_table(path, lambda row: (int(row["stamp_ns"]), float(row["travelled_m"])))
     return np.array([stamp for stamp, _ in rows], np.int64), np.array([metres for _, metres in rows], float)
 
 

@@ -1,0 +1,144 @@
+"""The command line as a whole: help, versions, and what a user can get wrong."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command_line import only_line, umf
+
+from umf_ros import __version__, doctor
+
+COMMANDS = ["demo", "simulate", "replay", "play", "report", "evaluate", "explain", "train", "export", "doctor"]
+GROUPS = {"pretrain": ["image", "lidar"], "graph": ["optimize", "plot"]}
+
+
+@pytest.fixture(autouse=True)
+def somewhere_empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Commands run where nothing is, so that whatever they leave is seen."""
+    folder = tmp_path / "here"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def left_behind(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def test_help_lists_every_command_with_one_line() -> None:
+    ended = umf("--help")
+    assert ended.status == 0
+    for name in [*COMMANDS, *GROUPS]:
+        (line,) = [line for line in ended.out.splitlines() if line.strip("│ ").startswith(f"{name} ")]
+        assert len(line.strip("│ ").removeprefix(name).strip()) > 10
+
+
+@pytest.mark.parametrize("words", [[name] for name in COMMANDS] + [[g, c] for g, cs in GROUPS.items() for c in cs])
+def test_every_command_explains_itself_and_its_options(words: list[str]) -> None:
+    ended = umf(*words, "--help")
+    assert ended.status == 0 and ended.err == ""
+    assert f"Usage: umf {' '.join(words)} " in ended.text and len(ended.text) > 150
+    assert umf(*words, "-h").out == ended.out
+
+
+def test_without_a_command_the_help_is_shown() -> None:
+    ended = umf()
+    assert ended.status == 2 and "Usage: umf" in ended.text and "replay" in ended.text
+
+
+def test_the_version_is_the_package_s() -> None:
+    assert umf("--version").out == f"umf_ros {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["repaly"], "repaly"),
+        (["--verbose"], "--verbose"),
+        (["replay"], "missing argument 'bag'"),
+        (["replay", "a.mcap", "b.mcap"], "b.mcap"),
+        (["replay", "a.mcap", "--confg", "x.yaml"], "--config"),  # the nearest option is offered
+        (["replay", "a.mcap", "--min-probability", "2"], "'--min-probability'"),
+        (["replay", "a.mcap", "--min-probability", "high"], "'--min-probability'"),
+        (["demo", "--seed", "-1"], "'--seed'"),
+        (["demo", "--seed", "one"], "'--seed'"),
+        (["demo", "--rate", "0"], "'--rate'"),
+        (["demo", "--duration", "5"], "'--duration'"),
+        (["play", "a.mcap", "--rate", "-1"], "'--rate'"),
+        (["simulate", "a.mcap", "--workers", "0"], "'--workers'"),
+        (["evaluate", "--worlds", "test", "--seed", "-3"], "'--seed'"),
+        (["explain", "a.mcap", "1"], "missing argument 'match'"),
+        (["explain", "a.mcap", "soon", "1"], "'soon' is neither a stamp in ns nor seconds"),
+        (["explain", "a.mcap", "5", "--", "-1"], "'-1' is before the start"),
+        (["explain", "a.mcap", "nan", "1"], "'nan' is before the start"),
+        (["report", "results"], "missing argument 'bag'"),
+        (["export"], "missing argument 'out'"),
+    ],
+)
+def test_wrong_usage_is_status_2_and_names_what_is_wrong(
+    somewhere_empty: Path, arguments: list[str], word: str
+) -> None:
+    ended = umf(*arguments)
+    assert ended.status == 2
+    assert word in ended.text.lower() and "Traceback" not in ended.text
+    assert ended.out == "" and left_behind(somewhere_empty) == []
+
+
+NO_BAG = "there is no recording nowhere.mcap"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["demo", "--bag", "nowhere.mcap"], NO_BAG),
+        (["demo", "--out", "/proc/results"], "cannot write to /proc/results"),
+        (["replay", "nowhere.mcap"], NO_BAG),
+        (["report", "nowhere", "nowhere.mcap"], NO_BAG),
+        (["evaluate", "nowhere.mcap"], NO_BAG),
+        (["explain", "nowhere.mcap", "1", "0"], NO_BAG),
+        (["simulate"], "say where to write: OUT.mcap, --shards DIR or --contact-sheet OUT.png"),
+        (["simulate", "drive.bag"], "cannot write drive.bag: the name must end in .mcap"),
+        (["simulate", "drive.mcap", "--preset", "olympus"], "unknown preset 'olympus'"),
+        (["export", "net.onnx"], "net.onnx: OpenVINO's files end in .xml"),
+        (["export", "net.xml", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
+        (["graph", "optimize", "nowhere.g2o"], "nowhere.g2o"),
+        (["graph", "plot", "nowhere.g2o"], "nowhere.g2o"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
+    somewhere_empty: Path, arguments: list[str], message: str
+) -> None:
+    assert message in only_line(umf(*arguments))
+    assert [name for name in left_behind(somewhere_empty) if name != "results"] == []
+
+
+def test_ctrl_c_is_status_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> list[object]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(doctor, "checks", interrupted)
+    ended = umf("doctor")
+    assert ended.status == 130 and "Traceback" not in ended.text
+
+
+def test_a_reader_that_goes_away_is_no_traceback() -> None:
+    command = f"{sys.executable} -m umf_ros.cli evaluate --help | true; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120, check=False)
+    assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+
+
+def test_play_hands_the_recording_to_the_player() -> None:
+    command = [sys.executable, "-m", "umf_ros.cli", "play", "nowhere.mcap", "--rate", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (1, f"umf: {NO_BAG}\n")
+
+
+def test_advice_keeps_its_brackets(monkeypatch: pytest.MonkeyPatch) -> None:
+    finding = doctor.Finding("ROS 2 Python", False, "[Errno 2] not there", "pip install 'ros-rclpy[fastrtps]==7.1.6'")
+    monkeypatch.setattr(doctor, "checks", lambda: [("ROS 2 Python", lambda: finding)])
+    ended = umf("doctor")
+    assert ended.status == 1
+    assert "pip install 'ros-rclpy[fastrtps]==7.1.6'" in ended.out and "[Errno 2] not there" in ended.out

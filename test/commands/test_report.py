@@ -1,0 +1,272 @@
+"""`umf report` on a run folder: judged, drawn, one page that stands alone, and what happens when a file is damaged."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from command_line import Ended, only_line, umf
+from conftest import make_keyframe
+from recordings import CLOUD, LEFT, START_NS, TRUTH, drive, small_settings, traverse, write_mcap
+
+from umf_ros.bags.frames import read_frames
+from umf_ros.bags.reader import open_bag
+from umf_ros.bags.trajectories import Trajectory, write_tum
+from umf_ros.frames import Candidate, Frame, LoopClosure, Verdict
+from umf_ros.geometry import Array, make_pose, relative
+from umf_ros.loop_detector import Detection
+from umf_ros.results.recorder import RunRecorder
+
+LATENCY = {"embed": 30.0, "query": 1.0, "verify": 9.0, "total": 40.0}
+PIXELS = np.array([[10, 12, 50, 30], [40, 20, 20, 41]], np.float32)
+
+
+def verdict(query: Frame, match: Frame, error_m: float, probability: float) -> Verdict:
+    """A closure between two frames that is wrong by so much, sideways."""
+    poses = [drive((frame.stamp_ns - START_NS) * 1e-9) for frame in (match, query)]
+    pose = relative(*poses) @ make_pose(np.eye(3), [0, error_m, 0])
+    closure = LoopClosure(query.stamp_ns, match.stamp_ns, pose, np.eye(6) * 0.01, probability)
+    return Verdict(Candidate(0, match.stamp_ns, 0.8), "accepted", {"inliers_image": 2.0}, closure, PIXELS)
+
+
+def record_run(folder: Path, bag: Path, settings_folder: Path) -> list[Frame]:
+    """A run with two true closures and a false one, written as the replay writes it."""
+    folder.mkdir()
+    settings = small_settings(settings_folder, loop__min_time_gap_s=1.0, loop__min_travel_m=0.5)
+    frames = list(read_frames(open_bag(bag), settings))
+    recorder = RunRecorder(folder, settings, "weights <v1>")
+    closures = {10: verdict(frames[10], frames[5], 0.1, 0.99), 11: verdict(frames[11], frames[6], 0.3, 0.95)}
+    closures[12] = verdict(frames[12], frames[7], 0.8, 0.9123)
+    for i, frame in enumerate(frames):
+        keyframe = replace(make_keyframe(0, 0.2 * i), stamp_ns=frame.stamp_ns)
+        rejected = Verdict(Candidate(1, frames[0].stamp_ns, 0.1), "few inliers", {"inliers_image": 1.0})
+        found = [closures[i], rejected] if i in closures else []
+        recorder.record(frame, Detection(frame.stamp_ns, keyframe, found, LATENCY))
+    recorder.write_summary({"image": 1, "cloud": 0, "odometry": 0, "worker": 0})
+    recorder.close()
+    stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
+    truth = np.stack([drive(second) for second in (stamps - START_NS) * 1e-9])
+    write_tum(folder / "trajectory_optimized.tum", Trajectory(stamps, truth))
+    write_tum(folder / "trajectory_odometry.tum", Trajectory(stamps, drifted(truth)))
+    return frames
+
+
+def drifted(poses: Array) -> Array:
+    """The same drive, a tenth too long."""
+    longer = poses.copy()
+    longer[:, :3, 3] *= 1.1
+    return longer
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_mcap(tmp_path_factory.mktemp("bag") / "drive.mcap", traverse(4.0))
+
+
+@pytest.fixture
+def run(bag: Path, tmp_path: Path) -> Path:
+    record_run(tmp_path / "run", bag, tmp_path)
+    return tmp_path / "run"
+
+
+class Page(HTMLParser):
+    """What a browser would see, and every address that the page refers to."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open_tags: list[str] = []
+        self.addresses: list[str] = []
+        self.rows: list[list[str]] = []
+        self.headings: list[str] = []
+        self.captions: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attributes if name in ("src", "href")]
+        if tag not in ("img", "meta"):
+            self.open_tags.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag == "td":
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open_tags.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        innermost = self.open_tags[-1] if self.open_tags else ""
+        if innermost == "td":
+            self.rows[-1][-1] += data
+        if innermost in ("h1", "h2"):
+            self.headings.append(data)
+        if innermost == "figcaption":
+            self.captions.append(data)
+
+
+def page_of(run: Path) -> Page:
+    page = Page((run / "report.html").read_text(encoding="utf-8"))
+    assert page.open_tags == []
+    return page
+
+
+def report(run: Path, bag: Path, *more: str | Path) -> Ended:
+    ended = umf("report", run, bag, *more)
+    assert ended.status == 0, ended.text
+    return ended
+
+
+def test_closures_are_judged_by_the_truth_of_the_recording(run: Path, bag: Path) -> None:
+    ended = report(run, bag)
+    found = json.loads((run / "summary.json").read_text())["ground_truth"]
+    assert (found["closures_true"], found["closures_false"]) == (2, 1)
+    assert found["ate_optimized_m"] == pytest.approx(0, abs=1e-3) and found["ate_odometry_m"] > 0.02
+    # 18 scans; the first five are less than a second old when they look back
+    assert found["revisits"] == 13
+    assert "2 true and 1 false loop closures" in ended.text and f"Report: {run}/report.html" in ended.out
+
+
+def test_the_page_stands_alone_and_is_well_formed(run: Path, bag: Path) -> None:
+    report(run, bag)
+    page = page_of(run)
+    assert page.headings == ["Loop closures", "Trajectory", "Matches: query left, match right", "All closures"]
+    assert len(page.addresses) == 4 == len(page.captions)
+    for address in page.addresses:
+        assert address.startswith("data:image/png;base64,")
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None and picture.std() > 5
+
+
+def test_the_page_lists_every_closure_with_its_errors(run: Path, bag: Path) -> None:
+    report(run, bag)
+    with (run / "closures.csv").open() as file:
+        written = [(row["query_stamp_ns"], row["match_stamp_ns"]) for row in csv.DictReader(file)]
+    rows = [row for row in page_of(run).rows if len(row) == 8]
+    assert [(row[0], row[1]) for row in rows] == written
+    assert [row[7] for row in rows] == ["yes", "yes", "NO"]
+    assert [float(row[5]) for row in rows] == pytest.approx([0.1, 0.3, 0.8], abs=2e-3)
+    assert [row[4] for row in rows] == ["0.99", "0.95", "0.9123"]
+    facts = {row[0]: row[1] for row in page_of(run).rows if len(row) == 2}
+    assert facts["closures"] == "3 published, 3 candidates rejected"
+    assert facts["latency"] == "40 ms per keyframe, median (embed 30, query 1, verify 9)"
+    assert facts["dropped"] == "image 1, cloud 0, odometry 0, worker 0"
+
+
+def test_match_pictures_show_both_images_joined_at_the_inliers(run: Path, bag: Path, tmp_path: Path) -> None:
+    report(run, bag)
+    frames = {frame.stamp_ns: frame for frame in read_frames(open_bag(bag), small_settings(tmp_path))}
+    paths = sorted((run / "matches").glob("*.png"))
+    assert len(paths) == 3
+    for path in paths:
+        query, match = (frames[int(stamp)].left for stamp in path.stem.split("_"))
+        assert query is not None and match is not None
+        picture = cv2.imread(str(path)).astype(int)
+        margin, gap = picture.shape[0] - 48, picture.shape[1] - 2 * 64
+        left, right = picture[margin:, :64], picture[margin:, 64 + gap :]
+        coloured = [np.ptp(side, axis=2) > 0 for side in (left, right)]
+        for side, image, drawn in zip((left, right), (query, match), coloured, strict=True):
+            np.testing.assert_array_equal(side[~drawn][:, 0], image[~drawn])
+        for u, v, match_u, match_v in PIXELS.astype(int):
+            # a circle of three pixels around the feature, in both images
+            assert coloured[0][v - 4 : v + 5, u - 4 : u + 5].any()
+            assert coloured[1][match_v - 4 : match_v + 5, match_u - 4 : match_u + 5].any()
+        assert not coloured[0][:8, 48:].any()  # no line comes near this corner
+
+
+def test_reporting_twice_gives_the_same(run: Path, bag: Path) -> None:
+    report(run, bag)
+    first = (run / "report.html").read_bytes(), (run / "summary.json").read_bytes()
+    report(run, bag)
+    assert ((run / "report.html").read_bytes(), (run / "summary.json").read_bytes()) == first
+
+
+def test_without_a_truth_nothing_is_judged(bag: Path, tmp_path: Path) -> None:
+    record_run(tmp_path / "run", bag, tmp_path)
+    blind = write_mcap(tmp_path / "blind.mcap", [entry for entry in traverse(4.0) if entry[0] != TRUTH])
+    ended = report(tmp_path / "run", blind)
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["ground_truth"] is None
+    assert "3 loop closures; there is no ground truth to judge them by." in ended.text
+    rows = [row for row in page_of(tmp_path / "run").rows if len(row) == 8]
+    assert [row[5:] for row in rows] == [["", "", ""]] * 3
+
+
+def test_a_truth_file_goes_before_that_of_the_recording(run: Path, bag: Path, tmp_path: Path) -> None:
+    seconds = np.arange(0, 4, 0.1)
+    stamps = START_NS + np.round(seconds * 1e9).astype(np.int64)
+    # a truth in which the rover stands: no closure has the right pose
+    write_tum(tmp_path / "other.tum", Trajectory(stamps, np.tile(np.eye(4), (len(stamps), 1, 1))))
+    report(run, bag, "--ground-truth", tmp_path / "other.tum")
+    found = json.loads((run / "summary.json").read_text())["ground_truth"]
+    assert (found["closures_true"], found["closures_false"]) == (0, 3)
+
+
+def test_closures_outside_of_the_truth_are_not_judged(run: Path, bag: Path, tmp_path: Path) -> None:
+    seconds = np.arange(0, 2.55, 0.05)
+    stamps = START_NS + np.round(seconds * 1e9).astype(np.int64)
+    write_tum(tmp_path / "short.tum", Trajectory(stamps, np.stack([drive(second) for second in seconds])))
+    report(run, bag, "--ground-truth", tmp_path / "short.tum")
+    found = json.loads((run / "summary.json").read_text())["ground_truth"]
+    assert (found["closures_true"], found["closures_false"]) == (2, 0)
+    assert [row[7] for row in page_of(run).rows if len(row) == 8] == ["yes", "yes", ""]
+
+
+def test_without_images_there_are_no_match_pictures(bag: Path, tmp_path: Path) -> None:
+    record_run(tmp_path / "run", bag, tmp_path)
+    dark = write_mcap(tmp_path / "dark.mcap", [entry for entry in traverse(4.0) if entry[0] in (CLOUD, TRUTH)])
+    report(tmp_path / "run", dark)
+    assert list((tmp_path / "run" / "matches").iterdir()) == []
+    assert len(page_of(tmp_path / "run").addresses) == 1
+
+
+def test_a_run_without_closures_and_trajectories(bag: Path, tmp_path: Path) -> None:
+    settings = small_settings(tmp_path)
+    (tmp_path / "run").mkdir()
+    recorder = RunRecorder(tmp_path / "run", settings, "weights")
+    recorder.write_summary({})
+    recorder.close()
+    ended = report(tmp_path / "run", bag)
+    assert "0 true and 0 false loop closures" in ended.text
+    assert re.search("latency", ended.text) is None  # nothing was measured
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("summary.json", None, "holds no finished run: summary.json is missing"),
+        ("summary.json", '{"frames": 3, ', "summary.json is not the summary of a run"),
+        ("summary.json", "[]", "summary.json is not the summary of a run"),
+        ("summary.json", '{"hello": 1}', "summary.json is not the summary of a run"),
+        ("closures.csv", None, "cannot read"),
+        ("closures.csv", "query_stamp_ns,match_stamp_ns\n1,2\n", "closures.csv, line 2: not a row of this table"),
+        ("keyframes.csv", "stamp_ns,session,travelled_m\n5,0,1.5\n6,0\n", "keyframes.csv, line 3: not a row"),
+        ("inliers.csv", "query_stamp_ns,match_stamp_ns,query_u\nx,2,3\n", "inliers.csv, line 2: not a row"),
+        ("config.yaml", "loop: {topk: 3}\n", "unknown parameter loop.topk"),
+        ("trajectory_odometry.tum", "1.0 0 0 0\n", "trajectory_odometry.tum, line 1: expected 8 numbers"),
+    ],
+)
+def test_a_damaged_run_is_one_clear_line(run: Path, bag: Path, name: str, content: str | None, message: str) -> None:
+    (run / name).unlink()
+    if content is not None:
+        (run / name).write_text(content)
+    assert message in only_line(umf("report", run, bag))
+    assert not (run / "report.html").exists()
+
+
+def test_names_with_brackets_are_kept(bag: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run [old]"
+    record_run(folder, bag, tmp_path)
+    assert f"Report: {folder}/report.html" in report(folder, bag).out
+
+
+def test_the_recording_of_another_run_is_no_crash(run: Path, tmp_path: Path) -> None:
+    other = write_mcap(tmp_path / "other.mcap", [entry for entry in traverse(0.5) if entry[0] == LEFT])
+    report(run, other)
+    assert list((run / "matches").iterdir()) == []
