@@ -67,3 +67,47 @@ def test_nothing_is_taken_after_closing() -> None:
     worker.submit(1)
     time.sleep(0.01)
     assert done == []
+
+
+def test_draining_waits_for_the_item_in_hand() -> None:
+    gate, started, done = threading.Event(), threading.Event(), []
+
+    def work(item: int) -> None:
+        started.set()
+        gate.wait()
+        done.append(item)
+
+    worker: Worker[int] = Worker(work, lambda _: None, queue_size=9)
+    worker.submit(1)
+    started.wait()
+    assert not worker.drain(timeout_s=0.01) and done == []
+    gate.set()
+    assert worker.drain() and done == [1]
+    worker.close()
+
+
+def test_what_is_left_when_closing_takes_too_long_is_counted() -> None:
+    gate, started, done = threading.Event(), threading.Event(), []
+
+    def work(item: int) -> None:
+        started.set()
+        gate.wait()
+        done.append(item)
+
+    worker: Worker[int] = Worker(work, lambda _: None, queue_size=9)
+    for item in range(4):
+        worker.submit(item)
+    started.wait()
+    worker.close(timeout_s=0.01)
+    assert worker.dropped == 3
+    gate.set()
+    assert worker.drain() and done == [0]
+
+
+def test_an_error_in_one_item_does_not_hide_those_of_others() -> None:
+    told: list[str] = []
+    worker: Worker[int] = Worker(lambda item: 1 // 0 if item % 2 else None, lambda e: told.append(str(e)), 9)
+    for item in range(6):
+        worker.submit(item)
+    worker.close()
+    assert len(told) == 3 and "zero" in told[0]

@@ -1,0 +1,159 @@
+"""The offline run: what it leaves behind when it ends, is stopped early, has no odometry, or starts over."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import small_settings, traverse, write_mcap
+
+from umf_ros.bags.frames import read_frames
+from umf_ros.bags.reader import open_bag
+from umf_ros.bags.trajectories import read_tum
+from umf_ros.config import Settings, load_settings
+from umf_ros.embedding.baselines import ThumbnailEmbedder
+from umf_ros.errors import OutputError
+from umf_ros.frames import Frame
+from umf_ros.loop_detector import LoopDetector
+from umf_ros.replay import Replay
+
+TABLES = ["candidates.csv", "closures.csv", "config.yaml", "inliers.csv", "keyframes.csv", "summary.json"]
+GRAPH = ["graph.g2o", "graph_verdicts.csv", "trajectory_odometry.tum", "trajectory_optimized.tum"]
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> list[Frame]:
+    """Scans, images and odometry of four seconds."""
+    folder = tmp_path_factory.mktemp("bag")
+    return list(read_frames(open_bag(write_mcap(folder / "a.mcap", traverse(4.0))), small_settings(folder)))
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    gaps = {"loop__min_time_gap_s": 1.0, "loop__min_travel_m": 0.3}
+    policy = {"keyframe__min_translation_m": 0.2, "keyframe__min_period_s": 0.0, "keyframe__untracked_period_s": 0.5}
+    return small_settings(tmp_path, **gaps, **policy)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "run").mkdir()
+    return tmp_path / "run"
+
+
+def replay_of(folder: Path, settings: Settings) -> Replay:
+    return Replay(folder, settings, LoopDetector(settings, ThumbnailEmbedder()))
+
+
+def names_in(folder: Path) -> list[str]:
+    names = sorted(path.name for path in folder.iterdir())
+    return [name for name in names if not name.endswith("ids.csv")]
+
+
+def keyframes_in(folder: Path) -> list[dict[str, str]]:
+    with (folder / "keyframes.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_whole_run_leaves_tables_trajectories_and_graph(
+    folder: Path, settings: Settings, frames: list[Frame]
+) -> None:
+    replay = replay_of(folder, settings)
+    detections = list(replay.run(frames))
+    assert [detection.frame_stamp_ns for detection in detections] == [frame.stamp_ns for frame in frames]
+    assert replay.finish({"image": 0}) is True
+    assert set(TABLES + GRAPH) <= set(names_in(folder))
+    summary = json.loads((folder / "summary.json").read_text())
+    chosen = [detection.keyframe.stamp_ns for detection in detections if detection.keyframe is not None]
+    assert summary["frames"] == summary["pairs"] == len(frames) and summary["keyframes"] == len(chosen)
+    assert [int(row["stamp_ns"]) for row in keyframes_in(folder)] == chosen
+    assert summary["queries"] == sum(bool(detection.verdicts) for detection in detections) > 0
+    assert summary["closures_rejected"] == sum(
+        verdict.closure is None for detection in detections for verdict in detection.verdicts
+    )
+    assert summary["weights"] == ThumbnailEmbedder().name
+    assert load_settings(folder / "config.yaml") == settings
+    assert len(read_tum(folder / "trajectory_odometry.tum")) > 2
+
+
+def test_a_run_that_is_stopped_is_as_complete_as_far_as_it_went(
+    folder: Path, settings: Settings, frames: list[Frame]
+) -> None:
+    replay = replay_of(folder, settings)
+    for count, _ in enumerate(replay.run(frames), 1):
+        if count == 7:
+            break
+    assert replay.finish({}) is True
+    assert set(TABLES + GRAPH) <= set(names_in(folder))
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["frames"] == 7 and summary["keyframes"] == len(keyframes_in(folder))
+    assert read_tum(folder / "trajectory_odometry.tum").stamps_ns[-1] <= frames[6].stamp_ns
+
+
+def test_rows_are_on_disk_while_the_run_goes_on(folder: Path, settings: Settings, frames: list[Frame]) -> None:
+    found = 0
+    for detection in replay_of(folder, settings).run(frames):
+        found += detection.keyframe is not None
+        assert len(keyframes_in(folder)) == found
+
+
+def test_without_odometry_there_is_no_graph_and_it_says_so(
+    folder: Path, settings: Settings, frames: list[Frame]
+) -> None:
+    replay = replay_of(folder, settings)
+    list(replay.run(replace(frame, odom_T_body=None) for frame in frames))
+    assert replay.finish({}) is False
+    assert names_in(folder) == TABLES
+    assert {row["travelled_m"] for row in keyframes_in(folder)} == {"nan"}
+
+
+def test_a_recording_that_starts_over_is_another_session(folder: Path, settings: Settings, frames: list[Frame]) -> None:
+    replay = replay_of(folder, settings)
+    list(replay.run([*frames, *(replace(frame, session=1) for frame in frames)]))
+    assert replay.finish({}) is True
+    rows = keyframes_in(folder)
+    first, second = ([row["stamp_ns"] for row in rows if row["session"] == session] for session in ("0", "1"))
+    assert first == second and len(first) > 3
+
+
+def test_a_run_of_no_frames_is_a_run(folder: Path, settings: Settings) -> None:
+    replay = replay_of(folder, settings)
+    assert list(replay.run([])) == [] and replay.finish({}) is False
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["frames"] == summary["keyframes"] == 0 and summary["latency_ms"]["total"]["p50"] is None
+
+
+def test_the_same_frames_give_the_same_tables(tmp_path: Path, settings: Settings, frames: list[Frame]) -> None:
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        replay = replay_of(tmp_path / name, settings)
+        list(replay.run(frames))
+        replay.finish({})
+    for table in [name for name in TABLES + GRAPH if name != "summary.json"]:
+        assert (tmp_path / "one" / table).read_bytes() == (tmp_path / "two" / table).read_bytes(), table
+
+
+def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path: Path, settings: Settings) -> None:
+    with pytest.raises(OutputError, match=r"cannot write .*nowhere/config\.yaml"):
+        replay_of(tmp_path / "nowhere", settings)
+
+
+def test_places_are_kept_from_run_to_run_when_a_file_is_named(tmp_path: Path, frames: list[Frame]) -> None:
+    database = {"path": str(tmp_path / "places.sqlite")}
+    settings = small_settings(tmp_path, database=database, loop__min_time_gap_s=1.0)
+    counts = []
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        replay = replay_of(tmp_path / name, settings)
+        detections = list(replay.run(frames))
+        replay.finish({})
+        counts.append(sum(bool(detection.verdicts) for detection in detections))
+        sessions = {row["session"] for row in keyframes_in(tmp_path / name)}
+        assert sessions == {"0" if name == "first" else "1"}
+    # the second run has the first one's places to look at from its first keyframe on
+    assert counts[1] == len(keyframes_in(tmp_path / "second")) > counts[0]
+    assert np.isfinite(float(keyframes_in(tmp_path / "second")[-1]["travelled_m"]))
