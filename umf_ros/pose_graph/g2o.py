@@ -7,7 +7,7 @@ roll and pitch is given the weight of what it does say.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -132,7 +132,23 @@ def write_g2o(path: str | Path, poses: Iterable[Array], edges: Sequence[Edge], p
     Raises:
         OutputError: the file cannot be written.
     """
-    lines = _planar_lines(poses, edges) if planar else _spatial_lines(poses, edges)
+    _write(path, _planar_lines(poses, edges) if planar else _spatial_lines(poses, edges))
+
+
+def write_vertex_table(path: str | Path, vertices: Mapping[tuple[int, int], int]) -> None:
+    """Write which vertex of a g2o file is which stamp: `id,session,stamp_ns` lines.
+
+    Args:
+        path: the file.
+        vertices: vertex id by session and stamp.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    _write(path, ["id,session,stamp_ns", *(f"{v},{session},{stamp}" for (session, stamp), v in vertices.items())])
+
+
+def _write(path: str | Path, lines: Iterable[str]) -> None:
     try:
         Path(path).write_text("".join(line + "\n" for line in lines), encoding="ascii")
     except OSError as error:

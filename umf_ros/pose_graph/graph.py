@@ -25,12 +25,12 @@ from umf_ros.pose_graph.closures import (
 )
 from umf_ros.pose_graph.condensed import Edge, Edges, odometry_edges
 from umf_ros.pose_graph.ends import Scale
-from umf_ros.pose_graph.g2o import write_g2o
+from umf_ros.pose_graph.g2o import write_g2o, write_vertex_table
 from umf_ros.pose_graph.judge import Judge
 from umf_ros.pose_graph.odometry import Stamps
 from umf_ros.pose_graph.sessions import Sessions
 from umf_ros.pose_graph.shape import Shape
-from umf_ros.pose_graph.trajectory_files import write_tum, write_vertex_table
+from umf_ros.trajectory import Trajectory, write_tum
 
 logger = logging.getLogger(__name__)
 _NO_ODOMETRY_YET = "its odometry has not arrived"
@@ -250,8 +250,14 @@ class PoseGraph:
         return gtsam_to_ros_covariance(covariance, self._sessions.at(session, last)[0])
 
     def write_tum(self, path: str | Path, optimized: bool = True) -> None:
-        """Write the trajectory, or the odometry, as a TUM file."""
-        write_tum(path, *(self.trajectory() if optimized else self.odometry()))
+        """Write the trajectory, or the odometry, of all joined sessions in order of their stamps as a TUM file.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        stamps, poses = self.trajectory() if optimized else self.odometry()
+        order = np.argsort(stamps, kind="stable")
+        write_tum(path, Trajectory(stamps[order], poses[order]))
 
     def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
         """Verdicts of the N closures with known ends, and (N, 2, 3) map positions of match and query."""

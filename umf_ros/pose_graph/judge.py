@@ -53,6 +53,7 @@ class Judge:
         self._vetoed: set[int] = set()
         self._too_far: set[int] = set()
         self._contests: dict[int, int] = {}
+        self._chances: dict[int, float] = {}
         self._brought_close: list[int] = []
         self.scale = Scale()
         self.closures: list[TrackedClosure] = []
@@ -162,6 +163,7 @@ class Judge:
                 continue
             distance, misfit_m, chance = self._compare(row)
             self._too_far.discard(row)
+            self._chances[row] = 1.0
             if self._settings.use_gate and distance > self._settings.gate_chi2:
                 self._note(row, State.REJECTED, _CONTRADICTS, distance, misfit_m)
             elif self._settings.max_correction_m and misfit_m > self._settings.max_correction_m:
@@ -169,6 +171,7 @@ class Judge:
                 self._note(row, State.REJECTED, f"moves the pose by {misfit_m:.1f} m", distance, misfit_m)
             else:
                 self._note(row, State.UNDECIDED, _UNSURE, distance, misfit_m)
+                self._chances[row] = chance
                 if chance <= self._settings.max_chance or not self._settings.use_support:
                     agreed.add(row)
         return agreed
@@ -199,7 +202,8 @@ class Judge:
         for row in rows:
             if members[row] and not any(row in group for group in groups):
                 group, evidence = self._agreement.group(row, members)
-                if evidence >= self._settings.min_support:
+                # to agree with the map as well is one more thing that chance has to explain
+                if evidence - np.log(self._chances[row]) >= self._settings.min_support:
                     groups.append(group)
         return groups
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.bags.trajectories import Trajectory, write_tum
 from umf_ros.bags.writer import BagWriter
 from umf_ros.errors import OutputError
 from umf_ros.simulation import gnss, imu
@@ -29,6 +28,7 @@ from umf_ros.simulation.messages import (
 )
 from umf_ros.simulation.pool import ahead
 from umf_ros.simulation.simulator import START_NS, Simulator
+from umf_ros.trajectory import Trajectory, write_tum
 
 Event = tuple[int, int, str, Any]
 """Time of recording in ns, rank of its stream, topic and message."""
