@@ -1,4 +1,4 @@
-"""`umf replay` as a user runs it: in a process of its own, on a simulated recording."""
+"""`umf replay` as a user runs it, on a simulated recording; in a process of its own where that matters."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import only_line
+from command_line import umf as umf_here
+from recordings import ODOMETRY, TRUTH, traverse, write_mcap
 
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.results.tables import read_closures
@@ -119,30 +122,65 @@ def test_a_truncated_recording_is_used_as_far_as_it_goes(mini_bag: Path, mini_co
     assert summary["keyframes"] > 5
 
 
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_mcap(tmp_path_factory.mktemp("small") / "small.mcap", traverse(1.0))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["nowhere.mcap"], "there is no recording nowhere.mcap"),
-        (["{notes}"], "notes"),
+        (["{notes}"], "notes.txt is no recording"),
+        (["{odometry}"], "no topic of a known data set"),
         (["{bag}", "--config", "nowhere.yaml"], "cannot read nowhere.yaml"),
         (["{bag}", "--config", "{wrong}"], "unknown parameter loop.topk"),
-        (["{bag}", "--dataset", "kitti"], "dataset"),
+        (["{bag}", "--config", "{notes}"], "notes.txt: expected names and values, found a str"),
+        (["{bag}", "--dataset", "kitti"], "dataset: input should be 'simulated', 's3li-etna' or 's3li-vulcano'"),
         (["{bag}", "--embedder", "magic"], "magic"),
         (["{bag}", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
-        (["{bag}", "--weights", "{notes}"], "notes"),
-        (["{bag}", "--odometry", "{notes}"], "line 1"),
-        (["{bag}", "--out", "{notes}/results"], "cannot write to"),
+        (["{bag}", "--weights", "{notes}"], "notes.txt"),
+        (["{bag}", "--odometry", "{notes}"], "line 1: expected numbers"),
+        (["{bag}", "--odometry", "{early}"], "the odometry file covers none of the recording"),
+        (["{bag}", "--odometry", "{early}", "--odometry-frame", "wheel"], "unknown frame 'wheel' of the odometry"),
+        (["{bag}", "--ground-truth", "nowhere.pos"], "cannot read nowhere.pos"),
+        (["{bag}", "--ground-truth", "{notes}"], "notes.txt, line 1"),
+        (["{bag}", "--config", "{foreign}"], "notes.txt cannot be used as a place database"),
+        (["{bag}", "--config", "{mounted}"], "cannot read /nowhere.yaml"),
     ],
 )
-def test_what_a_user_can_get_wrong_is_one_clear_line(
-    mini_bag: Path, tmp_path: Path, arguments: list[str], message: str
+def test_what_a_user_can_get_wrong_is_one_clear_line_and_leaves_nothing(
+    small: Path, tmp_path: Path, arguments: list[str], message: str
 ) -> None:
-    notes, wrong = tmp_path / "notes.txt", tmp_path / "wrong.yaml"
-    notes.write_text("these are notes\n")
-    wrong.write_text("loop: {topk: 3}\n")
-    filled = [argument.format(bag=mini_bag, notes=notes, wrong=wrong) for argument in arguments]
-    done = umf("replay", *filled, *([] if "--out" in filled else ["--out", tmp_path / "out"]))
-    assert done.returncode == 1
-    lines = done.stderr.strip().splitlines()
-    assert lines and lines[-1].startswith("umf: ") and message in lines[-1]
-    assert "Traceback" not in done.stderr and len(lines) == 1
+    written = {
+        "notes": "these are notes\n",
+        "wrong": "loop: {topk: 3}\n",
+        "early": "1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n",
+        "foreign": f"embedding: {{method: thumbnail}}\ndatabase: {{path: {tmp_path / 'notes.txt'}}}\n",
+        "mounted": "calibration: /nowhere.yaml\n",
+    }
+    names = {"bag": small} | {name: tmp_path / f"{name}.txt" for name in written}
+    names["odometry"] = tmp_path / "odometry.mcap"
+    write_mcap(names["odometry"], [entry for entry in traverse(0.3) if entry[0] == ODOMETRY])
+    for name, content in written.items():
+        names[name].write_text(content)
+    filled = [argument.format(**names) for argument in arguments]
+    assert message in only_line(umf_here("replay", *filled, "--out", tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_that_have_no_place_are_one_clear_line(small: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    line = only_line(umf_here("replay", small, "--embedder", "thumbnail", "--out", tmp_path / "file" / "results"))
+    assert line.startswith(f"cannot write to {tmp_path}/file/results")
+
+
+def test_a_recording_without_truth_is_not_judged_and_its_name_keeps_its_brackets(tmp_path: Path) -> None:
+    whole = write_mcap(tmp_path / "whole.mcap", [entry for entry in traverse(3.0) if entry[0] != TRUTH]).read_bytes()
+    bag = tmp_path / "cut [copy].mcap"
+    bag.write_bytes(whole[: len(whole) * 2 // 3])
+    ended = umf_here("replay", bag, "--embedder", "thumbnail", "--dataset", "simulated", "--out", tmp_path / "out")
+    assert ended.status == 0, ended.text
+    assert f"{bag} breaks off; its first" in ended.out
+    assert "there is no ground truth to judge them by" in ended.text
+    assert json.loads((tmp_path / "out" / "latest" / "summary.json").read_text())["ground_truth"] is None
