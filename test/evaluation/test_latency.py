@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from landmarks import LandmarkEmbedder, frame_of
-from tiny_worlds import TINY
 
 from umf_ros.evaluation import latency
-from umf_ros.evaluation.latency import WARM_UP, Cost, at_full_size, cost_of_preset, measure
+from umf_ros.evaluation.latency import WARM_UP, Cost, at_full_size, measure
 from umf_ros.frames import Embedding, Frame
-from umf_ros.networks.presets import PRESETS
-from umf_ros.networks.umf import UMF, count_parameters
 
 FRAMES = [frame_of(stamp, 1) for stamp in range(5)]
 
@@ -61,17 +56,3 @@ def test_frames_are_timed_at_the_size_of_the_real_camera() -> None:
     assert large.points is frame.points and large.stamp_ns == 7
     blind = replace(frame, left=None)
     assert at_full_size(blind) is blind
-
-
-@pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return tmp_path / "cache"
-
-
-def test_timing_a_preset_leaves_nothing_in_the_users_cache(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
-    cost = cost_of_preset("tiny", FRAMES[:1], repeats=1)
-    assert cost.name == "tiny" and cost.parameters == count_parameters(UMF(TINY)) > 1000
-    assert cost.eager_ms > 0 and cost.fast_ms > 0
-    assert os.environ["XDG_CACHE_HOME"] == str(cache) and not cache.exists()

@@ -29,3 +29,27 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"cannot write .*summary\.json"):
         write_atomically(path, "new")
     assert path.read_text() == "old"
+
+
+def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path: Path) -> None:
+    names = [create_run_folder(tmp_path).name for _ in range(12)]
+    assert len(set(names)) == 12 and sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, "latest"])
+
+
+def test_a_latest_that_leads_nowhere_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "latest").symlink_to("a run that was deleted")
+    folder = create_run_folder(tmp_path)
+    assert (tmp_path / "latest").resolve() == folder.resolve()
+
+
+def test_a_folder_named_latest_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "latest").mkdir()
+    (tmp_path / "latest" / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match=f"cannot write to {tmp_path}"):
+        create_run_folder(tmp_path)
+    assert (tmp_path / "latest" / "notes.txt").read_text() == "mine"
+
+
+def test_a_place_for_results_is_made_when_it_is_asked_for(tmp_path: Path) -> None:
+    check_writable(tmp_path / "a" / "b")
+    assert (tmp_path / "a" / "b").is_dir() and list((tmp_path / "a" / "b").iterdir()) == []

@@ -4,16 +4,18 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from conftest import make_frame, make_keyframe
 
 from umf_ros.config import Settings, load_settings
-from umf_ros.errors import OutputError
+from umf_ros.errors import OutputError, UmfError
 from umf_ros.frames import Candidate, LoopClosure, Verdict
 from umf_ros.geometry import make_pose
 from umf_ros.loop_detector import Detection
+from umf_ros.results import recorder as recorder_module
 from umf_ros.results.recorder import RunRecorder, count_drops, read_summary
 from umf_ros.results.tables import read_closures
 from umf_ros.sensors.counters import SURPLUS, InputCounter
@@ -100,3 +102,44 @@ def test_the_effective_settings_are_written_first(tmp_path: Path) -> None:
 def test_a_folder_that_is_gone_is_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot write"):
         RunRecorder(tmp_path / "gone", Settings(), "w")
+
+
+def test_the_realtime_factor_is_recorded_time_by_elapsed_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A looped bag starts over: its second lap counts like the first, and the jump back does not."""
+    now_s = [50.0]
+    monkeypatch.setattr(recorder_module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    recorder = RunRecorder(tmp_path, Settings(), "w")
+    for session in range(2):
+        for second in (100, 110, 130):
+            recorder.record(make_frame(second, session=session), Detection(second * 10**9))
+    now_s[0] += 20.0
+    assert recorder.summary({})["realtime_factor"] == 3.0
+
+
+def test_the_summary_can_be_written_again_as_the_run_goes_on(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, Settings(), "w")
+    for count in range(1, 4):
+        recorder.record(make_frame(count), detection(count, []))
+        recorder.write_summary({"worker": count})
+        summary = read_summary(tmp_path)
+        assert summary["keyframes"] == count and summary["drops"] == {"worker": count}
+        assert summary["peak_rss_mb"] > 20 and summary["seed"] == 0
+    assert sorted(path.name for path in tmp_path.glob("summary*")) == ["summary.json"]
+
+
+def test_a_keyframe_that_was_asked_and_found_nothing_is_no_query(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, Settings(), "w")
+    rejected = Verdict(Candidate(1, 5, 0.4), "few inliers", {})
+    recorder.record(make_frame(1), detection(1, []))
+    recorder.record(make_frame(2), detection(2, [rejected, rejected]))
+    recorder.record(make_frame(60), detection(60, [accepted(60, 2), accepted(60, 3), rejected]))
+    summary = recorder.summary({})
+    assert (summary["keyframes"], summary["queries"]) == (3, 2)
+    assert (summary["closures_published"], summary["closures_rejected"]) == (2, 3)
+
+
+@pytest.mark.parametrize("content", ["", "[1, 2]", '{"frames": 3}', '{"closures_published": '])
+def test_a_foreign_summary_is_one_clear_line(tmp_path: Path, content: str) -> None:
+    (tmp_path / "summary.json").write_text(content)
+    with pytest.raises(UmfError, match=r"summary\.json is not the summary of a run"):
+        read_summary(tmp_path)
