@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+import importlib.util
+import os
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from umf_ros import doctor
+from umf_ros import doctor, embedding
 from umf_ros.commands.doctor import command
+from umf_ros.errors import WeightsError
 
 
 def broken_package(folder: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> str:
@@ -81,3 +86,71 @@ def test_the_command_fails_exactly_when_something_is_wrong(
     output = capsys.readouterr().out
     assert "what was found" in output
     assert ("what helps" in output) is not fine
+
+
+@pytest.mark.parametrize(
+    ("version", "minimum", "fine"),
+    [
+        ("2.10.1", "2.9", True),
+        ("2.9", "2.10", False),
+        ("10", "9.9", True),
+        ("2.4.0+cpu", "2.4", True),
+        ("2", "2.0.1", False),
+    ],
+)
+def test_versions_are_compared_number_by_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str, minimum: str, fine: bool
+) -> None:
+    name = broken_package(tmp_path, monkeypatch, f"__version__ = {version!r}")
+    finding = doctor.check_package(name, name, minimum)
+    assert (finding.fine, finding.found) == (fine, version)
+
+
+def test_the_ros_packages_of_this_machine_are_found() -> None:
+    ros, messages = doctor.check_rclpy(), doctor.check_messages()
+    assert ros.fine and ros.found.startswith("rclpy 7.") and "rmw_" in ros.found
+    assert messages.fine and messages.found == "all there"
+
+
+def test_a_missing_message_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = importlib.util.find_spec
+    hidden = {"nav_msgs", "std_srvs"}
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in hidden else real(name))
+    finding = doctor.check_messages()
+    assert not finding.fine and finding.found == "missing: nav_msgs, std_srvs"
+    assert "ros-jazzy-common-interfaces" in finding.advice
+
+
+def test_weights_that_cannot_be_used_are_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(settings: object) -> None:
+        raise WeightsError("umf_light.safetensors is damaged")
+
+    monkeypatch.setattr(embedding, "make_embedder", refuse)
+    finding = doctor.check_weights()
+    assert (finding.fine, finding.found) == (False, "umf_light.safetensors is damaged")
+    assert "embedding.weights" in finding.advice
+
+
+@pytest.mark.parametrize(("cores", "fine", "found"), [(1, False, "1 core"), (2, True, "2 cores")])
+def test_one_core_is_too_few_for_a_live_rover(
+    monkeypatch: pytest.MonkeyPatch, cores: int, fine: bool, found: str
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    finding = doctor.check_processor()
+    assert (finding.fine, finding.found) == (fine, found)
+
+
+@pytest.mark.parametrize(("free_mb", "fine"), [(20, False), (64, True)])
+def test_little_shared_memory_is_a_problem(monkeypatch: pytest.MonkeyPatch, free_mb: int, fine: bool) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free_mb * 10**6))
+    finding = doctor.check_shared_memory()
+    assert (finding.fine, finding.found) == (fine, f"{free_mb} MB free in /dev/shm")
+    assert "--shm-size" in finding.advice
+
+
+def test_a_program_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "TIMEOUT_S", 0.5)
+    name = broken_package(tmp_path, monkeypatch, "import time; time.sleep(60)")
+    finding = doctor.check_package(name, name, "1")
+    assert not finding.fine and finding.found == "no answer within 0.5 s"

@@ -1,0 +1,109 @@
+"""Ctrl-C during a run, and what is shown while it goes on."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+
+import numpy as np
+import pytest
+from conftest import make_keyframe
+from rich.console import Console
+
+from umf_ros.commands.progress import WARNING, FrameProgress, stop_on_interrupt, undisturbed
+from umf_ros.frames import Candidate, LoopClosure, Verdict
+from umf_ros.loop_detector import Detection
+
+
+@pytest.fixture(autouse=True)
+def handler() -> object:
+    """What Ctrl-C does outside of a run; it must do that again afterwards."""
+    before = signal.getsignal(signal.SIGINT)
+    yield before
+    assert signal.getsignal(signal.SIGINT) is before
+    signal.signal(signal.SIGINT, before)
+
+
+def press_ctrl_c() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_the_first_ctrl_c_only_asks_for_an_end() -> None:
+    done = 0
+    with stop_on_interrupt() as interrupted:
+        for step in range(10):
+            if step == 3:
+                press_ctrl_c()
+            done += 1
+            if interrupted():
+                break
+    assert done == 4 and interrupted()
+
+
+def test_the_second_ctrl_c_ends_at_once() -> None:
+    with pytest.raises(KeyboardInterrupt), stop_on_interrupt() as interrupted:
+        press_ctrl_c()
+        assert interrupted()
+        press_ctrl_c()
+        pytest.fail("still here")
+
+
+def test_without_ctrl_c_nothing_is_asked() -> None:
+    with stop_on_interrupt() as interrupted:
+        pass
+    assert not interrupted()
+
+
+def test_an_error_in_the_run_gives_ctrl_c_back() -> None:
+    with pytest.raises(ZeroDivisionError), stop_on_interrupt():
+        raise ZeroDivisionError
+    with pytest.raises(KeyboardInterrupt):
+        press_ctrl_c()
+
+
+def test_nothing_interrupts_the_writing_of_results() -> None:
+    written = []
+    with undisturbed():
+        for part in range(3):
+            press_ctrl_c()
+            written.append(part)
+    assert written == [0, 1, 2]
+    with pytest.raises(KeyboardInterrupt):
+        press_ctrl_c()
+
+
+def test_an_error_while_writing_gives_ctrl_c_back() -> None:
+    with pytest.raises(ZeroDivisionError), undisturbed():
+        raise ZeroDivisionError
+
+
+def found(stamp_s: float, closures: int) -> Detection:
+    stamp = round(stamp_s * 1e9)
+    made = [LoopClosure(stamp, i, np.eye(4), np.eye(6)) for i in range(closures)]
+    verdicts = [Verdict(Candidate(i, i, 0.9), "accepted", closure=closure) for i, closure in enumerate(made)]
+    return Detection(stamp, make_keyframe(stamp_s), verdicts)
+
+
+def test_places_and_closures_are_counted_beside_the_bar() -> None:
+    out = io.StringIO()
+    with FrameProgress(Console(file=out, force_terminal=True, width=100)) as progress:
+        progress.show(0.1, found(1, 0))
+        progress.show(0.2, Detection(2))  # passed over: no place
+        progress.show(0.5, found(3, 2))
+        progress.show(1.0, found(4, 1))
+    assert "3 places, 3 closures" in out.getvalue()
+
+
+def test_where_there_is_no_terminal_no_bar_is_drawn() -> None:
+    out = io.StringIO()
+    with FrameProgress(Console(file=out)) as progress:
+        progress.show(0.5, found(1, 1))
+    assert out.getvalue().strip() == ""
+
+
+@pytest.mark.parametrize("text", ["runs[old]/a.mcap breaks off", "[/x] is no tag", "a line " + "that is long " * 20])
+def test_warnings_are_printed_as_they_are(text: str) -> None:
+    out = io.StringIO()
+    Console(file=out, width=80).print(text, **WARNING)
+    assert out.getvalue() == text + "\n"
