@@ -1,0 +1,138 @@
+"""Odometry between its samples, and points freed of the motion during the scan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from recordings import drive
+from scipy.spatial.transform import Rotation
+
+from umf_ros.geometry import Array, invert, make_pose, transform
+from umf_ros.sensors.buffers import OdometryBuffer
+from umf_ros.sensors.clock import StreamClock
+from umf_ros.sensors.motion import deskew
+
+START_NS = 1_625_680_800_000_000_000
+S = 10**9
+
+
+def ns(second: float) -> int:
+    return START_NS + round(second * S)
+
+
+def filled(seconds: Array, length_s: float = 10.0, max_gap_s: float = 1.0) -> OdometryBuffer:
+    buffer = OdometryBuffer(round(length_s * S), round(max_gap_s * S))
+    for second in seconds:
+        buffer.add(ns(second), drive(second))
+    return buffer
+
+
+def test_poses_are_those_of_the_drive_also_between_the_samples() -> None:
+    buffer = filled(np.arange(0, 3, 0.1))
+    for second in (0.0, 0.05, 1.234, 2.9):
+        found = buffer.at(ns(second))
+        assert found is not None
+        np.testing.assert_allclose(found[:3, :3], drive(second)[:3, :3], atol=1e-6)
+        np.testing.assert_allclose(found[:3, 3], drive(second)[:3, 3], atol=5e-4)
+    sample = buffer.at(ns(0.3))
+    assert sample is not None and np.array_equal(sample, drive(0.1 * 3))
+
+
+def test_nothing_is_known_before_after_and_across_a_gap() -> None:
+    buffer = filled(np.array([1.0, 1.1, 3.0, 3.1]))
+    for second, known in ((0.99, False), (1.0, True), (1.05, True), (2.0, False), (3.0, True), (3.11, False)):
+        assert (buffer.at(ns(second)) is not None) is known, second
+    assert buffer.passed(ns(3.1)) and not buffer.passed(ns(3.1) + 1)
+    buffer.clear()
+    assert buffer.at(ns(1.0)) is None and not buffer.passed(ns(0))
+
+
+def test_old_poses_are_forgotten() -> None:
+    buffer = filled(np.arange(0, 100, 0.5), length_s=10)
+    assert buffer.at(ns(95)) is not None and buffer.at(ns(90)) is not None
+    assert buffer.at(ns(70)) is None
+
+
+def test_a_path_begins_and_ends_where_it_is_asked_to() -> None:
+    buffer = filled(np.arange(0, 3, 0.1))
+    stamps, poses = buffer.path(ns(0.25), ns(0.55))
+    assert stamps.tolist() == [ns(0.25), ns(0.3), ns(0.4), ns(0.5), ns(0.55)]
+    np.testing.assert_allclose(poses[0][:3, 3], drive(0.25)[:3, 3], atol=1e-3)
+    # beyond the newest pose nothing is known
+    stamps, poses = buffer.path(ns(2.85), ns(3.2))
+    assert stamps.tolist() == [ns(2.85), ns(2.9)] and len(poses) == 2
+    assert buffer.path(ns(7), ns(8))[1] == []
+
+
+def test_points_are_where_they_would_be_seen_from_one_pose() -> None:
+    rng = np.random.default_rng(2)
+    seconds = np.linspace(0, 0.2, 401)
+    world = rng.uniform((2, -8, -2), (30, 8, 2), (401, 3))
+    seen = np.stack([transform(invert(drive(t)), point[None])[0] for t, point in zip(seconds, world, strict=True)])
+    stamps = START_NS + np.round(seconds * S).astype(np.int64)
+    path_at = np.arange(0, 0.201, 0.02)
+    path = (START_NS + np.round(path_at * S).astype(np.int64), [drive(t) for t in path_at])
+    freed = deskew(seen.astype(np.float32), stamps, path, drive(0.1))
+    assert freed.dtype == np.float32
+    np.testing.assert_allclose(freed, transform(invert(drive(0.1)), world), atol=3e-3)
+    # without it the far points are centimetres to decimetres off
+    assert np.abs(seen - transform(invert(drive(0.1)), world)).max() > 0.3
+
+
+def test_a_standing_rover_changes_nothing() -> None:
+    rng = np.random.default_rng(3)
+    pose = make_pose(Rotation.random(random_state=rng).as_matrix(), [5, 6, 7])
+    points = rng.uniform(-20, 20, (50, 3)).astype(np.float32)
+    stamps = START_NS + np.arange(50) * 4_000_000
+    freed = deskew(points, stamps, (stamps[[0, -1]], [pose, pose]), pose)
+    np.testing.assert_allclose(freed, points, atol=1e-5)
+
+
+def test_outside_of_the_path_the_rover_is_taken_to_stand() -> None:
+    path = (np.array([ns(0.0), ns(0.1)]), [drive(0.0), drive(0.1)])
+    points = np.tile(np.array([[10, 0, 0]], np.float32), (4, 1))
+    stamps = np.array([ns(-0.5), ns(0.0), ns(0.1), ns(0.9)])
+    freed = deskew(points, stamps, path, drive(0.0))
+    np.testing.assert_array_equal(freed[0], freed[1])
+    np.testing.assert_array_equal(freed[2], freed[3])
+    np.testing.assert_allclose(freed[2], transform(drive(0.1), points[:1])[0], atol=1e-5)
+
+
+def test_the_key_may_lie_anywhere_on_the_path() -> None:
+    path_at = np.arange(0, 0.21, 0.05)
+    path = (START_NS + np.round(path_at * S).astype(np.int64), [drive(t) for t in path_at])
+    point, stamp = np.array([[12, 3, 0.5]], np.float32), np.array([ns(0.1)])
+    world = transform(drive(0.1), point)
+    for key in (0.0, 0.1, 0.2):
+        freed = deskew(point, stamp, path, drive(key))
+        np.testing.assert_allclose(transform(drive(key), freed), world, atol=1e-4)
+
+
+def heard(*messages: tuple[str, float]) -> StreamClock:
+    clock = StreamClock()
+    for name, second in messages:
+        clock.advance(name, ns(second))
+    return clock
+
+
+@pytest.mark.parametrize(
+    ("second", "fault", "restarts"),
+    [(5.1, None, False), (5.0, "duplicate", False), (4.5, "out of order", False), (4.0, None, True), (0.0, None, True)],
+)
+def test_a_stamp_is_judged_by_its_own_input(second: float, fault: str | None, restarts: bool) -> None:
+    clock = heard(("left", 5.0), ("cloud", 9.0))
+    assert clock.restarts("left", ns(second)) is restarts
+    if not restarts:
+        assert clock.fault("left", ns(second)) == fault
+    assert clock.fault("odometry", ns(0)) is None  # the first of its input
+
+
+def test_after_a_restart_the_clock_runs_anew() -> None:
+    clock = heard(("left", 5.0), ("cloud", 9.0))
+    assert (clock.session, clock.elapsed_ns, clock.has_heard("cloud")) == (0, 4 * S, True)
+    clock.restart()
+    assert (clock.session, clock.now_ns, clock.elapsed_ns, clock.has_heard("cloud")) == (1, None, 0, False)
+    clock.advance("left", ns(0.5))
+    # what comes late from before the restart is nearer to its end than to the new beginning
+    assert clock.fault("cloud", ns(8.9)) == "stale"
+    assert clock.fault("cloud", ns(0.6)) is None
