@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import pickle
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -22,6 +24,7 @@ from umf_ros.simulation.world import World, ground
 from umf_ros.verification.lifting import project
 
 SPEED_M_S = 1.0
+STEP_M = 2.4  # between frames
 SCALE_ERROR, TURN_ERROR_RAD_M = 0.01, 0.001  # of the odometry, per metre driven
 DEPTH_STRIDE = 4
 FAR_M = 40.0
@@ -82,9 +85,23 @@ def load_shard(path: Path) -> Drive:
     return Drive(name, frames, truth, depths)
 
 
-def simulate(seed: int, family: str, aliasing: float, step_m: float = 1.6, setting: str = "hard") -> Drive:
+def kept(folder: Path | None, seed: int, family: str, aliasing: float, step_m: float = STEP_M) -> Drive:
+    """The same as `simulate`, from a file in the folder where an earlier call left it."""
+    if folder is None:
+        return simulate(seed, family, aliasing, step_m)
+    path = folder / f"{seed}_{family}_{aliasing:g}_{step_m:g}.pkl"
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_suffix(f".{os.getpid()}")
+        unfinished.write_bytes(pickle.dumps(simulate(seed, family, aliasing, step_m)))
+        unfinished.replace(path)
+    drive: Drive = pickle.loads(path.read_bytes())
+    return drive
+
+
+def simulate(seed: int, family: str, aliasing: float, step_m: float = STEP_M) -> Drive:
     """Three passes through a fresh world: the second and third with offsets, turned headings and another sun."""
-    chosen = replace(SETTINGS[setting], aliasing=aliasing)
+    chosen = replace(SETTINGS["hard"], aliasing=aliasing)
     trail = ground(seed, family, aliasing).trail
     passes = plan_passes(trail, ("first", "offset", "offset"), chosen, step_m, seed)
     world = World(seed, family, aliasing, np.concatenate([drive.path for drive in passes]))
@@ -95,10 +112,10 @@ def simulate(seed: int, family: str, aliasing: float, step_m: float = 1.6, setti
     return Drive(f"{seed} {family} {aliasing:g}", frames, truth, np.array([sample.depth for sample in samples]))
 
 
-def test_worlds(count: int, seed: int) -> Iterator[tuple[int, str, float]]:
-    """Seeds, families and aliasing of unseen worlds: families in turn, every second one repeats itself fully."""
+def worlds(first: int, count: int) -> Iterator[tuple[int, str, float]]:
+    """Seeds, families and aliasing of worlds: families in turn, every second one repeats itself fully."""
     for number in range(count):
-        yield 20_000 + (100 * seed + number) % 10_000, FAMILIES[number % len(FAMILIES)], (1.0, 0.6)[number % 2]
+        yield first + number, FAMILIES[number % len(FAMILIES)], (1.0, 0.6)[number % 2]
 
 
 def _frames(

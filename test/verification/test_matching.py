@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from umf_ros.frames import LocalFeatures, SuperFeatures
+from umf_ros.frames import SuperFeatures
 from umf_ros.verification.matching import eligible_superfeatures, mutual_neighbours, similarities
 
 
@@ -25,13 +26,13 @@ def test_mutual_neighbours_of_nothing_are_none() -> None:
     assert mutual_neighbours(np.empty((5, 0))).shape == (0, 2)
 
 
-def test_similarities_use_the_strongest_features_only() -> None:
+@pytest.mark.parametrize(("ours", "theirs"), [(10, 12), (700, 900), (0, 5), (5, 0)])
+def test_similarities_are_cosines_however_many_features_there_are(ours: int, theirs: int) -> None:
     rng = np.random.default_rng(0)
-    points = np.zeros((30, 3), np.float32)
-    features = LocalFeatures(points, unit(rng.standard_normal((30, 8))), np.ones(30, np.float32), points)
-    found = similarities(features, features, 10)
-    assert found.shape == (10, 10)
-    np.testing.assert_allclose(np.diag(found), 1, atol=2e-3)
+    query, match = unit(rng.standard_normal((ours, 64))), unit(rng.standard_normal((theirs, 64)))
+    found = similarities(query, match)
+    assert found.shape == (ours, theirs) and found.dtype == np.float32
+    np.testing.assert_allclose(found, query.astype(float) @ match.astype(float).T, atol=1e-5)
 
 
 def test_identical_superfeatures_all_match() -> None:

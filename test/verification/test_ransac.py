@@ -34,11 +34,26 @@ def test_homography_of_a_mirrored_image_is_refused() -> None:
     assert found is None or found.count < 20
 
 
-def test_too_few_pairs_give_no_model() -> None:
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_pairs_give_no_model(count: int) -> None:
     rng = np.random.default_rng(2)
-    assert fit_homography(rng.random((3, 2)), rng.random((3, 2)), 1.0, 50, seed=0) is None
-    assert fit_rigid(rng.random((2, 3)), rng.random((2, 3)), 1.0, 50, seed=0) is None
-    assert fit_rigid(np.empty((0, 3)), np.empty((0, 3)), 1.0, 50, seed=0) is None
+    assert fit_homography(rng.random((count + 1, 2)), rng.random((count + 1, 2)), 1.0, 50, seed=0) is None
+    assert fit_rigid(rng.random((count, 3)), rng.random((count, 3)), 1.0, 50, seed=0) is None
+    assert fit_homography(np.empty((0, 2)), np.empty((0, 2)), 1.0, 50, seed=0) is None
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("pixels", [np.full((30, 2), 7.0), np.outer(np.arange(30.0), [3.0, 1.0])])
+def test_pixels_on_a_spot_or_a_line_fix_no_homography(pixels: np.ndarray) -> None:
+    assert fit_homography(pixels, pixels, 6.0, 100, seed=0) is None
+
+
+def test_exact_pairs_give_the_exact_homography() -> None:
+    a = np.random.default_rng(9).uniform(0, 600, (30, 2))
+    found = fit_homography(a, warp(a), 1.0, 100, seed=0)
+    assert found is not None and found.inliers.all()
+    np.testing.assert_allclose(found.model / found.model[2, 2], HOMOGRAPHY, rtol=1e-4, atol=1e-6)
 
 
 def test_rigid_motion_is_found_and_refined() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from umf_ros.frames import Keyframe, LocalFeatures, Points
 from umf_ros.geometry import Array, make_pose, transform
 from umf_ros.verification.lifting import project
+from umf_ros.verification.matching import similarities
 from umf_ros.verification.ransac import fit_rigid
 from umf_ros.verification.reranking import Ranked
 
@@ -122,7 +123,7 @@ def _rank_agreement(ours: LocalFeatures, theirs: LocalFeatures, distance: Array,
     if not usable.any():
         return float("nan")
     rows, nearest = rows[usable], nearest[usable]
-    similarity = ours.descriptors[rows].astype(np.float32) @ theirs.descriptors.astype(np.float32).T
+    similarity = similarities(ours.descriptors[rows], theirs.descriptors)
     own = similarity[np.arange(len(rows)), nearest]
     below = ((similarity < own[:, None]) & peers[usable]).sum(axis=1)
     rank = below / np.maximum(peers[usable].sum(axis=1) - 1, 1)

@@ -7,15 +7,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.frames import LocalFeatures, SuperFeatures
-from umf_ros.geometry import Array
+from umf_ros.frames import SuperFeatures
 
 Indices = NDArray[np.intp]
+SERIAL = 2**18  # multiplications up to which OpenBLAS stays on one thread; its others would spin for nothing
 
 
-def similarities(query: LocalFeatures, match: LocalFeatures, limit: int) -> Array:
-    """Cosine similarities (Q, M) of the `limit` strongest features of both sides, float32."""
-    return query.descriptors[:limit].astype(np.float32) @ match.descriptors[:limit].astype(np.float32).T
+def similarities(query: NDArray[Any], match: NDArray[Any]) -> NDArray[np.float32]:
+    """Cosine similarities (Q, M), float32, of unit descriptors (Q, D) and (M, D)."""
+    ours, theirs = query.astype(np.float32), match.astype(np.float32).T
+    rows = max(SERIAL // max(theirs.size, 1), 1)
+    found = np.empty((len(ours), theirs.shape[1]), np.float32)
+    for start in range(0, len(ours), rows):
+        np.matmul(ours[start : start + rows], theirs, out=found[start : start + rows])
+    return found
 
 
 def mutual_neighbours(similarity: NDArray[Any]) -> Indices:
@@ -41,7 +46,7 @@ def eligible_superfeatures(query: SuperFeatures, match: SuperFeatures, ratio: fl
     count = min(len(query.descriptors), len(match.descriptors))
     if count < 2:
         return np.empty(0, np.intp)
-    similarity = query.descriptors.astype(np.float32) @ match.descriptors.astype(np.float32).T
+    similarity = similarities(query.descriptors, match.descriptors)
     squared = np.maximum(2 - 2 * similarity, 0)
     pairs = mutual_neighbours(-squared)
     ids = pairs[pairs[:, 0] == pairs[:, 1], 0]

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from umf_ros.geometry import Array, make_pose
 
+MIN_AREA = 1e-3  # of a sampled triangle, twice over; the points fill the unit square
+
 Mask = NDArray[np.bool_]
 
 
@@ -41,11 +43,13 @@ def fit_homography(a: Array, b: Array, threshold: float, iterations: int, seed: 
     Inliers are transferred nearer than `threshold`, in the unit of the points. Models that mirror
     the image are refused: no rigid scene in front of a camera looks like that.
     """
-    samples = _samples(len(a), 4, iterations, seed)
-    if not len(samples):
+    if len(a) < 4:
         return None
+    samples = _samples(len(a), 4, iterations, seed)
     to_unit, unit_a, unit_b = _shared_unit(a, b)
     models = _homographies(unit_a[samples], unit_b[samples])
+    if not len(models):
+        return None
     inliers = _transfers(models, unit_a, unit_b, threshold * to_unit[0, 0])
     best = int(inliers.sum(axis=1).argmax())
     model, agrees = models[best], inliers[best]
@@ -53,7 +57,7 @@ def fit_homography(a: Array, b: Array, threshold: float, iterations: int, seed: 
         return None
     refined = _least_squares(unit_a[agrees], unit_b[agrees])
     wider = _transfers(refined[None], unit_a, unit_b, threshold * to_unit[0, 0])[0]
-    if wider.sum() > agrees.sum():
+    if wider.sum() > agrees.sum() and np.linalg.det(refined) > 0:
         model, agrees = refined, wider
     return Consensus(np.linalg.inv(to_unit) @ model @ to_unit, agrees)
 
@@ -67,15 +71,13 @@ def fit_rigid(
     rover does not lie on its side.
     """
     samples = _samples(len(a), 3, iterations, seed)
-    if not len(samples):
-        return None
     rotations, translations = _triads(a[samples], b[samples], threshold)
     upright = rotations[:, 2, 2] > np.cos(max_tilt)
     if not upright.any():
         return None
     rotations, translations = rotations[upright], translations[upright]
-    error = _length(a @ rotations.transpose(0, 2, 1) + translations[:, None] - b)
-    inliers = error < threshold
+    moved = (rotations.reshape(-1, 3) @ a.T).reshape(len(rotations), 3, -1)
+    inliers = ((moved + translations[..., None] - b.T) ** 2).sum(axis=1) < threshold**2
     best = inliers[int(inliers.sum(axis=1).argmax())]
     if best.sum() < 3:
         return None
@@ -99,10 +101,9 @@ def kabsch(a: Array, b: Array) -> Array | None:
     return make_pose(rotation, centre_b - rotation @ centre_a)
 
 
+@cache
 def _samples(count: int, size: int, iterations: int, seed: int) -> NDArray[np.intp]:
     """Index tuples (S, size) without repetition inside a tuple."""
-    if count < size:
-        return np.empty((0, size), np.intp)
     picks = (_draws(iterations, seed)[:, :size] * count).astype(np.intp)
     ordered = np.sort(picks, axis=1)
     return picks[(ordered[:, 1:] > ordered[:, :-1]).all(axis=1)]
@@ -123,80 +124,82 @@ def _shared_unit(a: Array, b: Array) -> tuple[Array, Array, Array]:
 
 
 def _homographies(a: Array, b: Array) -> Array:
-    """Homographies (S, 3, 3) through four point pairs each, (S, 4, 2); degenerate ones come out wild, not as errors."""
-    left, right = _equations(a, b)
-    free = np.linalg.solve(left + 1e-9 * np.eye(8), right)[..., 0]
-    return np.concatenate([free, np.ones((len(free), 1))], axis=1).reshape(-1, 3, 3)
+    """Homographies (S', 3, 3) through those of the four point pairs, (S, 4, 2), that one view of a plane can explain.
+
+    Three points that run clockwise in one image do so in the other: most wrong samples fail this,
+    and so does every mirrored one. The models have positive depths at their samples.
+    """
+    quads = np.stack([a, b])
+    turns = _turns(quads)
+    plausible = (turns[0] * turns[1] > 0).all(axis=1) & (np.abs(turns[0]).min(axis=1) > MIN_AREA)
+    (turns_a, turns_b), corners = turns[:, plausible], _homogeneous(quads[:, plausible, :3])
+    # both quadrilaterals as images of the canonical one; the scale of a column follows from the fourth point
+    to_b = corners[1].transpose(0, 2, 1) * (turns_b[:, :3] / turns_a[:, :3] / turns_a[:, 3:])[:, None]
+    from_a = _cross(corners[0][:, [1, 2, 0]], corners[0][:, [2, 0, 1]])
+    return to_b @ from_a
+
+
+def _turns(quads: Array) -> Array:
+    """Twice the signed areas (..., 4) of the triangles 423, 143, 124 and 123 of quadrilaterals (..., 4, 2)."""
+    first, second, third = quads[..., [3, 0, 0, 0], :], quads[..., [1, 3, 1, 1], :], quads[..., [2, 2, 3, 2], :]
+    one, other = second - first, third - first
+    found: Array = one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
+    return found
+
+
+def _homogeneous(points: Array) -> Array:
+    return np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
 
 
 def _least_squares(a: Array, b: Array) -> Array:
     """The homography (3, 3) that fits pairs (N, 2) best."""
-    left, right = _equations(a[None], b[None])
-    free = np.linalg.lstsq(left[0], right[0], rcond=None)[0][:, 0]
+    x, y, u, v = a[:, 0], a[:, 1], b[:, 0], b[:, 1]
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    rows_u = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=1)
+    rows_v = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=1)
+    rows, right = np.concatenate([rows_u, rows_v]), np.concatenate([u, v])
+    free = np.linalg.solve(rows.T @ rows + 1e-9 * np.eye(8), rows.T @ right)
     return np.append(free, 1.0).reshape(3, 3)
 
 
-def _equations(a: Array, b: Array) -> tuple[Array, Array]:
-    """Linear equations (S, 2N, 8) of the free entries, and their right sides (S, 2N, 1)."""
-    x, y, u, v = a[..., 0], a[..., 1], b[..., 0], b[..., 1]
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    rows_u = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=-1)
-    rows_v = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=-1)
-    return np.concatenate([rows_u, rows_v], axis=1), np.concatenate([u, v], axis=1)[..., None]
-
-
 def _transfers(models: Array, a: Array, b: Array, threshold: float) -> Mask:
-    """Which pairs (S, N) each model takes to their counterpart without mirroring the plane."""
-    mapped = np.column_stack([a, np.ones(len(a))]) @ models.transpose(0, 2, 1)
-    depth = mapped[..., 2]
-    error = np.hypot(mapped[..., 0] - b[:, 0] * depth, mapped[..., 1] - b[:, 1] * depth)
-    found: Mask = (error < threshold * depth) & (depth > 0) & (_orientation(models) > 0)[:, None]
+    """Which pairs (S, N) each model takes to their counterpart."""
+    mapped = (models.reshape(-1, 3) @ _homogeneous(a).T).reshape(len(models), 3, -1)
+    depth = mapped[:, 2]
+    across, down = mapped[:, 0] - b[:, 0] * depth, mapped[:, 1] - b[:, 1] * depth
+    found: Mask = (across**2 + down**2 < (threshold * depth) ** 2) & (depth > 0)
     return found
-
-
-def _orientation(models: Array) -> Array:
-    """Sign of the Jacobian at the origin of the unit frame: negative for a mirrored image."""
-    h = models / models[:, 2:, 2:]
-    return (h[:, 0, 0] - h[:, 0, 2] * h[:, 2, 0]) * (h[:, 1, 1] - h[:, 1, 2] * h[:, 2, 1]) - (
-        h[:, 0, 1] - h[:, 0, 2] * h[:, 2, 1]
-    ) * (h[:, 1, 0] - h[:, 1, 2] * h[:, 2, 0])
 
 
 def _triads(a: Array, b: Array, threshold: float) -> tuple[Array, Array]:
     """Motions between triangles (S, 3, 3) of equal side lengths: rotations (R, 3, 3), translations (R, 3)."""
-    sides_a, sides_b = _sides(a), _sides(b)
-    alike = (np.abs(sides_a - sides_b) < 2 * threshold).all(axis=1) & (sides_a.min(axis=1) > 3 * threshold)
-    a, b = a[alike], b[alike]
-    frames_a, valid_a = _triangle_frames(a)
-    frames_b, valid_b = _triangle_frames(b)
-    valid = valid_a & valid_b
-    rotations = frames_b[valid] @ frames_a[valid].transpose(0, 2, 1)
-    centres_a, centres_b = a[valid].mean(axis=1), b[valid].mean(axis=1)
-    return rotations, centres_b - np.einsum("sij,sj->si", rotations, centres_a)
+    triangles = np.stack([a, b])
+    sides = np.sqrt(_squared(triangles - triangles[:, :, [2, 0, 1]]))
+    alike = (np.abs(sides[0] - sides[1]) < 2 * threshold).all(axis=1) & (sides[0].min(axis=1) > 3 * threshold)
+    triangles = triangles[:, alike]
+    frames, valid = _triangle_frames(triangles)
+    keep = valid.all(axis=0)
+    rotations = frames[1, keep] @ frames[0, keep].transpose(0, 2, 1)
+    centres = triangles[:, keep].mean(axis=2)
+    return rotations, centres[1] - np.einsum("sij,sj->si", rotations, centres[0])
 
 
 def _triangle_frames(triangles: Array) -> tuple[Array, Mask]:
-    """Right-handed orthonormal frames (S, 3, 3), axes as columns, and which triangles are not degenerate."""
-    first = triangles[:, 1] - triangles[:, 0]
-    normal = _cross(first, triangles[:, 2] - triangles[:, 0])
-    length, area = _length(first), _length(normal)
-    valid = area > 0.05 * np.maximum(length, 1e-9) ** 2
-    x = first / np.maximum(length, 1e-12)[:, None]
-    z = normal / np.maximum(area, 1e-12)[:, None]
-    return np.stack([x, _cross(z, x), z], axis=2), valid
+    """Right-handed orthonormal frames (..., 3, 3), axes as columns, and which triangles are not degenerate."""
+    first = triangles[..., 1, :] - triangles[..., 0, :]
+    normal = _cross(first, triangles[..., 2, :] - triangles[..., 0, :])
+    squared, area = _squared(first), np.sqrt(_squared(normal))
+    x = first / np.sqrt(np.maximum(squared, 1e-24))[..., None]
+    z = normal / np.maximum(area, 1e-12)[..., None]
+    return np.stack([x, _cross(z, x), z], axis=-1), area > 0.05 * np.maximum(squared, 1e-18)
 
 
-def _sides(triangles: Array) -> Array:
-    """Lengths (S, 3) of the sides of triangles (S, 3, 3)."""
-    return _length(triangles - triangles[:, [2, 0, 1]])
-
-
-def _length(vectors: Array) -> Array:
+def _squared(vectors: Array) -> Array:
     squared: Array = np.einsum("...i,...i->...", vectors, vectors)
-    return np.sqrt(squared)
+    return squared
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Cross product of rows (S, 3); numpy's own spends most of its time on axes."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+    """Cross product of rows (..., 3); numpy's own spends most of its time on axes."""
+    product: Array = a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
+    return product

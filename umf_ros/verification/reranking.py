@@ -98,4 +98,5 @@ def _by_ransac(query: Keyframe, candidate: Candidate, keyframe: Keyframe, settin
 
 
 def _pairs(query: LocalFeatures, match: LocalFeatures, settings: Verification) -> Indices:
-    return mutual_neighbours(similarities(query, match, settings.rerank_features))
+    limit = settings.rerank_features
+    return mutual_neighbours(similarities(query.descriptors[:limit], match.descriptors[:limit]))
