@@ -49,23 +49,26 @@ class Agreement:
             self.add(row, scale)
 
     def group(self, row: int, members: NDArray[np.bool_]) -> tuple[list[int], float]:
-        """Closures out of `members` that agree with `row` and among each other, and the evidence for them in nats.
-
-        The evidence is that of their agreement alone: every member of another place adds the
-        improbability of its chance agreement with those before it.
-        """
+        """Closures out of `members` that agree with `row` and among each other, and the evidence for them in nats."""
         friends = [other for other in self._friends[row] if members[other]]
         friends.sort(key=lambda other: -sum(1 for third in friends if third in self._friends[other]))
-        group, witnesses, evidence = [row], [row], 0.0
+        group = [row]
         for other in friends:
-            if any(other in self._enemies[member] for member in group):
-                continue
-            group.append(other)
-            if not self._same_place(other, witnesses):
-                chance = min(self._friends[other][w] for w in witnesses if w in self._friends[other])
-                evidence -= float(np.log(max(chance, 1e-6)))
-                witnesses.append(other)
-        return group, evidence
+            if not any(other in self._enemies[member] for member in group):
+                group.append(other)
+        return group, self._evidence(group)
+
+    def _evidence(self, group: list[int]) -> float:
+        """What the group's agreement says: every further place adds its improbability by chance with the nearest."""
+        witnesses, others, evidence = group[:1], group[1:], 0.0
+        while others := [other for other in others if not self._same_place(other, witnesses[-1:])]:
+            chance, nearest = min(
+                (min(self._friends[other][w] for w in witnesses if w in self._friends[other]), other)
+                for other in others
+            )
+            evidence += min(-float(np.log(max(chance, 1e-9))), _MOST_PER_PLACE)
+            witnesses.append(nearest)
+        return evidence
 
     def contested(self, row: int, members: NDArray[np.bool_]) -> bool:
         """Whether one of `members` speaks against the closure."""
@@ -112,3 +115,5 @@ class Agreement:
 
 
 _MOST_COMPARED = 40
+# nats: where one place is mistaken for another, the next is too more often than by chance
+_MOST_PER_PLACE = 4.0

@@ -202,8 +202,9 @@ class Judge:
         for row in rows:
             if members[row] and not any(row in group for group in groups):
                 group, evidence = self._agreement.group(row, members)
-                # to agree with the map as well is one more thing that chance has to explain
-                if evidence - np.log(self._chances[row]) >= self._settings.min_support:
+                # that all agree with the map as well is one more thing that chance has to explain
+                evidence -= float(np.log(max(self._chances[member] for member in group)))
+                if evidence >= self._settings.min_support:
                     groups.append(group)
         return groups
 

@@ -20,7 +20,7 @@ _OUTLIERS = 0.5
 _NATS_PER_FACTOR = 5.0
 _FEWEST_LOOPS = 10
 _TOLERANCE = np.log(1.8)
-# an error that builds up in one direction hardly shows in short loops
+# an error that builds up in one direction hardly shows in short loops, unless all is stated in other units
 _LEAST_ODOMETRY = 0.3
 
 
@@ -51,7 +51,9 @@ class ScaleEstimator:
         # a factor has to earn its freedom, else noise in few loops would be taken for a wrong scale
         choices = [(0, one, one), (1, odometry, one), (1, one, closures), (2, int(both[0]), int(both[1]))]
         _, row, column = max(choices, key=lambda c: likelihood[c[1], c[2]] - _NATS_PER_FACTOR * c[0])
-        return Scale(max(_settle(float(_GRID[row])), _LEAST_ODOMETRY), _settle(float(_GRID[column])))
+        closures_factor = _settle(float(_GRID[column]))
+        least = _LEAST_ODOMETRY * min(closures_factor, 1.0)
+        return Scale(max(_settle(float(_GRID[row])), least), closures_factor)
 
 
 def _settle(factor: float) -> float:
