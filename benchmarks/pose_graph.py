@@ -172,9 +172,8 @@ def try_world(name: str, world: World, chosen: list[Cell]) -> list[tuple[str, Ce
 
 def resist(worlds: dict[str, World], quick: bool, jobs: int) -> dict[str, float]:
     """Every cell of wrong closures, rightly stated and mis-stated odometry; prints them as they are done."""
-    print(
-        f"{'graph':26s} {'wrong':>10s} {'stated':>7s} {'precision':>9s} {'recall':>7s} {'error m':>8s} {'transient':>9s}"
-    )
+    columns = f"{'graph':26s} {'wrong':>10s} {'stated':>7s} {'precision':>9s} {'recall':>7s} {'error m':>8s}"
+    print(f"{columns} {'transient':>9s}")
     plain: list[Outcome] = []
     misscaled: list[Outcome] = []
     with ProcessPoolExecutor(jobs) as pool:
