@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from processes import Process
+from processes import Process, wait_until
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
@@ -49,7 +49,8 @@ def live(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFac
         for node in nodes:
             node.wait_for("ready")
         player = Process("", folder / "player.log", command=[*player_command, "--wait-for-subscribers", "--quiet"])
-        assert player._process.wait(240) == 0, player.output
+        wait_until(lambda: player.exit_code is not None, 240)
+        assert player.exit_code == 0, player.output
         player.kill()
         assert nodes[0].interrupt() == 0, nodes[0].output
         assert nodes[1].interrupt() == 0, nodes[1].output

@@ -17,7 +17,10 @@ from recordings import POINT
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_srvs.srv import SetBool, Trigger
 
+from umf_ros.config import Database
+from umf_ros.embedding.baselines import ThumbnailEmbedder
 from umf_ros.nodes.conversions import to_time
+from umf_ros.places.database import PlaceDatabase
 
 MODULE = "umf_ros.nodes.loop_closure_node"
 # a thumbnail needs no weights; no odometry or camera_info, so that nothing waits for them
@@ -100,7 +103,8 @@ def rig(ros_context: None) -> Iterator[Rig]:
 
 @pytest.fixture
 def node(rig: Rig, tmp_path: Path) -> Iterator[Process]:
-    process = Process(MODULE, tmp_path / "node.log", *PARAMETERS, f"results_dir:={tmp_path / 'run'}")
+    own = f"results_dir:={tmp_path / 'run'}", f"database.path:={tmp_path / 'map.sqlite'}"
+    process = Process(MODULE, tmp_path / "node.log", *PARAMETERS, *own)
     process.wait_for("ready")
     assert rig.until(lambda: rig.images.get_subscription_count() > 0 and rig.clouds.get_subscription_count() > 0)
     yield process
@@ -143,10 +147,17 @@ def test_a_clock_that_jumps_back_starts_a_new_session(rig: Rig, node: Process) -
     assert node.exit_code is None
 
 
-def test_services_pause_save_and_forget(rig: Rig, node: Process) -> None:
+def test_services_pause_save_and_forget(rig: Rig, node: Process, tmp_path: Path) -> None:
     for i in range(4):
         rig.publish_pair(START_NS + i * 213_000_000)
     assert rig.until(lambda: rig.count("places") >= 3)
+    saved = rig.call(Trigger, "save", Trigger.Request())
+    assert saved.success and saved.message.endswith(f"places saved to {tmp_path / 'map.saved.sqlite'}")
+    thumbnails = ThumbnailEmbedder()
+    settings = Database(path=str(tmp_path / "map.saved.sqlite"))
+    copy = PlaceDatabase(settings, thumbnails.name, thumbnails.dimension)
+    assert len(copy) == int(saved.message.split()[0]) >= 3
+    copy.close()
     assert rig.call(SetBool, "pause", SetBool.Request(data=True)).message == "paused"
     assert rig.until(lambda: rig.messages.get("loop_closure_node: detector") == "paused")
     before = rig.count("cloud_received")

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -143,3 +145,27 @@ def test_a_foreign_summary_is_one_clear_line(tmp_path: Path, content: str) -> No
     (tmp_path / "summary.json").write_text(content)
     with pytest.raises(UmfError, match=r"summary\.json is not the summary of a run"):
         read_summary(tmp_path)
+
+
+def test_the_summary_can_be_written_while_the_run_goes_on_in_another_thread(tmp_path: Path) -> None:
+    """The live node's timer writes it while the worker records."""
+    recorder = RunRecorder(tmp_path, Settings(), "w")
+    errors: list[Exception] = []
+
+    def record() -> None:
+        try:
+            for count in range(1500):
+                recorder.record(make_frame(count), detection(count, []))
+        except Exception as error:
+            errors.append(error)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # threads take turns as often as they can
+    try:
+        worker = threading.Thread(target=record)
+        worker.start()
+        while worker.is_alive():
+            recorder.summary({})
+    finally:
+        sys.setswitchinterval(interval)
+    assert errors == [] and recorder.summary({})["keyframes"] == 1500

@@ -113,8 +113,9 @@ class LoopClosureNode(Node):
     def _detect(self, frame: Frame) -> None:
         with self._lock:
             detection = self._detector.process(frame)
+            # before anybody forgets them
+            matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
         self._last = detection
-        matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
         self._announcer.announce(detection, matches)
         if self._recorder is not None:
             self._recorder.record(frame, detection)

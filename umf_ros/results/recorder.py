@@ -142,5 +142,6 @@ def read_summary(folder: Path) -> dict[str, Any]:
 def _percentiles(values: array[float]) -> dict[str, float | None]:
     if not values:
         return {"p50": None, "p95": None, "max": None}
-    p50, p95 = np.percentile(values, [50, 95])
-    return {"p50": round(float(p50), 3), "p95": round(float(p95), 3), "max": round(max(values), 3)}
+    copied = values[:]  # numpy would lock the array itself, and another thread appends to it
+    p50, p95 = np.percentile(copied, [50, 95])
+    return {"p50": round(float(p50), 3), "p95": round(float(p95), 3), "max": round(max(copied), 3)}
