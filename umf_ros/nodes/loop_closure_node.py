@@ -198,7 +198,8 @@ def _counts(synchronizer: Synchronizer) -> dict[str, int]:
     counts: dict[str, int] = {}
     for name, counter in synchronizer.counters.items():
         counts |= {f"{name}_received": counter.received, f"{name}_used": counter.used}
-        counts |= {f"{name}_dropped_{reason.replace(' ', '_')}": count for reason, count in counter.dropped.items()}
+        dropped = dict(counter.dropped)  # the decoder adds reasons meanwhile
+        counts |= {f"{name}_dropped_{reason.replace(' ', '_')}": count for reason, count in dropped.items()}
     return counts
 
 
