@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import signal
@@ -16,7 +17,9 @@ from command_line import only_line
 from command_line import umf as umf_here
 from recordings import ODOMETRY, TRUTH, traverse, write_mcap
 
-from umf_ros.bags.trajectories import read_tum
+from umf_ros.bags.reader import open_bag
+from umf_ros.bags.trajectories import read_ground_truth, read_tum
+from umf_ros.geometry import invert, relative, rotation_angle
 from umf_ros.results.tables import read_closures
 
 FILES = (
@@ -46,6 +49,54 @@ def test_it_finds_true_closures_and_straightens_the_trajectory(run: Path) -> Non
     assert truth["closures_true"] == summary["closures_published"] == len(read_closures(run / "closures.csv"))
     assert truth["ate_optimized_m"] < truth["ate_odometry_m"]
     assert truth["revisits"] >= truth["closures_true"]
+
+
+def test_closures_agree_with_the_truth_of_the_recording_one_by_one(run: Path, mini_bag: Path) -> None:
+    truth = {stamp: pose for stamp, pose in zip(*truth_of(mini_bag), strict=True)}
+    stamps = np.array(sorted(truth))
+    for closure in read_closures(run / "closures.csv"):
+        # the truth comes fifty times a second: the nearest is at most 10 ms and 2.5 cm away
+        match, query = (
+            truth[stamps[np.abs(stamps - s).argmin()]] for s in (closure.match_stamp_ns, closure.query_stamp_ns)
+        )
+        error = invert(relative(match, query)) @ closure.match_T_query
+        sigma = np.sqrt(np.diag(closure.covariance)[:3])
+        assert np.linalg.norm(error[:3, 3]) < 0.5 and np.degrees(rotation_angle(error)) < 5
+        assert (sigma > 1e-4).all() and (sigma < 1.0).all()
+        assert closure.query_stamp_ns - closure.match_stamp_ns >= 8e9  # as the settings demand
+        assert closure.probability >= 0.9
+
+
+def truth_of(bag: Path) -> tuple[np.ndarray, np.ndarray]:
+    truth = read_ground_truth(open_bag(bag))
+    assert truth is not None
+    return truth.stamps_ns, truth.poses
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_tables_tell_the_same_story(run: Path) -> None:
+    candidates, keyframes = rows_of(run / "candidates.csv"), rows_of(run / "keyframes.csv")
+    closures = rows_of(run / "closures.csv")
+    accepted = [(c["query_stamp_ns"], c["match_stamp_ns"]) for c in candidates if c["reason"] == "accepted"]
+    assert accepted == [(c["query_stamp_ns"], c["match_stamp_ns"]) for c in closures]
+    stamps = [int(keyframe["stamp_ns"]) for keyframe in keyframes]
+    assert stamps == sorted(set(stamps))
+    travelled = {int(k["stamp_ns"]): float(k["travelled_m"]) for k in keyframes}
+    for candidate in candidates:
+        query, match = int(candidate["query_stamp_ns"]), int(candidate["match_stamp_ns"])
+        assert query - match >= 8e9 and travelled[query] - travelled[match] >= 15.0
+        assert candidate["reason"] and -1 <= float(candidate["similarity"]) <= 1
+        assert all(isinstance(value, float) for value in json.loads(candidate["numbers"]).values())
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["keyframes"] == len(keyframes)
+    assert summary["queries"] == len({candidate["query_stamp_ns"] for candidate in candidates})
+    assert summary["closures_rejected"] == len(candidates) - len(closures)
+    inliers = {(i["query_stamp_ns"], i["match_stamp_ns"]) for i in rows_of(run / "inliers.csv")}
+    assert inliers <= set(accepted)
 
 
 def test_the_folder_is_complete(run: Path) -> None:
