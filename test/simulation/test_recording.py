@@ -129,3 +129,29 @@ def test_frames_need_no_file(drive):
     assert np.percentile(frame.points[:, 2], 20) < 0.8  # the ground, in the frame of the rover's feet
     assert frame.image_stamp_ns == drive.exposures[0].stamp_ns
     assert np.allclose(frame.body_T_camera, drive.calibration.body_T_camera, atol=0.02)
+
+
+def test_scans_of_the_bag_are_those_of_the_drive(drive, messages):
+    for number in (0, 4):
+        scan, message = drive.scan(number), messages["/bf_lidar/points_raw"][number][1]
+        cloud, returned = decode_cloud(message), scan.intensity > 0
+        assert stamp_ns(message) == drive.scan_stamps_ns[number]
+        np.testing.assert_array_equal(cloud.points, scan.points[returned])
+        np.testing.assert_array_equal(cloud.intensity, scan.intensity[returned])
+
+
+def test_images_of_the_bag_are_those_of_the_drive(drive, messages):
+    picture, message = drive.picture(drive.exposures[2]), messages["/stereo/left/image_rect"][2][1]
+    assert stamp_ns(message) == drive.exposures[2].stamp_ns
+    assert np.array_equal(message.data.reshape(512, 688), picture.image)
+    depth, rocks = (messages[f"/ground_truth/{name}"][2][1].data for name in ("depth", "instance"))
+    assert np.array_equal(depth.view(np.float32).reshape(512, 688), picture.depth)
+    assert np.array_equal(rocks.view(np.int32).reshape(512, 688), picture.instance)
+
+
+def test_the_truth_of_the_bag_is_the_motion(drive, messages):
+    for index in (0, 20, 50):
+        log_ns, message = messages["/ground_truth/pose"][index]
+        place = message.pose.position
+        assert [place.x, place.y, place.z] == pytest.approx(drive.pose(log_ns)[:3, 3].tolist(), abs=1e-9)
+        assert message.header.frame_id == "world"
