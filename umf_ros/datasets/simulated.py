@@ -13,6 +13,7 @@ from umf_ros.frames import StereoCamera
 
 NUMBERS = ("fx", "fy", "cx", "cy")
 REQUIRED = ("images", "points", "world_T_body", "pass_index", "body_T_camera", *NUMBERS, "width", "height")
+PER_SAMPLE = ("images", "points", "depth", "world_T_body", "pass_index")
 
 
 class SimulatedWorld:
@@ -27,6 +28,9 @@ class SimulatedWorld:
         missing = [name for name in REQUIRED if name not in content]
         if missing:
             raise UmfError(f"{path} is not a shard of a simulated world: {', '.join(missing)} missing")
+        counts = {name: len(content[name]) for name in PER_SAMPLE if name in content}
+        if len(set(counts.values())) > 1:
+            raise UmfError(f"{path} holds {', '.join(f'{count} {name}' for name, count in counts.items())}")
         self.name = path.stem
         self.place = path.stem
         self.setting = str(content.get("setting", "hard"))
@@ -60,7 +64,10 @@ class SimulatedWorld:
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(path) as archive:
+        archive = np.load(path)
+        if isinstance(archive, np.ndarray):
+            raise UmfError(f"{path} is not a shard of a simulated world, but a single array")
+        with archive:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError:
         raise UmfError(f"{path} does not exist") from None
