@@ -3,19 +3,83 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from umf_ros.config import PoseGraph as Settings
-from umf_ros.geometry import Array
+from umf_ros.geometry import Array, make_pose
 from umf_ros.pose_graph import lie
-from umf_ros.pose_graph.closures import State
+from umf_ros.pose_graph.closures import ClosureVerdict, State, TrackedClosure
 from umf_ros.pose_graph.condensed import Edge, between
 from umf_ros.pose_graph.graph import PoseGraph
-from umf_ros.pose_graph.synthetic import PERIOD_NS, World
+from umf_ros.pose_graph.odometry import OdometryChain
+from umf_ros.pose_graph.synthetic import PERIOD_NS, World, WorldClosure
 
-SETTINGS = Settings(keyframe_spacing_m=1e-6, max_gap_s=1.5, estimate_scale=True)
+SETTINGS = Settings(keyframe_spacing_m=1e-6, max_gap_s=1.5)
+LAP = 100
+ODOMETRY_SIGMAS = np.array([*np.deg2rad([0.2] * 3), 0.02, 0.02, 0.02])
+CLOSURE_COVARIANCE = np.diag([*np.deg2rad([0.5] * 3), 0.05, 0.05, 0.05]) ** 2
+
+
+def two_laps(seed: int = 0, noise: float = 1.0, bias: Array | None = None) -> World:
+    """Twice round a circle of 100 m, a pose per metre: pose k + 100 is where pose k was.
+
+    Args:
+        seed: of the odometry's noise.
+        noise: factor on it.
+        bias: (6,) twist by which every metre of the odometry is wrong.
+    """
+    count = 2 * LAP
+    turn = np.array([0, 0, 2 * np.pi / LAP, 1.0, 0, 0])
+    errors = noise * np.random.default_rng(seed).normal(size=(count - 1, 6)) * ODOMETRY_SIGMAS
+    steps = lie.exp(turn[None]) @ lie.exp(errors if bias is None else errors + bias)
+    odometry = [np.eye(4)]
+    for step in steps:
+        odometry.append(odometry[-1] @ step)
+    covariances = np.tile(np.diag(ODOMETRY_SIGMAS**2), (count, 1, 1))
+    return World(lie.exp(np.arange(count)[:, None] * turn), np.stack(odometry), covariances, [])
+
+
+def closing(
+    world: World,
+    pairs: Iterable[tuple[int, int]],
+    shift_m: tuple[float, float, float] = (0, 0, 0),
+    noise: float = 0.0,
+) -> World:
+    """The world with more closures: exact but for a shift of the second pose in the map, and noise if wanted."""
+    shift, closures = make_pose(np.eye(3), shift_m), list(world.closures)
+    for first, second in pairs:
+        error = noise * np.random.default_rng(second).normal(0, np.sqrt(np.diag(CLOSURE_COVARIANCE)))
+        pose = lie.invert(world.truth[first]) @ shift @ world.truth[second] @ lie.exp(error[None])[0]
+        closures.append(WorldClosure(first, second, pose, CLOSURE_COVARIANCE, not any(shift_m)))
+    return replace(world, closures=closures)
+
+
+def lap_pairs(*first: int) -> list[tuple[int, int]]:
+    """Poses of the first lap with where the second passes them."""
+    return [(k, k + LAP) for k in first]
+
+
+def chain_of(world: World, settings: Settings = SETTINGS, stated: float = 1.0) -> OdometryChain:
+    """The world's odometry alone."""
+    chain = OdometryChain(settings)
+    for k, pose in enumerate(world.odometry):
+        covariance = world.step_covariance(k)
+        chain.add(k * PERIOD_NS, pose, None if covariance is None else covariance * stated**2)
+    chain.update()
+    return chain
+
+
+def tracked(world: World) -> list[TrackedClosure]:
+    """The world's closures as the graph holds them."""
+    messages = [world.message(row) for row in range(len(world.closures))]
+    covariances = [closure.covariance for closure in world.closures]
+    return [
+        TrackedClosure(0, 0, ClosureVerdict(message, State.UNDECIDED, "new"), covariance)
+        for message, covariance in zip(messages, covariances, strict=True)
+    ]
 
 
 def feed_odometry(graph: PoseGraph, world: World, poses: Iterable[int], stated: float = 1.0) -> None:

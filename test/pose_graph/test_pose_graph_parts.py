@@ -5,16 +5,14 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from graph_worlds import SETTINGS, drive, feed_odometry
+from graph_worlds import SETTINGS, drive
 
 from umf_ros.config import PoseGraph as Settings
 from umf_ros.geometry import Array, relative
 from umf_ros.pose_graph import lie
-from umf_ros.pose_graph.agreement import chance_to_agree
 from umf_ros.pose_graph.condensed import Edge, between
-from umf_ros.pose_graph.graph import PoseGraph
 from umf_ros.pose_graph.odometry import OdometryChain, OdometryLog
-from umf_ros.pose_graph.synthetic import PERIOD_NS, rover_loops, with_wrong_closures
+from umf_ros.pose_graph.synthetic import PERIOD_NS, rover_loops
 
 WORLD = rover_loops(300, 12)
 
@@ -82,22 +80,6 @@ def test_standing_still_adds_no_keyframes() -> None:
     assert len(chain.stamps) == 1
 
 
-@pytest.mark.parametrize("stated", [1 / 3, 1.0, 3.0])
-def test_the_scale_of_the_odometry_is_found_among_wrong_closures(stated: float) -> None:
-    world = with_wrong_closures(rover_loops(500, 15), 0.5, "random", 1)
-    scale = drive(world, stated=stated).scale
-    assert scale.odometry == pytest.approx(1 / stated, rel=0.4)
-    assert scale.closures == 1.0
-
-
-def test_a_few_loops_move_no_scale() -> None:
-    graph = PoseGraph(SETTINGS)
-    feed_odometry(graph, WORLD, range(300), stated=3.0)
-    for row in range(3):
-        graph.add_closure(WORLD.message(row))
-    assert graph.scale.odometry == 1.0
-
-
 def test_the_maps_certainty_is_never_below_the_true_marginal() -> None:
     graph = drive(WORLD)
     certainty = graph._judge._certainty
@@ -117,10 +99,3 @@ def test_the_maps_certainty_is_never_below_the_true_marginal() -> None:
         bound = certainty.predict(0, i * PERIOD_NS, 0, j * PERIOD_NS).covariance
         assert bound is not None
         assert np.linalg.eigvalsh(bound - exact).min() > -0.02 * np.linalg.eigvalsh(exact).max()
-
-
-def test_agreement_says_less_the_less_is_known() -> None:
-    known = np.diag([1e-4] * 3 + [0.1**2] * 3)
-    vague = np.diag([1e-4] * 3 + [20.0**2] * 3)
-    chances = chance_to_agree(np.stack([known, vague]), Settings())
-    assert chances[0] < 0.01 and chances[1] == 1.0

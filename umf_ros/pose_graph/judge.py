@@ -65,7 +65,7 @@ class Judge:
         """
         rows = [self._take(tracked) for tracked in arrived]
         self._changed = set(rows)
-        if self._rescale() or (self._certainty is None and rows):
+        if self._rescale() or (rows and self._sessions.outgrown):
             self._solve()
             rows = list(range(len(self.closures)))
         self._decide({*rows, *self._brought_close})
@@ -244,10 +244,17 @@ class Judge:
             doubtful = self._sessions.doubtful(self._pick(group), self._pick(accepted), self.scale)
         except GraphError:
             return None
-        return [accepted[k] for k in doubtful]
+        return self._unsupported([accepted[k] for k in doubtful], group)
+
+    def _unsupported(self, doubtful: list[int], trusted: list[int]) -> list[int]:
+        """The doubtful that not even the trusted speak for: else the odometry between is wrong, not the closure."""
+        members = np.zeros(len(self.closures), bool)
+        members[trusted] = True
+        enough = self._settings.min_support
+        return [row for row in doubtful if self._agreement.group(row, members)[1] < enough]
 
     def _ask_again(self) -> None:
-        """Let graduated non-convexity look at all accepted closures, and the gate at those it doubts."""
+        """Let graduated non-convexity look at all accepted closures; without those it doubts all are judged anew."""
         accepted = [row for row, c in enumerate(self.closures) if c.accepted]
         if not self._settings.use_gnc or not accepted:
             return
@@ -255,11 +262,12 @@ class Judge:
             doubtful = [accepted[k] for k in self._sessions.doubtful([], self._pick(accepted), self.scale)]
         except GraphError:
             return
+        doubtful = self._unsupported(doubtful, [row for row in accepted if row not in doubtful])
         if doubtful and self._agreement.places(doubtful) < self._agreement.places(accepted) / 2:
             for row in doubtful:
                 self._note(row, State.REJECTED, _OUTVOTED)
             self._solve()
-            self._accept(dict.fromkeys(self._gate(doubtful), _AGREES))
+            self._decide_all()
 
     def _accept(self, reasons: dict[int, str]) -> None:
         if reasons:

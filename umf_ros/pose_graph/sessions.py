@@ -85,9 +85,18 @@ class Sessions:
         """Stamp of the newest odometry of all sessions; 0 without."""
         return max((int(chain.log.stamps[-1]) for chain in self.chains if len(chain.log.stamps)), default=0)
 
+    @property
+    def outgrown(self) -> bool:
+        """Whether a session has odometry but no pose in the last solution."""
+        if self.solution is None:
+            return True
+        vertices = np.diff(self.solution.starts, append=np.full(len(self.chains), self.solution.starts[-1]))
+        return any(estimate is not None and not vertices[s] for s, estimate in enumerate(self.estimates))
+
     def forget(self) -> None:
         """Go back to the odometry alone."""
         self._optimizer = Optimizer()
+        self.solution = None
         self.parts = list(range(len(self.chains)))
         self.estimates = [self._unsolved(s) if len(c.stamps) else None for s, c in enumerate(self.chains)]
 
