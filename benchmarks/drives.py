@@ -11,10 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.progress import track
 from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import Frame, Image, StereoCamera
+from umf_ros.embedding.embedder import Embedder
+from umf_ros.frames import Frame, Image, Keyframe, StereoCamera
 from umf_ros.geometry import Array, make_pose, relative, rotation_angle, transform
+from umf_ros.loop_detector import make_keyframe
 from umf_ros.sensors.calibration import Calibration, load_calibration
 from umf_ros.simulation.camera import TRAINING_SIZE, resized
 from umf_ros.simulation.families import FAMILIES
@@ -35,16 +38,23 @@ class Drive:
     """Frames of one world in the order they were taken.
 
     Attributes:
+        seed: of the world.
         name: seed, family and aliasing.
         frames: with odometry that drifts.
         truth: (N, 4, 4) `world_T_body`.
         depths: (N, 56, 56) metres along the optical axis, 0 for sky.
     """
 
+    seed: int
     name: str
     frames: list[Frame]
     truth: Array
     depths: Array
+
+    @property
+    def travelled(self) -> Array:
+        """Metres (N,) driven up to each frame."""
+        return travelled(self.truth)
 
     def overlap(self, query: int, match: int) -> float:
         """Share of what the query's camera sees (nearer than 40 m) that the match's camera sees too."""
@@ -72,19 +82,6 @@ class Drive:
         return np.concatenate([match_T_query[:3, 3] - true[:3, 3], turn])
 
 
-def load_shard(path: Path) -> Drive:
-    """A training or validation shard as a drive."""
-    with np.load(path) as shard:
-        facts = {name: float(shard[name]) for name in ("fx", "fy", "cx", "cy", "baseline")}
-        camera = StereoCamera(int(shard["width"]), int(shard["height"]), **facts)
-        calibration = replace(load_calibration("simulated"), camera=camera, body_T_camera=shard["body_T_camera"])
-        truth = shard["world_T_body"].astype(float)
-        images, points, depths, seed = shard["images"], shard["points"], shard["depth"], int(shard["seed"])
-        name = f"{seed} {shard['family']} {float(shard['aliasing']):g}"
-    frames = _frames(images, points, truth, calibration, seed)
-    return Drive(name, frames, truth, depths)
-
-
 def kept(folder: Path | None, seed: int, family: str, aliasing: float, step_m: float = STEP_M) -> Drive:
     """The same as `simulate`, from a file in the folder where an earlier call left it."""
     if folder is None:
@@ -109,7 +106,19 @@ def simulate(seed: int, family: str, aliasing: float, step_m: float = STEP_M) ->
     samples = list(Survey(world, passes, calibration))
     truth = np.array([sample.world_T_body for sample in samples], float)
     frames = _frames([sample.image for sample in samples], [s.points for s in samples], truth, calibration, seed)
-    return Drive(f"{seed} {family} {aliasing:g}", frames, truth, np.array([sample.depth for sample in samples]))
+    return Drive(seed, f"{seed} {family} {aliasing:g}", frames, truth, np.array([sample.depth for sample in samples]))
+
+
+def embedded(drive: Drive, embedder: Embedder) -> list[Keyframe]:
+    """A keyframe for every frame of a drive."""
+    frames = track(drive.frames, f"embedding {drive.name}", transient=True)
+    return [make_keyframe(frame, embedder, metres) for frame, metres in zip(frames, drive.travelled, strict=True)]
+
+
+def travelled(poses: Array) -> Array:
+    """Metres (N,) driven up to each of the poses (N, 4, 4)."""
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def worlds(first: int, count: int) -> Iterator[tuple[int, str, float]]:
@@ -122,10 +131,9 @@ def _frames(
     images: Iterable[Image], points: Iterable[Any], truth: Array, calibration: Calibration, seed: int
 ) -> list[Frame]:
     camera = resized(calibration.camera, *TRAINING_SIZE)
-    travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
     odometry = _drifting(truth, np.random.default_rng([seed, 17]))
     frames = []
-    for image, cloud, distance, odom in zip(images, points, travelled, odometry, strict=True):
+    for image, cloud, distance, odom in zip(images, points, travelled(truth), odometry, strict=True):
         returns = cloud[np.isfinite(cloud[:, 0])].astype(np.float32)
         frames.append(
             Frame(

@@ -76,9 +76,10 @@ def mirrored(seed: int) -> Pair:
 
 
 def thousands_of_neighbours(seed: int) -> Pair:
-    """Unrelated frames with 3,000 features each, all alike: mutual neighbours without end."""
+    """Unrelated frames with the same 3,000 features in other places: mutual neighbours without end."""
     query, match = _unrelated(seed)
-    return _crowded(query, seed), _crowded(match, seed + 1)
+    looks = np.random.default_rng(seed).standard_normal((3000, 64))
+    return _crowded(query, looks, 2 * seed), _crowded(match, looks, 2 * seed + 1)
 
 
 TRAPS: dict[str, Callable[[int], Pair]] = {
@@ -106,15 +107,14 @@ def _unrelated(seed: int) -> Pair:
     return take(here, pose_at(here, -12, 3, 10), 100, seed), take(there, pose_at(there, -10, 0, 0), 10, seed)
 
 
-def _crowded(keyframe: Keyframe, seed: int) -> Keyframe:
+def _crowded(keyframe: Keyframe, looks: Array, seed: int) -> Keyframe:
     rng = np.random.default_rng(seed)
-    looks = 1.0 + 0.05 * rng.standard_normal((3000, 64))
-    looks /= np.linalg.norm(looks, axis=1, keepdims=True)
+    pixel_looks, point_looks = (part / np.linalg.norm(part, axis=1, keepdims=True) for part in (looks, looks[:, :32]))
     pixels = rng.uniform(0, [CAMERA.width, CAMERA.height], (3000, 2)).astype(np.float32)
     points = np.column_stack([rng.uniform(3, 25, 3000), rng.uniform(-8, 8, 3000), rng.uniform(-1, 1, 3000)])
     salient = np.ones(3000, np.float32)
-    image = LocalFeatures(pixels, looks.astype(np.float16), salient, points.astype(np.float32))
-    cloud = LocalFeatures(points.astype(np.float32), looks[:, :32].astype(np.float16), salient, image.points)
+    image = LocalFeatures(pixels, pixel_looks.astype(np.float16), salient, points.astype(np.float32))
+    cloud = LocalFeatures(points.astype(np.float32), point_looks.astype(np.float16), salient, image.points)
     return replace(keyframe, embedding=replace(keyframe.embedding, image=image, cloud=cloud))
 
 

@@ -21,7 +21,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from drives import Drive, kept, worlds
+from drives import Drive, embedded, kept, worlds
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -30,10 +30,8 @@ from traps import TRAPS, spring
 from umf_ros.config import Database, Loop, Verification
 from umf_ros.config import Embedding as EmbeddingSettings
 from umf_ros.embedding import make_embedder
-from umf_ros.embedding.embedder import Embedder
 from umf_ros.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.geometry import Array, heading, wrap_angle
-from umf_ros.loop_detector import make_keyframe
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.simulation.seeds import TEST
 from umf_ros.verification import Verifier
@@ -84,7 +82,7 @@ def main(
     for number, family, aliasing in worlds(TEST[100 * seed % len(TEST)], 1 if quick else count):
         with console.status(f"simulating world {number} ({family}, aliasing {aliasing:g})"):
             drive = kept(drives, number, family, aliasing)
-        result, queries = _replay(drive, embedder)
+        result, queries = replay(drive, embedded(drive, embedder), Verifier(Verification()))
         console.print(f"world {result.name}: {len(result.errors)} accepted, {result.wrong} wrong")
         results.append(result)
         sample = sample or queries
@@ -106,20 +104,17 @@ def verify_sample(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _replay(drive: Drive, embedder: Embedder) -> tuple[World, list[Query]]:
-    """Run a drive as the loop detector does; also returns some queries with their candidates."""
+def replay(drive: Drive, keyframes: list[Keyframe], verifier: Verifier) -> tuple[World, list[Query]]:
+    """Verify along a drive as the loop detector does; also returns some queries with their candidates."""
     result = World(drive.name)
     sample: list[Query] = []
     rules = Loop()
-    database = PlaceDatabase(Database(), embedder.name, embedder.dimension)
-    verifier = Verifier(Verification())
-    travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(drive.truth[:, :3, 3], axis=0), axis=1))])
-    for query, frame in enumerate(track(drive.frames, f"world {drive.name}", transient=True)):
-        keyframe = make_keyframe(frame, embedder, float(travelled[query]))
+    database = PlaceDatabase(Database(), "drive", len(keyframes[0].embedding.descriptor))
+    for query, keyframe in enumerate(track(keyframes, f"verifying {drive.name}", transient=True)):
         found = [(one, database[one.index]) for one in database.query(keyframe, rules)]
         verdicts = verifier.verify(keyframe, found)
         closures = [verdict.closure for verdict in verdicts if verdict.closure is not None]
-        _record(result, drive, query, travelled, found, closures)
+        _record(result, drive, query, found, closures)
         if found:
             result.queries += 1
             result.rerank_ms.append(verifier.latency_ms["rerank"])
@@ -136,7 +131,6 @@ def _record(
     result: World,
     drive: Drive,
     query: int,
-    travelled: Array,
     found: list[tuple[Candidate, Keyframe]],
     closures: list[LoopClosure],
 ) -> None:
@@ -149,15 +143,15 @@ def _record(
         result.vectors.append(drive.error_vector(query, match, closure.match_T_query))
         result.covariances.append(closure.covariance)
         right |= error[0] <= WRONG_M and error[1] <= WRONG_DEG
-    revisited = _revisited(drive, query, travelled)
+    revisited = _revisited(drive, query)
     result.revisits += bool(revisited)
     result.retrieved += bool(revisited & set(index.values()))
     result.recalled += bool(revisited) and right
 
 
-def _revisited(drive: Drive, query: int, travelled: Array) -> set[int]:
+def _revisited(drive: Drive, query: int) -> set[int]:
     """Earlier keyframes within 5 m and 30 deg whose view overlaps by 30 % or more."""
-    rules, truth = Loop(), drive.truth
+    rules, truth, travelled = Loop(), drive.truth, drive.travelled
     earlier = (travelled[query] - travelled[:query] > rules.min_travel_m) & (
         drive.frames[query].stamp_ns - np.array([frame.stamp_ns for frame in drive.frames[:query]])
         > rules.min_time_gap_s * 1e9

@@ -10,7 +10,7 @@ import pytest
 from umf_ros.errors import ConfigError
 from umf_ros.verification.acceptance import MEASURES, Calibration, load_calibration, measure, save_calibration
 from umf_ros.verification.covariance import Spread, covariance_of
-from umf_ros.verification.fitting import Example, fit_logistic, fit_spread, inside_ellipsoid
+from umf_ros.verification.fitting import Example, fit_logistic, fit_spread, inside_ellipsoid, scale_spread
 
 GOOD = {
     "similarity": 0.8,
@@ -148,3 +148,38 @@ def test_spread_is_recovered_and_honest() -> None:
     covariances = covariance_of(np.array(informations), fitted)
     assert 0.93 <= inside_ellipsoid(np.array(errors), covariances) <= 0.97
     assert inside_ellipsoid(np.array(errors), covariances / 9) < 0.6
+
+
+@pytest.mark.parametrize("factor", [0.2, 1.0, 9.0])
+def test_covariances_of_the_wrong_size_are_scaled_until_95_percent_lie_inside(factor: float) -> None:
+    """Whether they were too timid or too bold."""
+    rng = np.random.default_rng(2)
+    true, stated = Spread(10.0, 0.01, 0.05), Spread(10.0 * factor, 0.01 * factor**0.5, 0.05 * factor**0.5)
+    informations = np.array([np.diag(10 ** rng.uniform(3, 6, 6)) for _ in range(500)])
+    errors = np.array([rng.multivariate_normal(np.zeros(6), covariance_of(found, true)) for found in informations])
+    scaled = scale_spread(stated, errors, covariance_of(informations, stated))
+    assert 0.93 <= inside_ellipsoid(errors, covariance_of(informations, scaled)) <= 0.97
+    assert scaled.inflation == pytest.approx(true.inflation, rel=0.2)
+
+
+def test_a_measure_that_argues_against_itself_is_given_no_weight() -> None:
+    rng = np.random.default_rng(3)
+    found = examples(200, rng)
+    perverse = [
+        Example(one.numbers | {"overlap": GOOD["overlap"] * (0.3 if one.right else 1.0)}, "scan", one.right)
+        for one in found
+    ]
+    assert fit_logistic(perverse, "scan").weights["overlap"] == 0
+
+
+def test_examples_of_another_kind_are_left_aside() -> None:
+    rng = np.random.default_rng(4)
+    found = examples(100, rng)
+    others = [Example(BAD, "image", True)] * 50
+    assert fit_logistic(found + others, "scan") == fit_logistic(found, "scan")
+
+
+@pytest.mark.parametrize("name", ["residual_m", "position_std_m", "prior_sigmas"])
+def test_larger_errors_never_make_a_closure_more_probable(shipped: Calibration, name: str) -> None:
+    odds = [shipped.probability(GOOD | {name: GOOD[name] * factor}, "scan") for factor in (0.5, 1, 2, 5, 20)]
+    assert odds == sorted(odds, reverse=True)

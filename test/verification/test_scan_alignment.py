@@ -3,12 +3,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scenes import landscape, pose_at, take
 from scipy.spatial.transform import Rotation
 
-from umf_ros.geometry import Array, make_pose, relative, rotation_angle
+from umf_ros.geometry import Array, invert, make_pose, relative, rotation_angle, transform
 from umf_ros.verification.covariance import SEARCH_M, Spread, covariance_of, information
-from umf_ros.verification.registration import Surface, align, inspect
+from umf_ros.verification.registration import Alignment, Surface, align, inspect
 
 GROUND = landscape(8)
 PLANE = replace(GROUND, bumps=np.empty((0, 4)))
@@ -100,3 +101,38 @@ def test_noisier_scans_are_less_certain() -> None:
     sure = covariance_of(information(inspect(match, query, true)), SPREAD)
     unsure = covariance_of(information(inspect(rough_match, rough_query, rough_true)), SPREAD)
     assert np.trace(unsure[:3, :3]) > 3 * np.trace(sure[:3, :3])
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 40.0])
+def test_a_ridge_leaves_the_shift_along_it_open(heading_deg: float) -> None:
+    """In axes of the match, whichever way the query looks."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(3, 25, 8000), rng.uniform(-10, 10, 8000)
+    sides = np.abs(x - 14) > 0.5  # the crest itself has no normal
+    ridge = np.column_stack([x, y, -0.5 * np.abs(x - 14)])[sides]
+    turn = make_pose(Rotation.from_euler("z", heading_deg, degrees=True).as_matrix(), [0.0, 0.0, 0.0])
+    turned = transform(invert(turn), ridge).astype(np.float32)
+    found = information(inspect(Surface(ridge.astype(np.float32)), Surface(turned), turn))
+    along, across = np.sqrt(np.diag(covariance_of(found, SPREAD)))[[1, 0]]
+    assert along > 1.0 and across < 0.1
+
+
+def test_covariance_names_the_axes_of_the_match_and_turns_about_the_query() -> None:
+    """A better known direction of the match must come out better known, however the query is turned."""
+    jacobian = np.zeros((300, 6))
+    jacobian[:100, 0] = jacobian[100:200, 5] = 1.0
+    residuals = np.random.default_rng(0).normal(0, 0.02, 300)
+    covariance = covariance_of(information(Alignment(np.eye(4), residuals, jacobian, 1.0)), SPREAD)
+    deviation = np.sqrt(np.diag(covariance))
+    assert deviation[0] < 0.02 and deviation[5] < 0.02
+    np.testing.assert_allclose(deviation[1:3], SEARCH_M, rtol=0.01)
+
+
+def test_a_few_outliers_do_not_make_a_fit_surer_or_much_less_sure() -> None:
+    match, query, true = surfaces()
+    found = inspect(match, query, true)
+    spoiled = found.residuals.copy()
+    spoiled[::20] = 0.35
+    clean = np.trace(covariance_of(information(found), SPREAD)[:3, :3])
+    dirty = np.trace(covariance_of(information(replace(found, residuals=spoiled)), SPREAD)[:3, :3])
+    assert clean < dirty < 2.0 * clean

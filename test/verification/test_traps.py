@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from traps import TRAPS, spring
 
+from umf_ros.config import Verification
+from umf_ros.frames import Candidate
 from umf_ros.verification import Verifier
+from umf_ros.verification.matching import mutual_neighbours, similarities
 from umf_ros.verification.ransac import fit_homography
+from umf_ros.verification.terrain import Fan, TerrainMap, search
+from umf_ros.verification.verifier import MIN_TERRAIN_SCORE
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -36,3 +44,33 @@ def test_the_mirror_trap_is_a_real_one() -> None:
     pairs = similarity.argmax(axis=1)
     upright = fit_homography(ours.positions.astype(float), unmirrored[pairs], 20.0, 200, seed=0)
     assert upright is not None and upright.count >= 20
+
+
+def test_the_crowded_trap_is_a_real_one() -> None:
+    """Mutual neighbours without end, in both modalities."""
+    query, match = TRAPS["thousands_of_neighbours"](0)
+    for ours, theirs in (
+        (query.embedding.image, match.embedding.image),
+        (query.embedding.cloud, match.embedding.cloud),
+    ):
+        assert ours is not None and theirs is not None
+        assert len(mutual_neighbours(similarities(ours.descriptors, theirs.descriptors))) > 2000
+
+
+@pytest.mark.parametrize("name", ["empty_scans", "planar_scans"])
+def test_no_relief_no_pose_from_it(name: str) -> None:
+    query, match = TRAPS[name](0)
+    fits = search(TerrainMap(match.points), Fan(TerrainMap(query.points)))
+    assert all(fit.score < MIN_TERRAIN_SCORE for fit in fits)
+
+
+@pytest.mark.parametrize("name", list(TRAPS))
+def test_neighbouring_keyframes_do_not_talk_a_trap_into_a_closure(name: str) -> None:
+    """A coincidence that lasts, as identical ground does, gathers support; support alone must not suffice."""
+    verifier = Verifier(Verification())
+    query, match = TRAPS[name](0)
+    for step in range(4):
+        here = replace(query, stamp_ns=query.stamp_ns + step, odom_T_body=np.eye(4), travelled_m=100.0)
+        there = replace(match, stamp_ns=match.stamp_ns + step, odom_T_body=np.eye(4), travelled_m=10.0)
+        verdict = verifier.verify(here, [(Candidate(0, there.stamp_ns, 0.97), there)])[0]
+        assert verdict.closure is None, verdict.numbers

@@ -8,23 +8,25 @@ import numpy as np
 from umf_ros.frames import Keyframe, LocalFeatures, Points
 from umf_ros.geometry import Array, make_pose, transform
 from umf_ros.verification.lifting import project
-from umf_ros.verification.matching import similarities
+from umf_ros.verification.matching import similarities, strongest
 from umf_ros.verification.ransac import fit_rigid
 from umf_ros.verification.reranking import Ranked
 
 POINT_THRESHOLD_M = 0.75
 PIXEL_THRESHOLD = 0.025  # of the image's width
-MIN_INLIERS = 6
+MIN_POINTS = 6  # that agree on a motion
+MIN_PIXELS = 10  # that agree on a view: with two coordinates each, more of them agree by chance
 REACH_PIXELS = 0.04  # of the image's width, around the place where a feature should reappear
 REACH_M = 1.0
 PEERS = 8  # features a comparison needs
+COMPARED = 400  # strongest features of a side that are compared, which bounds time and memory
 
 
 def pose_from_points(query: Keyframe, ranked: Ranked, iterations: int, seed: int) -> Array | None:
     """`match_T_query` from 3-D/3-D pairs of both modalities at once, or None."""
     ours, theirs = paired_points(query, ranked)
     consensus = fit_rigid(ours, theirs, POINT_THRESHOLD_M, iterations, seed)
-    return consensus.model if consensus is not None and consensus.count >= MIN_INLIERS else None
+    return consensus.model if consensus is not None and consensus.count >= MIN_POINTS else None
 
 
 def pose_from_pixels(query: Keyframe, ranked: Ranked, iterations: int) -> Array | None:
@@ -35,7 +37,7 @@ def pose_from_pixels(query: Keyframe, ranked: Ranked, iterations: int) -> Array 
     points = ours.points[ranked.image_pairs[:, 0]].astype(float)
     pixels = theirs.positions[ranked.image_pairs[:, 1]].astype(float)
     known = np.isfinite(points).all(axis=1)
-    if known.sum() < MIN_INLIERS:
+    if known.sum() < MIN_PIXELS:
         return None
     camera = ranked.keyframe.camera
     found, rotation, translation, inliers = cv2.solvePnPRansac(
@@ -47,7 +49,7 @@ def pose_from_pixels(query: Keyframe, ranked: Ranked, iterations: int) -> Array 
         reprojectionError=PIXEL_THRESHOLD * camera.width,
         flags=cv2.SOLVEPNP_P3P,
     )
-    if not found or inliers is None or len(inliers) < MIN_INLIERS:
+    if not found or inliers is None or len(inliers) < MIN_PIXELS:
         return None
     return ranked.keyframe.body_T_camera @ make_pose(cv2.Rodrigues(rotation)[0], translation.ravel())
 
@@ -62,7 +64,7 @@ def image_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
     ours, theirs = query.embedding.image, match.embedding.image
     if ours is None or theirs is None:
         return float("nan")
-    camera = match.camera
+    ours, theirs, camera = strongest(ours, COMPARED), strongest(theirs, COMPARED), match.camera
     pixels, depth = project(transform(pose, ours.points.astype(float)), camera, match.body_T_camera)
     # row bands: sky, horizon and foreground look different in every place
     offset = pixels[:, None] - theirs.positions[None].astype(float)
@@ -76,6 +78,7 @@ def cloud_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
     ours, theirs = query.embedding.cloud, match.embedding.cloud
     if ours is None or theirs is None:
         return float("nan")
+    ours, theirs = strongest(ours, COMPARED), strongest(theirs, COMPARED)
     moved = transform(pose, ours.positions.astype(float))
     distance = np.linalg.norm(moved[:, None] - theirs.positions[None], axis=2)
     range_ours = np.linalg.norm(moved, axis=1)[:, None]

@@ -87,9 +87,21 @@ def fit_spread(errors: Array, informations: Array) -> Spread:
         return float(np.mean(np.linalg.slogdet(covariances)[1] + 16 * np.log1p(squared / 10)))
 
     found = minimize(surprise, np.log([10.0, 0.01, 0.05]), method="Nelder-Mead", options={"maxiter": 300}).x
-    squared = _squared_distances(errors, covariance_of(informations, _spread(found)))
-    scale = float(np.quantile(squared, 0.95)) / float(chi2.ppf(0.95, 6))
-    return _spread(found + np.log(scale) * np.array([1.0, 0.5, 0.5]))
+    spread = _spread(found)
+    return scale_spread(spread, errors, covariance_of(informations, spread))
+
+
+def scale_spread(spread: Spread, errors: Array, covariances: Array) -> Spread:
+    """The spread that makes covariances (N, 6, 6) just so much larger or smaller that 95 % of their errors lie inside.
+
+    Args:
+        spread: with which the covariances were made.
+        errors: (N, 6), ROS order.
+        covariances: (N, 6, 6) of the same poses.
+    """
+    variance = float(np.quantile(_squared_distances(errors, covariances), 0.95)) / float(chi2.ppf(0.95, 6))
+    deviation = variance**0.5
+    return Spread(spread.inflation * variance, spread.floor_m * deviation, spread.floor_deg * deviation)
 
 
 def _spread(logarithms: Array) -> Spread:

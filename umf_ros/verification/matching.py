@@ -7,10 +7,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.frames import SuperFeatures
+from umf_ros.frames import LocalFeatures, SuperFeatures
 
 Indices = NDArray[np.intp]
 SERIAL = 2**18  # multiplications up to which OpenBLAS stays on one thread; its others would spin for nothing
+
+
+def strongest(features: LocalFeatures, count: int) -> LocalFeatures:
+    """The first `count` features: a bound on what their comparison costs."""
+    if len(features.positions) <= count:
+        return features
+    first = slice(count)
+    return LocalFeatures(
+        features.positions[first], features.descriptors[first], features.saliency[first], features.points[first]
+    )
 
 
 def similarities(query: NDArray[Any], match: NDArray[Any]) -> NDArray[np.float32]:

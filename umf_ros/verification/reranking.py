@@ -9,7 +9,7 @@ import numpy as np
 
 from umf_ros.config import Verification
 from umf_ros.frames import Candidate, Keyframe, LocalFeatures
-from umf_ros.verification.matching import Indices, eligible_superfeatures, mutual_neighbours, similarities
+from umf_ros.verification.matching import Indices, eligible_superfeatures, mutual_neighbours, similarities, strongest
 from umf_ros.verification.ransac import Consensus, fit_homography, fit_rigid
 
 IMAGE_THRESHOLD = 0.03  # of the image's width: a cell of the feature map is 1.8 %
@@ -98,5 +98,5 @@ def _by_ransac(query: Keyframe, candidate: Candidate, keyframe: Keyframe, settin
 
 
 def _pairs(query: LocalFeatures, match: LocalFeatures, settings: Verification) -> Indices:
-    limit = settings.rerank_features
-    return mutual_neighbours(similarities(query.descriptors[:limit], match.descriptors[:limit]))
+    ours, theirs = strongest(query, settings.rerank_features), strongest(match, settings.rerank_features)
+    return mutual_neighbours(similarities(ours.descriptors, theirs.descriptors))

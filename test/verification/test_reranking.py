@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import landscape, pose_at, take, without_image, without_scan
+
+from umf_ros.config import Verification
+from umf_ros.frames import Candidate, Keyframe, SuperFeatures
+from umf_ros.verification.reranking import Ranked, rerank
+
+GROUND = landscape(20)
+QUERY = take(GROUND, pose_at(GROUND, -14.0, 1.2, 6.0), 100.0)
+SAME = take(GROUND, pose_at(GROUND, -15.0, 0.0, 0.0), 10.0)
+RANSAC = Verification()
+
+
+def elsewhere(number: int) -> Keyframe:
+    other = landscape(40 + number)
+    return take(other, pose_at(other, -15.0, number - 3.0, 0.0), 20.0 + number)
+
+
+def offered(*keyframes: Keyframe, similarity: float = 0.5) -> list[tuple[Candidate, Keyframe]]:
+    return [(Candidate(n, keyframe.stamp_ns, similarity), keyframe) for n, keyframe in enumerate(keyframes)]
+
+
+def stamps(ranked: list[Ranked]) -> list[int]:
+    return [item.candidate.stamp_ns for item in ranked]
+
+
+def blind(keyframe: Keyframe) -> Keyframe:
+    return replace(keyframe, embedding=replace(keyframe.embedding, image=None, cloud=None))
+
+
+def test_same_place_comes_first_whatever_the_descriptors_say() -> None:
+    candidates = offered(*map(elsewhere, range(5)), similarity=0.9) + offered(SAME, similarity=0.1)
+    ranked = rerank(QUERY, candidates, RANSAC)
+    assert ranked[0].keyframe is SAME
+    assert ranked[0].score > 3 * ranked[1].score
+    assert sorted(stamps(ranked)) == sorted(candidate.stamp_ns for candidate, _ in candidates)
+
+
+def test_equals_are_ordered_by_similarity_then_by_age() -> None:
+    keyframes = [blind(elsewhere(number)) for number in range(4)]
+    similarity = (0.2, 0.7, 0.2, 0.9)
+    candidates = [(Candidate(n, k.stamp_ns, s), k) for n, (k, s) in enumerate(zip(keyframes, similarity, strict=True))]
+    ranked = rerank(QUERY, candidates[::-1], RANSAC)
+    assert stamps(ranked) == [keyframes[n].stamp_ns for n in (3, 1, 0, 2)]
+    assert all(item.score == 0 for item in ranked)
+
+
+def test_score_counts_the_inliers_of_both_modalities() -> None:
+    found = rerank(QUERY, offered(SAME), RANSAC)[0]
+    assert found.image is not None and found.cloud is not None
+    assert found.score == found.image.count + found.cloud.count
+    assert found.numbers["inliers_image"] == found.image.count > 30
+    assert found.numbers["inliers_cloud"] == found.cloud.count > 20
+
+
+@pytest.mark.parametrize("modalities", ["image", "cloud"])
+def test_one_modality_is_blind_for_the_other(modalities: str) -> None:
+    settings = Verification(modalities=modalities)
+    found = rerank(QUERY, offered(SAME), settings)[0]
+    stripped = without_scan(SAME) if modalities == "image" else without_image(SAME)
+    assert found.score == rerank(QUERY, offered(stripped), settings)[0].score > 0
+    assert (found.image is None) == (modalities == "cloud")
+    assert (found.cloud is None) == (modalities == "image")
+
+
+@pytest.mark.parametrize("absent", ["image", "cloud"])
+def test_a_missing_modality_on_one_side_counts_nothing(absent: str) -> None:
+    partial = without_image(SAME) if absent == "image" else without_scan(SAME)
+    ranked = rerank(QUERY, offered(partial), RANSAC)[0]
+    assert ranked.numbers[f"inliers_{absent}"] == 0
+    assert ranked.score > 0
+
+
+def test_only_the_strongest_features_are_matched() -> None:
+    found = rerank(QUERY, offered(SAME), Verification(rerank_features=40))[0]
+    assert 0 < len(found.image_pairs) <= 40
+    assert found.image_pairs.max() < 40 and found.cloud_pairs.max() < 40
+
+
+def test_same_seed_same_ranking_and_another_seed_other_samples() -> None:
+    candidates = offered(SAME, *map(elsewhere, range(3)))
+    first, again = (rerank(QUERY, candidates, Verification(seed=3)) for _ in range(2))
+    assert stamps(first) == stamps(again)
+    for one, two in zip(first, again, strict=True):
+        assert one.image is not None and two.image is not None
+        assert one.image.model.tobytes() == two.image.model.tobytes()
+    other = rerank(QUERY, candidates, Verification(seed=4))
+    assert other[0].keyframe is SAME
+    assert other[0].numbers != first[0].numbers or other[1].numbers != first[1].numbers
+
+
+def supers(rows: np.ndarray) -> SuperFeatures:
+    unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return SuperFeatures(unit.astype(np.float16), np.ones(len(rows), np.float32))
+
+
+def with_supers(keyframe: Keyframe, image: np.ndarray, cloud: np.ndarray) -> Keyframe:
+    embedding = replace(keyframe.embedding, super_image=supers(image), super_cloud=supers(cloud))
+    return replace(keyframe, embedding=embedding)
+
+
+@pytest.mark.parametrize(("modalities", "expected"), [("image", 8), ("cloud", 5), ("both", 13)])
+def test_superfeatures_are_counted_by_modality(modalities: str, expected: int) -> None:
+    rng = np.random.default_rng(0)
+    image, cloud = rng.standard_normal((8, 32)), rng.standard_normal((5, 32))
+    query, same = with_supers(QUERY, image, cloud), with_supers(SAME, image + 0.05, cloud - 0.05)
+    shuffled = with_supers(elsewhere(0), image[::-1], np.roll(cloud, 2, axis=0))
+    settings = Verification(rerank="superfeatures", modalities=modalities)
+    best, worst = rerank(query, offered(shuffled, same), settings)
+    assert best.keyframe is same
+    assert (best.superfeatures, worst.superfeatures) == (expected, 0)
+
+
+def test_no_candidates_no_ranking() -> None:
+    assert rerank(QUERY, [], RANSAC) == []
