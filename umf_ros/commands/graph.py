@@ -79,7 +79,7 @@ def plot(
     file: File,
     output: Annotated[Path, typer.Option("--output", "-o", help="Picture to write.")] = Path("graph.png"),
 ) -> None:
-    """Draw a graph file: odometry grey, closures green, from above and from the side."""
+    """Draw a graph file: odometry dark, closures green, from above and from the side."""
     from umf_ros.pose_graph.g2o import read_g2o
     from umf_ros.pose_graph.picture import draw
 

@@ -27,6 +27,13 @@ def invert(poses: Array) -> Array:
     return result
 
 
+def orthonormal(poses: Array) -> Array:
+    """(N, 4, 4) poses with the rotation nearest to each: products of many poses drift off it."""
+    result = poses.copy()
+    result[..., :3, :3] = Rotation.from_matrix(poses[..., :3, :3]).as_matrix()
+    return result
+
+
 def adjoint(poses: Array) -> Array:
     """(N, 6, 6) adjoints: a twist at the child, seen at the parent."""
     result = np.zeros((*poses.shape[:-2], 6, 6))

@@ -38,7 +38,7 @@ class OdometryLog:
         if not self._arrived:
             return None
         stamps = np.array([stamp for stamp, _ in self._arrived], np.int64)
-        poses = np.stack([pose for _, pose in self._arrived])
+        poses = lie.orthonormal(np.stack([pose for _, pose in self._arrived]))
         self._arrived = []
         return self._merge(stamps, poses[:, :3])
 

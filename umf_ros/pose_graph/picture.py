@@ -13,7 +13,7 @@ from umf_ros.pose_graph.replay import as_recording
 
 
 def draw(content: G2oGraph, path: str | Path) -> None:
-    """Draw positions, odometry (grey) and closures (green) from above, and from the side where height varies.
+    """Draw odometry (dark) and closures (green) from above, and from the side where height varies.
 
     Poses the file does not give are composed from its odometry.
 
@@ -35,8 +35,7 @@ def draw(content: G2oGraph, path: str | Path) -> None:
     for column, (across, up, points) in enumerate(views, start=1):
         axes = figure.add_subplot(1, len(views), column, xlabel=across, ylabel=up, aspect="equal")
         _draw_lines(axes, points, recording.chains, closures)
-    title = f"{len(at)} poses, {len(closures)} closures"
-    figure.suptitle(title)
+    figure.suptitle(f"{len(at)} poses, {len(closures)} closures")
     try:
         figure.savefig(path, dpi=120)
     except (OSError, ValueError) as error:
@@ -49,11 +48,13 @@ def _draw_lines(axes: object, points: Array, chains: list[int], closures: Array)
 
     assert isinstance(axes, Axes)
     for start, end in zip(chains, [*chains[1:], len(points)], strict=True):
-        axes.plot(*points[start:end].T, color="0.5", linewidth=0.8, label="odometry" if start == 0 else None)
+        axes.plot(*points[start:end].T, color="0.2", linewidth=0.8, zorder=3, label="odometry" if start == 0 else None)
     if len(closures):
-        axes.add_collection(
-            LineCollection(list(points[closures]), colors="tab:green", linewidths=0.6, label="closures")
-        )
-    axes.plot(*points[:1].T, "o", color="tab:blue", markersize=5, label="start")
+        # thousands of closures would bury the path
+        alpha = float(np.clip(500 / len(closures), 0.05, 0.8))
+        lines = LineCollection(list(points[closures]), colors="tab:green", linewidths=0.6, alpha=alpha)
+        axes.add_collection(lines)
+        axes.plot([], [], color="tab:green", label="closures")
+    axes.plot(*points[:1].T, "o", color="tab:blue", markersize=5, zorder=4, label="start")
     axes.legend(loc="best", fontsize="small")
     axes.grid(alpha=0.3)

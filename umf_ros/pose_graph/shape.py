@@ -55,6 +55,8 @@ class Shape:
 
     def around(self, stamps: Stamps, poses: Array) -> Shape:
         """The shape linearised around (N, 4, 4) corrected poses at sorted stamps."""
+        # shaping is repeated, and inverting by transposing would multiply what is not quite orthonormal
+        poses = lie.orthonormal(poses)
         odometry = self._chain.poses_at(stamps)
         noise = self._chain.noise_at(stamps, odometry)
         odometry = self._chain.at_origin(odometry)

@@ -1,0 +1,222 @@
+"""Graph files driven through the back-end, what a run leaves behind, and pictures."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graph_worlds import LAP, SETTINGS, accepted, closing, lap_pairs, rms, two_laps
+
+from umf_ros.bags.trajectories import read_tum
+from umf_ros.errors import OutputError
+from umf_ros.geometry import make_pose, relative
+from umf_ros.pose_graph import lie
+from umf_ros.pose_graph.closures import State
+from umf_ros.pose_graph.condensed import Edge
+from umf_ros.pose_graph.g2o import G2oGraph, read_g2o, write_g2o
+from umf_ros.pose_graph.graph import PoseGraph
+from umf_ros.pose_graph.picture import draw
+from umf_ros.pose_graph.replay import PERIOD_NS, Recording, as_recording, drive
+from umf_ros.pose_graph.results import VERDICT_COLUMNS, verdict_table, write_results
+from umf_ros.pose_graph.synthetic import World
+
+WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))
+
+
+def content_of(world: World, first_id: int = 0, stride: int = 1) -> G2oGraph:
+    """The world as a file would give it."""
+    ids = [first_id + stride * k for k in range(len(world.truth))]
+    edges = [
+        Edge(ids[k - 1], ids[k], relative(world.odometry[k - 1], world.odometry[k]), world.step_covariances[k])
+        for k in range(1, len(ids))
+    ]
+    edges += [Edge(ids[c.first], ids[c.second], c.pose, c.covariance) for c in world.closures]
+    return G2oGraph(dict(zip(ids, world.odometry, strict=True)), edges)
+
+
+def driven(recording: Recording) -> PoseGraph:
+    graph = PoseGraph(recording.settings(SETTINGS))
+    for _ in drive(graph, recording):
+        pass
+    return graph
+
+
+@pytest.fixture(scope="module")
+def finished() -> PoseGraph:
+    return driven(as_recording(content_of(WORLD)))
+
+
+def test_a_file_becomes_odometry_and_closures() -> None:
+    recording = as_recording(content_of(WORLD))
+    np.testing.assert_allclose(recording.odometry, WORLD.odometry, atol=1e-9)
+    assert recording.chains == [0] and recording.step_covariance(0) is None
+    found = [(edge.first, edge.second) for edge in recording.closures]
+    assert found == sorted(((c.first, c.second) for c in WORLD.closures), key=lambda pair: pair[::-1])
+
+
+def test_ids_may_be_any_growing_numbers() -> None:
+    recording = as_recording(content_of(WORLD, first_id=5000, stride=3))
+    assert recording.ids[:2].tolist() == [5000, 5003]
+    assert accepted(driven(recording)) == {(c.first, c.second) for c in WORLD.closures if c.right}
+
+
+def test_a_backward_edge_is_turned_round() -> None:
+    content = content_of(WORLD)
+    turned = [
+        Edge(e.second, e.first, lie.invert(e.pose), lie.conjugate(lie.adjoint(e.pose), e.covariance))
+        for e in content.edges
+    ]
+    recording = as_recording(G2oGraph(content.poses, turned))
+    np.testing.assert_allclose(recording.odometry, WORLD.odometry, atol=1e-9)
+    expected = as_recording(content)
+    for row in (0, 5):
+        np.testing.assert_allclose(recording.closures[row].pose, expected.closures[row].pose, atol=1e-9)
+        np.testing.assert_allclose(recording.closures[row].covariance, expected.closures[row].covariance, atol=1e-9)
+
+
+def test_a_second_edge_between_neighbours_is_a_closure() -> None:
+    content = content_of(two_laps())
+    again = Edge(7, 8, content.edges[7].pose, content.edges[7].covariance)
+    recording = as_recording(G2oGraph(content.poses, [*content.edges, again]))
+    assert [(edge.first, edge.second) for edge in recording.closures] == [(7, 8)]
+
+
+def test_where_odometry_is_missing_a_new_chain_begins_at_its_vertex() -> None:
+    content = content_of(closing(two_laps(), lap_pairs(0, 15, 30, 45)))
+    kept = [edge for edge in content.edges if (edge.first, edge.second) != (LAP - 1, LAP)]
+    recording = as_recording(G2oGraph(content.poses, kept))
+    assert recording.chains == [0, LAP]
+    np.testing.assert_allclose(recording.odometry[LAP], content.poses[LAP])
+    assert len(driven(recording).trajectory()[0]) == 2 * LAP
+
+
+def test_driving_tells_its_progress_and_settles() -> None:
+    recording = as_recording(content_of(WORLD))
+    graph = PoseGraph(recording.settings(SETTINGS))
+    assert list(drive(graph, recording)) == list(range(1, len(WORLD.closures) + 1))
+    assert accepted(graph) == {(c.first, c.second) for c in WORLD.closures if c.right}
+    assert graph.verdict_counts() == {State.ACCEPTED: len(WORLD.closures) - 1, State.REJECTED: 1}
+    assert rms(graph.trajectory()[1], WORLD.truth) < 0.5
+
+
+def test_a_file_without_closures_is_its_odometry() -> None:
+    graph = driven(as_recording(content_of(two_laps())))
+    np.testing.assert_allclose(graph.trajectory()[1], two_laps().odometry, atol=1e-9)
+    assert graph.closures() == []
+
+
+def test_results_hold_both_trajectories_for_evaluation(finished: PoseGraph, tmp_path: Path) -> None:
+    write_results(finished, tmp_path / "new" / "folder")
+    optimized = read_tum(tmp_path / "new" / "folder" / "trajectory_optimized.tum")
+    odometry = read_tum(tmp_path / "new" / "folder" / "trajectory_odometry.tum")
+    np.testing.assert_allclose(optimized.poses, finished.trajectory()[1], atol=1e-8)
+    np.testing.assert_allclose(odometry.poses, WORLD.odometry, atol=1e-8)
+    np.testing.assert_array_equal(optimized.stamps_ns, np.arange(2 * LAP) * PERIOD_NS)
+
+
+def test_settling_again_and_again_changes_nothing() -> None:
+    graph = driven(as_recording(content_of(WORLD)))
+    once = graph.trajectory()[1]
+    for _ in range(4):
+        graph.settle()
+    poses = graph.trajectory()[1]
+    turns = poses[:, :3, :3]
+    np.testing.assert_allclose(np.swapaxes(turns, 1, 2) @ turns, np.tile(np.eye(3), (len(turns), 1, 1)), atol=1e-8)
+    np.testing.assert_allclose(poses, once, atol=1e-6)
+
+
+def test_the_verdict_table_says_why(finished: PoseGraph) -> None:
+    rows = list(csv.DictReader(io.StringIO(verdict_table(finished.closures()))))
+    assert tuple(rows[0]) == VERDICT_COLUMNS
+    assert len(rows) == len(WORLD.closures)
+    (bad,) = [row for row in rows if row["verdict"] == "rejected"]
+    assert (bad["match_stamp_ns"], bad["query_stamp_ns"]) == (str(47 * PERIOD_NS), str(147 * PERIOD_NS))
+    assert bad["reason"] == "contradicts the map"
+    assert float(bad["mahalanobis"]) > 5 and float(bad["misfit_m"]) == pytest.approx(50**0.5, rel=0.2)
+
+
+def test_rejected_closures_are_not_in_the_written_graph(finished: PoseGraph, tmp_path: Path) -> None:
+    finished.write_g2o(tmp_path / "a.g2o")
+    pairs = {(edge.first, edge.second) for edge in read_g2o(tmp_path / "a.g2o").edges}
+    assert (0, LAP) in pairs and (47, 47 + LAP) not in pairs
+
+
+def test_the_written_graph_is_at_its_own_optimum(finished: PoseGraph, tmp_path: Path) -> None:
+    finished.write_g2o(tmp_path / "a.g2o")
+    again = driven(as_recording(read_g2o(tmp_path / "a.g2o")))
+    assert rms(again.trajectory()[1], finished.trajectory()[1]) < 1e-3
+
+
+def test_a_clock_that_went_back_is_written_in_order(tmp_path: Path) -> None:
+    graph = PoseGraph(SETTINGS)
+    world = closing(two_laps(), lap_pairs(0, 15, 30, 45), noise=1.0)
+    for k in range(LAP):
+        graph.add_odometry((k + LAP) * PERIOD_NS, world.odometry[k])
+    graph.begin_session()
+    for k in range(LAP):
+        graph.add_odometry(k * PERIOD_NS, world.odometry[LAP + k])
+    for row, closure in enumerate(world.closures):
+        match, query = (closure.first + LAP) * PERIOD_NS, (closure.second - LAP) * PERIOD_NS
+        graph.add_closure(replace(world.message(row), match_stamp_ns=match, query_stamp_ns=query))
+    graph.settle()
+    assert (np.diff(graph.trajectory()[0]) < 0).any()
+    graph.write_tum(tmp_path / "a.tum")
+    written = read_tum(tmp_path / "a.tum")
+    assert (np.diff(written.stamps_ns) > 0).all() and len(written) == 2 * LAP
+
+
+@pytest.mark.parametrize("target", ["results", "tum", "g2o"])
+def test_a_place_that_cannot_be_written_is_one_clear_error(finished: PoseGraph, tmp_path: Path, target: str) -> None:
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    with pytest.raises(OutputError, match="cannot write"):
+        if target == "results":
+            write_results(finished, blocker / "folder")
+        elif target == "tum":
+            finished.write_tum(blocker / "a.tum")
+        else:
+            finished.write_g2o(blocker / "a.g2o")
+
+
+def test_a_plane_file_stays_a_plane_file(tmp_path: Path) -> None:
+    flat = [Edge(k, k + 1, make_pose(np.eye(3), [1.0, 0.1, 0]), np.eye(6)) for k in range(5)]
+    write_g2o(tmp_path / "in.g2o", [np.eye(4)] * 6, flat, planar=True)
+    content = read_g2o(tmp_path / "in.g2o")
+    driven(as_recording(content)).write_g2o(tmp_path / "out.g2o", planar=content.planar)
+    lines = (tmp_path / "out.g2o").read_text().splitlines()
+    assert [line.split()[0] for line in lines] == ["VERTEX_SE2"] * 6 + ["EDGE_SE2"] * 5
+    assert lines[5] == "VERTEX_SE2 5 5 0.5 0"
+
+
+@pytest.mark.parametrize(("lift_m", "views"), [(0.0, 1), (5.0, 2)])
+def test_a_picture_shows_the_side_only_where_there_is_height(tmp_path: Path, lift_m: float, views: int) -> None:
+    from matplotlib.image import imread
+
+    content = content_of(WORLD)
+    for vertex, pose in content.poses.items():
+        pose[2, 3] = lift_m * np.sin(vertex / 20)
+    draw(content, tmp_path / "a.png")
+    height, width = imread(tmp_path / "a.png").shape[:2]
+    assert width / height == pytest.approx(views * 7 / 6.5, rel=0.01)
+
+
+def test_a_picture_of_thousands_of_closures_still_shows_the_path(tmp_path: Path) -> None:
+    from matplotlib.image import imread
+
+    pairs = [(a, b) for a in range(0, 100, 2) for b in range(100, 200, 2)]
+    draw(content_of(closing(two_laps(), pairs)), tmp_path / "a.png")
+    image = imread(tmp_path / "a.png")[..., :3]
+    dark = (image.max(axis=-1) < 0.45).sum()
+    pure_green = ((image - [0.17, 0.63, 0.17]) ** 2).sum(axis=-1) < 0.01
+    assert dark > 2000 and pure_green.mean() < 0.2
+
+
+def test_a_picture_of_edges_alone_is_composed_from_odometry(tmp_path: Path) -> None:
+    content = content_of(WORLD)
+    draw(G2oGraph({}, content.edges), tmp_path / "a.png")
+    draw(content, tmp_path / "b.png")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
