@@ -1,0 +1,123 @@
+"""`umf graph` as a person meets it: what it prints, writes and refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graph_worlds import closing, lap_pairs, two_laps
+from typer.testing import CliRunner, Result
+
+from umf_ros.commands.graph import MOST_ROWS, app
+from umf_ros.errors import OutputError, UmfError
+from umf_ros.geometry import relative
+from umf_ros.pose_graph.condensed import Edge
+from umf_ros.pose_graph.g2o import read_g2o, write_g2o
+from umf_ros.pose_graph.synthetic import World
+
+RIGHT = closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0)
+
+
+def write_world(path: Path, world: World, stated: float = 1.0) -> Path:
+    edges = [
+        Edge(k - 1, k, relative(world.odometry[k - 1], world.odometry[k]), stated**2 * world.step_covariances[k])
+        for k in range(1, len(world.truth))
+    ]
+    edges += [Edge(c.first, c.second, c.pose, c.covariance) for c in world.closures]
+    write_g2o(path, world.odometry, edges)
+    return path
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "120"})
+
+
+def test_a_sound_graph_is_two_numbers_and_no_table(tmp_path: Path) -> None:
+    result = run("optimize", write_world(tmp_path / "a.g2o", RIGHT))
+    assert result.exit_code == 0
+    assert result.output.strip() == "200 poses, 15 closures: 15 accepted"
+
+
+def test_a_rejected_closure_is_named_by_the_ids_of_the_file(tmp_path: Path) -> None:
+    world = closing(RIGHT, [(20, 150)], (6.0, 0, 0))
+    result = run("optimize", write_world(tmp_path / "a.g2o", world))
+    (row,) = [line for line in result.output.splitlines() if "contradicts" in line]
+    cells = [cell.strip() for cell in row.strip("│").split("│")]
+    assert cells[:4] == ["20", "150", "rejected", "contradicts the map"]
+    assert float(cells[4]) > 5 and 5 < float(cells[5]) < 7
+
+
+def test_a_long_list_of_rejections_is_cut_and_says_where_to_find_all(tmp_path: Path) -> None:
+    # every wrong closure says something else
+    world = RIGHT
+    for k in range(MOST_ROWS + 5):
+        world = closing(world, [(2 * k, 2 * k + 31 + k)], (4.0 + k, -20.0 + 3 * k, 0))
+    table = tmp_path / "verdicts.csv"
+    result = run("optimize", write_world(tmp_path / "a.g2o", world), "--verdicts", table)
+    assert "... and 5 more (--verdicts FILE writes all)" in result.output
+    assert result.output.count("contradicts the map") == MOST_ROWS
+    rejected = [line for line in table.read_text().splitlines() if ",rejected," in line]
+    assert len(rejected) == MOST_ROWS + 5
+
+
+def test_misstated_noise_is_said(tmp_path: Path) -> None:
+    world = closing(two_laps(), lap_pairs(*range(0, 90, 2)), noise=1.0)
+    result = run("optimize", write_world(tmp_path / "a.g2o", world, stated=1 / 4))
+    (line,) = [line for line in result.output.splitlines() if "stated standard deviations are wrong" in line]
+    assert 2.5 < float(line.split("odometry x")[1].split(",")[0]) < 6.0
+
+
+@pytest.mark.parametrize(
+    ("layers", "scale_is_said"), [("all", True), ("gate,support,gnc", False), ("gate, scale", True)]
+)
+def test_guards_are_chosen_by_name(tmp_path: Path, layers: str, scale_is_said: bool) -> None:
+    world = closing(two_laps(), lap_pairs(*range(0, 90, 2)), noise=1.0)
+    result = run("optimize", write_world(tmp_path / "a.g2o", world, stated=1 / 4), "--reject", layers)
+    assert result.exit_code == 0
+    assert ("deviations are wrong" in result.output) is scale_is_said
+
+
+def test_the_written_graph_is_closer_to_the_truth(tmp_path: Path) -> None:
+    path = write_world(tmp_path / "a.g2o", RIGHT)
+    result = run("optimize", path, "-o", tmp_path / "b.g2o")
+    assert f"optimised graph: {tmp_path / 'b.g2o'}" in result.output.replace("\n", "")
+    ends = [list(read_g2o(file).poses.values())[-1][:3, 3] for file in (path, tmp_path / "b.g2o")]
+    before, after = (np.linalg.norm(end - RIGHT.truth[-1][:3, 3]) for end in ends)
+    assert after < 0.5 * before
+    table = (tmp_path / "b.csv").read_text().splitlines()
+    assert table[0] == "id,session,stamp_ns" and len(table) == 201
+
+
+def test_skipped_lines_are_named_but_not_by_the_hundred(tmp_path: Path) -> None:
+    path = write_world(tmp_path / "a.g2o", RIGHT)
+    path.write_text(path.read_text() + "EDGE_SE3:QUAT 1 2 broken\n" * (MOST_ROWS + 7))
+    result = run("optimize", path)
+    assert result.output.count("skipped line") == MOST_ROWS
+    assert "... and 7 more lines" in result.output and "15 accepted" in result.output
+
+
+def test_several_chains_are_counted(tmp_path: Path) -> None:
+    path = write_world(tmp_path / "a.g2o", RIGHT)
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("EDGE_SE3:QUAT 99 100 ")]
+    path.write_text("\n".join(lines))
+    assert "200 poses in 2 chains, 15 closures: 15 accepted" in run("optimize", path).output
+
+
+@pytest.mark.parametrize("option", ["-o", "--verdicts"])
+def test_output_that_cannot_be_written_is_an_error(tmp_path: Path, option: str) -> None:
+    result = run("optimize", write_world(tmp_path / "a.g2o", RIGHT), option, tmp_path / "no" / "file")
+    assert isinstance(result.exception, OutputError) and "cannot write" in str(result.exception)
+
+
+@pytest.mark.parametrize("layers", ["gates", "gate,,gnc", "ALL"])
+def test_an_unknown_guard_lists_the_known_ones(tmp_path: Path, layers: str) -> None:
+    result = run("optimize", write_world(tmp_path / "a.g2o", RIGHT), "--reject", layers)
+    assert isinstance(result.exception, UmfError)
+    assert "expected all, none, or some of gate, support, gnc, scale" in str(result.exception)
+
+
+def test_the_picture_goes_where_it_should(tmp_path: Path) -> None:
+    result = run("plot", write_world(tmp_path / "a.g2o", RIGHT), "-o", tmp_path / "b.png")
+    assert result.exit_code == 0 and "b.png" in result.output
+    assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
