@@ -302,13 +302,14 @@ def umf(*arguments: object) -> str:
 def test_training_from_the_command_line(folder, tmp_path, monkeypatch):
     start, out, config = tmp_path / "start.safetensors", tmp_path / "run", tmp_path / "run.yaml"
     torch.manual_seed(5)
-    save_weights(UMF(TINY), start, {})
+    save_weights(UMF(TINY), start, {"command": "umf train before", "steps": 7, "earlier_runs": [{"steps": 3}]})
     config.write_text(yaml.safe_dump({"preset": "tiny", "epoch_steps": 1, "batch": 4, "local_pairs": 1}))
     monkeypatch.setattr(sys, "argv", ["umf", "train", str(folder), f"--config={config}", "--steps", "1"])
     said = umf("train", folder, "--config", config, "--start", start, "--out", out, "--steps", 1)
     assert f"weights: {out / 'tiny.safetensors'}" in said.replace("\n", "")
     card = read_card(out / "tiny.safetensors")
     assert card["steps"] == 1 and card["settings"]["start"] == "start.safetensors"
+    assert [run["steps"] for run in card["earlier_runs"]] == [3, 7]
     assert card["command"] == f"umf train {folder.name} --config=run.yaml --steps 1"
     begun, ended = (load_weights(path).state_dict() for path in (start, out / "tiny.safetensors"))
     largest = max(float((begun[name] - ended[name]).abs().max()) for name in begun if name.endswith("head.weight"))

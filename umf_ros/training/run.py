@@ -14,7 +14,7 @@ from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import save_weights
 from umf_ros.training.config import TrainingSettings
 from umf_ros.training.distributed import join_team
-from umf_ros.training.setup import check_preset, common_card, make_network, open_worlds, write_settings
+from umf_ros.training.setup import check_preset, common_card, earlier_runs, make_network, open_worlds, write_settings
 from umf_ros.training.trainer import Progress, Trainer
 from umf_ros.training.validation import figures
 
@@ -67,6 +67,7 @@ def _card(
     return common_card(settings.preset, network, training, trainer.progress.seconds) | {
         "settings": settings.model_dump() | folders,
         "final_losses": {name: round(value, 4) for name, value in trainer.progress.losses.items()},
+        "earlier_runs": earlier_runs(settings.start),
         "training_samples": sum(len(world) for world in training),
         "validation_stride": settings.validation_stride,
         "validation": {

@@ -19,7 +19,7 @@ from umf_ros.datasets.simulated import WorldFolder
 from umf_ros.errors import ConfigError, OutputError
 from umf_ros.networks.presets import PRESETS
 from umf_ros.networks.umf import UMF, channels_last, count_parameters
-from umf_ros.networks.weights import load_weights
+from umf_ros.networks.weights import load_weights, read_card
 
 
 def check_preset(name: str) -> None:
@@ -72,6 +72,22 @@ def make_network(preset: str, start: str, image_size: tuple[int, int] | None = N
         network.load_state_dict(trained.state_dict())
     channels_last(network)
     return network.train()
+
+
+def earlier_runs(start: str) -> list[dict[str, Any]]:
+    """The runs that the weights to start from went through, oldest first, as their cards have them.
+
+    Args:
+        start: weights file; empty: none.
+
+    Raises:
+        WeightsError: the weights have no card.
+    """
+    if not start:
+        return []
+    card = read_card(Path(start))
+    told = ("command", "settings", "steps", "training_hours", "training_worlds")
+    return [*card.get("earlier_runs", []), {name: card.get(name) for name in told}]
 
 
 def write_settings(settings: BaseModel, path: Path) -> None:
