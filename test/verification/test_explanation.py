@@ -6,13 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import typer
+from command_line import umf
 from scenes import landscape, pose_at, take
 
-from umf_ros.commands.explain import _moment, _nearest
 from umf_ros.config import Verification
-from umf_ros.errors import BagError, OutputError
-from umf_ros.frames import Frame
+from umf_ros.errors import OutputError
 from umf_ros.verification.explanation import Explanation, draw, explain
 
 GROUND = landscape(20)
@@ -56,26 +54,7 @@ def test_unwritable_picture_is_one_clear_error(tmp_path: Path) -> None:
         draw(explained(same=True), None, None, tmp_path / "missing" / "pair.png")
 
 
-def frames(count: int) -> list[Frame]:
-    camera = take(GROUND, pose_at(GROUND, 0, 0, 0), 1.0).camera
-    return [Frame(1_700_000_000_000_000_000 + n * 250_000_000, camera, np.eye(4), np.eye(4)) for n in range(count)]
-
-
-def test_moments_are_stamps_or_seconds_from_the_start() -> None:
-    recording = frames(40)
-    late, early = _nearest(recording, [_moment("7.6"), _moment(str(recording[3].stamp_ns))])
-    assert late.stamp_ns == recording[30].stamp_ns
-    assert early.stamp_ns == recording[3].stamp_ns
-
-
-def test_moments_outside_the_recording_are_one_clear_error() -> None:
-    with pytest.raises(BagError, match="no frame within a second of 99"):
-        _nearest(frames(8), [99.0, 0.0])
-    with pytest.raises(BagError, match="has no frame"):
-        _nearest([], [1.0, 2.0])
-
-
 @pytest.mark.parametrize("text", ["soon", "-3", "nan"])
-def test_moments_that_are_none_are_refused(text: str) -> None:
-    with pytest.raises(typer.BadParameter):
-        _moment(text)
+def test_moments_that_are_none_are_refused(tmp_path: Path, text: str) -> None:
+    ended = umf("explain", tmp_path, "--", text, "1.0")
+    assert ended.status == 2 and text in ended.text
