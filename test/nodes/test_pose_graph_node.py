@@ -108,7 +108,6 @@ def process(tmp_path: Path) -> Iterator[Process]:
         tmp_path / "node.log",
         f"results_dir:={tmp_path / 'results'}",
         "pose_graph.max_gap_s:=3",
-        "pose_graph.estimate_scale:=true",
     )
     started.wait_for("ready")
     yield started
