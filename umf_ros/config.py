@@ -127,7 +127,9 @@ class PoseGraph(Group):
         0.02, gt=0, le=1, description="a closure is accepted at once where a wrong one had at most this chance to agree"
     )
     min_support: float = Field(
-        8.0, ge=0, description="evidence from which closures that support each other are believed, nats"
+        8.0,
+        ge=0,
+        description="evidence from which closures that support each other are believed, nats (4 at most per further place)",
     )
     place_m: float = Field(10.0, ge=0, description="closures this close along the path are one witness, m")
     support_range_m: float = Field(80.0, gt=0, description="closures this close along the path are compared, m")
