@@ -129,7 +129,7 @@ class PoseGraph(Group):
     min_support: float = Field(
         8.0,
         ge=0,
-        description="evidence from which closures that support each other are believed, nats (4 at most per further place)",
+        description="evidence that makes closures of several places believed, nats; a further place gives up to 4",
     )
     place_m: float = Field(10.0, ge=0, description="closures this close along the path are one witness, m")
     support_range_m: float = Field(80.0, gt=0, description="closures this close along the path are compared, m")
