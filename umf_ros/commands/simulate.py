@@ -103,13 +103,15 @@ def _write_shards(folder: Path, worlds: str, sequences: str, seed: int, workers:
         for world in _seed_range(worlds):
             family, setting = shard_plan(world)
             path = folder / f"world_{world:05d}.npz"
-            if not path.exists():
+            if not path.exists():  # or its world would be built for nothing
                 _write_shard(path, survey_world(world, family, setting), setting, workers, progress)
 
 
 def _write_shard(path: Path, survey: Survey, setting: str, workers: int, progress: Progress) -> None:
     from umf_ros.simulation.shards import write_shard
 
+    if path.exists():
+        return
     task = progress.add_task(path.stem, total=len(survey))
     write_shard(path, survey, setting, workers, lambda done: progress.update(task, completed=done))
 

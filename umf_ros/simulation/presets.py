@@ -74,7 +74,7 @@ def _traverse_1(relief: Relief, rng: np.random.Generator) -> Walker:
 
 
 def _traverse_2(relief: Relief, rng: np.random.Generator) -> Walker:
-    return Walker(relief.trail, rng).forward(120, lateral_m=2).cross(90).forward(400, lateral_m=4)
+    return Walker(relief.trail, rng).forward(110, lateral_m=2).cross(50).turn_back().forward(150, lateral_m=3)
 
 
 def _loops(relief: Relief, rng: np.random.Generator) -> Walker:
@@ -117,7 +117,7 @@ ETNA = {
     name: Preset(summary, plan, length_m, samples, shared=True)
     for name, summary, plan, length_m, samples in (
         ("traverse_1", "out and back", _traverse_1, 371, 726),
-        ("traverse_2", "along the trail, cutting across it", _traverse_2, 300, 642),
+        ("traverse_2", "along the trail, across it and back", _traverse_2, 300, 642),
         ("loops", "three laps of one loop", _loops, 587, 858),
         ("crater", "around the crater, two and a half times", _crater, 1010, 1148),
         ("crater_inout", "around the crater, across it and back the other way", _crater_inout, 1338, 1590),

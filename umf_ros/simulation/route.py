@@ -73,7 +73,9 @@ class Walker:
         normal = np.stack([-np.sin(self._heading[index]), np.cos(self._heading[index])], 1)
         again = "offset" if self._direction > 0 else "opposite"
         self._append(self._points[index] + offset[:, None] * normal)
-        self._labels += [again if self._visited[i] else "first" for i in index]
+        fresh = ~self._visited[index]
+        fresh &= np.isin(np.arange(count), np.unique(index, return_index=True)[1])  # a move may be longer than a lap
+        self._labels += ["first" if new else again for new in fresh]
         self._visited[index] = True
         self._at, self._offset = int(index[-1] + self._direction) % len(self._points), float(offset[-1])
         return self
