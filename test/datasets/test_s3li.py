@@ -10,11 +10,11 @@ import pytest
 from recordings import ODOMETRY, START_NS, TRUTH, drive, small_settings, traverse, write_mcap, write_ros1
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.bags.trajectories import Trajectory, write_tum
 from umf_ros.datasets.s3li import ETNA_TEST, ETNA_TRAINING, read_bag, read_toolkit
 from umf_ros.errors import BagError, UmfError
 from umf_ros.geometry import heading, transform
 from umf_ros.sensors.calibration import load_calibration
+from umf_ros.trajectory import Trajectory, write_tum
 
 DATA = Path(__file__).parent / "data"
 LATITUDE, LONGITUDE, HEIGHT = 37.7275, 15.0030, 2650.0

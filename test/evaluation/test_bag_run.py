@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from landmarks import PLACES, LandmarkEmbedder, frame_of
 
-from umf_ros.bags.trajectories import Trajectory
 from umf_ros.config import Settings, load_settings
 from umf_ros.embedding.baselines import ThumbnailEmbedder
 from umf_ros.errors import UmfError
 from umf_ros.evaluation.bag_run import BagEvaluation, BagResult, write_bag_result
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array, make_pose
+from umf_ros.trajectory import Trajectory
 
 LAPS = 2
 START_NS = 1_625_680_800_000_000_000

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from umf_ros.bags.trajectories import Trajectory
 from umf_ros.config import Loop
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, make_pose, relative
 from umf_ros.results.tables import KEYFRAMES, Table
 from umf_ros.results.truth import Judged, judge_run, trajectory_error
+from umf_ros.trajectory import Trajectory
 
 START_NS = 1_600_000_000 * 10**9
 RULES = Loop(min_time_gap_s=20, min_travel_m=15)

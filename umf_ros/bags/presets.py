@@ -6,9 +6,7 @@ from typing import Literal
 
 from umf_ros.bags.reader import Bag
 from umf_ros.errors import BagError
-from umf_ros.topics import TOPICS, topics_of
-
-__all__ = ["GROUND_TRUTH_TOPIC", "TOPICS", "Dataset", "detect_dataset", "topics_of"]
+from umf_ros.topics import TOPICS
 
 Dataset = Literal["simulated", "s3li-etna", "s3li-vulcano"]
 

@@ -16,8 +16,7 @@ from umf_ros.errors import BagError, MessageError
 from umf_ros.geometry import Array, make_pose
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.messages import decode_pose, stamp_ns
-from umf_ros.trajectory import Trajectory as Trajectory
-from umf_ros.trajectory import write_tum as write_tum
+from umf_ros.trajectory import Trajectory
 
 
 def read_tum(path: str | Path) -> Trajectory:

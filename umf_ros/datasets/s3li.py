@@ -15,7 +15,7 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import detect_dataset
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.rtklib import east_north_up
-from umf_ros.bags.trajectories import Trajectory, read_ground_truth, read_tum
+from umf_ros.bags.trajectories import read_ground_truth, read_tum
 from umf_ros.config import Settings, load_settings
 from umf_ros.datasets.pickles import load_data_frame
 from umf_ros.datasets.recorded import RecordedSequence, course, poses_of, stretches, travelled
@@ -26,6 +26,7 @@ from umf_ros.evaluation.trajectory import align_rigidly
 from umf_ros.frames import Frame, Image
 from umf_ros.geometry import Array, transform
 from umf_ros.sensors.calibration import Calibration, load_calibration
+from umf_ros.trajectory import Trajectory
 
 ETNA_TEST = ("s3li_loops", "s3li_traverse_1")
 ETNA_TRAINING = ("s3li_traverse_2", "s3li_crater", "s3li_crater_inout", "s3li_mapping", "s3li_landmarks")

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.bags.trajectories import Trajectory
 from umf_ros.config import Settings
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.errors import UmfError
@@ -24,6 +23,7 @@ from umf_ros.evaluation.summary import percent
 from umf_ros.frames import Frame
 from umf_ros.keyframes import KeyframeSelector
 from umf_ros.results.folder import write_atomically
+from umf_ros.trajectory import Trajectory
 
 SHOWN = ("fused", "superfeatures both", "ransac both")
 

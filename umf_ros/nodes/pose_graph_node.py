@@ -18,7 +18,6 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from umf_ros.bags.presets import topics_of
 from umf_ros.errors import MessageError, UmfError
 from umf_ros.geometry import Array
 from umf_ros.nodes import pose_graph_messages as messages
@@ -30,6 +29,7 @@ from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.graph import PoseGraph
 from umf_ros.pose_graph.results import write_results
+from umf_ros.topics import topics_of
 from umf_ros.worker import Worker
 
 ODOMETRY_DEPTH = 200

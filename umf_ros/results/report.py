@@ -13,7 +13,7 @@ from rich.table import Table
 
 from umf_ros.bags.images import read_left_images
 from umf_ros.bags.reader import Bag
-from umf_ros.bags.trajectories import Trajectory, read_ground_truth, read_tum
+from umf_ros.bags.trajectories import read_ground_truth, read_tum
 from umf_ros.config import Settings, load_settings
 from umf_ros.evaluation import html
 from umf_ros.evaluation.plots import ODOMETRY, OPTIMISED, TRUTH, draw_match, plot_trajectories
@@ -23,6 +23,7 @@ from umf_ros.geometry import Array, relative, rotation_angle, transform
 from umf_ros.results.recorder import read_summary, write_summary
 from umf_ros.results.tables import INLIERS, read_closures, read_table
 from umf_ros.results.truth import Judged, judge_run
+from umf_ros.trajectory import Trajectory
 
 MAX_PICTURES = 40
 

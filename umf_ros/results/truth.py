@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.bags.trajectories import Trajectory
 from umf_ros.config import Loop
 from umf_ros.evaluation.loops import Judgement, count_revisits, judge
 from umf_ros.evaluation.trajectory import absolute_trajectory_error
 from umf_ros.frames import LoopClosure
 from umf_ros.results.tables import read_table
+from umf_ros.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True)
