@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,9 @@ from umf_ros.geometry import make_pose
 
 if TYPE_CHECKING:
     from umf_ros.simulation.relief import Relief
+
+# a shell that starts the tests in the background has them ignore Ctrl-C, which some of them press
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 CAMERA = StereoCamera(688, 512, 579.488, 579.488, 342.133, 255.806, 0.2003)
 

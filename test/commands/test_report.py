@@ -139,8 +139,8 @@ def test_the_page_stands_alone_and_is_well_formed(run: Path, bag: Path) -> None:
     page = page_of(run)
     assert page.headings == ["Loop closures", "Trajectory", "Matches: query left, match right", "All closures"]
     assert len(page.addresses) == 4 == len(page.captions)
-    for address in page.addresses:
-        assert address.startswith("data:image/png;base64,")
+    for address, kind in zip(page.addresses, ("png", "jpeg", "jpeg", "jpeg"), strict=True):
+        assert address.startswith(f"data:image/{kind};base64,")
         picture = cv2.imdecode(np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
         assert picture is not None and picture.std() > 5
 

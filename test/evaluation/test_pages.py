@@ -7,6 +7,7 @@ import io
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from rich.console import Console
@@ -85,6 +86,16 @@ def test_a_picture_is_inside_the_page(tmp_path: Path) -> None:
     parsed = Text(html.picture(tmp_path / "a.png", NASTY))
     assert base64.b64decode(parsed.attributes["src"].removeprefix("data:image/png;base64,")) == content
     assert parsed.attributes["alt"] == NASTY and NASTY in parsed.text
+
+
+def test_a_photograph_is_inside_the_page_and_small(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(60, 90, (200, 300, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), noise)
+    parsed = Text(html.photograph(tmp_path / "a.png", "a"))
+    content = base64.b64decode(parsed.attributes["src"].removeprefix("data:image/jpeg;base64,"))
+    seen = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    assert seen.shape == noise.shape and abs(seen.mean() - noise.mean()) < 1
+    assert len(content) < 0.5 * (tmp_path / "a.png").stat().st_size
 
 
 def test_a_report_in_markdown() -> None:

@@ -93,17 +93,6 @@ def test_results_are_written_even_when_a_callback_fails() -> None:
     assert nodes[0].closed == 1 and not rclpy.ok()
 
 
-def test_results_are_written_when_ros_is_shut_down_from_outside() -> None:
-    nodes: list[Dutiful] = []
-
-    def make() -> Node:
-        nodes.append(Dutiful(rclpy.shutdown))
-        return nodes[0]
-
-    assert run(make) == 0
-    assert nodes[0].closed == 1
-
-
 def test_arguments_reach_the_node() -> None:
     values: list[object] = []
 

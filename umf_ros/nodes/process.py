@@ -49,6 +49,7 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     finally:
         if isinstance(node, Closing):
             node.close()
+        executor.shutdown()  # it must not outlive what it waits for
         node.destroy_node()
         rclpy.try_shutdown()
     return 0

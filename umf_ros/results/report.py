@@ -109,7 +109,7 @@ class RunReport:
         pictures = sorted((self._folder / "matches").glob("*.png"))[:MAX_PICTURES]
         if pictures:
             sections.append(html.heading("Matches: query left, match right"))
-            sections += [html.picture(path, path.stem.replace("_", " matched with ")) for path in pictures]
+            sections += [html.photograph(path, path.stem.replace("_", " matched with ")) for path in pictures]
         sections += [html.heading("All closures"), self._closure_table()]
         page = html.page("Loop closures", sections)
         (self._folder / "report.html").write_text(page, encoding="utf-8")
