@@ -35,7 +35,7 @@ class Drive:
         return len(self.world_T_body)
 
     def sample(self, index: int) -> Sample:
-        raise NotImplementedError
+        raise AssertionError(f"drawing needs poses alone, not sample {index}")
 
 
 def straight(length: int, passes: int = 2, yaw_deg: float = 0.0, **facts: str) -> Drive:

@@ -18,9 +18,7 @@ _LIDAR = f"Pretrain the voxel encoder: guess hidden voxels, most of them near th
 
 
 @app.command("image", help=_IMAGE)
-@app.command(
-    "lidar", help=f"Pretrain the voxel encoder: guess hidden voxels, most of them near (Voxel-MAE).{_AFTERWARDS}"
-)
+@app.command("lidar", help=_LIDAR)
 def command(
     context: typer.Context,
     data: Annotated[Path, typer.Argument(help="Folder of worlds (.npz shards); no revisits or poses are needed.")],

@@ -98,20 +98,20 @@ def _write_shards(folder: Path, worlds: str, sequences: str, seed: int, workers:
             if sequences not in SEQUENCES:
                 raise ConfigError(f"unknown sequences {sequences!r}; expected one of {', '.join(SEQUENCES)}")
             for name, survey in SEQUENCES[sequences](seed):
-                _write_shard(folder / f"{name}.npz", survey, "hard", workers, progress)
+                path = folder / f"{name}.npz"
+                if not path.exists():
+                    _write_shard(path, survey, "hard", workers, progress)
             return
         for world in _seed_range(worlds):
             family, setting = shard_plan(world)
             path = folder / f"world_{world:05d}.npz"
-            if not path.exists():  # or its world would be built for nothing
+            if not path.exists():
                 _write_shard(path, survey_world(world, family, setting), setting, workers, progress)
 
 
 def _write_shard(path: Path, survey: Survey, setting: str, workers: int, progress: Progress) -> None:
     from umf_ros.simulation.shards import write_shard
 
-    if path.exists():
-        return
     task = progress.add_task(path.stem, total=len(survey))
     write_shard(path, survey, setting, workers, lambda done: progress.update(task, completed=done))
 
