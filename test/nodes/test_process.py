@@ -1,0 +1,52 @@
+"""Starting and stopping a node: signals, errors, last words."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from processes import ENVIRONMENT
+
+NODE = Path(__file__).parent / "dutiful_node.py"
+
+
+def start(action: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(NODE), action, *arguments]
+    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize("action", ["interrupt", "terminate"])
+def test_a_signal_ends_the_spinning_and_the_node_finishes_its_work(action: str) -> None:
+    ended = start(action)
+    assert ended.stdout.splitlines()[-2:] == ["closed while publishing", "context shut down"], ended.stderr
+    assert ended.returncode == 0
+
+
+def test_a_context_that_is_shut_down_ends_the_spinning_too() -> None:
+    ended = start("shutdown")
+    assert ended.stdout.splitlines()[-2:] == ["closed while cut off", "context shut down"], ended.stderr
+    assert ended.returncode == 0
+
+
+def test_a_node_without_work_to_finish_ends_too() -> None:
+    ended = start("plain")
+    assert (ended.returncode, ended.stdout) == (0, "context shut down\n"), ended.stderr
+
+
+def test_an_error_at_the_start_is_one_line_and_status_1() -> None:
+    ended = start("refuse")
+    assert (ended.returncode, ended.stdout) == (1, "context shut down\n")
+    assert ended.stderr == "umf: unknown parameter loop.topk\n"
+
+
+def test_results_are_written_even_when_a_callback_fails() -> None:
+    ended = start("fail")
+    assert ended.stdout.splitlines()[-1] == "closed while publishing"
+    assert ended.returncode == 1 and "ZeroDivisionError: a fault in the program" in ended.stderr
+
+
+def test_arguments_reach_the_node() -> None:
+    ended = start("interrupt", "--ros-args", "-p", "depth:=7")
+    assert ended.stdout.splitlines()[0] == "depth 7", ended.stderr
