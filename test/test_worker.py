@@ -6,6 +6,22 @@ import time
 from umf_ros.worker import Worker
 
 
+class HeldUp:
+    """A worker that waits in its first item until the gate opens."""
+
+    def __init__(self, queue_size: int) -> None:
+        self.gate, self.started = threading.Event(), threading.Event()
+        self.done: list[int] = []
+        self.worker: Worker[int] = Worker(self._work, lambda _: None, queue_size)
+        self.worker.submit(0)
+        self.started.wait()
+
+    def _work(self, item: int) -> None:
+        self.started.set()
+        self.gate.wait()
+        self.done.append(item)
+
+
 def test_items_are_done_in_order() -> None:
     done: list[int] = []
     worker: Worker[int] = Worker(done.append, lambda _: None, queue_size=100)
@@ -16,21 +32,12 @@ def test_items_are_done_in_order() -> None:
 
 
 def test_a_late_worker_drops_the_oldest_and_counts() -> None:
-    gate, started, done = threading.Event(), threading.Event(), []
-
-    def work(item: int) -> None:
-        started.set()
-        gate.wait()
-        done.append(item)
-
-    worker: Worker[int] = Worker(work, lambda _: None, queue_size=3)
-    worker.submit(0)
-    started.wait()
-    for i in range(1, 11):
-        worker.submit(i)
-    gate.set()
-    worker.close()
-    assert done == [0, 8, 9, 10] and worker.dropped == 7
+    late = HeldUp(queue_size=3)
+    for item in range(1, 11):
+        late.worker.submit(item)
+    late.gate.set()
+    late.worker.close()
+    assert late.done == [0, 8, 9, 10] and late.worker.dropped == 7
 
 
 def test_submitting_never_waits_for_the_work() -> None:
@@ -70,38 +77,21 @@ def test_nothing_is_taken_after_closing() -> None:
 
 
 def test_draining_waits_for_the_item_in_hand() -> None:
-    gate, started, done = threading.Event(), threading.Event(), []
-
-    def work(item: int) -> None:
-        started.set()
-        gate.wait()
-        done.append(item)
-
-    worker: Worker[int] = Worker(work, lambda _: None, queue_size=9)
-    worker.submit(1)
-    started.wait()
-    assert not worker.drain(timeout_s=0.01) and done == []
-    gate.set()
-    assert worker.drain() and done == [1]
-    worker.close()
+    late = HeldUp(queue_size=9)
+    assert not late.worker.drain(timeout_s=0.01) and late.done == []
+    late.gate.set()
+    assert late.worker.drain() and late.done == [0]
+    late.worker.close()
 
 
 def test_what_is_left_when_closing_takes_too_long_is_counted() -> None:
-    gate, started, done = threading.Event(), threading.Event(), []
-
-    def work(item: int) -> None:
-        started.set()
-        gate.wait()
-        done.append(item)
-
-    worker: Worker[int] = Worker(work, lambda _: None, queue_size=9)
-    for item in range(4):
-        worker.submit(item)
-    started.wait()
-    worker.close(timeout_s=0.01)
-    assert worker.dropped == 3
-    gate.set()
-    assert worker.drain() and done == [0]
+    late = HeldUp(queue_size=9)
+    for item in range(1, 4):
+        late.worker.submit(item)
+    late.worker.close(timeout_s=0.01)
+    assert late.worker.dropped == 3
+    late.gate.set()
+    assert late.worker.drain() and late.done == [0]
 
 
 def test_an_error_in_one_item_does_not_hide_those_of_others() -> None:

@@ -266,6 +266,18 @@ def test_an_image_is_not_pulled_towards_a_scan(batch):
     assert found["fused"].item() == 0
 
 
+def test_a_frame_with_nothing_in_common_has_no_rank_by_distance(batch):
+    """The first frame keeps its image alone, all others the scan alone: where it was taken orders nothing."""
+    plain = replace(batch, local_rows=batch.local_rows[:0])
+    moved = batch.places.position + np.array([[25.0, 0]] + [[0, 0]] * 7)
+    elsewhere = replace(plain, places=replace(batch.places, position=moved))
+    lonely = torch.tensor([True] + [False] * 7)
+    found = [evaluate(some, settings(), lonely, ~lonely)[1]["graded"].item() for some in (plain, elsewhere)]
+    assert found[0] == found[1] > 0
+    whole = [evaluate(some, settings())[1]["graded"].item() for some in (plain, elsewhere)]
+    assert whole[0] != whole[1]
+
+
 def test_a_bank_of_lookalikes_raises_the_loss(batch):
     """Descriptors of other worlds that look like the anchors must be pushed away."""
     plain = replace(batch, local_rows=batch.local_rows[:0])

@@ -29,6 +29,9 @@ def command(
     dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
     embedder: Annotated[str | None, Optional(help="umf, or a baseline, for a recording.")] = None,
     odometry: Annotated[Path | None, Optional(help="Odometry as a TUM file, where the recording has none.")] = None,
+    odometry_frame: Annotated[
+        str, Optional(help="Whose poses --odometry holds: body, imu, camera or lidar (S3LI's Eval/BASALT: imu).")
+    ] = "body",
     ground_truth: Annotated[Path | None, Optional(help="Truth as RTKLIB .pos or TUM file.")] = None,
 ) -> None:
     """Recall, precision, rerankers, lost modalities and cost.
@@ -45,7 +48,7 @@ def command(
         figures = _on_worlds(worlds, seed, quick, methods == "all", weights, out)
     else:
         assert bag is not None
-        figures = _on_recording(bag, config, dataset, embedder, weights, odometry, ground_truth, out)
+        figures = _on_recording(bag, config, dataset, embedder, weights, odometry, odometry_frame, ground_truth, out)
     if json_file is not None:
         import json
 
@@ -98,6 +101,7 @@ def _on_recording(
     embedder: str | None,
     weights: Path | None,
     odometry: Path | None,
+    odometry_frame: str,
     ground_truth: Path | None,
     out: Path,
 ) -> dict[str, float | int | None]:
@@ -106,7 +110,7 @@ def _on_recording(
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.presets import detect_dataset
     from umf_ros.bags.reader import open_bag
-    from umf_ros.bags.trajectories import read_ground_truth, read_tum
+    from umf_ros.bags.trajectories import read_ground_truth, read_odometry
     from umf_ros.commands.progress import WARNING
     from umf_ros.config import load_settings
     from umf_ros.embedding import make_embedder
@@ -126,7 +130,7 @@ def _on_recording(
     truth = read_ground_truth(recording, ground_truth)
     if truth is None:
         raise ConfigError(f"{bag} holds no ground truth; name a file with --ground-truth")
-    path = read_tum(odometry) if odometry else None
+    path = read_odometry(odometry, odometry_frame, settings) if odometry else None
     frames = FrameReader(recording, settings, path, warn=lambda text: console.print(text, **WARNING))
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, super_features=True))
     folder = create_run_folder(out)

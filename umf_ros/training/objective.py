@@ -164,7 +164,8 @@ class Objective(nn.Module):
         shared[:, :count] = images | clouds
         losses: dict[str, Tensor] = {}
         losses["fused"], active = self._metric(similarity, relations.positive & shared, relations.negative & shared)
-        losses["graded"] = graded(similarity[:, :count], relations.metres, relations.comparable)
+        comparable = relations.comparable & shared[:, :count]
+        losses["graded"] = graded(similarity[:, :count], relations.metres, comparable)
         for name, (descriptor, there) in alone.items():
             both = there[:, None] & there[None]
             positive, negative = relations.positive[:, :count] & both, relations.negative[:, :count] & both

@@ -22,11 +22,11 @@ class Draw:
 
 
 class PairSampler:
-    """Anchor-positive pairs: half of a batch along one stretch of one world, the rest from everywhere.
+    """Anchor-positive pairs of two worlds, half of each world's along one stretch of it.
 
-    Neighbours along a stretch are what a place is most easily taken for; other worlds keep the
-    descriptors apart. Hard worlds are drawn twice as often as easy ones. Positives come from another
-    pass where there is one.
+    What a place is taken for lies in its own world: its neighbours along the way, and what looks alike
+    farther off; a pair of another world is told apart by its ground alone. Hard worlds are drawn twice
+    as often as easy ones. Positives come from another pass.
 
     Raises:
         ConfigError: no sequence has a revisit.
@@ -44,13 +44,11 @@ class PairSampler:
 
     def draw(self, pairs: int, rng: np.random.Generator) -> list[tuple[Draw, Draw]]:
         """`pairs` anchor-positive pairs."""
-        world = int(rng.choice(len(self._chance), p=self._chance))
-        mirror = bool(rng.random() < self._mirror)
-        drawn = [self._pair(world, index, mirror, rng) for index in self._stretch(world, pairs // 2, rng)]
-        while len(drawn) < pairs:
-            other = int(rng.choice(len(self._chance), p=self._chance))
-            index = int(rng.choice(self._usable[other]))
-            drawn.append(self._pair(other, index, bool(rng.random() < self._mirror), rng))
+        drawn = []
+        for count in (pairs // 2, pairs - pairs // 2):
+            world = int(rng.choice(len(self._chance), p=self._chance))
+            mirror = bool(rng.random() < self._mirror)
+            drawn += [self._pair(world, index, mirror, rng) for index in self._stretch(world, count, rng)]
         return drawn
 
     def _stretch(self, world: int, count: int, rng: np.random.Generator) -> list[int]:
