@@ -115,6 +115,17 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
     assert [name for name in left_behind(somewhere_empty) if name != "results"] == []
 
 
+def test_an_exported_network_can_be_read_by_its_runtime(somewhere_empty: Path) -> None:
+    import openvino
+
+    ended = umf("export", "net.xml")
+    assert ended.status == 0 and left_behind(somewhere_empty) == ["net.bin", "net.xml"]
+    assert ended.out.startswith("net.xml: ") and "MB of weights" in ended.out
+    model = openvino.Core().read_model("net.xml")
+    assert [port.get_any_name() for port in model.inputs][0] == "image"
+    assert f"{len(model.inputs)} inputs, {len(model.outputs)} outputs" in ended.out
+
+
 def test_ctrl_c_is_status_130(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted() -> list[object]:
         raise KeyboardInterrupt
