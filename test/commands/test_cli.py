@@ -122,7 +122,7 @@ def test_an_exported_network_can_be_read_by_its_runtime(somewhere_empty: Path) -
     assert ended.status == 0 and left_behind(somewhere_empty) == ["net.bin", "net.xml"]
     assert ended.out.startswith("net.xml: ") and "MB of weights" in ended.out
     model = openvino.Core().read_model("net.xml")
-    assert [port.get_any_name() for port in model.inputs][0] == "image"
+    assert next(port.get_any_name() for port in model.inputs) == "image"
     assert f"{len(model.inputs)} inputs, {len(model.outputs)} outputs" in ended.out
 
 
