@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import os
 import signal
+import sys
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -15,26 +17,30 @@ from umf_ros.commands.progress import WARNING, FrameProgress, stop_on_interrupt,
 from umf_ros.frames import Candidate, LoopClosure, Verdict
 from umf_ros.loop_detector import Detection
 
+SIGNALS = signal.SIGINT, signal.SIGTERM
+
 
 @pytest.fixture(autouse=True)
-def handler() -> object:
-    """What Ctrl-C does outside of a run; it must do that again afterwards."""
-    before = signal.getsignal(signal.SIGINT)
-    yield before
-    assert signal.getsignal(signal.SIGINT) is before
-    signal.signal(signal.SIGINT, before)
+def handlers() -> Iterator[None]:
+    """What Ctrl-C and SIGTERM do outside of a run; they must do that again afterwards."""
+    former = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    before = [signal.getsignal(number) for number in SIGNALS]
+    yield
+    assert [signal.getsignal(number) for number in SIGNALS] == before
+    signal.signal(signal.SIGTERM, former)
 
 
 def press_ctrl_c() -> None:
     os.kill(os.getpid(), signal.SIGINT)
 
 
-def test_the_first_ctrl_c_only_asks_for_an_end() -> None:
+@pytest.mark.parametrize("number", SIGNALS)
+def test_the_first_signal_only_asks_for_an_end(number: int) -> None:
     done = 0
     with stop_on_interrupt() as interrupted:
         for step in range(10):
             if step == 3:
-                press_ctrl_c()
+                os.kill(os.getpid(), number)
             done += 1
             if interrupted():
                 break
@@ -62,11 +68,19 @@ def test_an_error_in_the_run_gives_ctrl_c_back() -> None:
         press_ctrl_c()
 
 
+def test_sigterm_after_ctrl_c_ends_at_once() -> None:
+    with pytest.raises(SystemExit), stop_on_interrupt():
+        press_ctrl_c()
+        os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("still here")
+
+
 def test_nothing_interrupts_the_writing_of_results() -> None:
     written = []
     with undisturbed():
         for part in range(3):
             press_ctrl_c()
+            os.kill(os.getpid(), signal.SIGTERM)
             written.append(part)
     assert written == [0, 1, 2]
     with pytest.raises(KeyboardInterrupt):

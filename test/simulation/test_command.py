@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+
 import pytest
+from processes import wait_until
 
 from umf_ros.commands.simulate import command
 from umf_ros.errors import UmfError
@@ -47,3 +52,12 @@ def test_seeds_that_hold_no_world(tmp_path, worlds):
 def test_unknown_sequences(tmp_path):
     with pytest.raises(UmfError, match="etna, thesis"):
         command(shards=tmp_path, sequences="luna")
+
+
+def test_a_terminated_simulation_leaves_nothing(tmp_path):
+    command = [sys.executable, "-m", "umf_ros.cli", "simulate", str(tmp_path / "a.mcap"), "--duration", "60"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        assert wait_until(lambda: any(file.stat().st_size for file in tmp_path.glob(".a.mcap.*")), 120)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 143
+    assert list(tmp_path.iterdir()) == []

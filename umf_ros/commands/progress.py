@@ -1,17 +1,19 @@
-"""Progress of a replay, and an orderly end on Ctrl-C."""
+"""Progress of a replay, and an orderly end on Ctrl-C or SIGTERM."""
 
 from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from umf_ros.loop_detector import Detection
+
+Handler = Callable[[int, FrameType | None], Any] | int | signal.Handlers | None
 
 WARNING: dict[str, Any] = {"style": "yellow", "markup": False, "highlight": False, "soft_wrap": True}
 """How a console prints a warning: names of files keep their brackets, and lines their length."""
@@ -50,27 +52,35 @@ class FrameProgress:
 
 @contextmanager
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Yield a function that says whether Ctrl-C was pressed; a second Ctrl-C interrupts as usual."""
-    pressed = False
-    before = signal.getsignal(signal.SIGINT)
+    """Yield a function that says whether Ctrl-C was pressed, or SIGTERM came; a second one ends at once, as usual."""
+    asked = False
 
     def remember(*_: object) -> None:
-        nonlocal pressed
-        pressed = True
-        signal.signal(signal.SIGINT, before)
+        nonlocal asked
+        asked = True
+        _restore(before)
 
-    signal.signal(signal.SIGINT, remember)
+    before = _replace(remember)
     try:
-        yield lambda: pressed
+        yield lambda: asked
     finally:
-        signal.signal(signal.SIGINT, before)
+        _restore(before)
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Ignore Ctrl-C for the few seconds in which results are written."""
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Ignore Ctrl-C and SIGTERM for the few seconds in which results are written."""
+    before = _replace(signal.SIG_IGN)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        _restore(before)
+
+
+def _replace(handler: Handler) -> dict[signal.Signals, Handler]:
+    return {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+
+
+def _restore(handlers: dict[signal.Signals, Handler]) -> None:
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
