@@ -21,7 +21,7 @@ from recordings import (
 )
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.bags.presets import detect_dataset
+from umf_ros.bags.presets import detect_dataset, settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.config import load_settings
 from umf_ros.errors import BagError
@@ -178,6 +178,21 @@ def test_data_sets_are_told_by_their_topics(tmp_path: Path) -> None:
     assert detect_dataset(open_bag(write_mcap(tmp_path / "d.mcap", bayer))) == "s3li-vulcano"
     with pytest.raises(BagError, match="/odom"):
         dataset("e.mcap", {ODOMETRY})
+
+
+def test_a_recording_is_read_as_the_file_says_and_only_then_by_its_topics(tmp_path: Path) -> None:
+    bag = open_bag(write_mcap(tmp_path / "a.mcap", [entry for entry in ENTRIES if entry[0] in (LEFT, CLOUD, TRUTH)]))
+    strange = open_bag(write_mcap(tmp_path / "b.mcap", [entry for entry in ENTRIES if entry[0] == ODOMETRY]))
+    config = tmp_path / "config.yaml"
+    config.write_text("dataset: s3li-etna\n")
+    assert settings_for(bag, None, "auto").dataset == "simulated"
+    assert settings_for(bag, config, "auto").dataset == "s3li-etna"
+    assert settings_for(bag, config, "s3li-vulcano", loop__top_k=3).dataset == "s3li-vulcano"
+    assert settings_for(bag, config, "auto", loop__top_k=3).loop.top_k == 3
+    config.write_text("topics: {left_image: /my/image, cloud: /my/points}\n")
+    assert settings_for(strange, config, "auto").topics.cloud == "/my/points"
+    with pytest.raises(BagError, match="no topic of a known data set"):
+        settings_for(strange, None, "auto")
 
 
 def test_topics_of_the_settings_win_over_those_of_the_data_set() -> None:

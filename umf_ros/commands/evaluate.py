@@ -108,11 +108,10 @@ def _on_recording(
     from rich.console import Console
 
     from umf_ros.bags.frames import FrameReader
-    from umf_ros.bags.presets import detect_dataset
+    from umf_ros.bags.presets import settings_for
     from umf_ros.bags.reader import open_bag
     from umf_ros.bags.trajectories import read_ground_truth, read_odometry
     from umf_ros.commands.progress import WARNING
-    from umf_ros.config import load_settings
     from umf_ros.embedding import make_embedder
     from umf_ros.evaluation.bag_run import BagEvaluation, write_bag_result
     from umf_ros.evaluation.markdown import print_table
@@ -121,9 +120,10 @@ def _on_recording(
 
     console = Console()
     recording = open_bag(bag)
-    settings = load_settings(
+    settings = settings_for(
+        recording,
         config,
-        dataset=detect_dataset(recording) if dataset == "auto" else dataset,
+        dataset,
         embedding__method=embedder,
         embedding__weights=str(weights) if weights else None,
     )

@@ -29,23 +29,21 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.frames import FrameReader
-    from umf_ros.bags.presets import detect_dataset
+    from umf_ros.bags.presets import settings_for
     from umf_ros.bags.reader import open_bag
-    from umf_ros.config import load_settings
     from umf_ros.loop_detector import make_detector_embedder, make_keyframe
     from umf_ros.verification.explanation import draw, explain
 
     console = Console()
     moments = [_moment(text) for text in (query, match)]
     recording = open_bag(bag)
-    settings = load_settings(
+    settings = settings_for(
+        recording,
         config,
-        dataset=None if dataset == "auto" else dataset,
+        dataset,
         embedding__method=embedder,
         embedding__weights=str(weights) if weights else None,
     )
-    if dataset == "auto" and not settings.model_fields_set & {"dataset", "topics"}:
-        settings = settings.model_copy(update={"dataset": detect_dataset(recording)})
     network = make_detector_embedder(settings)
     with console.status("looking for the two moments"):
         frames = _nearest(FrameReader(recording, settings), moments)

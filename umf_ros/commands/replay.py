@@ -32,11 +32,10 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.frames import FrameReader
-    from umf_ros.bags.presets import detect_dataset
+    from umf_ros.bags.presets import settings_for
     from umf_ros.bags.reader import open_bag
     from umf_ros.bags.trajectories import read_ground_truth, read_odometry
     from umf_ros.commands.progress import WARNING, FrameProgress, stop_on_interrupt, undisturbed
-    from umf_ros.config import load_settings
     from umf_ros.loop_detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
     from umf_ros.results.folder import create_run_folder
@@ -45,15 +44,14 @@ def command(
 
     console = Console()
     recording = open_bag(bag)
-    settings = load_settings(
+    settings = settings_for(
+        recording,
         config,
-        dataset=None if dataset == "auto" else dataset,
+        dataset,
         embedding__method=embedder,
         embedding__weights=str(weights) if weights else None,
         verification__min_probability=min_probability,
     )
-    if dataset == "auto" and not settings.model_fields_set & {"dataset", "topics"}:
-        settings = settings.model_copy(update={"dataset": detect_dataset(recording)})
     path = read_odometry(odometry, odometry_frame, settings) if odometry else None
     reader = FrameReader(recording, settings, path, warn=lambda text: console.print(text, **WARNING))
     if ground_truth is not None:
