@@ -1,0 +1,98 @@
+"""Whether pretraining helps: random against pretrained encoders at equal fine-tuning (thesis table 5.6).
+
+`python benchmarks/pretraining.py [--quick] [--seed N] [--json FILE] [--folder FOLDER]`
+
+Simulates training and validation worlds (those in the folder are kept), pretrains both encoders
+without labels, then trains two networks alike but for where they start, with several seeds.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from umf_ros.commands import simulate
+from umf_ros.datasets.simulated import WorldFolder
+from umf_ros.evaluation.markdown import print_table
+from umf_ros.evaluation.scores import Scores
+from umf_ros.networks.weights import load_weights
+from umf_ros.simulation.seeds import TRAINING, VALIDATION
+from umf_ros.training.config import load_training
+from umf_ros.training.pretraining.run import pretrain
+from umf_ros.training.pretraining.settings import make_settings
+from umf_ros.training.run import train
+from umf_ros.training.validation import MODES, mean_of, validate
+
+Results = dict[str, dict[str, Scores]]
+FIGURES = {"R@1": "recall1", "R@5": "recall5", "top 1 %": "recall_top_percent", "within 5 m": "recall1_within_5m"}
+# what trains the global descriptors alone: local features have no part in the table
+FINE_TUNING = {"local_pairs": 0, "weight_super": 0.0, "bank": 0, "weight_image": 1.0, "weight_cloud": 0.7}
+
+
+def main(
+    quick: Annotated[bool, typer.Option("--quick", help="Few worlds and steps: does it run?")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Other worlds and weights.")] = 0,
+    folder: Annotated[Path, typer.Option(help="Keeps worlds and runs.")] = Path("runs/pretraining"),
+    steps: Annotated[int, typer.Option(min=1, help="Fine-tuning steps.")] = 500,
+    repeats: Annotated[int, typer.Option(min=1, help="Fine-tuning runs of each kind, with different seeds.")] = 2,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
+) -> None:
+    """Fine-tune from random and from pretrained encoders, and compare recall on validation worlds."""
+    console = Console()
+    worlds, held_out = (1, 1) if quick else (16, 4)
+    if quick:
+        steps, repeats = 20, 1
+    train_folder, validation_folder = folder / "train", folder / "validation"
+    first, unseen = TRAINING.start + 100 * seed, VALIDATION.start + 100 * seed
+    simulate.command(shards=train_folder, worlds=f"{first}:{first + worlds}")
+    simulate.command(shards=validation_folder, worlds=f"{unseen}:{unseen + held_out}")
+    validation = WorldFolder(validation_folder).refresh()
+    columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
+    found: dict[str, list[Results]] = {"random": [], "pretrained": []}
+    with Progress(*columns, console=console, transient=True) as bars:
+        bar = bars.add_task("", total=2 * steps * (1 + repeats))
+        start = _pretrained(train_folder, folder, steps, seed, _advance(bars, bar, "pretraining"))
+        for number in range(repeats):
+            for kind, weights in (("random", ""), ("pretrained", str(start))):
+                settings = load_training(
+                    None, train=str(train_folder), steps=steps, seed=seed + number, start=weights, **FINE_TUNING
+                )
+                tuned = train(settings, folder / f"{kind}_{number}", False, _advance(bars, bar, f"training, {kind}"))
+                found[kind].append(validate(load_weights(tuned), validation))
+    rows = [_row(kind, mode, runs) for mode in MODES for kind, runs in found.items()]
+    title = f"Recall on {held_out} worlds never seen, after {steps} steps on {worlds}; mean of {repeats} runs"
+    print_table(console, title, (["encoders at first", *FIGURES, "R@1 of each run"], rows))
+    figures = {f"recall1_{mode}_{kind}": _mean(runs, mode, "recall1") for mode in MODES for kind, runs in found.items()}
+    if json_file:
+        json_file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+def _pretrained(data: Path, folder: Path, steps: int, seed: int, report: Callable[[object], None]) -> Path:
+    """Weights whose image encoder, then whose voxel encoder has been pretrained."""
+    image = pretrain(make_settings("image", data, steps=steps, seed=seed), folder / "image", False, report)
+    settings = make_settings("lidar", data, steps=steps, seed=seed, start=str(image))
+    return pretrain(settings, folder / "lidar", False, report)
+
+
+def _advance(bars: Progress, bar: TaskID, text: str) -> Callable[[object], None]:
+    return lambda _: bars.update(bar, advance=1, description=text)
+
+
+def _mean(runs: list[Results], mode: str, figure: str) -> float:
+    return round(float(np.mean([mean_of(run, mode, figure) for run in runs])), 4)
+
+
+def _row(kind: str, mode: str, runs: list[Results]) -> list[str]:
+    values = [f"{100 * _mean(runs, mode, figure):.1f}" for figure in FIGURES.values()]
+    return [f"{mode}, {kind}", *values, "  ".join(f"{100 * mean_of(run, mode, 'recall1'):.1f}" for run in runs)]
+
+
+if __name__ == "__main__":
+    typer.run(main)
