@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from graph_worlds import LAP, SETTINGS, accepted, closing, lap_pairs, rms, two_laps
+from graph_worlds import LAP, SETTINGS, accepted, closing, feed_odometry, lap_pairs, rms, two_laps
 
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.errors import OutputError
@@ -149,6 +149,44 @@ def test_the_written_graph_is_at_its_own_optimum(finished: PoseGraph, tmp_path: 
     finished.write_g2o(tmp_path / "a.g2o")
     again = driven(as_recording(read_g2o(tmp_path / "a.g2o")))
     assert rms(again.trajectory()[1], finished.trajectory()[1]) < 1e-3
+
+
+def test_covariances_are_written_as_they_were_used(tmp_path: Path) -> None:
+    """Closures are ten times worse than they say: the file must not repeat what they say."""
+    world = closing(two_laps(), lap_pairs(*range(0, 90, 2)), noise=10.0)
+    graph = PoseGraph(SETTINGS)
+    feed_odometry(graph, world, range(len(world.truth)))
+    graph.add_closures([world.message(row) for row in range(len(world.closures))])
+    graph.settle()
+    assert graph.scale.closures > 3
+    graph.write_g2o(tmp_path / "a.g2o")
+    again = PoseGraph(SETTINGS.model_copy(update={"estimate_scale": False}))
+    for _ in drive(again, as_recording(read_g2o(tmp_path / "a.g2o"))):
+        pass
+    assert rms(again.trajectory()[1], graph.trajectory()[1]) < 2e-3
+
+
+def test_vertices_keep_the_ids_of_their_file(tmp_path: Path) -> None:
+    lines = [f"VERTEX_SE2 {k} {k / 10 - 10} 0 0" for k in range(100, 160, 10)]
+    lines += [f"EDGE_SE2 {k} {k + 10} 1 0 0 100 0 0 100 0 1000" for k in range(100, 150, 10)]
+    lines += ["EDGE_SE2 150 100 -5 0 0 100 0 0 100 0 1000"]
+    (tmp_path / "in.g2o").write_text("\n".join(lines))
+    recording = as_recording(read_g2o(tmp_path / "in.g2o"))
+    graph = driven(recording)
+    graph.write_g2o(tmp_path / "out.g2o", True, recording.vertex_of)
+    written = read_g2o(tmp_path / "out.g2o")
+    assert list(written.poses) == list(range(100, 160, 10))
+    assert [(edge.first, edge.second) for edge in written.edges] == [
+        (100, 110),
+        (110, 120),
+        (120, 130),
+        (130, 140),
+        (140, 150),
+        (100, 150),
+    ]
+    assert not (tmp_path / "out.csv").exists()
+    rows = list(csv.DictReader(io.StringIO(verdict_table(graph.closures(), recording.vertex_of))))
+    assert [(row["match"], row["query"]) for row in rows] == [("100", "150")]
 
 
 def test_a_clock_that_went_back_is_written_in_order(tmp_path: Path) -> None:

@@ -191,10 +191,59 @@ def test_closures_in_one_call_are_judged_together() -> None:
     assert states(together) == dict.fromkeys((0, 12, 24, 36), State.ACCEPTED)
 
 
-def test_the_same_pair_of_keyframes_closes_once() -> None:
+def test_the_same_measurement_of_a_pair_closes_once() -> None:
     world = closing(two_laps(), lap_pairs(10))
     graph = driven(world)
     graph.add_closure(world.message(0))
     other = replace(world.message(0), covariance=2 * world.message(0).covariance)
     assert graph.add_closure(other) == []
     assert graph.counts["closure twice"] == 1 and len(graph.closures()) == 1
+
+
+def test_a_second_measurement_of_a_pair_is_weighed_against_the_first() -> None:
+    """The first says nonsense: it must not stand in the way of the second."""
+    world = closing(two_laps(), lap_pairs(0, 10, 20, 30))
+    graph = driven(world)
+    nonsense = world.message(1).match_T_query.copy()
+    nonsense[:3, 3] += [40.0, 0, 0]
+    graph.add_closure(replace(world.message(1), match_T_query=nonsense))
+    for row in range(4):
+        graph.add_closure(world.message(row))
+    graph.settle()
+    found = [(verdict.state, verdict.closure.match_T_query[0, 3] > 20) for verdict in graph.closures()]
+    assert sorted(found) == [(State.ACCEPTED, False)] * 4 + [(State.REJECTED, True)]
+    ends = world.message(1).match_stamp_ns, world.message(1).query_stamp_ns
+    graph.revoke(*ends)
+    assert graph.verdict_counts() == {State.ACCEPTED: 3, State.REJECTED: 2}
+
+
+def test_a_looped_recording_closes_its_loops_in_every_lap() -> None:
+    world = closing(two_laps(), lap_pairs(0, 10, 20, 30))
+    graph = driven(world)
+    graph.add_closures([world.message(row) for row in range(4)])
+    once = graph.map_T_odom()
+    graph.begin_session()
+    for k, pose in enumerate(world.odometry):
+        graph.add_odometry(k * PERIOD_NS, pose)
+    assert len(graph.add_closures([world.message(row) for row in range(4)])) == 4
+    assert graph.verdict_counts() == {State.ACCEPTED: 8} and not graph.counts["closure twice"]
+    # as far as the first lap's closures have improved what is thought of the odometry
+    np.testing.assert_allclose(graph.map_T_odom(), once, atol=0.02)
+    assert np.linalg.norm(once[:3, 3]) > 0.5
+
+
+def test_a_closure_before_all_odometry_waits_for_it() -> None:
+    world = closing(two_laps(), lap_pairs(10))
+    graph = PoseGraph(SETTINGS)
+    late = world.message(0)
+    epoch_ns = 1_700_000_000 * 10**9
+    (first,) = graph.add_closure(
+        replace(late, match_stamp_ns=late.match_stamp_ns + epoch_ns, query_stamp_ns=late.query_stamp_ns + epoch_ns)
+    )
+    assert first.state is State.WAITING
+    for k, pose in enumerate(world.odometry):
+        graph.add_odometry(epoch_ns + k * PERIOD_NS, pose)
+        if k == 0:
+            assert graph.update() == []
+    graph.settle()
+    assert graph.verdict_counts() == {State.ACCEPTED: 1}

@@ -65,11 +65,11 @@ def optimize(
         pass
     _report(console, graph, recording)
     if output is not None:
-        graph.write_g2o(output, planar=content.planar)
+        graph.write_g2o(output, planar=content.planar, vertex_of=recording.vertex_of)
         console.print(f"optimised graph: {output}")
     if verdicts is not None:
         try:
-            verdicts.write_text(verdict_table(graph.closures()), encoding="utf-8")
+            verdicts.write_text(verdict_table(graph.closures(), recording.vertex_of), encoding="utf-8")
         except OSError as error:
             raise OutputError(f"cannot write {verdicts}: {error.strerror}") from None
 
@@ -105,6 +105,9 @@ def _report(console: Console, graph: PoseGraph, recording: Recording) -> None:
     sessions = f" in {len(recording.chains)} chains" if len(recording.chains) > 1 else ""
     console.print(f"{len(recording.ids)} poses{sessions}, {len(recording.closures)} closures: ", end="")
     console.print(", ".join(f"{count} {state}" for state, count in sorted(counts.items())))
+    for what, count in sorted(graph.counts.items()):
+        if what != "odometry":
+            console.print(f"[yellow]{count} x {what}", highlight=False)
     scale = graph.scale
     if scale.odometry != 1 or scale.closures != 1:
         console.print(
@@ -122,8 +125,6 @@ def _report(console: Console, graph: PoseGraph, recording: Recording) -> None:
 
 
 def _row(verdict: ClosureVerdict, recording: Recording) -> list[str]:
-    from umf_ros.pose_graph.replay import PERIOD_NS
-
     ends = (verdict.closure.match_stamp_ns, verdict.closure.query_stamp_ns)
-    names = [str(int(recording.ids[stamp // PERIOD_NS])) for stamp in ends]
+    names = [str(recording.vertex_of(stamp)) for stamp in ends]
     return [*names, verdict.state, verdict.reason, f"{verdict.residual:.1f}", f"{verdict.residual_m:.2f}"]

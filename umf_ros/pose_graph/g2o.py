@@ -7,7 +7,7 @@ roll and pitch is given the weight of what it does say.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -126,13 +126,29 @@ def _invert(information: Array) -> Array:
     return 0.5 * (covariance + covariance.T)
 
 
-def write_g2o(path: str | Path, poses: Iterable[Array], edges: Sequence[Edge], planar: bool = False) -> None:
-    """Write vertices 0, 1, ... and edges; `planar` keeps x, y and heading only.
+def write_g2o(
+    path: str | Path,
+    poses: Sequence[Array],
+    edges: Sequence[Edge],
+    planar: bool = False,
+    ids: Sequence[int] | None = None,
+) -> None:
+    """Write vertices and edges.
+
+    Args:
+        path: the file.
+        poses: (4, 4) of each vertex.
+        edges: between vertices by their place in `poses`.
+        planar: keep x, y and heading only.
+        ids: of the vertices in the file; None: 0, 1, ...
 
     Raises:
         OutputError: the file cannot be written.
     """
-    _write(path, _planar_lines(poses, edges) if planar else _spatial_lines(poses, edges))
+    names = range(len(poses)) if ids is None else ids
+    vertex, edge = (_planar_vertex, _planar_edge) if planar else (_spatial_vertex, _spatial_edge)
+    lines = [vertex(pose, name) for pose, name in zip(poses, names, strict=True)]
+    _write(path, lines + [edge(item, names[item.first], names[item.second]) for item in edges])
 
 
 def write_vertex_table(path: str | Path, vertices: Mapping[tuple[int, int], int]) -> None:
@@ -155,22 +171,24 @@ def _write(path: str | Path, lines: Iterable[str]) -> None:
         raise OutputError(f"cannot write {path}: {error.strerror}") from None
 
 
-def _spatial_lines(poses: Iterable[Array], edges: Sequence[Edge]) -> Iterator[str]:
-    for vertex, pose in enumerate(poses):
-        yield f"VERTEX_SE3:QUAT {vertex} {_numbers([*pose[:3, 3], *to_quaternion(pose)])}"
-    for edge in edges:
-        information = np.linalg.inv(edge.covariance)[_SWAP][np.triu_indices(6)]
-        measured = [*edge.pose[:3, 3], *to_quaternion(edge.pose)]
-        yield f"EDGE_SE3:QUAT {edge.first} {edge.second} {_numbers(measured)} {_numbers(information)}"
+def _spatial_vertex(pose: Array, name: int) -> str:
+    return f"VERTEX_SE3:QUAT {name} {_numbers([*pose[:3, 3], *to_quaternion(pose)])}"
 
 
-def _planar_lines(poses: Iterable[Array], edges: Sequence[Edge]) -> Iterator[str]:
-    for vertex, pose in enumerate(poses):
-        yield f"VERTEX_SE2 {vertex} {_numbers([*pose[:2, 3], heading(pose)])}"
-    for edge in edges:
-        plane = np.linalg.inv(edge.covariance[np.ix_([3, 4, 2], [3, 4, 2])])[np.triu_indices(3)]
-        measured = [*edge.pose[:2, 3], heading(edge.pose)]
-        yield f"EDGE_SE2 {edge.first} {edge.second} {_numbers(measured)} {_numbers(plane)}"
+def _spatial_edge(edge: Edge, first: int, second: int) -> str:
+    information = np.linalg.inv(edge.covariance)[_SWAP][np.triu_indices(6)]
+    measured = [*edge.pose[:3, 3], *to_quaternion(edge.pose)]
+    return f"EDGE_SE3:QUAT {first} {second} {_numbers(measured)} {_numbers(information)}"
+
+
+def _planar_vertex(pose: Array, name: int) -> str:
+    return f"VERTEX_SE2 {name} {_numbers([*pose[:2, 3], heading(pose)])}"
+
+
+def _planar_edge(edge: Edge, first: int, second: int) -> str:
+    plane = np.linalg.inv(edge.covariance[np.ix_([3, 4, 2], [3, 4, 2])])[np.triu_indices(3)]
+    measured = [*edge.pose[:2, 3], heading(edge.pose)]
+    return f"EDGE_SE2 {first} {second} {_numbers(measured)} {_numbers(plane)}"
 
 
 def _numbers(values: Iterable[float]) -> str:

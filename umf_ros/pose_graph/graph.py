@@ -38,11 +38,17 @@ _NO_ODOMETRY_YET = "its odometry has not arrived"
 
 @dataclass
 class _Waiting:
-    """A closure without odometry, the newest stamp when it came, and whether that was said."""
+    """A closure without odometry, the newest stamp when it came (None: there was none), and whether that was said."""
 
     closure: LoopClosure
-    since_ns: int
+    since_ns: int | None
     announced: bool = False
+
+    def waited_ns(self, newest_ns: int | None) -> int:
+        """How far the odometry has come since, from its first message on."""
+        if self.since_ns is None:
+            self.since_ns = newest_ns
+        return 0 if newest_ns is None or self.since_ns is None else newest_ns - self.since_ns
 
 
 class PoseGraph:
@@ -56,7 +62,7 @@ class PoseGraph:
         self._sessions = Sessions(self._settings)
         self._judge = Judge(self._settings, self._sessions)
         self._waiting: list[_Waiting] = []
-        self._seen: set[tuple[int, int]] = set()
+        self._seen: set[tuple[int, int, bytes]] = set()
         self._late = False
         self._refused: list[ClosureVerdict] = []
         self.counts: Counter[str] = Counter()
@@ -64,6 +70,7 @@ class PoseGraph:
     def begin_session(self) -> None:
         """Start a new odometry chain with its own gauge; later odometry belongs to it."""
         self._sessions.begin()
+        self._seen.clear()  # a looped recording closes the same loops again, between the same stamps
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
         """Take one odometry message; any order, a second message of one stamp is dropped.
@@ -132,26 +139,29 @@ class PoseGraph:
             return []
 
     def revoke(self, match_stamp_ns: int, query_stamp_ns: int) -> list[ClosureVerdict]:
-        """Take a closure out for good.
+        """Take every closure between two keyframes out for good.
 
         Raises:
             GraphError: there is no such closure, or the graph cannot be solved without it.
         """
-        for row, tracked in enumerate(self._judge.closures):
-            if (tracked.closure.match_stamp_ns, tracked.closure.query_stamp_ns) == (match_stamp_ns, query_stamp_ns):
-                return self._judge.veto(row)
-        raise GraphError(f"no closure between keyframes {match_stamp_ns} and {query_stamp_ns}")
+        ends = (match_stamp_ns, query_stamp_ns)
+        closures = enumerate(tracked.closure for tracked in self._judge.closures)
+        rows = [row for row, closure in closures if (closure.match_stamp_ns, closure.query_stamp_ns) == ends]
+        if not rows:
+            raise GraphError(f"no closure between keyframes {match_stamp_ns} and {query_stamp_ns}")
+        return [verdict for row in rows for verdict in self._judge.veto(row)]
 
     def _receive(self, closure: LoopClosure) -> ClosureVerdict | None:
         try:
             check_closure(closure, self._settings.max_closure_m)
         except GraphError as error:
             return self._refuse(closure, str(error))
-        ends = (closure.match_stamp_ns, closure.query_stamp_ns)
-        if ends in self._seen:
+        # two measurements of one pair are two closures; the same one again is a message sent twice
+        message = (closure.match_stamp_ns, closure.query_stamp_ns, closure.match_T_query.tobytes())
+        if message in self._seen:
             self.counts["closure twice"] += 1
             return None
-        self._seen.add(ends)
+        self._seen.add(message)
         self._waiting.append(_Waiting(closure, self._sessions.newest_ns))
         return None
 
@@ -163,11 +173,13 @@ class PoseGraph:
     def _take_waiting(self) -> tuple[list[ClosureVerdict], list[TrackedClosure]]:
         """Closures whose odometry is there, and verdicts about the others."""
         verdicts, arrived, waiting = [], [], []
+        newest_ns = self._sessions.newest_ns
         for entry in self._waiting:
             tracked = self._locate(entry.closure)
+            waited_ns = entry.waited_ns(newest_ns)
             if tracked is not None:
                 arrived.append(tracked)
-            elif self._sessions.newest_ns - entry.since_ns > self._settings.max_pending_s * 1e9:
+            elif waited_ns > self._settings.max_pending_s * 1e9:
                 verdicts.append(self._refuse(entry.closure, "no odometry at its keyframes"))
             else:
                 if not entry.announced:
@@ -264,8 +276,14 @@ class PoseGraph:
         self._refresh()
         return [tracked.verdict for tracked in self._judge.closures], self._judge.positions()
 
-    def write_g2o(self, path: str | Path, planar: bool = False) -> None:
-        """Write keyframes, odometry and accepted closures, and `<name>.csv` with vertex, session and stamp.
+    def write_g2o(self, path: str | Path, planar: bool = False, vertex_of: Callable[[int], int] | None = None) -> None:
+        """Write keyframes, odometry and accepted closures, with the covariances that the solution used.
+
+        Args:
+            path: the file.
+            planar: two-dimensional.
+            vertex_of: gives the vertex id of a stamp; None counts from 0 and writes `<name>.csv` beside the
+                file, with vertex, session and stamp.
 
         Raises:
             OutputError: a file cannot be written.
@@ -285,6 +303,9 @@ class PoseGraph:
             if c.accepted:
                 match = vertices[c.match, c.closure.match_stamp_ns]
                 query = vertices[c.query, c.closure.query_stamp_ns]
-                edges.append(Edge(match, query, c.closure.match_T_query, c.covariance))
-        write_g2o(path, poses, edges, planar)
-        write_vertex_table(Path(path).with_suffix(".csv"), vertices)
+                covariance = self._judge.scale.closures**2 * c.covariance
+                edges.append(Edge(match, query, c.closure.match_T_query, covariance))
+        ids = [row if vertex_of is None else vertex_of(stamp) for (_, stamp), row in vertices.items()]
+        write_g2o(path, poses, edges, planar, ids)
+        if vertex_of is None:
+            write_vertex_table(Path(path).with_suffix(".csv"), vertices)

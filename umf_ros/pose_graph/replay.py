@@ -42,6 +42,10 @@ class Recording:
         """The settings with every vertex a keyframe and no limit on a closure's length."""
         return settings.model_copy(update={"keyframe_spacing_m": 1e-6, "max_gap_s": 1.5, "max_closure_m": 1e7})
 
+    def vertex_of(self, stamp_ns: int) -> int:
+        """Id in the file of the vertex with a stamp."""
+        return int(self.ids[stamp_ns // PERIOD_NS])
+
     def message(self, row: int) -> LoopClosure:
         """Closure `row` with stamps for keys."""
         edge = self.closures[row]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Callable
 from pathlib import Path
 
 from umf_ros.errors import OutputError
@@ -31,13 +32,19 @@ def write_results(graph: PoseGraph, folder: str | Path) -> None:
     graph.write_g2o(folder / "graph.g2o")
 
 
-def verdict_table(verdicts: list[ClosureVerdict]) -> str:
-    """All verdicts as CSV."""
+def verdict_table(verdicts: list[ClosureVerdict], vertex_of: Callable[[int], int] | None = None) -> str:
+    """All verdicts as CSV.
+
+    Args:
+        verdicts: one line each.
+        vertex_of: gives the vertex id of a stamp, where the closures are edges of a g2o file.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(VERDICT_COLUMNS)
+    writer.writerow(VERDICT_COLUMNS if vertex_of is None else ("match", "query", *VERDICT_COLUMNS[2:]))
     for verdict in verdicts:
-        ends = (verdict.closure.match_stamp_ns, verdict.closure.query_stamp_ns)
+        ends = [verdict.closure.match_stamp_ns, verdict.closure.query_stamp_ns]
+        ends = ends if vertex_of is None else [vertex_of(stamp) for stamp in ends]
         numbers = (f"{verdict.residual:.3f}", f"{verdict.residual_m:.3f}")
         writer.writerow([*ends, verdict.state.value, verdict.reason, *numbers])
     return text.getvalue()

@@ -81,9 +81,9 @@ class Sessions:
         return changed
 
     @property
-    def newest_ns(self) -> int:
-        """Stamp of the newest odometry of all sessions; 0 without."""
-        return max((int(chain.log.stamps[-1]) for chain in self.chains if len(chain.log.stamps)), default=0)
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest odometry of all sessions; None without."""
+        return max((int(chain.log.stamps[-1]) for chain in self.chains if len(chain.log.stamps)), default=None)
 
     @property
     def outgrown(self) -> bool:
