@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.config import Settings, load_settings
 from umf_ros.embedding.ground_truth import GroundTruthEmbedder
+from umf_ros.errors import OutputError
 from umf_ros.frames import Frame
 from umf_ros.geometry import invert, make_pose, relative, rotation_angle, transform
 from umf_ros.loop_detector import Detection, LoopDetector
@@ -117,9 +118,28 @@ def test_a_clock_that_jumps_back_forgets_the_future(frames: list[Frame]) -> None
     assert len(found.database) == 30
     restarted = found.process(replace(frames[10], session=1))
     assert len(found.database) == 11
-    # what the first session knew of the time before is another session's, and may be matched at once
+    # what the first session knew of the time before is another session's, near along the path or not
     assert restarted.keyframe is not None and restarted.keyframe.session == 1
-    assert restarted.verdicts
+    assert not restarted.verdicts
+    minute_later = replace(frames[12], session=1, stamp_ns=frames[10].stamp_ns + 60 * 10**9)
+    assert len(found.process(minute_later).verdicts) > 5
+
+
+def test_a_full_disk_costs_the_memory_and_not_the_closures(
+    frames: list[Frame], detections: list[Detection], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = detector()
+    for frame, before in zip(frames, detections, strict=True):
+        if before.closures:
+            break
+        found.process(frame)
+
+    def full(_: object) -> int:
+        raise OutputError("no space left on device")
+
+    monkeypatch.setattr(found.database, "add", full)
+    now = found.process(frame)
+    assert len(now.closures) == len(before.closures) > 0 and str(now.fault) == "no space left on device"
 
 
 def test_reset_forgets_everything(frames: list[Frame]) -> None:

@@ -19,6 +19,7 @@ from umf_ros.embedding.baselines import ThumbnailEmbedder
 from umf_ros.errors import OutputError
 from umf_ros.frames import Frame
 from umf_ros.loop_detector import LoopDetector
+from umf_ros.places.database import PlaceDatabase
 from umf_ros.replay import Replay
 
 TABLES = ["candidates.csv", "closures.csv", "config.yaml", "inliers.csv", "keyframes.csv", "summary.json"]
@@ -145,11 +146,12 @@ def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path: Path, settings: 
 def test_places_are_kept_from_run_to_run_when_a_file_is_named(tmp_path: Path, frames: list[Frame]) -> None:
     database = {"path": str(tmp_path / "places.sqlite")}
     settings = small_settings(tmp_path, database=database, loop__min_time_gap_s=1.0)
+    later = [replace(frame, stamp_ns=frame.stamp_ns + 60 * 10**9) for frame in frames]
     counts = []
-    for name in ("first", "second"):
+    for name, driven in (("first", frames), ("second", later)):
         (tmp_path / name).mkdir()
         replay = replay_of(tmp_path / name, settings)
-        detections = list(replay.run(frames))
+        detections = list(replay.run(driven))
         replay.finish({})
         counts.append(sum(bool(detection.verdicts) for detection in detections))
         sessions = {row["session"] for row in keyframes_in(tmp_path / name)}
@@ -157,3 +159,30 @@ def test_places_are_kept_from_run_to_run_when_a_file_is_named(tmp_path: Path, fr
     # the second run has the first one's places to look at from its first keyframe on
     assert counts[1] == len(keyframes_in(tmp_path / "second")) > counts[0]
     assert np.isfinite(float(keyframes_in(tmp_path / "second")[-1]["travelled_m"]))
+
+
+def test_a_recording_played_twice_finds_no_keyframe_again_in_itself(tmp_path: Path, frames: list[Frame]) -> None:
+    database = {"path": str(tmp_path / "places.sqlite")}
+    settings = small_settings(tmp_path, database=database, loop__min_time_gap_s=1.0)
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        replay = replay_of(tmp_path / name, settings)
+        verdicts = [(d.frame_stamp_ns, v.candidate.stamp_ns) for d in replay.run(frames) for v in d.verdicts]
+        replay.finish({})
+        assert all(query - match >= 10**9 for query, match in verdicts)
+    assert verdicts
+
+
+def test_a_full_disk_ends_the_replay_after_what_was_found_is_kept(
+    tmp_path: Path, settings: Settings, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        raise OutputError("no space left on device")
+
+    monkeypatch.setattr(PlaceDatabase, "add", full)
+    (tmp_path / "run").mkdir()
+    replay = replay_of(tmp_path / "run", settings)
+    with pytest.raises(OutputError, match="no space"):
+        list(replay.run(frames))
+    replay.finish({})
+    assert len(keyframes_in(tmp_path / "run")) == 1

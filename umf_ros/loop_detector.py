@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,10 +11,13 @@ from dataclasses import dataclass, field
 from umf_ros.config import Settings
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
+from umf_ros.errors import OutputError
 from umf_ros.frames import Frame, Keyframe, LoopClosure, Verdict
 from umf_ros.keyframes import KeyframeSelector
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier, lift, thin_scan
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,12 +29,14 @@ class Detection:
         keyframe: the keyframe it became, or None when it was passed over.
         verdicts: one for every candidate that was tested, best first.
         latency_ms: milliseconds of embed, query and verify, and of their total.
+        fault: why the keyframe could not be remembered (a full disk); what was found stands.
     """
 
     frame_stamp_ns: int
     keyframe: Keyframe | None = None
     verdicts: list[Verdict] = field(default_factory=list)
     latency_ms: dict[str, float] = field(default_factory=dict)
+    fault: OutputError | None = None
 
     @property
     def closures(self) -> list[LoopClosure]:
@@ -77,8 +83,12 @@ class LoopDetector:
             candidates = self.database.query(keyframe, self._rules)
         with latency.measure("verify"):
             verdicts = self._verifier.verify(keyframe, [(found, self.database[found.index]) for found in candidates])
-        self.database.add(keyframe)
-        return Detection(frame.stamp_ns, keyframe, verdicts, latency.milliseconds)
+        fault = None
+        try:
+            self.database.add(keyframe)
+        except OutputError as error:
+            fault = error
+        return Detection(frame.stamp_ns, keyframe, verdicts, latency.milliseconds, fault)
 
     def reset(self) -> None:
         """Forget all places."""
@@ -89,7 +99,8 @@ class LoopDetector:
     def _start_session(self, frame: Frame) -> None:
         """The clock jumped back (a looped bag): what was recorded from here on lies in the future now."""
         self._session = frame.session
-        self.database.forget_from(frame.stamp_ns)
+        forgotten = self.database.forget_from(frame.stamp_ns, self._first_session)
+        logger.warning("the clock went back: a new session begins, %d places are forgotten", forgotten)
         self._selector.reset()
         self._verifier.reset()
 

@@ -31,12 +31,18 @@ class Replay:
         self._session = 0
 
     def run(self, frames: Iterable[Frame]) -> Iterator[Detection]:
-        """Process frame by frame, yielding what became of each; stop iterating to stop the run."""
+        """Process frame by frame, yielding what became of each; stop iterating to stop the run.
+
+        Raises:
+            OutputError: the disk is full.
+        """
         for frame in frames:
             detection = self._detector.process(frame)
             self._recorder.record(frame, detection)
             self._extend_graph(frame, detection)
             yield detection
+            if detection.fault is not None:
+                raise detection.fault
 
     def finish(self, drops: Mapping[str, int]) -> bool:
         """Write the summary, and trajectories and graph where there was odometry; returns whether there was."""

@@ -62,11 +62,22 @@ def test_without_odometry_time_alone_decides() -> None:
     assert stamps_found(places, make_keyframe(100)) == [0, 1]
 
 
-def test_other_sessions_are_always_admissible() -> None:
+def test_other_sessions_may_lie_near_along_the_path_but_never_in_the_future() -> None:
     places = database()
-    places.add(make_keyframe(99, 99, session=0))
-    assert stamps_found(places, make_keyframe(100, 100, session=1)) == [99]
+    for second in (0, 99, 100, 101):  # the last three: the same recording, played before
+        places.add(make_keyframe(second, 99, session=0))
+    assert stamps_found(places, make_keyframe(100, 100, session=1)) == [0]
+    assert stamps_found(places, make_keyframe(100, 100, session=0)) == []
     assert places.next_session == 1
+
+
+def test_a_clock_that_went_back_does_not_erase_earlier_runs() -> None:
+    places = database()
+    places.add(make_keyframe(50, session=0))
+    for second in (10, 60):
+        places.add(make_keyframe(second, session=1))
+    assert places.forget_from(20 * 10**9, first_session=1) == 1
+    assert [places[row].stamp_ns // 10**9 for row in range(len(places))] == [50, 10]
 
 
 def test_best_match_comes_first_and_weak_ones_can_be_cut() -> None:

@@ -84,10 +84,12 @@ class LoopClosureNode(Node):
         for frame in self._synchronizer.flush():
             self._worker.submit(frame)
         self._worker.close(timeout_s=30.0)
-        if self._recorder is not None:
-            self._recorder.write_summary(self._drops())
-            self._recorder.close()
-        self._detector.database.close()
+        try:
+            if self._recorder is not None:
+                self._recorder.write_summary(self._drops())
+                self._recorder.close()
+        finally:
+            self._detector.database.close()
 
     def _subscribe(self, name: str, topic: str) -> InputWatch:
         watch = InputWatch(self, name, topic)
@@ -117,18 +119,20 @@ class LoopClosureNode(Node):
             matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
         self._last = detection
         self._announcer.announce(detection, matches)
-        if self._recorder is not None:
-            self._recorder.record(frame, detection)
         for closure in detection.closures:
             self._closures += 1
             self.get_logger().info(describe(self._closures, closure))
+        if detection.fault is not None:
+            self._complain(detection.fault)
+        if self._recorder is not None:
+            self._recorder.record(frame, detection)
 
     def _complain(self, error: Exception) -> None:
         self._last_error = f"{type(error).__name__}: {error}"
         self.get_logger().error(self._last_error, throttle_duration_sec=10.0)
 
     def _drops(self) -> dict[str, int]:
-        return count_drops(self._synchronizer.counters, self._worker.dropped)
+        return count_drops(self._synchronizer.counters, self._worker.dropped + self._decoder.dropped)
 
     def _diagnose(self) -> None:
         message = DiagnosticArray()
@@ -141,7 +145,10 @@ class LoopClosureNode(Node):
             if watch.warning:
                 self.get_logger().warning(watch.warning, throttle_duration_sec=30.0)
         if self._recorder is not None:
-            self._recorder.write_summary(self._drops())
+            try:
+                self._recorder.write_summary(self._drops())
+            except OutputError as error:  # closures matter more than the tally
+                self._complain(error)
 
     def _own_status(self) -> DiagnosticStatus:
         latency = self._last.latency_ms.get("total", 0.0) if self._last else 0.0
@@ -159,8 +166,8 @@ class LoopClosureNode(Node):
         }
         if self._paused:
             return status(WARN, "detector", "paused", values)
-        if self._worker.dropped:
-            return status(WARN, "detector", "too slow: frames are being dropped", values)
+        if self._worker.dropped or self._decoder.dropped:
+            return status(WARN, "detector", "too slow: messages are being dropped", values)
         return status(OK, "detector", f"{self._closures} closures among {len(self._detector.database)} places", values)
 
     def _save(self, _: Any, response: Any) -> Any:

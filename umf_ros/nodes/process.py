@@ -27,8 +27,8 @@ class Closing(Protocol):
 def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> int:
     """Spin one node until Ctrl-C, then let it finish; returns the exit status.
 
-    A `UmfError` while the node starts is one line on stderr and status 1. The first SIGINT or SIGTERM
-    ends the spinning; while the node writes its results further ones are ignored.
+    A `UmfError` while the node starts or finishes is one line on stderr and status 1. The first SIGINT or
+    SIGTERM ends the spinning; while the node writes its results further ones are ignored.
     """
     # our own handlers: rclpy's would shut the context down before the node has published its last words
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
@@ -41,18 +41,23 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
         return 1
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    status = 0
     try:
         while not stop.requested and rclpy.ok():
             executor.spin_once(timeout_sec=0.2)
     except ExternalShutdownException:
         pass
     finally:
-        if isinstance(node, Closing):
-            node.close()
+        try:
+            if isinstance(node, Closing):
+                node.close()
+        except UmfError as error:
+            complain(error)
+            status = 1
         executor.shutdown()  # it must not outlive what it waits for
         node.destroy_node()
         rclpy.try_shutdown()
-    return 0
+    return status
 
 
 def complain(error: UmfError) -> None:

@@ -55,7 +55,7 @@ class PlaceDatabase:
     def query(self, keyframe: Keyframe, rules: Loop) -> list[Candidate]:
         """The most similar earlier places, best first, by exhaustive search.
 
-        Keyframes of the same session must be older than `min_time_gap_s` and further back along
+        Keyframes must be older than `min_time_gap_s`, and those of the same session further back along
         the path than `min_travel_m`; where either path length is unknown, time alone decides.
         """
         found = self._index.search(keyframe.embedding.descriptor, rules.top_k, self._admissible(keyframe, rules))
@@ -63,9 +63,15 @@ class PlaceDatabase:
             Candidate(i, self._stamps[i], similarity) for i, similarity in found if similarity >= rules.min_similarity
         ]
 
-    def forget_from(self, stamp_ns: int) -> int:
-        """Forget keyframes from `stamp_ns` on, as when a recording starts over; returns how many."""
-        keep = np.array(self._stamps, np.int64) < stamp_ns
+    def forget_from(self, stamp_ns: int, first_session: int = 0) -> int:
+        """Forget keyframes from `stamp_ns` on, as when a recording starts over; returns how many.
+
+        Args:
+            stamp_ns: the first that is forgotten.
+            first_session: earlier sessions (of earlier runs) are kept whatever their stamps.
+        """
+        earlier = np.array(self._sessions, np.int64) < first_session
+        keep = earlier | (np.array(self._stamps, np.int64) < stamp_ns)
         kept = np.flatnonzero(keep).tolist()
         forgotten = len(self) - len(kept)
         if forgotten:
@@ -97,4 +103,4 @@ class PlaceDatabase:
         # comparisons with NaN are False: an unknown path length never excludes
         near = keyframe.travelled_m - travelled < rules.min_travel_m
         foreign = np.array(self._sessions, np.int64) != keyframe.session
-        return foreign | (old & ~near)
+        return old & (foreign | ~near)

@@ -26,6 +26,10 @@ class StreamClock:
         """Time since the first stamp of this session."""
         return 0 if self.now_ns is None else self.now_ns - self._start_ns
 
+    def newest_ns(self, *names: str) -> int | None:
+        """Latest stamp of some inputs in this session, or None before their first."""
+        return max((self._last[name] for name in names if name in self._last), default=None)
+
     def has_heard(self, name: str) -> bool:
         """Whether a message of input `name` has come in this session."""
         return name in self._last
@@ -43,7 +47,7 @@ class StreamClock:
         return "out of order" if last - RESTART_NS < stamp_ns < last else None
 
     def restarts(self, name: str, stamp_ns: int) -> bool:
-        """Whether a message of input `name` is the first one after a restart."""
+        """Whether a message of input `name` says that the recording runs anew; one alone may be wrong."""
         last = self._last.get(name)
         return last is not None and stamp_ns <= last - RESTART_NS
 

@@ -8,7 +8,7 @@ from typing import Any
 from umf_ros.config import Topics
 from umf_ros.errors import MessageError
 from umf_ros.sensors.messages import decode_camera_info, decode_cloud, decode_image, decode_odometry, stamp_ns
-from umf_ros.sensors.synchronizer import Input, Synchronizer
+from umf_ros.sensors.synchronizer import SILENCE_NS, Input, Synchronizer
 
 
 def wanted_inputs(topics: Topics) -> set[Input]:
@@ -34,8 +34,9 @@ class Intake:
         self._synchronizer = synchronizer
         self._warn = warn
         self._warned: set[tuple[str, str]] = set()
-        self._stereo_info = bool(topics.right_info)
+        self._stereo_info = bool(topics.right_info and topics.right_image)
         self._infos: dict[str, Any] = {}
+        self._used: set[str] = set()
         self._handlers: dict[str, tuple[Input, Callable[[Any], None]]] = {
             topics.left_image: ("left", self._left),
             topics.right_image: ("right", self._right),
@@ -85,9 +86,12 @@ class Intake:
         self._use_info("right", message)
 
     def _use_info(self, side: str, message: Any) -> None:
-        """Use the first camera_info of the pair."""
-        if side in self._infos:
+        """Use the first camera_info of the pair, or the left one alone when the right camera stays silent."""
+        left = self._infos.setdefault(side, message) if side == "left" else self._infos.get("left")
+        right = self._infos.setdefault(side, message) if side == "right" else self._infos.get("right")
+        if left is None or self._used == set(self._infos):
             return
-        self._infos[side] = message
-        if "left" in self._infos and (not self._stereo_info or "right" in self._infos):
-            self._synchronizer.use_camera(decode_camera_info(self._infos["left"], self._infos.get("right")))
+        if right is None and self._stereo_info and stamp_ns(message) - stamp_ns(left) < SILENCE_NS:
+            return
+        self._used = set(self._infos)
+        self._synchronizer.use_camera(decode_camera_info(left, right))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from typing import Literal
 
 from umf_ros.config import Sync
@@ -28,6 +29,15 @@ SILENCE_NS = 5_000_000_000
 """An input of which nothing has come in this much stream time is taken to be absent."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Doubted:
+    """A message whose stamp jumped back, until another one tells a restart from a slip of its clock."""
+
+    name: Input
+    stamp_ns: int
+    add: Callable[[], None]
+
+
 class Synchronizer:
     """Builds one frame per scan from the image nearest to it and the odometry; without a LiDAR one per image.
 
@@ -38,7 +48,8 @@ class Synchronizer:
     with what is there; an input that has been silent for long is not waited for until it speaks.
 
     When stamps jump back (the recording starts again), the waiting frames are completed with what is
-    there, the buffers are emptied and a new session begins.
+    there, the buffers are emptied and a new session begins. One message does not make a restart: it is held
+    back until a second one agrees, and dropped when its input goes on as before.
 
     Not for several threads at once.
 
@@ -64,6 +75,7 @@ class Synchronizer:
         self._anchors: deque[Anchor] = deque()
         self._frames: list[Frame] = []
         self._given_up_ns = -1  # images up to here come too late
+        self._doubted: _Doubted | None = None
 
     @property
     def session(self) -> int:
@@ -87,7 +99,7 @@ class Synchronizer:
             MessageError: of kind "size" when the calibration is for other images.
         """
         self._check_size(image)
-        if self._accept("left", stamp_ns):
+        if self._accept("left", stamp_ns, lambda: self.add_left(stamp_ns, image)):
             self._left.add(stamp_ns, image, late=stamp_ns <= self._given_up_ns)
             if "cloud" not in self._inputs:
                 self._anchors.append(Anchor(stamp_ns, stamp_ns))
@@ -100,20 +112,20 @@ class Synchronizer:
             MessageError: of kind "size" when the calibration is for other images.
         """
         self._check_size(image)
-        if self._accept("right", stamp_ns):
+        if self._accept("right", stamp_ns, lambda: self.add_right(stamp_ns, image)):
             self._right.add(stamp_ns, image, late=stamp_ns <= self._given_up_ns)
             self._build()
 
     def add_cloud(self, stamp_ns: int, cloud: Cloud) -> None:
         """Add a scan by the stamp of its message, the start of the scan."""
-        if self._accept("cloud", stamp_ns):
+        if self._accept("cloud", stamp_ns, lambda: self.add_cloud(stamp_ns, cloud)):
             key = stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
             self._anchors.append(Anchor(key, stamp_ns, filter_cloud(cloud, self._calibration)))
             self._build()
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
         """Add a (4, 4) pose of the odometry."""
-        if self._accept("odometry", stamp_ns):
+        if self._accept("odometry", stamp_ns, lambda: self.add_odometry(stamp_ns, odom_T_body)):
             self._odometry.add(stamp_ns, odom_T_body)
             self.counters["odometry"].used += 1
             self._build()
@@ -133,13 +145,23 @@ class Synchronizer:
 
     def flush(self) -> list[Frame]:
         """Complete the waiting frames with what is there, at the end of the stream, and pop them."""
+        self._drop_doubted()
         self._clear()
         return self.pop()
 
-    def _accept(self, name: Input, stamp_ns: int) -> bool:
+    def _accept(self, name: Input, stamp_ns: int, add: Callable[[], None]) -> bool:
+        doubted = self._doubted
         if self._clock.restarts(name, stamp_ns):
+            if doubted is None or abs(stamp_ns - doubted.stamp_ns) > SILENCE_NS:
+                self._drop_doubted()
+                self._doubted = _Doubted(name, stamp_ns, add)
+                return False
+            self._doubted = None
             self._clear()
             self._clock.restart()
+            doubted.add()
+        elif doubted and doubted.name == name:
+            self._drop_doubted()
         counter = self.counters[name]
         counter.received += 1
         fault = self._clock.fault(name, stamp_ns)
@@ -149,6 +171,11 @@ class Synchronizer:
         self._clock.advance(name, stamp_ns)
         self._absent.discard(name)
         return True
+
+    def _drop_doubted(self) -> None:
+        if self._doubted is not None:
+            self.reject(self._doubted.name, "clock jump")
+            self._doubted = None
 
     def _check_size(self, image: Image) -> None:
         height, width = image.shape
@@ -172,8 +199,14 @@ class Synchronizer:
             anchor = self._anchors.popleft()
             self._complete(anchor)
             self._forget_before(anchor.stamp_ns)  # the scans to come are later than this one
-        if self._clock.now_ns is not None:
-            self._forget_before(self._clock.now_ns - self._max_wait_ns)
+        now_ns = self._sensed_ns
+        if now_ns is not None:
+            self._forget_before(now_ns - self._max_wait_ns)
+
+    @property
+    def _sensed_ns(self) -> int | None:
+        """Latest stamp of the sensors: odometry may run ahead on another machine's clock."""
+        return self._clock.newest_ns("left", "right", "cloud")
 
     def _forget_before(self, key_ns: int) -> None:
         """Let go of the images that are too old for a frame at this key."""
@@ -181,7 +214,8 @@ class Synchronizer:
         self._right.forget_before(key_ns - self._slop_ns - STEREO_SLOP_NS)
 
     def _is_complete(self, anchor: Anchor) -> bool:
-        if self._clock.now_ns is not None and self._clock.now_ns > anchor.stamp_ns + self._max_wait_ns:
+        now_ns = self._sensed_ns
+        if now_ns is not None and now_ns > anchor.stamp_ns + self._max_wait_ns:
             self._note_absent()
             return True
         if len(self._anchors) >= self._settings.queue_size:
