@@ -121,8 +121,8 @@ def test_a_clock_that_jumps_back_forgets_the_future(frames: list[Frame]) -> None
     # what the first session knew of the time before is another session's, near along the path or not
     assert restarted.keyframe is not None and restarted.keyframe.session == 1
     assert not restarted.verdicts
-    minute_later = replace(frames[12], session=1, stamp_ns=frames[10].stamp_ns + 60 * 10**9)
-    assert len(found.process(minute_later).verdicts) > 5
+    later = replace(frames[len(frames) - 1], session=1)
+    assert len(found.process(later).verdicts) > 5
 
 
 def test_a_full_disk_costs_the_memory_and_not_the_closures(
