@@ -122,7 +122,7 @@ def test_a_clock_that_jumps_back_forgets_the_future(frames: list[Frame]) -> None
     assert restarted.keyframe is not None and restarted.keyframe.session == 1
     assert not restarted.verdicts
     later = replace(frames[len(frames) - 1], session=1)
-    assert len(found.process(later).verdicts) > 5
+    assert len(found.process(later).verdicts) > 2
 
 
 def test_a_full_disk_costs_the_memory_and_not_the_closures(
