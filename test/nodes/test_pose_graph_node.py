@@ -45,6 +45,7 @@ class Rig(Node):
         self._hear(PoseWithCovarianceStamped, "pose", qos_profile_sensor_data)
         self._hear(TransformStamped, "map_to_odom", qos_profile_sensor_data)
         self.values: dict[str, str] = {}
+        self.inputs: set[str] = set()
         self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
 
     def _hear(self, kind: type, name: str, qos: object) -> None:
@@ -53,6 +54,7 @@ class Rig(Node):
 
     def _diagnose(self, message: DiagnosticArray) -> None:
         for status in message.status:
+            self.inputs.add(status.name)
             if status.name == "pose_graph_node: pose graph":
                 self.values = {pair.key: pair.value for pair in status.values}
 
@@ -164,7 +166,7 @@ def test_a_drive_ends_on_its_true_path_and_wrong_closures_stay_out(rig: Rig, pro
 def test_bad_messages_are_counted_and_the_node_goes_on(rig: Rig, process: Process) -> None:
     rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
     world = rig.world
-    broken = odometry(0, world.odometry[0])
+    broken, undated = odometry(PERIOD_NS, world.odometry[0]), odometry(0, world.odometry[0])
     broken.pose.pose.orientation.w = 3.0
     rig.odometry.publish(broken)
     rig.drive(0, 100)
@@ -176,17 +178,37 @@ def test_bad_messages_are_counted_and_the_node_goes_on(rig: Rig, process: Proces
     own.header.frame_id = own.child_frame_id
     for message in (foreign, flat, own):
         rig.closures.publish(message)
-    wanted = ("pose_not_a_rotation", "closure_frame", "reject_edge")
+    wanted = ("pose_not_a_rotation", "stamp", "closure_frame", "reject_edge")
 
     def all_counted() -> bool:
         # a best-effort message may be lost: broken ones are sent until each kind was seen
         rig.odometry.publish(broken)
+        rig.odometry.publish(undated)
         rig.reject.publish(String(data="the red one"))
         return all(name in rig.values for name in wanted)
 
     rig.until(all_counted)
     rig.until(lambda: sum(name.startswith("closure refused") for name in rig.values) == 2)
     rig.until(lambda: rig.taken >= 95)
+    assert "a new session" not in process.output
+
+
+def test_a_rover_without_odometry_is_no_fault(rig: Rig, tmp_path: Path) -> None:
+    process = Process(MODULE, tmp_path / "node.log", "topics.odometry:=''")
+    process.wait_for("ready")
+    rig.until(lambda: "closures" in " ".join(rig.inputs))
+    assert not any("odometry" in name for name in rig.inputs) and process.exit_code is None
+    assert process.interrupt() == 0, process.output
+    process.kill()
+
+
+def test_a_folder_that_cannot_be_written_is_told_at_the_start(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    process = Process(MODULE, tmp_path / "node.log", f"results_dir:={tmp_path / 'file' / 'results'}")
+    wait_until(lambda: process.exit_code is not None, 90.0)
+    assert process.exit_code == 1
+    assert process.output == f"umf: cannot write to {tmp_path / 'file' / 'results'}: Not a directory\n"
+    process.kill()
 
 
 def test_services_revoke_save_and_reset(rig: Rig, process: Process, tmp_path: Path) -> None:

@@ -7,13 +7,16 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -28,15 +31,16 @@ from umf_ros.nodes.process import run
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.graph import PoseGraph
+from umf_ros.pose_graph.restarts import RestartGuard
 from umf_ros.pose_graph.results import write_results
+from umf_ros.results.folder import check_writable
+from umf_ros.sensors.messages import stamp_ns
 from umf_ros.topics import topics_of
 from umf_ros.worker import Worker
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works
 QUEUE = 100_000
-NEW_SESSION_AFTER_NS = 5_000_000_000
-"""Odometry this much older than the newest is not late: the clock has been set back."""
 REJECT = re.compile(r"\s*keyframe/(\d+)\s+keyframe/(\d+)\s*")
 
 
@@ -47,17 +51,19 @@ class PoseGraphNode(Node):
         super().__init__("pose_graph_node", automatically_declare_parameters_from_overrides=True)
         self._settings, own = declare(self, results_dir="folder for trajectories, graph and verdicts; empty: none")
         self._results = own["results_dir"]
+        if self._results:
+            check_writable(Path(self._results))
         self._frames = self._settings.frames
         self._lock = threading.Lock()
         self._begin()
         self._make_publishers()
         self._worker: Worker[Callable[[], None]] = Worker(self._run, self._complain, QUEUE)
+        self._watches: list[InputWatch] = []
         odometry_topic = topics_of(self._settings).odometry
-        self._watches = [InputWatch(self, "odometry", odometry_topic), InputWatch(self, "closures", "/loop_closures")]
         if odometry_topic:
             qos = sensor_qos(self._settings.qos, ODOMETRY_DEPTH)
-            self.create_subscription(Odometry, odometry_topic, self._on_odometry, qos)
-        self.create_subscription(Odometry, "/loop_closures", self._on_closure, CLOSURES_QOS)
+            self._subscribe("odometry", odometry_topic, self._on_odometry, qos)
+        self._subscribe("closures", "/loop_closures", self._on_closure, CLOSURES_QOS)
         self.create_subscription(String, "~/reject_edge", self._on_reject, 10)
         self.create_service(Trigger, "~/reject_last", self._reject_last)
         self.create_service(Trigger, "~/save", self._save)
@@ -71,7 +77,21 @@ class PoseGraphNode(Node):
         if self._results:
             write_results(self._graph, self._results)
 
+    def _subscribe(self, name: str, topic: str, take: Callable[[Odometry, int], None], qos: QoSProfile) -> None:
+        watch = InputWatch(self, name, topic)
+        self._watches.append(watch)
+
+        def receive(message: Odometry) -> None:
+            watch.saw(from_time(message.header.stamp))
+            try:
+                take(message, stamp_ns(message))
+            except MessageError as error:
+                self._refuse(error)
+
+        self.create_subscription(Odometry, topic, receive, qos)
+
     def _begin(self) -> None:
+        self._guard = RestartGuard()
         self._graph = PoseGraph(self._settings.pose_graph)
         self._refused: Counter[str] = Counter()
         self._newest_ns = -1
@@ -80,7 +100,7 @@ class PoseGraphNode(Node):
         self._drawn = -1
 
     def _make_publishers(self) -> None:
-        self._path_publisher = self.create_publisher(Path, "~/path", LATCHED_QOS)
+        self._path_publisher = self.create_publisher(PathMessage, "~/path", LATCHED_QOS)
         self._pose_publisher = self.create_publisher(PoseWithCovarianceStamped, "~/pose", 50)
         self._marker_publisher = self.create_publisher(MarkerArray, "~/markers", LATCHED_QOS)
         self._verdict_publisher = self.create_publisher(DiagnosticArray, "~/verdicts", CLOSURES_QOS)
@@ -88,13 +108,8 @@ class PoseGraphNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._broadcast = _broadcaster(self) if self._frames.publish_tf else None
 
-    def _on_odometry(self, message: Odometry) -> None:
-        stamp_ns = from_time(message.header.stamp)
-        self._watches[0].saw(stamp_ns)
-        try:
-            odom_T_body = from_pose(message.pose.pose)
-        except MessageError as error:
-            return self._refuse(error)
+    def _on_odometry(self, message: Odometry, stamp_ns: int) -> None:
+        odom_T_body = from_pose(message.pose.pose)
         self._worker.submit(lambda: self._add_odometry(stamp_ns, odom_T_body))
         # the newest correction, not the next: the pose never waits for the optimiser
         map_T_odom = self._map_T_odom
@@ -105,12 +120,8 @@ class PoseGraphNode(Node):
         if self._broadcast is not None:
             self._broadcast(transform)
 
-    def _on_closure(self, message: Odometry) -> None:
-        self._watches[1].saw(from_time(message.header.stamp))
-        try:
-            closure = closure_from_message(message)
-        except MessageError as error:
-            return self._refuse(error)
+    def _on_closure(self, message: Odometry, _: int) -> None:
+        closure = closure_from_message(message)
         self._worker.submit(lambda: self._announce(self._graph.add_closure(closure)))
 
     def _on_reject(self, message: String) -> None:
@@ -126,12 +137,14 @@ class PoseGraphNode(Node):
             step()
 
     def _add_odometry(self, stamp_ns: int, odom_T_body: Any) -> None:
-        if self._newest_ns - stamp_ns > NEW_SESSION_AFTER_NS:
-            self.get_logger().warning("the odometry's clock went back: a new session begins")
+        restarted, samples = self._guard.take(stamp_ns, odom_T_body)
+        if restarted:
+            self.get_logger().warning(f"{restarted}: a new session begins")
             self._graph.begin_session()
             self._newest_ns = -1
-        self._newest_ns = max(self._newest_ns, stamp_ns)
-        self._graph.add_odometry(stamp_ns, odom_T_body)
+        for stamp_ns, odom_T_body in samples:
+            self._newest_ns = max(self._newest_ns, stamp_ns)
+            self._graph.add_odometry(stamp_ns, odom_T_body)
 
     def _announce(self, verdicts: list[ClosureVerdict]) -> None:
         if not verdicts:
@@ -175,6 +188,7 @@ class PoseGraphNode(Node):
 
     def _own_status(self) -> DiagnosticStatus:
         values: dict[str, object] = {**self._graph.counts, **self._refused, "queue_dropped": self._worker.dropped}
+        values["odometry_out_of_line"] = self._guard.slips
         values |= {state.value: count for state, count in self._graph.verdict_counts().items()}
         trouble = self._worker.dropped or any(name.startswith("optimiser") for name in self._graph.counts)
         level = WARN if trouble or self._refused else OK

@@ -30,6 +30,8 @@ _LOOPS_PER_CLOSURE = 3
 _MOST_ROUNDS = 4
 # a closure this far from the map (m) is not looked at again before the map moves
 _CLOSE_M = 2.0
+# 99 of 100 right closures differ less from the map: one that nobody supports has to be such a one
+_USUAL_SIGMAS = 4.1
 _AGREES = "agrees with the map"
 _SUPPORTED = "supported by other places"
 _UNOPPOSED = "nothing speaks against it"
@@ -209,8 +211,9 @@ class Judge:
         return groups
 
     def _unopposed(self, patience_m: float) -> set[int]:
-        """Undecided closures that have waited long enough without contradiction."""
+        """Undecided closures that have waited long enough without contradiction, the map's included."""
         undecided = [row for row, c in enumerate(self.closures) if c.verdict.state is State.UNDECIDED]
+        undecided = [row for row in undecided if self.closures[row].verdict.residual <= _USUAL_SIGMAS]
         against = np.array([c.verdict.state is not State.REJECTED for c in self.closures])
         waited = [row for row in undecided if self._waited(row) >= patience_m]
         return {row for row in waited if not self._agreement.contested(row, against)}
