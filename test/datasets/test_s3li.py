@@ -85,6 +85,20 @@ def test_headings_come_from_the_odometry_where_there_is_some(tmp_path: Path) -> 
     assert expected[0] == pytest.approx(30 + np.degrees(0.3) * 0.1, abs=2.0)
 
 
+def test_odometry_of_the_imu_is_turned_to_the_body(tmp_path: Path) -> None:
+    """S3LI's Eval/BASALT holds poses of the IMU, whose axes are not the rover's."""
+    bag = write_mcap(tmp_path / "a.mcap", entries(8))
+    stamps = START_NS + np.arange(180, dtype=np.int64) * 50_000_000
+    body = np.stack([drive(i * 0.05) for i in range(180)])
+    settings = small_settings(tmp_path, dataset="s3li-etna").model_copy(update={"calibration": ""})
+    body_T_imu = load_calibration("s3li-etna").body_T_imu
+    truth, found = write_pos(tmp_path / "a.pos", 9), []
+    for frame, poses in (("body", body), ("imu", body @ body_T_imu)):
+        write_tum(tmp_path / f"{frame}.tum", Trajectory(stamps, poses))
+        found.append(read_bag(bag, truth, tmp_path / f"{frame}.tum", settings, 0.5, frame).world_T_body)
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5)
+
+
 def test_the_simulators_own_truth_needs_no_file(tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "a.mcap", traverse(4))
     sequence = read_bag(bag, settings=small_settings(tmp_path))

@@ -9,7 +9,7 @@ import sys
 import rclpy
 from rclpy.node import Node
 
-from umf_ros.errors import ConfigError
+from umf_ros.errors import ConfigError, OutputError
 from umf_ros.nodes.process import run
 
 
@@ -23,6 +23,7 @@ ACTIONS = {
     "terminate": lambda: os.kill(os.getpid(), signal.SIGTERM),
     "shutdown": rclpy.shutdown,
     "fail": fail,
+    "overflow": lambda: os.kill(os.getpid(), signal.SIGINT),
 }
 
 
@@ -31,12 +32,15 @@ class Dutiful(Node):
         if action == "refuse":
             raise ConfigError("unknown parameter loop.topk")
         super().__init__("dutiful", automatically_declare_parameters_from_overrides=True)
+        self._action = action
         self.create_timer(0.01, ACTIONS[action])
         print("depth", self.get_parameter_or("depth").value)
 
     def close(self) -> None:
         os.kill(os.getpid(), signal.SIGINT)  # an impatient user
         print("closed while", "publishing" if rclpy.ok() else "cut off")
+        if self._action == "overflow":
+            raise OutputError("cannot write results: No space left on device")
 
 
 class Plain(Node):

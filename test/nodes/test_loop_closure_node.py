@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -134,6 +135,20 @@ def test_it_takes_frames_survives_bad_ones_and_ends_in_order(rig: Rig, node: Pro
     assert summary["pairs"] == 8 and summary["keyframes"] == 8
     assert summary["drops"]["image"] == 3 and summary["drops"]["cloud"] == 1
     assert "Traceback" not in node.output
+
+
+def test_results_that_vanish_cost_the_tally_and_nothing_else(rig: Rig, node: Process, tmp_path: Path) -> None:
+    rig.publish_pair(START_NS)
+    assert rig.until(lambda: rig.count("cloud_received") == 1)
+    shutil.rmtree(tmp_path / "run")
+    assert rig.until(lambda: "cannot write" in rig.values.get("last_error", ""))
+    for i in range(1, 5):
+        rig.publish_pair(START_NS + i * 213_000_000)
+        rig.until(lambda i=i: rig.count("cloud_received") > i)
+    assert rig.until(lambda: rig.count("places") >= 4), node.output
+    assert node.interrupt() == 1
+    assert "Traceback" not in node.output
+    assert node.output.strip().splitlines()[-1].startswith(f"umf: cannot write {tmp_path / 'run' / 'summary.json'}")
 
 
 def test_a_clock_that_jumps_back_starts_a_new_session(rig: Rig, node: Process) -> None:

@@ -47,6 +47,12 @@ def test_results_are_written_even_when_a_callback_fails() -> None:
     assert ended.returncode == 1 and "ZeroDivisionError: a fault in the program" in ended.stderr
 
 
+def test_results_that_cannot_be_written_are_one_line_and_status_1() -> None:
+    ended = start("overflow")
+    assert ended.returncode == 1 and ended.stdout.splitlines()[-1] == "context shut down"
+    assert ended.stderr == "umf: cannot write results: No space left on device\n"
+
+
 def test_arguments_reach_the_node() -> None:
     ended = start("interrupt", "--ros-args", "-p", "depth:=7")
     assert ended.stdout.splitlines()[0] == "depth 7", ended.stderr

@@ -57,6 +57,23 @@ def test_good_messages_after_bad_ones_still_make_a_frame(synchronizer: Synchroni
     assert (frame.camera.fx, frame.camera.baseline) == (77, 0.2)
 
 
+@pytest.mark.parametrize(
+    ("topics", "seconds"), [(Topics(right_image=""), 0), (Topics(right_info=""), 0), (Topics(), 6)]
+)
+def test_a_left_camera_alone_is_used_with_its_own_intrinsics(
+    synchronizer: Synchronizer, topics: Topics, seconds: int
+) -> None:
+    """At once where no right camera is expected, after some silence where one is."""
+    intake = Intake(synchronizer, topics, lambda _: None)
+    intake.take(LEFT_INFO, camera_info(START_NS, 77.0, (64, 48)))
+    start = START_NS + seconds * 10**9
+    intake.take(LEFT_INFO, camera_info(start, 77.0, (64, 48)))
+    intake.take(CLOUD, cloud(start, scan(np.full((3, 3), 4.0))))
+    intake.take(LEFT, image(start + 100_000_000, np.full((48, 64), 9, np.uint8)))
+    (frame,) = synchronizer.pop()
+    assert frame.camera.fx == 77
+
+
 def test_useless_camera_info_is_told_and_the_calibration_file_stands(synchronizer: Synchronizer) -> None:
     told: list[str] = []
     intake = Intake(synchronizer, Topics(right_info=""), told.append)

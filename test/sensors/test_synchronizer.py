@@ -289,6 +289,33 @@ def test_a_recording_that_starts_again_is_a_new_session(calibration: Calibration
     check_accounts(synchronizer)
 
 
+@pytest.mark.parametrize("name", ["left", "odometry", "cloud"])
+def test_one_stamp_that_jumps_back_is_no_restart(calibration: Calibration, name: str) -> None:
+    """A sensor that loses its clock for one message, and says the time since it was switched on."""
+    streams = rover(6.0)
+    plain = feed(Synchronizer(Sync(), calibration), in_order(streams))
+    synchronizer = Synchronizer(Sync(), calibration)
+    arrivals = in_order(streams)
+    for row, stamp in ((150, 12 * S), (300, 15 * S)):
+        arrivals.insert(row, (name, stamp, streams[name][0][2]))
+    frames = feed(synchronizer, arrivals)
+    assert synchronizer.session == 0 and synchronizer.counters[name].dropped["clock jump"] == 2
+    assert len(frames) == len(plain) and all(same(a, b) for a, b in zip(frames, plain, strict=True))
+
+
+def test_odometry_of_a_computer_whose_clock_runs_ahead_costs_no_image(calibration: Calibration) -> None:
+    streams = rover(6.0)
+    streams["odometry"] = [(name, stamp + 3 * S, pose) for name, stamp, pose in streams["odometry"]]
+    arrivals = sorted(
+        (item for stream in streams.values() for item in stream),
+        key=lambda item: item[1] - 3 * S * (item[0] == "odometry"),
+    )
+    synchronizer = Synchronizer(Sync(), calibration)
+    frames = feed(synchronizer, arrivals) + synchronizer.flush()
+    assert len(frames) == len(streams["cloud"]) and all(frame.left is not None for frame in frames)
+    assert synchronizer.counters["left"].lost == 0
+
+
 def test_stragglers_of_the_session_before_do_not_start_another_one(calibration: Calibration) -> None:
     streams = rover(4.0)
     synchronizer = Synchronizer(Sync(), calibration)

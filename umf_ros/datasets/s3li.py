@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.presets import detect_dataset
+from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.rtklib import east_north_up
-from umf_ros.bags.trajectories import read_ground_truth, read_tum
-from umf_ros.config import Settings, load_settings
+from umf_ros.bags.trajectories import read_ground_truth, read_odometry
+from umf_ros.config import Settings
 from umf_ros.datasets.pickles import load_data_frame
 from umf_ros.datasets.recorded import RecordedSequence, course, poses_of, stretches, travelled
 from umf_ros.datasets.sample import Sample
@@ -46,6 +46,7 @@ def read_bag(
     odometry: Path | None = None,
     settings: Settings | None = None,
     spacing_m: float = 1.0,
+    odometry_frame: str = "body",
 ) -> RecordedSequence:
     """A recording as a sequence, one sample every `spacing_m` of the true path.
 
@@ -58,16 +59,18 @@ def read_bag(
         odometry: TUM file, where the recording has none.
         settings: topics and calibration; None: those of the data set the recording's topics belong to.
         spacing_m: distance between samples.
+        odometry_frame: whose poses `odometry` holds: body, imu (S3LI's Eval/BASALT), camera or lidar.
 
     Raises:
         BagError: unreadable recording or truth, or no truth at all.
     """
     recording = open_bag(bag)
-    settings = settings or load_settings(None, dataset=detect_dataset(recording))
+    settings = settings or settings_for(recording, None, "auto")
     known = read_ground_truth(recording, truth)
     if known is None:
         raise BagError(f"{bag} holds no ground truth; name a file")
-    frames = FrameReader(recording, settings, read_tum(odometry) if odometry else None)
+    path = read_odometry(odometry, odometry_frame, settings) if odometry else None
+    frames = FrameReader(recording, settings, path)
     kept, positions = _spaced(frames, known, spacing_m)
     if len(kept) < 3:
         raise BagError(f"the ground truth of {bag} covers {len(kept)} samples; do the clocks agree?")

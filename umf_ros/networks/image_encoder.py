@@ -134,3 +134,7 @@ class ImageEncoder(nn.Module):
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Coarse (B, tokens, H/16, W/16) and fine (B, local, H/4, W/4) maps of an image (B, 1, H, W)."""
         return self.pyramid(self.backbone(image))
+
+    def fine_layers(self) -> list[nn.Module]:
+        """What only the fine map needs: without local features nothing teaches it."""
+        return [self.pyramid.fine, self.pyramid.laterals[0], self.pyramid.laterals[1]]

@@ -72,6 +72,10 @@ class VoxelEncoder(nn.Module):
         fine = fine + _double(self.up_fine(middle))
         return coarse, self._fine_features(fine, folded, fine_index)
 
+    def fine_layers(self) -> list[nn.Module]:
+        """What only the fine features need: without local features nothing teaches it."""
+        return [self.fine, self.up_fine]
+
     def _fine_features(self, cells: Tensor, folded: Tensor, index: Tensor) -> Tensor:
         parent, child = parent_and_child(index)
         context = take(cells, parent)

@@ -138,6 +138,9 @@ class Trainer:
 
     def _step(self, batch: TrainingBatch, rng: np.random.Generator) -> dict[str, float]:
         self._network.train()
+        if self._settings.freeze_encoders:  # their running statistics too
+            self._network.image_encoder.eval()
+            self._network.voxel_encoder.eval()
         for group in self._optimiser.param_groups:
             group["lr"] = self._learning_rate()
         device = self._team.device
@@ -218,7 +221,8 @@ def _choose_parameters(network: UMF, settings: TrainingSettings) -> list[nn.Para
     if not settings.weight_super or not settings.local_pairs:
         frozen += [network.super_image, network.super_cloud]
     if not settings.local_pairs:
-        frozen += [network.image_local, network.cloud_local]
+        frozen += [network.image_local, network.cloud_local, *network.image_encoder.fine_layers()]
+        frozen += network.voxel_encoder.fine_layers()
     for module in frozen:
         module.requires_grad_(False)
     return [parameter for parameter in network.parameters() if parameter.requires_grad]
