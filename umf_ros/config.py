@@ -91,6 +91,12 @@ class Verification(Group):
     rerank: Literal["ransac", "superfeatures"] = Field(
         "ransac", description="how local features reorder the candidates"
     )
+    rerank_weight: float = Field(
+        0.03,
+        ge=0,
+        le=1000,
+        description="what e times as many inliers weigh against cosine similarity; 1000: inliers alone (thesis)",
+    )
     modalities: Literal["both", "image", "cloud"] = Field("both", description="local features that reranking uses")
     rerank_features: int = Field(
         200, ge=20, le=2000, description="strongest features per modality that reranking matches"

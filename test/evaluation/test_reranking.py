@@ -10,7 +10,7 @@ from landmarks import PLACES, LandmarkEmbedder, at, frame_of
 
 from umf_ros.config import Verification
 from umf_ros.evaluation.embedded import MODES, PlaceCollection, as_keyframe
-from umf_ros.evaluation.reranking import METHODS, TIE, TOP_K, Evidence, gather_evidence, recall1_by_candidates
+from umf_ros.evaluation.reranking import METHODS, TOP_K, Evidence, gather_evidence, recall1_by_candidates
 from umf_ros.evaluation.retrieval import NOTHING, Ranking, rank
 from umf_ros.frames import Keyframe
 
@@ -48,19 +48,18 @@ def test_local_features_know_the_place(gathered, method: str) -> None:
     assert [int(row) for row in evidence.ranking(ranking, method).order[:, 0]] == ASKED
 
 
-def test_the_similarity_breaks_ties_and_no_more(gathered) -> None:
+def test_counts_of_both_modalities_are_evidence_beside_the_similarity(gathered) -> None:
     ranking, similarity, evidence, _ = gathered
-    tie = TIE * np.take_along_axis(similarity, ranking.order, axis=1)
-    for method, scores in evidence.scores.items():
-        counts = scores - tie
-        np.testing.assert_allclose(counts, np.round(counts), atol=1e-9, err_msg=method)
+    before = np.take_along_axis(similarity, ranking.order, axis=1)
+    gained = {method: (scores - before) / Verification().rerank_weight for method, scores in evidence.scores.items()}
     for name in ("superfeatures", "ransac"):
-        both, image, cloud = (evidence.scores[f"{name} {part}"] - tie for part in ("both", "image", "lidar"))
+        both, image, cloud = (gained[f"{name} {part}"] for part in ("both", "image", "lidar"))
         np.testing.assert_allclose(both, image + cloud, atol=1e-9)
+        for counts in (np.expm1(image), np.expm1(cloud)):
+            np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
     # all twelve super-features of a place are its own
     right = [list(row).index(place) for row, place in zip(ranking.order, ASKED, strict=True)]
-    found = (evidence.scores["superfeatures image"] - tie)[[0, 1, 2], right]
-    np.testing.assert_allclose(found, 12)
+    np.testing.assert_allclose(np.expm1(gained["superfeatures image"][[0, 1, 2], right]), 12)
 
 
 def test_only_the_first_candidates_are_reordered(gathered) -> None:

@@ -33,12 +33,18 @@ def blind(keyframe: Keyframe) -> Keyframe:
     return replace(keyframe, embedding=replace(keyframe.embedding, image=None, cloud=None))
 
 
-def test_same_place_comes_first_whatever_the_descriptors_say() -> None:
-    candidates = offered(*map(elsewhere, range(5)), similarity=0.9) + offered(SAME, similarity=0.1)
+def test_the_same_place_comes_before_some_that_only_look_more_alike() -> None:
+    candidates = offered(*map(elsewhere, range(5)), similarity=0.8) + offered(SAME, similarity=0.6)
     ranked = rerank(QUERY, candidates, RANSAC)
     assert ranked[0].keyframe is SAME
     assert ranked[0].score > 3 * ranked[1].score
     assert sorted(stamps(ranked)) == sorted(candidate.stamp_ns for candidate, _ in candidates)
+
+
+def test_how_much_inliers_weigh_is_a_setting() -> None:
+    candidates = offered(*map(elsewhere, range(5)), similarity=0.9) + offered(SAME, similarity=0.1)
+    thesis, none = (rerank(QUERY, candidates, Verification(rerank_weight=weight)) for weight in (1000, 0))
+    assert thesis[0].keyframe is SAME and none[-1].keyframe is SAME
 
 
 def test_equals_are_ordered_by_similarity_then_by_age() -> None:

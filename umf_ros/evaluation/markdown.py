@@ -12,14 +12,15 @@ Table = tuple[list[str], list[list[str]]]
 
 
 def print_table(console: Console, title: str, table: Table) -> None:
-    """Print one table; the first column is text, the others are numbers."""
+    """Print one table; the first column is text, the others are numbers. A file gets whole lines, however long."""
     head, rows = table
     drawn = RichTable(title=title, title_justify="left", title_style="bold")
     for number, name in enumerate(head):
         drawn.add_column(name, justify="left" if number == 0 else "right", no_wrap=number == 0)
     for row in rows:
         drawn.add_row(*row)
-    console.print(drawn)
+    width = console.width if console.is_terminal else max(console.width, console.measure(drawn, options=console.options.update(max_width=400)).maximum)
+    console.print(drawn, width=width, crop=False)
 
 
 def to_markdown(title: str, notes: Sequence[str], tables: Mapping[str, Table], pictures: Mapping[str, str]) -> str:

@@ -13,14 +13,17 @@ from umf_ros.evaluation.retrieval import NOTHING, Mask, Ranking
 from umf_ros.evaluation.retrieval import rerank as reorder
 from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array
-from umf_ros.verification.reranking import Ranked, rerank
+from umf_ros.verification.reranking import Ranked, rerank, weigh
 
 TOP_K = 20
 """Candidates that are reranked (thesis 5.5.2)."""
-TIE = 1e-3
-"""Weight of the global similarity: it orders what has as many inliers, and never more than that."""
 
-METHODS = tuple(f"{method} {part}" for method in ("superfeatures", "ransac") for part in ("image", "lidar", "both"))
+METHODS = {
+    f"{method} {part}": tuple(f"{method} {modality}" for modality in modalities)
+    for method in ("superfeatures", "ransac")
+    for part, modalities in {"image": ["image"], "lidar": ["lidar"], "both": ["image", "lidar"]}.items()
+}
+"""What is counted by each method: modalities alone, and both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +31,7 @@ class Evidence:
     """What the local features say of the candidates.
 
     Attributes:
-        scores: (Q, K) by method: pairs or inliers, with the global similarity as a tie-break.
+        scores: (Q, K) by method: pairs or inliers beside the global similarity.
         milliseconds: median per query of each reranker, both modalities.
     """
 
@@ -67,9 +70,11 @@ def gather_evidence(
             for column, index in enumerate(head)
             if index != NOTHING
         ]
-        for method, counts in _count(query, found, settings, took).items():
-            for column, value in counts.items():
-                scores[method][row, column] = value + TIE * float(similarity[row, head[column]])
+        counted = _count(query, found, settings, took)
+        for method, modalities in METHODS.items():
+            for column in range(len(found)):
+                counts = [counted[name][column] for name in modalities]
+                scores[method][row, column] = weigh(float(similarity[row, head[column]]), counts, settings)
         report()
     return Evidence(scores, {name: float(np.median(values)) for name, values in took.items() if values})
 
@@ -77,25 +82,20 @@ def gather_evidence(
 def _count(
     query: Keyframe, found: list[tuple[Candidate, Keyframe]], settings: Verification, took: dict[str, list[float]]
 ) -> dict[str, dict[int, float]]:
-    """Scores of every method by column of the candidate."""
+    """Counts of each reranker and modality by column of the candidate."""
     super_image = _timed(query, found, settings, "superfeatures", "image")
     super_cloud = _timed(query, found, settings, "superfeatures", "cloud")
     ransac = _timed(query, found, settings, "ransac", "both")
     took["superfeatures"].append(super_image[1] + super_cloud[1])
     took["ransac"].append(ransac[1])
-    image, cloud = (
-        {item.candidate.index: float(item.superfeatures) for item in part} for part in (super_image[0], super_cloud[0])
-    )
+    pairs = {
+        "superfeatures image": {item.candidate.index: item.score for item in super_image[0]},
+        "superfeatures lidar": {item.candidate.index: item.score for item in super_cloud[0]},
+    }
     numbers = {item.candidate.index: item.numbers for item in ransac[0]}
-    visual = {column: value["inliers_image"] for column, value in numbers.items()}
-    lidar = {column: value["inliers_cloud"] for column, value in numbers.items()}
-    return {
-        "superfeatures image": image,
-        "superfeatures lidar": cloud,
-        "superfeatures both": {column: image[column] + cloud[column] for column in image},
-        "ransac image": visual,
-        "ransac lidar": lidar,
-        "ransac both": {column: visual[column] + lidar[column] for column in visual},
+    return pairs | {
+        "ransac image": {column: value["inliers_image"] for column, value in numbers.items()},
+        "ransac lidar": {column: value["inliers_cloud"] for column, value in numbers.items()},
     }
 
 
