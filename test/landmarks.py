@@ -65,7 +65,7 @@ class LandmarkEmbedder:
             shown = (shown + later) % PLACES
         descriptor = np.full(PLACES, 0.1, np.float32)
         descriptor[shown] = 1.0
-        descriptor[place] += 0.8
+        descriptor[place] += 0.87
         return Embedding(
             descriptor / np.linalg.norm(descriptor),
             image=_features(place, 2) if seen else None,

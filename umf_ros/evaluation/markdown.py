@@ -19,8 +19,10 @@ def print_table(console: Console, title: str, table: Table) -> None:
         drawn.add_column(name, justify="left" if number == 0 else "right", no_wrap=number == 0)
     for row in rows:
         drawn.add_row(*row)
-    width = console.width if console.is_terminal else max(console.width, console.measure(drawn, options=console.options.update(max_width=400)).maximum)
-    console.print(drawn, width=width, crop=False)
+    if not console.is_terminal:
+        needed = console.measure(drawn, options=console.options.update(max_width=400)).maximum
+        console = Console(file=console.file, width=max(console.width, needed))
+    console.print(drawn)
 
 
 def to_markdown(title: str, notes: Sequence[str], tables: Mapping[str, Table], pictures: Mapping[str, str]) -> str:
