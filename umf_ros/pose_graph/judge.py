@@ -67,7 +67,8 @@ class Judge:
         """
         rows = [self._take(tracked) for tracked in arrived]
         self._changed = set(rows)
-        if self._rescale() or (rows and self._sessions.outgrown):
+        unsolved = bool(self.closures) and self._certainty is None  # the solver failed when they came
+        if self._rescale() or unsolved or (rows and self._sessions.outgrown):
             self._solve()
             rows = list(range(len(self.closures)))
         self._decide({*rows, *self._brought_close})
