@@ -7,7 +7,7 @@ import pytest
 from graph_worlds import SETTINGS, chain_of, closing, lap_pairs, tracked, two_laps
 
 from umf_ros.config import PoseGraph as Settings
-from umf_ros.pose_graph.agreement import Agreement, chance_to_agree
+from umf_ros.pose_graph.agreement import Agreement, chance_over_right, chance_to_agree
 from umf_ros.pose_graph.ends import ClosureEnds, Scale
 from umf_ros.pose_graph.synthetic import World
 
@@ -123,6 +123,23 @@ def test_renewing_with_a_wider_scale_lets_enemies_go() -> None:
     assert not agreement.contested(2, everyone(world))
     agreement.renew(Scale())
     assert agreement.contested(2, everyone(world))
+
+
+def test_what_hangs_on_to_a_proven_group_by_a_weak_link_is_left_out() -> None:
+    # five places that agree well, and far along the path one that is only not contradicted
+    world = closing(closing(two_laps(), lap_pairs(0, 12, 24, 36)), lap_pairs(80), (0, 0, 1.2))
+    agreement = compared(world, stated=2.0)
+    everybody = everyone(world)
+    assert not agreement.contested(4, everybody)
+    group, evidence = agreement.group(0, everybody)
+    assert sorted(group) == [0, 1, 2, 3] and evidence >= SETTINGS.min_support
+    assert 4 not in agreement.group(4, everybody)[0]
+
+
+def test_a_bad_fit_says_less_than_a_good_one() -> None:
+    covariance = np.diag([1e-4] * 3 + [0.25, 0.25, 1e-4])[None].repeat(5, axis=0)
+    doubts = chance_over_right(covariance, np.array([0.0, 6.0, 12.0, 20.0, 30.0]), Settings())
+    assert doubts[0] == doubts[1] < doubts[2] < doubts[3] <= doubts[4] == 1.0
 
 
 @pytest.mark.parametrize(("along_m", "across_m", "expected"), [(0.1, 0.2, 0.00248), (1.0, 2.0, 0.248), (9.0, 9.0, 1.0)])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from umf_ros.config import PoseGraph as PoseGraphSettings
 from umf_ros.geometry import Array
@@ -22,14 +23,32 @@ def chance_to_agree(covariances: Array, settings: PoseGraphSettings) -> Array:
     return np.minimum(settings.gate_chi2 * spreads.prod(axis=-1) / settings.alias_radius_m**2, 1.0)
 
 
+def chance_over_right(covariances: Array, distances: Array, settings: PoseGraphSettings) -> Array:
+    """(N,) chance of wrong closures to fit as well as these, over that of right ones to fit as badly; one at most.
+
+    Args:
+        covariances: (N, 6, 6) of the predictions.
+        distances: (N,) squared Mahalanobis distances from them; better than the mean of right ones says no more.
+        settings: of the pose graph.
+    """
+    squared = np.maximum(distances, _DEGREES)
+    closer = chance_to_agree(covariances, settings) * squared / settings.gate_chi2
+    return np.minimum(closer / np.maximum(chi2.sf(squared, _DEGREES), 1e-12), 1.0)
+
+
 class Agreement:
-    """The graph of agreeing closures; a row is the number of a closure in `ClosureEnds`."""
+    """The graph of agreeing closures; a row is the number of a closure in `ClosureEnds`.
+
+    Attributes:
+        place_of: for each closure the first one that tells of the same place.
+    """
 
     def __init__(self, ends: ClosureEnds, settings: PoseGraphSettings) -> None:
         self._ends = ends
         self._settings = settings
         self._friends: list[dict[int, float]] = []
         self._enemies: list[set[int]] = []
+        self.place_of: list[int] = []
 
     def add(self, row: int, scale: Scale) -> Cycles:
         """Compare the newest closure with all near ones; returns the loops it makes with them."""
@@ -37,6 +56,8 @@ class Agreement:
         self._friends.append({})
         self._enemies.append(set())
         near = self._near(row)
+        known = sorted({self.place_of[other] for other in near})
+        self.place_of.append(next((first for first in known if self._same_place(row, [first])), row))
         loops = cycles(self._ends, np.full(len(near), row), near)
         self._compare(row, near, loops, scale)
         return loops
@@ -44,7 +65,7 @@ class Agreement:
     def renew(self, scale: Scale) -> None:
         """Compare all again, as after a change of scale or of the odometry's past."""
         count = len(self._friends)
-        self._friends, self._enemies = [], []
+        self._friends, self._enemies, self.place_of = [], [], []
         for row in range(count):
             self.add(row, scale)
 
@@ -56,19 +77,41 @@ class Agreement:
         for other in friends:
             if not any(other in self._enemies[member] for member in group):
                 group.append(other)
-        return group, self._evidence(group)
+        return self._core(group)
 
-    def _evidence(self, group: list[int]) -> float:
-        """What the group's agreement says: every further place adds its improbability by chance with the nearest."""
-        witnesses, others, evidence = group[:1], group[1:], 0.0
+    def _core(self, group: list[int]) -> tuple[list[int], float]:
+        """The group without what only hangs on to it, and the evidence for it.
+
+        From the two places that agree best on, every further place adds its improbability by chance with
+        the nearest. Once that is enough, a place must be believable for itself: a wrong one agrees with
+        right ones too where little would have shown it.
+        """
+        witnesses, others, evidence = [self._surest(group)], group, 0.0
         while others := [other for other in others if not self._same_place(other, witnesses[-1:])]:
             chance, nearest = min(
-                (min(self._friends[other][w] for w in witnesses if w in self._friends[other]), other)
+                (min((self._friends[other][w] for w in witnesses if w in self._friends[other]), default=1.0), other)
                 for other in others
             )
+            if evidence >= self._settings.min_support and chance > self._settings.max_chance:
+                break
             evidence += min(-float(np.log(max(chance, 1e-9))), _MOST_PER_PLACE)
             witnesses.append(nearest)
-        return evidence
+        return [member for member in group if member not in others], evidence
+
+    def _surest(self, group: list[int]) -> int:
+        """One of the two closures that agree best of those that tell of different places."""
+        inside = set(group)
+        pairs = [
+            (chance, one, other)
+            for one in group
+            for other, chance in self._friends[one].items()
+            if one < other and other in inside and self.place_of[one] != self.place_of[other]
+        ]
+        return next((one for _, one, other in sorted(pairs) if not self._same_place(one, [other])), group[0])
+
+    def companions(self, row: int, members: NDArray[np.bool_]) -> list[int]:
+        """Closures out of `members` that say the same of the same place."""
+        return [other for other in self._friends[row] if members[other] and self._same_place(other, [row])]
 
     def contested(self, row: int, members: NDArray[np.bool_]) -> bool:
         """Whether one of `members` speaks against the closure."""
@@ -90,9 +133,10 @@ class Agreement:
     def _compare(self, row: int, near: NDArray[np.int64], loops: Cycles, scale: Scale) -> None:
         covariances = loops.covariances(scale)
         distances = lie.mahalanobis(loops.residuals, covariances)
-        chances = chance_to_agree(covariances, self._settings)
-        for other, distance, chance in zip(near.tolist(), distances, chances, strict=True):
-            if chance >= 1:
+        telling = chance_to_agree(covariances, self._settings) < 1
+        chances = chance_over_right(covariances, distances, self._settings)
+        for other, distance, tells, chance in zip(near.tolist(), distances, telling, chances, strict=True):
+            if not tells:
                 continue
             if distance <= self._settings.pair_chi2:
                 self._friends[row][other] = self._friends[other][row] = float(chance)
@@ -115,5 +159,6 @@ class Agreement:
 
 
 _MOST_COMPARED = 40
+_DEGREES = 6
 # nats: where one place is mistaken for another, the next is too more often than by chance
 _MOST_PER_PLACE = 4.0

@@ -9,6 +9,7 @@ accepted can be revoked by a better supported contradiction.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from umf_ros.errors import GraphError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array
 from umf_ros.pose_graph import lie
-from umf_ros.pose_graph.agreement import Agreement, chance_to_agree
+from umf_ros.pose_graph.agreement import Agreement, chance_over_right, chance_to_agree
 from umf_ros.pose_graph.certainty import Certainty
 from umf_ros.pose_graph.closures import ClosureVerdict, State, TrackedClosure
 from umf_ros.pose_graph.ends import ClosureEnds, Cycles, Scale, Side
@@ -32,6 +33,9 @@ _MOST_ROUNDS = 4
 _CLOSE_M = 2.0
 # 99 of 100 right closures differ less from the map: one that nobody supports has to be such a one
 _USUAL_SIGMAS = 4.1
+# what nobody supports has to be this much likelier right than wrong: while waiting costs little, and at the end
+_DOUBT_ON_THE_WAY = 0.25
+_DOUBT_AT_THE_END = 0.5
 _AGREES = "agrees with the map"
 _SUPPORTED = "supported by other places"
 _UNOPPOSED = "nothing speaks against it"
@@ -39,6 +43,22 @@ _UNSURE = "needs support from another place"
 _CONTRADICTS = "contradicts the map"
 _OUTVOTED = "revoked: more places contradict it"
 _BY_HAND = "revoked by hand"
+
+
+class Comparison(NamedTuple):
+    """A closure and the map.
+
+    Attributes:
+        distance: squared Mahalanobis distance.
+        misfit_m: metres.
+        chance: that the map does not tell a wrong closure from a right one.
+        doubt: chance of a wrong one to fit as well, over that of a right one to fit as badly.
+    """
+
+    distance: float
+    misfit_m: float
+    chance: float
+    doubt: float
 
 
 class Judge:
@@ -55,7 +75,7 @@ class Judge:
         self._vetoed: set[int] = set()
         self._too_far: set[int] = set()
         self._contests: dict[int, int] = {}
-        self._chances: dict[int, float] = {}
+        self._doubts: dict[int, float] = {}
         self._brought_close: list[int] = []
         self.scale = Scale()
         self.closures: list[TrackedClosure] = []
@@ -80,8 +100,8 @@ class Judge:
         if self._certainty is None:
             return []
         self._decide_all()
-        self._accept(dict.fromkeys(self._unopposed(0.0), _UNOPPOSED))
-        self._decide_all()
+        while self._accept(dict.fromkeys(self._unopposed(0.0, _DOUBT_AT_THE_END), _UNOPPOSED)):
+            self._decide_all()
         self._ask_again()
         for _ in range(_MOST_ROUNDS):
             self._sessions.reshape()
@@ -134,10 +154,11 @@ class Judge:
         agreed = self._gate(rows)
         believed = self._believe(rows)
         reasons = dict.fromkeys(self._challengers(rows), _SUPPORTED)
-        reasons |= dict.fromkeys(self._unopposed(self._settings.patience_m), _UNOPPOSED)
         reasons |= dict.fromkeys(believed, _SUPPORTED) | dict.fromkeys(agreed, _AGREES)
-        self._accept(reasons)
-        self._brought_close = self._worth_another_look() if reasons else []
+        # only where nothing else is accepted: the map it moves may well speak against them
+        if not reasons:
+            reasons = dict.fromkeys(self._unopposed(self._settings.patience_m, _DOUBT_ON_THE_WAY), _UNOPPOSED)
+        self._brought_close = self._worth_another_look() if self._accept(reasons) else []
         return bool(reasons)
 
     def _take(self, tracked: TrackedClosure) -> int:
@@ -146,7 +167,8 @@ class Judge:
         self._ends.append(self._sessions.chains, tracked)
         loops = self._agreement.add(row, self.scale)
         keep = slice(-_LOOPS_PER_CLOSURE, None)
-        self._estimator.add(Cycles(loops.residuals[keep], loops.odometry_noise[keep], loops.closure_noise[keep]))
+        loops = Cycles(loops.residuals[keep], loops.odometry_noise[keep], loops.closure_noise[keep])
+        self._estimator.add(loops, self._agreement.place_of[row])
         return row
 
     def _rescale(self) -> bool:
@@ -164,9 +186,9 @@ class Judge:
         for row in rows:
             if self.closures[row].accepted or row in self._vetoed:
                 continue
-            distance, misfit_m, chance = self._compare(row)
+            distance, misfit_m, chance, doubt = self._compare(row)
             self._too_far.discard(row)
-            self._chances[row] = 1.0
+            self._doubts[row] = 1.0
             if self._settings.use_gate and distance > self._settings.gate_chi2:
                 self._note(row, State.REJECTED, _CONTRADICTS, distance, misfit_m)
             elif self._settings.max_correction_m and misfit_m > self._settings.max_correction_m:
@@ -174,13 +196,13 @@ class Judge:
                 self._note(row, State.REJECTED, f"moves the pose by {misfit_m:.1f} m", distance, misfit_m)
             else:
                 self._note(row, State.UNDECIDED, _UNSURE, distance, misfit_m)
-                self._chances[row] = chance
+                self._doubts[row] = doubt
                 if chance <= self._settings.max_chance or not self._settings.use_support:
                     agreed.add(row)
         return agreed
 
-    def _compare(self, row: int) -> tuple[float, float, float]:
-        """Squared Mahalanobis distance and metres from the map, and the chance of a wrong closure to agree so well."""
+    def _compare(self, row: int) -> Comparison:
+        """Hold a closure against the map."""
         tracked = self.closures[row]
         assert self._certainty is not None
         predicted = self._certainty.predict(
@@ -188,10 +210,12 @@ class Judge:
         )
         misfit = lie.invert(tracked.closure.match_T_query) @ predicted.pose
         if predicted.covariance is None:
-            return 0.0, 0.0, 1.0
+            return Comparison(0.0, 0.0, 1.0, 1.0)
         covariance = predicted.covariance + self.scale.closures**2 * tracked.covariance
-        distance = float(lie.mahalanobis(lie.log(misfit[None]), covariance[None])[0])
-        return distance, float(np.linalg.norm(misfit[:3, 3])), float(chance_to_agree(covariance, self._settings))
+        distance = lie.mahalanobis(lie.log(misfit[None]), covariance[None])
+        chance = chance_to_agree(covariance[None], self._settings)
+        doubt = chance_over_right(covariance[None], distance, self._settings)
+        return Comparison(distance.item(), float(np.linalg.norm(misfit[:3, 3])), chance.item(), doubt.item())
 
     def _believe(self, rows: Iterable[int]) -> set[int]:
         """Groups around `rows` that no chance explains and that the map does not contradict."""
@@ -206,18 +230,35 @@ class Judge:
             if members[row] and not any(row in group for group in groups):
                 group, evidence = self._agreement.group(row, members)
                 # that all agree with the map as well is one more thing that chance has to explain
-                evidence -= float(np.log(max(self._chances[member] for member in group)))
+                evidence -= float(np.log(max(self._doubts[member] for member in group)))
                 if evidence >= self._settings.min_support:
                     groups.append(group)
         return groups
 
-    def _unopposed(self, patience_m: float) -> set[int]:
-        """Undecided closures that have waited long enough without contradiction, the map's included."""
-        undecided = [row for row, c in enumerate(self.closures) if c.verdict.state is State.UNDECIDED]
-        undecided = [row for row in undecided if self.closures[row].verdict.residual <= _USUAL_SIGMAS]
+    def _unopposed(self, patience_m: float, most_doubt: float) -> list[int]:
+        """Undecided closures of the place that fits best of those that have waited long enough.
+
+        Nothing speaks against them, the map included. One place at a time: the map that the first one
+        moves may speak against the next. A place's closures stand or fall together, so that one of a
+        wrong group does not pass for the luck of its noise.
+        """
+        open_to = np.array([not c.accepted for c in self.closures])
+        open_to[list(self._vetoed)] = False
+        waiting = [row for row, c in enumerate(self.closures) if c.verdict.state is State.UNDECIDED]
+        waiting = [row for row in waiting if self._waited(row) >= patience_m]
+        places = [[row, *self._agreement.companions(row, open_to)] for row in waiting]
+        self._gate(sorted({member for place in places for member in place}))
         against = np.array([c.verdict.state is not State.REJECTED for c in self.closures])
-        waited = [row for row in undecided if self._waited(row) >= patience_m]
-        return {row for row in waited if not self._agreement.contested(row, against)}
+        best: list[int] = []
+        least = _USUAL_SIGMAS
+        for place in places:
+            misfits = [self.closures[row].verdict.residual for row in place]
+            usual = [row for row, misfit in zip(place, misfits, strict=True) if misfit <= _USUAL_SIGMAS]
+            usual = [row for row in usual if row in waiting and self._doubts[row] <= most_doubt]
+            usual = [row for row in usual if not self._agreement.contested(row, against)]
+            if usual and np.median(misfits) <= least:
+                best, least = usual, float(np.median(misfits))
+        return best
 
     def _waited(self, row: int) -> float:
         travel = self._ends.query.travel.view
@@ -273,12 +314,13 @@ class Judge:
             self._solve()
             self._decide_all()
 
-    def _accept(self, reasons: dict[int, str]) -> None:
+    def _accept(self, reasons: dict[int, str]) -> bool:
+        for row, reason in reasons.items():
+            verdict = self.closures[row].verdict
+            self._note(row, State.ACCEPTED, reason, verdict.residual**2, verdict.residual_m)
         if reasons:
-            for row, reason in reasons.items():
-                verdict = self.closures[row].verdict
-                self._note(row, State.ACCEPTED, reason, verdict.residual**2, verdict.residual_m)
             self._solve()
+        return bool(reasons)
 
     def _solve(self) -> None:
         self._sessions.solve([c for c in self.closures if c.accepted], self.scale)

@@ -3,7 +3,8 @@
 Two closures close to each other and the odometry between their ends form a loop. What it misses
 closing by must fit the stated covariances; over many loops the factor by which it does not is
 found by maximum likelihood. Loops with a wrong closure are outliers of that likelihood, and wrong
-closures that agree with each other do no harm: they agree through the same true odometry.
+closures that agree with each other do no harm: they agree through the same true odometry. No single
+place decides that closures are worse than stated.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ _GRID = np.exp(np.linspace(np.log(1 / 64), np.log(64), 33))
 _ALIAS_SIGMAS = np.array([[0.5] * 3 + [5.0] * 3, [1.5] * 3 + [50.0] * 3])
 _OUTLIERS = 0.5
 _NATS_PER_FACTOR = 5.0
+# nats: the loops of one place share its closures, and two wrong groups there look like bad closures
+_MOST_PER_PLACE = 4.0
 _FEWEST_LOOPS = 10
 _TOLERANCE = np.log(1.8)
 # an error that builds up in one direction hardly shows in short loops, unless all is stated in other units
@@ -25,19 +28,22 @@ _LEAST_ODOMETRY = 0.3
 
 
 class ScaleEstimator:
-    """Adds up the likelihood of both factors on a grid, loop by loop."""
+    """Adds up the likelihood of both factors on a grid, loop by loop and place by place."""
 
     def __init__(self) -> None:
         logs = np.log(_GRID)
         # one decade off is two sigmas: a few loops cannot move a stated covariance
         self._likelihood = -0.5 * ((logs[:, None] / 1.15) ** 2 + (logs[None, :] / 1.15) ** 2)
+        self._of_place: dict[int, Array] = {}
         self.loops = 0
 
-    def add(self, cycles: Cycles) -> None:
-        """Take N loops in."""
+    def add(self, cycles: Cycles, place: int) -> None:
+        """Take in N loops of one place, to which others may have been added before."""
         if not len(cycles.residuals):
             return
-        self._likelihood = self._likelihood + _likelihoods(cycles).sum(axis=0)
+        new = _likelihoods(cycles).sum(axis=0)
+        self._of_place[place] = self._of_place.get(place, 0.0) + new
+        self._likelihood = self._likelihood + new
         self.loops += len(cycles.residuals)
 
     @property
@@ -49,11 +55,23 @@ class ScaleEstimator:
         odometry, closures = int(np.argmax(likelihood[:, one])), int(np.argmax(likelihood[one]))
         both = np.unravel_index(np.argmax(likelihood), likelihood.shape)
         # a factor has to earn its freedom, else noise in few loops would be taken for a wrong scale
-        choices = [(0, one, one), (1, odometry, one), (1, one, closures), (2, int(both[0]), int(both[1]))]
-        _, row, column = max(choices, key=lambda c: likelihood[c[1], c[2]] - _NATS_PER_FACTOR * c[0])
+        of_odometry = [(0, one, one), (1, odometry, one)]
+        of_closures = [(1, one, closures), (2, int(both[0]), int(both[1]))]
+
+        def merit(choice: tuple[int, int, int]) -> float:
+            factors, row, column = choice
+            return float(likelihood[row, column]) - _NATS_PER_FACTOR * factors
+
+        best, plain = max(of_odometry + of_closures, key=merit), max(of_odometry, key=merit)
+        row, column = best[1:] if self._widely_better(best[1:], plain[1:]) else plain[1:]
         closures_factor = _settle(float(_GRID[column]))
         least = _LEAST_ODOMETRY * min(closures_factor, 1.0)
         return Scale(max(_settle(float(_GRID[row])), least), closures_factor)
+
+    def _widely_better(self, one: tuple[int, int], other: tuple[int, int]) -> bool:
+        """Whether one choice is better in more than a single place."""
+        gains = np.array([likelihood[one] - likelihood[other] for likelihood in self._of_place.values()])
+        return bool(np.minimum(gains, _MOST_PER_PLACE).sum() > _NATS_PER_FACTOR)
 
 
 def _settle(factor: float) -> float:
