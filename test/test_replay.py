@@ -112,6 +112,20 @@ def test_without_odometry_there_is_no_graph_and_it_says_so(
     assert {row["travelled_m"] for row in keyframes_in(folder)} == {"nan"}
 
 
+def test_odometry_that_jumps_begins_a_chain_of_its_own_as_it_does_live(
+    folder: Path, settings: Settings, frames: list[Frame]
+) -> None:
+    half, moved = len(frames) // 2, np.eye(4)
+    moved[0, 3] = 500.0
+    later = [replace(f, odom_T_body=None if f.odom_T_body is None else moved @ f.odom_T_body) for f in frames[half:]]
+    replay = replay_of(folder, settings)
+    list(replay.run([*frames[:half], *later]))
+    replay.finish({})
+    vertices = [line for line in (folder / "graph.g2o").read_text().splitlines() if line.startswith("VERTEX")]
+    edges = [line for line in (folder / "graph.g2o").read_text().splitlines() if line.startswith("EDGE")]
+    assert len(vertices) - len(edges) == 2
+
+
 def test_a_recording_that_starts_over_is_another_session(folder: Path, settings: Settings, frames: list[Frame]) -> None:
     replay = replay_of(folder, settings)
     list(replay.run([*frames, *(replace(frame, session=1) for frame in frames)]))

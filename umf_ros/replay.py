@@ -9,6 +9,7 @@ from umf_ros.config import Settings
 from umf_ros.frames import Frame
 from umf_ros.loop_detector import Detection, LoopDetector
 from umf_ros.pose_graph.graph import PoseGraph
+from umf_ros.pose_graph.restarts import RestartGuard
 from umf_ros.pose_graph.results import write_results
 from umf_ros.results.recorder import RunRecorder
 
@@ -27,8 +28,9 @@ class Replay:
         self._detector = detector
         self._graph = PoseGraph(settings.pose_graph)
         self._recorder = RunRecorder(folder, settings, detector.embedder_name)
-        self._has_odometry = False
+        self._guard = RestartGuard()
         self._session = 0
+        self._has_odometry = False
 
     def run(self, frames: Iterable[Frame]) -> Iterator[Detection]:
         """Process frame by frame, yielding what became of each; stop iterating to stop the run.
@@ -56,10 +58,14 @@ class Replay:
     def _extend_graph(self, frame: Frame, detection: Detection) -> None:
         if frame.odom_T_body is None:
             return
-        if frame.session != self._session:
-            self._session = frame.session
-            self._graph.begin_session()
         self._has_odometry = True
-        self._graph.add_odometry(frame.stamp_ns, frame.odom_T_body)
+        if frame.session != self._session:
+            self._session, self._guard = frame.session, RestartGuard()
+            self._graph.begin_session()
+        starts_anew, samples = self._guard.take(frame.stamp_ns, frame.odom_T_body)
+        if starts_anew:
+            self._graph.begin_session()
+        for stamp_ns, odom_T_body in samples:
+            self._graph.add_odometry(stamp_ns, odom_T_body)
         if detection.closures:
             self._graph.add_closures(detection.closures)

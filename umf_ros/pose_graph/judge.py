@@ -35,7 +35,7 @@ _CLOSE_M = 2.0
 _USUAL_SIGMAS = 4.1
 # what nobody supports has to be this much likelier right than wrong: while waiting costs little, and at the end
 _DOUBT_ON_THE_WAY = 0.25
-_DOUBT_AT_THE_END = 0.5
+_DOUBT_AT_THE_END = 1.0
 _AGREES = "agrees with the map"
 _SUPPORTED = "supported by other places"
 _UNOPPOSED = "nothing speaks against it"

@@ -2,9 +2,9 @@
 
 Two closures close to each other and the odometry between their ends form a loop. What it misses
 closing by must fit the stated covariances; over many loops the factor by which it does not is
-found by maximum likelihood. Loops with a wrong closure are outliers of that likelihood, and wrong
-closures that agree with each other do no harm: they agree through the same true odometry. No single
-place decides that closures are worse than stated.
+found by maximum likelihood. Loops with a wrong closure are outliers of that likelihood, and wrong closures
+that agree with each other do no harm: they agree through the same true odometry. Two wrong groups that
+overlap look like noise of closures worse than stated: no single place decides about that.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from umf_ros.pose_graph.ends import Cycles, Scale
 _GRID = np.exp(np.linspace(np.log(1 / 64), np.log(64), 33))
 # what a loop with a wrong closure misses by: aliases close by, and anything at all
 _ALIAS_SIGMAS = np.array([[0.5] * 3 + [5.0] * 3, [1.5] * 3 + [50.0] * 3])
+_IN_PLANE, _OUT_OF_PLANE = [2, 3, 4], [0, 1, 5]
 _OUTLIERS = 0.5
 _NATS_PER_FACTOR = 5.0
-# nats: the loops of one place share its closures, and two wrong groups there look like bad closures
-_MOST_PER_PLACE = 4.0
 _FEWEST_LOOPS = 10
 _TOLERANCE = np.log(1.8)
+_SAME_UNITS = np.log(4.0)
 # an error that builds up in one direction hardly shows in short loops, unless all is stated in other units
 _LEAST_ODOMETRY = 0.3
 
@@ -41,7 +41,7 @@ class ScaleEstimator:
         """Take in N loops of one place, to which others may have been added before."""
         if not len(cycles.residuals):
             return
-        new = _likelihoods(cycles).sum(axis=0)
+        new = _likelihoods(_of_what_varies(cycles)).sum(axis=0)
         self._of_place[place] = self._of_place.get(place, 0.0) + new
         self._likelihood = self._likelihood + new
         self.loops += len(cycles.residuals)
@@ -63,19 +63,32 @@ class ScaleEstimator:
             return float(likelihood[row, column]) - _NATS_PER_FACTOR * factors
 
         best, plain = max(of_odometry + of_closures, key=merit), max(of_odometry, key=merit)
-        row, column = best[1:] if self._widely_better(best[1:], plain[1:]) else plain[1:]
-        closures_factor = _settle(float(_GRID[column]))
+        believed = best[2] <= one or self._widely_better(best[1:], plain[1:])
+        row, column = best[1:] if believed else plain[1:]
+        odometry_factor, closures_factor = float(_GRID[row]), float(_GRID[column])
+        if one not in (row, column) and abs(np.log(odometry_factor / closures_factor)) < _SAME_UNITS:
+            # rather other units than two mistakes: what counts is the ratio, and that is as stated
+            odometry_factor = closures_factor = max(odometry_factor, closures_factor)
+        closures_factor = _settle(closures_factor)
         least = _LEAST_ODOMETRY * min(closures_factor, 1.0)
-        return Scale(max(_settle(float(_GRID[row])), least), closures_factor)
+        return Scale(max(_settle(odometry_factor), least), closures_factor)
 
     def _widely_better(self, one: tuple[int, int], other: tuple[int, int]) -> bool:
-        """Whether one choice is better in more than a single place."""
+        """Whether one choice would be better without the place that speaks for it most."""
         gains = np.array([likelihood[one] - likelihood[other] for likelihood in self._of_place.values()])
-        return bool(np.minimum(gains, _MOST_PER_PLACE).sum() > _NATS_PER_FACTOR)
+        return bool(gains.sum() - gains.max() > _NATS_PER_FACTOR)
 
 
 def _settle(factor: float) -> float:
     return factor if abs(np.log(factor)) > _TOLERANCE else 1.0
+
+
+def _of_what_varies(cycles: Cycles) -> Cycles:
+    """Without height, roll and pitch where all is flat (a 2-D graph): that they fit exactly says nothing."""
+    if np.abs(cycles.residuals[:, _OUT_OF_PLANE]).max() > 1e-9:
+        return cycles
+    kept = np.ix_(np.arange(len(cycles.residuals)), _IN_PLANE, _IN_PLANE)
+    return Cycles(cycles.residuals[:, _IN_PLANE], cycles.odometry_noise[kept], cycles.closure_noise[kept])
 
 
 def _likelihoods(cycles: Cycles) -> Array:
@@ -89,6 +102,7 @@ def _likelihoods(cycles: Cycles) -> Array:
     determinant = 2 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
     inlier = -0.5 * ((turned[..., 0] ** 2)[:, None, None, :] / spread + np.log(spread)).sum(axis=-1)
     inlier -= 0.5 * determinant[:, None, None]
-    deviations = cycles.residuals[:, None, :] / _ALIAS_SIGMAS
-    outlier = np.logaddexp.reduce(-0.5 * (deviations**2).sum(axis=-1) - np.log(_ALIAS_SIGMAS).sum(axis=-1), axis=-1)
+    aliases = _ALIAS_SIGMAS if cycles.residuals.shape[1] == 6 else _ALIAS_SIGMAS[:, _IN_PLANE]
+    deviations = cycles.residuals[:, None, :] / aliases
+    outlier = np.logaddexp.reduce(-0.5 * (deviations**2).sum(axis=-1) - np.log(aliases).sum(axis=-1), axis=-1)
     return np.logaddexp(np.log(1 - _OUTLIERS) + inlier, np.log(_OUTLIERS / 2) + outlier[:, None, None])
