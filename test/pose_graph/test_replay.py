@@ -26,6 +26,8 @@ from umf_ros.pose_graph.synthetic import World
 
 WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))
 
+TRUSTING = {"estimate_scale": False, "use_support": False, "use_gate": False}
+
 
 def content_of(world: World, first_id: int = 0, stride: int = 1) -> G2oGraph:
     """The world as a file would give it."""
@@ -160,11 +162,30 @@ def test_covariances_are_written_as_they_were_used(tmp_path: Path) -> None:
     graph.settle()
     assert graph.scale.closures > 3
     graph.write_g2o(tmp_path / "a.g2o")
-    trusting = {"estimate_scale": False, "use_support": False, "use_gate": False}
-    again = PoseGraph(SETTINGS.model_copy(update=trusting))
+    again = PoseGraph(SETTINGS.model_copy(update=TRUSTING))
     for _ in drive(again, as_recording(read_g2o(tmp_path / "a.g2o"))):
         pass
     assert rms(again.trajectory()[1], graph.trajectory()[1]) < 2e-3
+
+
+def test_a_flat_graph_with_unit_information_comes_to_its_optimum(tmp_path: Path) -> None:
+    """Many a public graph states one metre and one radian for everything, though it is twenty times better."""
+    rng, turn, lines = np.random.default_rng(3), 2 * np.pi / 50, []
+    for k in range(150):
+        x, y, yaw = rng.normal([1.0, 0.0, turn], [0.05, 0.05, 0.02])
+        lines.append(f"EDGE_SE2 {k} {k + 1} {x} {y} {yaw} 1 0 0 1 0 1")
+    for k in range(50, 151, 3):
+        x, y, yaw = rng.normal(0.0, [0.05, 0.05, 0.02])
+        lines.append(f"EDGE_SE2 {k - 50} {k} {x} {y} {yaw} 1 0 0 1 0 1")
+    path = tmp_path / "unit.g2o"
+    path.write_text("\n".join(lines) + "\n")
+    recording = as_recording(read_g2o(path))
+    graph, trusting = driven(recording), PoseGraph(recording.settings(SETTINGS.model_copy(update=TRUSTING)))
+    for _ in drive(trusting, recording):
+        pass
+    assert graph.scale.odometry == graph.scale.closures < 0.2
+    assert graph.verdict_counts()["accepted"] == 34
+    assert rms(graph.trajectory()[1], trusting.trajectory()[1]) < 1e-3
 
 
 def test_vertices_keep_the_ids_of_their_file(tmp_path: Path) -> None:

@@ -100,7 +100,9 @@ class Judge:
         if self._certainty is None:
             return []
         self._decide_all()
-        while self._accept(dict.fromkeys(self._unopposed(0.0, _DOUBT_AT_THE_END), _UNOPPOSED)):
+        for _ in self.closures:
+            if not self._accept(dict.fromkeys(self._unopposed(0.0, _DOUBT_AT_THE_END), _UNOPPOSED)):
+                break
             self._decide_all()
         self._ask_again()
         for _ in range(_MOST_ROUNDS):
