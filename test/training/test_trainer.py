@@ -127,6 +127,23 @@ def test_frozen_encoders_stay(folder, tmp_path):
     assert "fusion.image_head.weight" in moved
 
 
+@pytest.mark.parametrize(("branch", "other"), [("image", "voxel_encoder"), ("cloud", "image_encoder")])
+def test_one_branch_learns_and_leaves_the_other_as_it_was(folder, tmp_path, branch, other):
+    torch.manual_seed(4)
+    network = UMF(TINY)
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    trainer = Trainer(
+        network, settings_for(folder, branch=branch, local_pairs=0, steps=2), WorldFolder(folder).refresh, list,
+        tmp_path, Team(0, 1, torch.device("cpu")),
+    )  # fmt: skip
+    trainer.run(silent, lambda *_: None)
+    moved = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
+    assert f"fusion.{branch}_head.weight" in moved and f"fusion.layers.0.{branch}_self.attention.query.weight" in moved
+    assert not [name for name in moved if other in name or "cross" in name or "absent" in name or "local" in name]
+    idle = [n for n, p in network.named_parameters() if p.requires_grad and p.grad is None]
+    assert idle == []
+
+
 def test_a_run_leaves_weights_card_log_and_settings(folder, tmp_path):
     settings = settings_for(folder, validation=str(folder), validate_epochs=1)
     path = train(settings, tmp_path / "run", resume=False, report=silent)
@@ -244,6 +261,8 @@ def test_wrong_settings_and_missing_data(folder, tmp_path):
         load_training(None, train="x", learning_rate=-1)
     with pytest.raises(ConfigError, match="extra"):
         load_training(None, train="x", teh_steps=1)
+    with pytest.raises(ConfigError, match="local_pairs must be 0"):
+        load_training(None, train="x", branch="image", local_pairs=4)
     with pytest.raises(ConfigError, match="unknown network"):
         train(settings_for(folder, preset="umf_giant"), tmp_path / "run", False, silent)
     (tmp_path / "empty").mkdir()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +15,8 @@ from umf_ros.networks.positions import image_positions, sine_encoding, voxel_pos
 from umf_ros.networks.presets import NetworkConfig
 from umf_ros.networks.superfeatures import IterativeAttention, SuperMap
 from umf_ros.networks.voxel_encoder import CELLS, VoxelEncoder
+
+Branch = Literal["both", "image", "cloud"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,15 +112,24 @@ class UMF(nn.Module):
         self.register_buffer("coarse_voxels", coarse, persistent=False)
         self.register_buffer("voxels", fine, persistent=False)
 
-    def encode(self, batch: NetworkInput) -> Features:
-        """Run both encoders and add the positions to the tokens."""
-        coarse, fine_image = self.image_encoder(batch.image)
-        image = self.image_tokens(coarse.flatten(2).transpose(1, 2))
-        image = image + self.cells.to(image.dtype)
+    def encode(self, batch: NetworkInput, branch: Branch = "both") -> Features:
+        """Run the encoders and add the positions to the tokens; of the branch left out all is zero."""
+        size = len(batch.image)
+        if branch == "cloud":
+            image = batch.image.new_zeros(size, *self.cells.shape)
+            fine_image = batch.image.new_zeros(size, self.config.local, *self.image_local.positions.shape[:2])
+        else:
+            coarse, fine_image = self.image_encoder(batch.image)
+            image = self.image_tokens(coarse.flatten(2).transpose(1, 2))
+            image = image + self.cells.to(image.dtype)
         everywhere = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device)
-        cloud, fine_cloud = self.voxel_encoder(batch.grid, batch.coarse_index, batch.fine_index)
-        cloud = self.cloud_tokens(cloud)
-        cloud = cloud + self.coarse_voxels[batch.coarse_index].to(cloud.dtype)
+        if branch == "image":
+            cloud = batch.image.new_zeros(*batch.coarse_index.shape, self.config.tokens)
+            fine_cloud = batch.image.new_zeros(*batch.fine_index.shape, self.config.local)
+        else:
+            cloud, fine_cloud = self.voxel_encoder(batch.grid, batch.coarse_index, batch.fine_index)
+            cloud = self.cloud_tokens(cloud)
+            cloud = cloud + self.coarse_voxels[batch.coarse_index].to(cloud.dtype)
         return Features(Tokens(image, everywhere), Tokens(cloud, batch.coarse_mask), fine_image, fine_cloud)
 
     def fuse(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> Fused:
@@ -125,6 +137,17 @@ class UMF(nn.Module):
         image = self.absent_image(features.image, image_present)
         cloud = self.absent_cloud(features.cloud, cloud_present)
         return self.fusion(image, cloud, image_present, cloud_present)
+
+    def branch_layers(self, branch: Literal["image", "cloud"]) -> list[nn.Module]:
+        """What belongs to one modality alone on the way to the descriptor."""
+        fusion = self.fusion
+        if branch == "image":
+            encoder: list[nn.Module] = [self.image_encoder, self.image_tokens]
+            own = [layer.get_submodule("image_self") for layer in fusion.layers]
+            return encoder + own + [fusion.image_norm, fusion.image_pool, fusion.image_head]
+        encoder = [self.voxel_encoder, self.cloud_tokens]
+        own = [layer.get_submodule("cloud_self") for layer in fusion.layers]
+        return encoder + own + [fusion.cloud_norm, fusion.cloud_pool, fusion.cloud_head]
 
     def describe_local(self, features: Features, batch: NetworkInput) -> tuple[LocalMap, LocalMap]:
         """Local features of the images and of the scans."""

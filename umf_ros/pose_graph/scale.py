@@ -17,7 +17,7 @@ from umf_ros.pose_graph.ends import Cycles, Scale
 _GRID = np.exp(np.linspace(np.log(1 / 64), np.log(64), 33))
 # what a loop with a wrong closure misses by: aliases close by, and anything at all
 _ALIAS_SIGMAS = np.array([[0.5] * 3 + [5.0] * 3, [1.5] * 3 + [50.0] * 3])
-_IN_PLANE, _OUT_OF_PLANE = [2, 3, 4], [0, 1, 5]
+_IN_PLANE, _OUT_OF_PLANE = np.array([2, 3, 4]), np.array([0, 1, 5])
 _OUTLIERS = 0.5
 _NATS_PER_FACTOR = 5.0
 _FEWEST_LOOPS = 10

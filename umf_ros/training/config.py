@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from umf_ros.config import Group
 from umf_ros.errors import ConfigError
+from umf_ros.networks.umf import Branch
 
 
 class TrainingSettings(Group):
@@ -49,11 +50,20 @@ class TrainingSettings(Group):
     modality_dropout: float = Field(
         0.15, ge=0, le=0.5, description="chance of losing the image, and of losing the scan"
     )
+    branch: Branch = Field(
+        "both", description="image or cloud: that branch alone learns, the other one is neither run nor changed"
+    )
     freeze_encoders: bool = Field(False, description="train fusion and heads only (thesis 4.6)")
     start: str = Field("", description="weights to start from")
     half: bool = Field(True, description="bfloat16 mixed precision")
     threads: int = Field(1, ge=1, description="threads per process")
     device: str = Field("auto", description="torch device; auto: a GPU when there is one")
+
+    @model_validator(mode="after")
+    def _local_heads_need_both(self) -> Self:
+        if self.branch != "both" and self.local_pairs:
+            raise ValueError(f"local_pairs must be 0 where only the {self.branch} branch learns")
+        return self
 
 
 def load_training(path: Path | None, **overrides: object) -> TrainingSettings:

@@ -110,10 +110,15 @@ class Objective(nn.Module):
             cloud_present: (B,) bool, scans it may use.
             bank: past descriptors; none are used while it is empty.
         """
-        features = self.network.encode(batch.input)
+        branch = self._settings.branch
+        features = self.network.encode(batch.input, branch)
+        if branch != "both":
+            nothing = torch.zeros_like(image_present)
+            image_present = batch.input.image_present if branch == "image" else nothing
+            cloud_present = batch.input.coarse_mask.any(1) if branch == "cloud" else nothing
         fused = self.network.fuse(features, image_present, cloud_present).descriptor
         relations = relate(batch.places, bank.places, self._rule, fused.device)
-        alone = self._alone(features, batch)
+        alone = self._alone(features, batch) if branch == "both" else {}
         # similarities need all their digits: at first they differ in the third
         with torch.autocast(fused.device.type, enabled=False):
             losses, active = self._global(fused, (image_present, cloud_present), alone, bank, relations)

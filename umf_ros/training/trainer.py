@@ -177,8 +177,9 @@ class Trainer:
         if not any(found.queries for by_mode in self.results.values() for found in by_mode.values()):
             keep(self._network, summary)  # nothing to compare by: the latest is the best
             return
-        progress.recall = mean_of(self.results, "fused", "recall1")
-        score = progress.recall + mean_of(self.results, "fused", "recall1_within_5m")
+        mode = "fused" if self._settings.branch == "both" else self._settings.branch
+        progress.recall = mean_of(self.results, mode, "recall1")
+        score = progress.recall + mean_of(self.results, mode, "recall1_within_5m")
         progress.stale = 0 if score > progress.best else progress.stale + 1
         if score > progress.best:
             progress.best = score
@@ -215,6 +216,10 @@ class Trainer:
 
 def _choose_parameters(network: UMF, settings: TrainingSettings) -> list[nn.Parameter]:
     """What the optimiser sees; the rest is switched off, so that nothing is silently left at random."""
+    if settings.branch != "both":
+        network.requires_grad_(False)
+        for layer in network.branch_layers(settings.branch):
+            layer.requires_grad_(True)
     frozen: list[nn.Module] = []
     if settings.freeze_encoders:
         frozen += [network.image_encoder, network.voxel_encoder]
