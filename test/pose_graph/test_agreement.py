@@ -7,7 +7,7 @@ import pytest
 from graph_worlds import SETTINGS, chain_of, closing, lap_pairs, tracked, two_laps
 
 from umf_ros.config import PoseGraph as Settings
-from umf_ros.pose_graph.agreement import Agreement, chance_over_right, chance_to_agree
+from umf_ros.pose_graph.agreement import Agreement, chance_to_agree, doubt
 from umf_ros.pose_graph.ends import ClosureEnds, Scale
 from umf_ros.pose_graph.synthetic import World
 
@@ -138,7 +138,7 @@ def test_what_hangs_on_to_a_proven_group_by_a_weak_link_is_left_out() -> None:
 
 def test_a_bad_fit_says_less_than_a_good_one() -> None:
     covariance = np.diag([1e-4] * 3 + [0.25, 0.25, 1e-4])[None].repeat(5, axis=0)
-    doubts = chance_over_right(covariance, np.array([0.0, 6.0, 12.0, 20.0, 30.0]), Settings())
+    doubts = doubt(covariance, np.array([0.0, 4.0, 12.0, 20.0, 40.0]), Settings())
     assert doubts[0] == doubts[1] < doubts[2] < doubts[3] <= doubts[4] == 1.0
 
 

@@ -47,7 +47,7 @@ def test_an_unsure_closure_waits_for_other_places() -> None:
     later: dict[int, State] = {}
     for row in (2, 3, 4):
         later |= states(graph.add_closure(world.message(row)))
-    later |= states(graph.update())
+    later |= states(graph.settle())
     assert later == dict.fromkeys((0, 1, 15, 30, 45), State.ACCEPTED)
     assert any("supported" in verdict.reason for verdict in graph.closures())
 

@@ -23,17 +23,18 @@ def chance_to_agree(covariances: Array, settings: PoseGraphSettings) -> Array:
     return np.minimum(settings.gate_chi2 * spreads.prod(axis=-1) / settings.alias_radius_m**2, 1.0)
 
 
-def chance_over_right(covariances: Array, distances: Array, settings: PoseGraphSettings) -> Array:
-    """(N,) chance of wrong closures to fit as well as these, over that of right ones to fit as badly; one at most.
+def doubt(covariances: Array, distances: Array, settings: PoseGraphSettings) -> Array:
+    """(N,) how much likelier wrong closures are to miss predictions by this than right ones; one at most.
 
     Args:
         covariances: (N, 6, 6) of the predictions.
-        distances: (N,) squared Mahalanobis distances from them; better than the mean of right ones says no more.
+        distances: (N,) squared Mahalanobis distances from them; better than most right ones says no more.
         settings: of the pose graph.
     """
-    squared = np.maximum(distances, _DEGREES)
-    closer = chance_to_agree(covariances, settings) * squared / settings.gate_chi2
-    return np.minimum(closer / np.maximum(chi2.sf(squared, _DEGREES), 1e-12), 1.0)
+    likeliest = _DEGREES - 2
+    right = chi2.pdf(np.maximum(distances, likeliest), _DEGREES)
+    wrong = chance_to_agree(covariances, settings) / settings.gate_chi2
+    return np.minimum(wrong / np.maximum(right, 1e-12), 1.0)
 
 
 class Agreement:
@@ -134,7 +135,7 @@ class Agreement:
         covariances = loops.covariances(scale)
         distances = lie.mahalanobis(loops.residuals, covariances)
         telling = chance_to_agree(covariances, self._settings) < 1
-        chances = chance_over_right(covariances, distances, self._settings)
+        chances = doubt(covariances, distances, self._settings)
         for other, distance, tells, chance in zip(near.tolist(), distances, telling, chances, strict=True):
             if not tells:
                 continue

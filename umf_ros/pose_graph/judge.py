@@ -19,7 +19,7 @@ from umf_ros.errors import GraphError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array
 from umf_ros.pose_graph import lie
-from umf_ros.pose_graph.agreement import Agreement, chance_over_right, chance_to_agree
+from umf_ros.pose_graph.agreement import Agreement, chance_to_agree, doubt
 from umf_ros.pose_graph.certainty import Certainty
 from umf_ros.pose_graph.closures import ClosureVerdict, State, TrackedClosure
 from umf_ros.pose_graph.ends import ClosureEnds, Cycles, Scale, Side
@@ -31,11 +31,9 @@ _LOOPS_PER_CLOSURE = 3
 _MOST_ROUNDS = 4
 # a closure this far from the map (m) is not looked at again before the map moves
 _CLOSE_M = 2.0
-# 99 of 100 right closures differ less from the map: one that nobody supports has to be such a one
-_USUAL_SIGMAS = 4.1
 # what nobody supports has to be this much likelier right than wrong: while waiting costs little, and at the end
-_DOUBT_ON_THE_WAY = 0.25
-_DOUBT_AT_THE_END = 1.0
+_DOUBT_ON_THE_WAY = 0.1
+_DOUBT_AT_THE_END = 0.5
 _AGREES = "agrees with the map"
 _SUPPORTED = "supported by other places"
 _UNOPPOSED = "nothing speaks against it"
@@ -52,7 +50,7 @@ class Comparison(NamedTuple):
         distance: squared Mahalanobis distance.
         misfit_m: metres.
         chance: that the map does not tell a wrong closure from a right one.
-        doubt: chance of a wrong one to fit as well, over that of a right one to fit as badly.
+        doubt: how much likelier a wrong closure misses the map by this than a right one.
     """
 
     distance: float
@@ -188,7 +186,7 @@ class Judge:
         for row in rows:
             if self.closures[row].accepted or row in self._vetoed:
                 continue
-            distance, misfit_m, chance, doubt = self._compare(row)
+            distance, misfit_m, chance, doubted = self._compare(row)
             self._too_far.discard(row)
             self._doubts[row] = 1.0
             if self._settings.use_gate and distance > self._settings.gate_chi2:
@@ -198,7 +196,7 @@ class Judge:
                 self._note(row, State.REJECTED, f"moves the pose by {misfit_m:.1f} m", distance, misfit_m)
             else:
                 self._note(row, State.UNDECIDED, _UNSURE, distance, misfit_m)
-                self._doubts[row] = doubt
+                self._doubts[row] = doubted
                 if chance <= self._settings.max_chance or not self._settings.use_support:
                     agreed.add(row)
         return agreed
@@ -216,8 +214,8 @@ class Judge:
         covariance = predicted.covariance + self.scale.closures**2 * tracked.covariance
         distance = lie.mahalanobis(lie.log(misfit[None]), covariance[None])
         chance = chance_to_agree(covariance[None], self._settings)
-        doubt = chance_over_right(covariance[None], distance, self._settings)
-        return Comparison(distance.item(), float(np.linalg.norm(misfit[:3, 3])), chance.item(), doubt.item())
+        doubted = doubt(covariance[None], distance, self._settings)
+        return Comparison(distance.item(), float(np.linalg.norm(misfit[:3, 3])), chance.item(), doubted.item())
 
     def _believe(self, rows: Iterable[int]) -> set[int]:
         """Groups around `rows` that no chance explains and that the map does not contradict."""
@@ -252,14 +250,12 @@ class Judge:
         self._gate(sorted({member for place in places for member in place}))
         against = np.array([c.verdict.state is not State.REJECTED for c in self.closures])
         best: list[int] = []
-        least = _USUAL_SIGMAS
         for place in places:
-            misfits = [self.closures[row].verdict.residual for row in place]
-            usual = [row for row, misfit in zip(place, misfits, strict=True) if misfit <= _USUAL_SIGMAS]
-            usual = [row for row in usual if row in waiting and self._doubts[row] <= most_doubt]
+            doubted = float(np.median([self._doubts[row] for row in place]))
+            usual = [row for row in place if row in waiting and self._doubts[row] <= most_doubt]
             usual = [row for row in usual if not self._agreement.contested(row, against)]
-            if usual and np.median(misfits) <= least:
-                best, least = usual, float(np.median(misfits))
+            if usual and doubted <= most_doubt:
+                best, most_doubt = usual, doubted
         return best
 
     def _waited(self, row: int) -> float:
