@@ -31,9 +31,10 @@ _LOOPS_PER_CLOSURE = 3
 _MOST_ROUNDS = 4
 # a closure this far from the map (m) is not looked at again before the map moves
 _CLOSE_M = 2.0
-# what nobody supports has to be this much likelier right than wrong: while waiting costs little, and at the end
-_DOUBT_ON_THE_WAY = 0.1
-_DOUBT_AT_THE_END = 0.5
+# the odds against a closure that nobody supports are these at most
+_MOST_DOUBT = 0.1
+# before any verdict, one of five closures is taken for wrong
+_WRONG_BEFORE, _RIGHT_BEFORE = 1, 4
 _AGREES = "agrees with the map"
 _SUPPORTED = "supported by other places"
 _UNOPPOSED = "nothing speaks against it"
@@ -99,7 +100,7 @@ class Judge:
             return []
         self._decide_all()
         for _ in self.closures:
-            if not self._accept(dict.fromkeys(self._unopposed(0.0, _DOUBT_AT_THE_END), _UNOPPOSED)):
+            if not self._accept(dict.fromkeys(self._unopposed(0.0, _MOST_DOUBT / self._odds()), _UNOPPOSED)):
                 break
             self._decide_all()
         self._ask_again()
@@ -157,7 +158,7 @@ class Judge:
         reasons |= dict.fromkeys(believed, _SUPPORTED) | dict.fromkeys(agreed, _AGREES)
         # only where nothing else is accepted: the map it moves may well speak against them
         if not reasons:
-            reasons = dict.fromkeys(self._unopposed(self._settings.patience_m, _DOUBT_ON_THE_WAY), _UNOPPOSED)
+            reasons = dict.fromkeys(self._unopposed(self._settings.patience_m, _MOST_DOUBT), _UNOPPOSED)
         self._brought_close = self._worth_another_look() if self._accept(reasons) else []
         return bool(reasons)
 
@@ -248,7 +249,8 @@ class Judge:
         waiting = [row for row in waiting if self._waited(row) >= patience_m]
         places = [[row, *self._agreement.companions(row, open_to)] for row in waiting]
         self._gate(sorted({member for place in places for member in place}))
-        against = np.array([c.verdict.state is not State.REJECTED for c in self.closures])
+        # what the map itself finds wrong rather than right speaks against nothing
+        against = np.array([c.accepted or self._doubts.get(row, 1.0) < 0.5 for row, c in enumerate(self.closures)])
         best: list[int] = []
         for place in places:
             doubted = float(np.median([self._doubts[row] for row in place]))
@@ -257,6 +259,12 @@ class Judge:
             if usual and doubted <= most_doubt:
                 best, most_doubt = usual, doubted
         return best
+
+    def _odds(self) -> float:
+        """Wrong closures for every right one, as far as is known: at the end that is all there is to go by."""
+        rejected = sum(c.verdict.state is State.REJECTED for c in self.closures)
+        accepted = sum(c.accepted for c in self.closures)
+        return (_WRONG_BEFORE + rejected) / (_RIGHT_BEFORE + accepted)
 
     def _waited(self, row: int) -> float:
         travel = self._ends.query.travel.view
