@@ -114,8 +114,8 @@ class UMF(nn.Module):
 
     def encode(self, batch: NetworkInput, branch: Branch = "both") -> Features:
         """Run the encoders and add the positions to the tokens; of the branch left out all is zero."""
-        size = len(batch.image)
         if branch == "cloud":
+            size = batch.image.shape[0]
             image = batch.image.new_zeros(size, *self.cells.shape)
             fine_image = batch.image.new_zeros(size, self.config.local, *self.image_local.positions.shape[:2])
         else:

@@ -250,14 +250,17 @@ class Judge:
         places = [[row, *self._agreement.companions(row, open_to)] for row in waiting]
         self._gate(sorted({member for place in places for member in place}))
         # what the map itself finds wrong rather than right speaks against nothing
+        undecided = np.array([c.verdict.state is State.UNDECIDED for c in self.closures])
         against = np.array([c.accepted or self._doubts.get(row, 1.0) < 0.5 for row, c in enumerate(self.closures)])
         best: list[int] = []
         for place in places:
-            doubted = float(np.median([self._doubts[row] for row in place]))
-            usual = [row for row in place if row in waiting and self._doubts[row] <= most_doubt]
+            doubts = np.array([self._doubts[row] for row in place])
+            if not patience_m:  # the last word: what other places say for it counts, though it did not suffice
+                doubts *= np.exp(-self._agreement.group(place[0], undecided)[1])
+            usual = [row for row, odds in zip(place, doubts, strict=True) if row in waiting and odds <= most_doubt]
             usual = [row for row in usual if not self._agreement.contested(row, against)]
-            if usual and doubted <= most_doubt:
-                best, most_doubt = usual, doubted
+            if usual and np.median(doubts) <= most_doubt:
+                best, most_doubt = usual, float(np.median(doubts))
         return best
 
     def _odds(self) -> float:
