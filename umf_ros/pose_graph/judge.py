@@ -100,7 +100,7 @@ class Judge:
             return []
         self._decide_all()
         for _ in self.closures:
-            if not self._accept(dict.fromkeys(self._unopposed(0.0, _MOST_DOUBT / self._odds()), _UNOPPOSED)):
+            if not self._accept(dict.fromkeys(self._unopposed(last_word=True), _UNOPPOSED)):
                 break
             self._decide_all()
         self._ask_again()
@@ -158,7 +158,7 @@ class Judge:
         reasons |= dict.fromkeys(believed, _SUPPORTED) | dict.fromkeys(agreed, _AGREES)
         # only where nothing else is accepted: the map it moves may well speak against them
         if not reasons:
-            reasons = dict.fromkeys(self._unopposed(self._settings.patience_m, _MOST_DOUBT), _UNOPPOSED)
+            reasons = dict.fromkeys(self._unopposed(), _UNOPPOSED)
         self._brought_close = self._worth_another_look() if self._accept(reasons) else []
         return bool(reasons)
 
@@ -236,26 +236,29 @@ class Judge:
                     groups.append(group)
         return groups
 
-    def _unopposed(self, patience_m: float, most_doubt: float) -> list[int]:
+    def _unopposed(self, last_word: bool = False) -> list[int]:
         """Undecided closures of the place that fits best of those that have waited long enough.
 
         Nothing speaks against them, the map included. One place at a time: the map that the first one
         moves may speak against the next. A place's closures stand or fall together, so that one of a
-        wrong group does not pass for the luck of its noise.
+        wrong group does not pass for the luck of its noise. The last word waits for nothing, and takes
+        into account how many closures were wrong and what other places say, though it did not suffice.
         """
+        patience_m = 0.0 if last_word else self._settings.patience_m
+        most_doubt = _MOST_DOUBT / self._odds() if last_word else _MOST_DOUBT
         open_to = np.array([not c.accepted for c in self.closures])
         open_to[list(self._vetoed)] = False
         waiting = [row for row, c in enumerate(self.closures) if c.verdict.state is State.UNDECIDED]
         waiting = [row for row in waiting if self._waited(row) >= patience_m]
         places = [[row, *self._agreement.companions(row, open_to)] for row in waiting]
         self._gate(sorted({member for place in places for member in place}))
-        # what the map itself finds wrong rather than right speaks against nothing
         undecided = np.array([c.verdict.state is State.UNDECIDED for c in self.closures])
+        # what the map itself finds wrong rather than right speaks against nothing
         against = np.array([c.accepted or self._doubts.get(row, 1.0) < 0.5 for row, c in enumerate(self.closures)])
         best: list[int] = []
         for place in places:
             doubts = np.array([self._doubts[row] for row in place])
-            if not patience_m:  # the last word: what other places say for it counts, though it did not suffice
+            if last_word:
                 doubts *= np.exp(-self._agreement.group(place[0], undecided)[1])
             usual = [row for row, odds in zip(place, doubts, strict=True) if row in waiting and odds <= most_doubt]
             usual = [row for row in usual if not self._agreement.contested(row, against)]
@@ -264,7 +267,7 @@ class Judge:
         return best
 
     def _odds(self) -> float:
-        """Wrong closures for every right one, as far as is known: at the end that is all there is to go by."""
+        """Wrong closures for every right one, as far as is known."""
         rejected = sum(c.verdict.state is State.REJECTED for c in self.closures)
         accepted = sum(c.accepted for c in self.closures)
         return (_WRONG_BEFORE + rejected) / (_RIGHT_BEFORE + accepted)
