@@ -38,7 +38,7 @@ def test_other_shapes(world: World) -> None:
     assert rms(graph.trajectory()[1], batch_optimum(world)) < 0.03
 
 
-@pytest.mark.parametrize("seed", [10004, 10005, 10030])
+@pytest.mark.parametrize("seed", [10004, 10005, 10030, 10101, 10131, 10132])
 def test_aliases_of_other_floors_never_shape_the_map(seed: int) -> None:
     """Places 3 to 15 m off, seen before the odometry's drift could contradict them: not even for a while."""
     world = with_wrong_closures(garage(500, seed), 0.5, "near", 1)
@@ -51,6 +51,12 @@ def test_aliases_of_other_floors_never_shape_the_map(seed: int) -> None:
     feed_odometry(graph, world, range(fed, len(world.truth)))
     graph.settle()
     assert accepted(graph) == right(world)
+
+
+def test_the_last_closures_of_a_drive_support_each_other() -> None:
+    """Two places agree, too few to move the map by 4 m on the way; at the end nothing is left to wait for."""
+    world = with_wrong_closures(rover_loops(400, 10177), 0.5, "near", 1)
+    assert accepted(drive(world)) == right(world)
 
 
 def test_overlapping_aliases_are_not_taken_for_noise() -> None:
