@@ -31,10 +31,12 @@ _LOOPS_PER_CLOSURE = 3
 _MOST_ROUNDS = 4
 # a closure this far from the map (m) is not looked at again before the map moves
 _CLOSE_M = 2.0
-# the odds against a closure that nobody supports are these at most
-_MOST_DOUBT = 0.1
+# the odds against a closure that nobody supports are these at most: on the way, and when nothing more will come
+_MOST_DOUBT, _MOST_DOUBT_AT_LAST = 0.1, 0.2
 # before any verdict, one of five closures is taken for wrong
 _WRONG_BEFORE, _RIGHT_BEFORE = 1, 4
+# what looks alike does so for a while: wrong closures seldom come alone
+_WRONG_ALONE = 0.1
 _AGREES = "agrees with the map"
 _SUPPORTED = "supported by other places"
 _UNOPPOSED = "nothing speaks against it"
@@ -245,7 +247,7 @@ class Judge:
         into account how many closures were wrong and what other places say, though it did not suffice.
         """
         patience_m = 0.0 if last_word else self._settings.patience_m
-        most_doubt = _MOST_DOUBT / self._odds() if last_word else _MOST_DOUBT
+        most_doubt = _MOST_DOUBT_AT_LAST if last_word else _MOST_DOUBT
         open_to = np.array([not c.accepted for c in self.closures])
         open_to[list(self._vetoed)] = False
         waiting = [row for row, c in enumerate(self.closures) if c.verdict.state is State.UNDECIDED]
@@ -259,7 +261,8 @@ class Judge:
         for place in places:
             doubts = np.array([self._doubts[row] for row in place])
             if last_word:
-                doubts *= np.exp(-self._agreement.group(place[0], undecided)[1])
+                doubts *= self._odds() * np.exp(-self._agreement.group(place[0], undecided)[1])
+                doubts *= _WRONG_ALONE if len(place) == 1 else 1.0
             usual = [row for row, odds in zip(place, doubts, strict=True) if row in waiting and odds <= most_doubt]
             usual = [row for row in usual if not self._agreement.contested(row, against)]
             if usual and np.median(doubts) <= most_doubt:
