@@ -17,7 +17,7 @@ from umf_ros.training.batches import BatchMaker, TrainingBatch
 from umf_ros.training.config import TrainingSettings, load_training
 from umf_ros.training.labels import Places, Rule, places_of
 from umf_ros.training.local_losses import correspondence, decorrelation, eligible, super_contrastive
-from umf_ros.training.losses import batch_hard_triplet, graded, multi_similarity
+from umf_ros.training.losses import batch_hard_triplet, graded, multi_similarity, neighbourhood_components
 from umf_ros.training.objective import Bank, Objective, attenuate, relate
 from umf_ros.training.sampler import PairSampler
 from umf_ros.training.views import Augmentation, ViewMaker
@@ -59,6 +59,26 @@ def test_triplets_are_a_loop_over_anchors(relations):
     assert len(excesses) == 4
     assert loss.item() == pytest.approx(sum(active) / len(active), rel=1e-5)
     assert share.item() == pytest.approx(len(active) / 4)
+
+
+def test_neighbourhood_components_are_a_loop_over_queries(relations):
+    similarity, wanted, unwanted = relations
+    penalties = []
+    for row in range(6):
+        right = sum(math.exp(20 * s) for s in similarity[row][wanted[row]].tolist())
+        wrong = sum(math.exp(20 * s) for s in similarity[row][unwanted[row]].tolist())
+        if right and wrong:
+            penalties.append(-math.log(right / (right + wrong)))
+    assert len(penalties) == 4
+    assert neighbourhood_components(*relations).item() == pytest.approx(np.mean(penalties), rel=1e-5)
+
+
+def test_queries_without_a_rival_teach_nothing():
+    similarity = torch.eye(3, requires_grad=True)
+    nothing, everything = torch.zeros(3, 3, dtype=torch.bool), torch.ones(3, 3, dtype=torch.bool)
+    loss = neighbourhood_components(similarity, nothing, everything)
+    loss.backward()
+    assert loss.item() == 0 and not similarity.grad.any()
 
 
 def test_a_batch_without_any_triplet_costs_nothing_and_stays_a_number():

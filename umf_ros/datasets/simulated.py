@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import struct
 import zipfile
 from pathlib import Path
 
@@ -13,6 +15,10 @@ from umf_ros.frames import StereoCamera
 
 NUMBERS = ("fx", "fy", "cx", "cy")
 REQUIRED = ("images", "points", "world_T_body", "pass_index", "body_T_camera", *NUMBERS, "width", "height")
+LARGE = ("images", "points")
+LOCAL_HEADER = 30
+"""Bytes before the name of a member of a zip archive; the last four are the lengths of what follows."""
+
 PER_SAMPLE = ("images", "points", "depth", "world_T_body", "pass_index")
 
 
@@ -68,11 +74,39 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         if isinstance(archive, np.ndarray):
             raise UmfError(f"{path} is not a shard of a simulated world, but a single array")
         with archive:
-            return {name: archive[name] for name in archive.files}
+            content = {name: archive[name] for name in archive.files if name not in LARGE}
+        return content | _mapped(path)
     except FileNotFoundError:
         raise UmfError(f"{path} does not exist") from None
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         raise UmfError(f"cannot read {path}: {' '.join(str(error).split())}") from None
+
+
+def _mapped(path: Path) -> dict[str, np.ndarray]:
+    """The large arrays of an archive without compression, read only when they are used.
+
+    A training set is larger than memory, and every process that reads it shares what is in the page cache.
+    """
+    found: dict[str, np.ndarray] = {}
+    with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
+        damaged = archive.testzip()
+        if damaged:
+            raise ValueError(f"{damaged} is damaged")
+        for name in LARGE:
+            entry = archive.NameToInfo.get(f"{name}.npy")
+            if entry is None:
+                continue
+            if entry.compress_type != zipfile.ZIP_STORED:
+                raise ValueError("it is compressed; shards are not")
+            stream.seek(entry.header_offset)
+            header = stream.read(LOCAL_HEADER)
+            stream.seek(sum(struct.unpack("<HH", header[-4:])), os.SEEK_CUR)  # its name and extra field
+            np.lib.format.read_magic(stream)
+            shape, fortran, kind = np.lib.format.read_array_header_1_0(stream)
+            if kind.hasobject:
+                raise ValueError("Object arrays are not read")
+            found[name] = np.memmap(path, kind, "r", stream.tell(), shape, "F" if fortran else "C")
+    return found
 
 
 class WorldFolder:

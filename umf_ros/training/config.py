@@ -53,6 +53,10 @@ class TrainingSettings(Group):
     branch: Branch = Field(
         "both", description="image or cloud: that branch alone learns, the other one is neither run nor changed"
     )
+    stage: Literal["network", "heads"] = Field(
+        "network",
+        description="heads: the layers after the pooling alone, each step on a whole world; minutes, and the last run",
+    )
     freeze_encoders: bool = Field(False, description="train fusion and heads only (thesis 4.6)")
     start: str = Field("", description="weights to start from")
     half: bool = Field(True, description="bfloat16 mixed precision")

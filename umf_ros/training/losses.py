@@ -29,6 +29,26 @@ def multi_similarity(
     return (pulls + pushes).mean()
 
 
+def neighbourhood_components(similarity: Tensor, wanted: Tensor, unwanted: Tensor, temperature: float = 0.05) -> Tensor:
+    """Neighbourhood components analysis (Goldberger et al. 2004): recall at one, softly counted.
+
+    What is maximised is the chance that a reference drawn by its similarity is a wanted one; of several
+    wanted ones the most similar is enough.
+
+    Args:
+        similarity: (B, R) cosine similarities of queries and references.
+        wanted: (B, R) bool.
+        unwanted: (B, R) bool.
+        temperature: difference of similarity that makes one reference e times as likely as another.
+    """
+    scores = similarity / temperature
+    absent = torch.finfo(scores.dtype).min / 2
+    right = torch.logsumexp(scores.masked_fill(~wanted, absent), 1)
+    wrong = torch.logsumexp(scores.masked_fill(~unwanted, absent), 1)
+    complete = wanted.any(1) & unwanted.any(1)
+    return F.softplus((wrong - right)[complete]).sum() / complete.sum().clamp(min=1)
+
+
 def batch_hard_triplet(
     similarity: Tensor, positive: Tensor, negative: Tensor, margin: float = 0.2
 ) -> tuple[Tensor, Tensor]:

@@ -10,12 +10,14 @@ import torch
 
 from umf_ros.datasets.sample import SampleSequence
 from umf_ros.datasets.simulated import WorldFolder
+from umf_ros.errors import ConfigError
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import save_weights
 from umf_ros.training.config import TrainingSettings
-from umf_ros.training.distributed import join_team
+from umf_ros.training.distributed import Team, join_team
+from umf_ros.training.heads import HeadFitter
 from umf_ros.training.setup import check_preset, common_card, earlier_runs, make_network, open_worlds, write_settings
-from umf_ros.training.trainer import Progress, Trainer
+from umf_ros.training.trainer import Progress, Trainer, Worlds
 from umf_ros.training.validation import figures
 
 
@@ -32,7 +34,7 @@ def train(settings: TrainingSettings, output: Path, resume: bool, report: Callab
         Path of the weights.
 
     Raises:
-        ConfigError: unknown preset, or worlds without revisits.
+        ConfigError: unknown preset, worlds without revisits, or heads to be resumed.
         OutputError: the folder cannot be written.
         WeightsError: nothing to resume from, or weights to start from that do not fit.
     """
@@ -46,8 +48,11 @@ def train(settings: TrainingSettings, output: Path, resume: bool, report: Callab
     with join_team(settings.device) as team:
         network = make_network(settings.preset, settings.start, settings.image_size)
         unseen = validation.refresh if validation else list
-        trainer = Trainer(network, settings, training.refresh, unseen, output, team)
-        if resume:
+        trainer = _trainer(settings, network, training.refresh, unseen, output, team)
+        if isinstance(trainer, HeadFitter):
+            if resume or team.size > 1:
+                raise ConfigError("stage: heads take minutes in one process: nothing to resume, nothing to share")
+        elif resume:
             trainer.resume()
 
         def keep(best: UMF, summary: dict[str, Any]) -> None:
@@ -57,11 +62,19 @@ def train(settings: TrainingSettings, output: Path, resume: bool, report: Callab
     return weights
 
 
+def _trainer(
+    settings: TrainingSettings, network: UMF, training: Worlds, validation: Worlds, folder: Path, team: Team
+) -> Trainer | HeadFitter:
+    if settings.stage == "heads":
+        return HeadFitter(network.to(team.device), settings, training, validation, folder)
+    return Trainer(network, settings, training, validation, folder, team)
+
+
 def _card(
     settings: TrainingSettings,
     network: UMF,
     training: Sequence[SampleSequence],
-    trainer: Trainer,
+    trainer: Trainer | HeadFitter,
 ) -> dict[str, Any]:
     folders = {name: Path(getattr(settings, name)).name for name in ("train", "validation", "start")}
     return common_card(settings.preset, network, training, trainer.progress.seconds) | {

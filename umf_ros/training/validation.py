@@ -19,6 +19,9 @@ from umf_ros.training.views import ViewMaker
 
 MODES = ("fused", "image", "cloud")
 
+Results = dict[str, dict[str, Scores]]
+"""Scores by sequence and mode."""
+
 
 _FIGURES = ("queries", "recall1", "recall5", "recall1_within_5m", "recall_at_precision1")
 
