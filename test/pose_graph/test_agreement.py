@@ -138,7 +138,8 @@ def test_what_hangs_on_to_a_proven_group_by_a_weak_link_is_left_out() -> None:
 
 def test_a_bad_fit_says_less_than_a_good_one() -> None:
     covariance = np.diag([1e-4] * 3 + [0.25, 0.25, 1e-4])[None].repeat(5, axis=0)
-    doubts = doubt(covariance, np.array([0.0, 4.0, 12.0, 20.0, 40.0]), Settings())
+    chances = chance_to_agree(covariance, Settings())
+    doubts = doubt(chances, np.array([0.0, 4.0, 12.0, 20.0, 40.0]), Settings())
     assert doubts[0] == doubts[1] < doubts[2] < doubts[3] <= doubts[4] == 1.0
 
 

@@ -53,6 +53,14 @@ def test_aliases_of_other_floors_never_shape_the_map(seed: int) -> None:
     assert accepted(graph) == right(world)
 
 
+def test_a_closure_that_fits_far_worse_than_all_others_is_doubted() -> None:
+    """Odometry stated three times too uncertain allows for an alias, in loops too short to show that it is."""
+    world = with_wrong_closures(garage(500, 10121), 0.5, "near", 1)
+    graph = drive(world, stated=3.0)
+    assert accepted(graph) == right(world)
+    assert rms(graph.trajectory()[1], batch_optimum(world)) < 0.3
+
+
 def test_the_last_closures_of_a_drive_support_each_other() -> None:
     """Two places agree, too few to move the map by 4 m on the way; at the end nothing is left to wait for."""
     world = with_wrong_closures(rover_loops(400, 10177), 0.5, "near", 1)

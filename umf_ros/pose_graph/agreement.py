@@ -23,17 +23,17 @@ def chance_to_agree(covariances: Array, settings: PoseGraphSettings) -> Array:
     return np.minimum(settings.gate_chi2 * spreads.prod(axis=-1) / settings.alias_radius_m**2, 1.0)
 
 
-def doubt(covariances: Array, distances: Array, settings: PoseGraphSettings) -> Array:
+def doubt(chances: Array, distances: Array, settings: PoseGraphSettings) -> Array:
     """(N,) how much likelier wrong closures are to miss predictions by this than right ones; one at most.
 
     Args:
-        covariances: (N, 6, 6) of the predictions.
+        chances: (N,) of wrong closures to agree with the predictions.
         distances: (N,) squared Mahalanobis distances from them; better than most right ones says no more.
         settings: of the pose graph.
     """
     likeliest = _DEGREES - 2
     right = chi2.pdf(np.maximum(distances, likeliest), _DEGREES)
-    wrong = chance_to_agree(covariances, settings) / settings.gate_chi2
+    wrong = chances / settings.gate_chi2
     return np.minimum(wrong / np.maximum(right, 1e-12), 1.0)
 
 
@@ -89,13 +89,13 @@ class Agreement:
         """
         witnesses, others, evidence = [self._surest(group)], group, 0.0
         while others := [other for other in others if not self._same_place(other, witnesses[-1:])]:
-            chance, nearest = min(
+            doubted, nearest = min(
                 (min((self._friends[other][w] for w in witnesses if w in self._friends[other]), default=1.0), other)
                 for other in others
             )
-            if evidence >= self._settings.min_support and chance > self._settings.max_chance:
+            if evidence >= self._settings.min_support and doubted > self._settings.max_chance:
                 break
-            evidence += min(-float(np.log(max(chance, 1e-9))), _MOST_PER_PLACE)
+            evidence += min(-float(np.log(max(doubted, 1e-9))), _MOST_PER_PLACE)
             witnesses.append(nearest)
         return [member for member in group if member not in others], evidence
 
@@ -103,9 +103,9 @@ class Agreement:
         """One of the two closures that agree best of those that tell of different places."""
         inside = set(group)
         pairs = [
-            (chance, one, other)
+            (doubted, one, other)
             for one in group
-            for other, chance in self._friends[one].items()
+            for other, doubted in self._friends[one].items()
             if one < other and other in inside and self.place_of[one] != self.place_of[other]
         ]
         return next((one for _, one, other in sorted(pairs) if not self._same_place(one, [other])), group[0])
@@ -134,13 +134,13 @@ class Agreement:
     def _compare(self, row: int, near: NDArray[np.int64], loops: Cycles, scale: Scale) -> None:
         covariances = loops.covariances(scale)
         distances = lie.mahalanobis(loops.residuals, covariances)
-        telling = chance_to_agree(covariances, self._settings) < 1
-        chances = doubt(covariances, distances, self._settings)
-        for other, distance, tells, chance in zip(near.tolist(), distances, telling, chances, strict=True):
-            if not tells:
+        chances = chance_to_agree(covariances, self._settings)
+        doubts = doubt(chances, distances, self._settings)
+        for other, distance, chance, doubted in zip(near.tolist(), distances, chances, doubts, strict=True):
+            if chance >= 1:  # says nothing
                 continue
             if distance <= self._settings.pair_chi2:
-                self._friends[row][other] = self._friends[other][row] = float(chance)
+                self._friends[row][other] = self._friends[other][row] = float(doubted)
             else:
                 self._enemies[row].add(other)
                 self._enemies[other].add(row)

@@ -55,9 +55,18 @@ class PooledWorld:
 
 
 def pool_world(
-    network: UMF, sequence: SampleSequence, rows: NDArray[np.int64], mirror: bool, rule: Rule
+    network: UMF, sequence: SampleSequence, rows: NDArray[np.int64], mirror: bool, rule: Rule, half: bool = False
 ) -> PooledWorld:
-    """Run the network up to the pooling on the frames `rows` (N,) of a world, or of its mirror image."""
+    """Run the network up to the pooling on the frames `rows` (N,) of a world, or of its mirror image.
+
+    Args:
+        network: is switched to evaluation.
+        sequence: the world.
+        rows: (N,) which frames.
+        mirror: take their mirror images.
+        rule: what is a true match.
+        half: run in bfloat16 mixed precision.
+    """
     device = next(network.parameters()).device
     maker = ViewMaker(network.config)
     pooled: dict[str, list[Pooled]] = {mode: [] for mode in MODES}
@@ -65,7 +74,7 @@ def pool_world(
     network.eval()
     for start in range(0, len(rows), _FRAMES):
         views = [maker.plain(sequence.sample(int(row)), mirror) for row in rows[start : start + _FRAMES]]
-        with torch.no_grad():
+        with torch.no_grad(), torch.autocast(device.type, torch.bfloat16, enabled=half):
             inputs = to_device(stack_views(views, network.config), device)
             features = network.encode(inputs)
             images, clouds = inputs.image_present, inputs.coarse_mask.any(1)
@@ -150,7 +159,7 @@ class HeadFitter:
         for sequence in self._training():
             for mirror in (False, True):
                 rows = np.arange(int(mirror), len(sequence), 2)
-                worlds.append(pool_world(self._network, sequence, rows, mirror, Rule()))
+                worlds.append(pool_world(self._network, sequence, rows, mirror, Rule(), self._settings.half))
         return worlds
 
     def _losses(self, world: PooledWorld) -> dict[str, Tensor]:
