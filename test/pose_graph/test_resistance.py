@@ -53,12 +53,21 @@ def test_aliases_of_other_floors_never_shape_the_map(seed: int) -> None:
     assert accepted(graph) == right(world)
 
 
-def test_a_closure_that_fits_far_worse_than_all_others_is_doubted() -> None:
-    """Odometry stated three times too uncertain allows for an alias, in loops too short to show that it is."""
-    world = with_wrong_closures(garage(500, 10121), 0.5, "near", 1)
+@pytest.mark.parametrize("seed", [10121, 10313])
+def test_odometry_stated_too_uncertain_makes_no_room_for_aliases(seed: int) -> None:
+    """Closures a little better than stated beside it are no other units: odometry alone is judged anew."""
+    world = with_wrong_closures(garage(500, seed), 0.5, "near", 1)
     graph = drive(world, stated=3.0)
+    assert graph.scale.odometry == pytest.approx(1 / 3, rel=0.2) and graph.scale.closures == 1
     assert accepted(graph) == right(world)
-    assert rms(graph.trajectory()[1], batch_optimum(world)) < 0.3
+
+
+def test_a_few_lucky_loops_do_not_make_odometry_better_than_stated() -> None:
+    world = with_wrong_closures(rover_loops(400, 10176), 0.5, "near", 1)
+    graph = drive(world)
+    assert graph.scale.odometry == 1
+    assert accepted(graph) == right(world)
+    assert rms(graph.trajectory()[1], batch_optimum(world)) < 0.03
 
 
 def test_the_last_closures_of_a_drive_support_each_other() -> None:

@@ -35,10 +35,6 @@ _CLOSE_M = 2.0
 _MOST_DOUBT, _MOST_DOUBT_AT_LAST = 0.1, 0.2
 # before any verdict, one of five closures is taken for wrong
 _WRONG_BEFORE, _RIGHT_BEFORE = 1, 4
-# a comparison tells of the map where the map's share in its uncertainty is this
-_OF_MAP = 0.9
-_AS_STATED = 3
-_DEGREES = 6
 # what looks alike does so for a while, so wrong closures seldom come alone: of those left undecided at the end of
 # drives in worlds 10200-10473 of benchmarks/pose_graph.py 1 of 67 wrong ones was alone and 59 of 213 right ones
 _WRONG_ALONE = 0.1
@@ -60,41 +56,12 @@ class Comparison(NamedTuple):
         misfit_m: metres.
         chance: that the map does not tell a wrong closure from a right one.
         doubt: how much likelier a wrong closure misses the map by this than a right one.
-        of_map: share of the map in the uncertainty of the comparison, the rest being the closure's own.
     """
 
     distance: float
     misfit_m: float
     chance: float
     doubt: float
-    of_map: float
-
-
-class Fit:
-    """How well the map foretold the first closure of every place that was accepted, against what it had stated.
-
-    Odometry stated too uncertain shows here even where the loops of near closures are too short to tell: a
-    closure that misses the map by far more than all others did is doubted, though its uncertainty allows it.
-    """
-
-    def __init__(self) -> None:
-        self._last: dict[int, tuple[float, float]] = {}
-        self._places: dict[int, float] = {}
-
-    def compared(self, row: int, distance: float, of_map: float) -> None:
-        """Note a comparison: squared Mahalanobis distance, and the map's share in the uncertainty."""
-        self._last[row] = distance, of_map
-
-    def accepted(self, row: int, place: int) -> None:
-        """Count the comparison of a closure that is accepted, if it is its place's first."""
-        distance, of_map = self._last.get(row, (0.0, 0.0))
-        self._places.setdefault(place, distance if of_map > _OF_MAP else float("nan"))
-
-    @property
-    def factor(self) -> float:
-        """Of the map's standard deviations, at most one; a few places more that fit as stated are assumed."""
-        told = [distance / _DEGREES for distance in self._places.values() if np.isfinite(distance)]
-        return min(1.0, float(np.sqrt((sum(told) + _AS_STATED) / (len(told) + _AS_STATED))))
 
 
 class Judge:
@@ -112,7 +79,6 @@ class Judge:
         self._too_far: set[int] = set()
         self._contests: dict[int, int] = {}
         self._doubts: dict[int, float] = {}
-        self._fit = Fit()
         self._brought_close: list[int] = []
         self.scale = Scale()
         self.closures: list[TrackedClosure] = []
@@ -225,8 +191,7 @@ class Judge:
         for row in rows:
             if self.closures[row].accepted or row in self._vetoed:
                 continue
-            distance, misfit_m, chance, doubted, of_map = self._compare(row)
-            self._fit.compared(row, distance, of_map)
+            distance, misfit_m, chance, doubted = self._compare(row)
             self._too_far.discard(row)
             self._doubts[row] = 1.0
             if self._settings.use_gate and distance > self._settings.gate_chi2:
@@ -250,18 +215,12 @@ class Judge:
         )
         misfit = lie.invert(tracked.closure.match_T_query) @ predicted.pose
         if predicted.covariance is None:
-            return Comparison(0.0, 0.0, 1.0, 1.0, 0.0)
-        own = self.scale.closures**2 * tracked.covariance
-        covariance, fitted = predicted.covariance + own, self._fit.factor**2 * predicted.covariance + own
-        missed, settings = lie.log(misfit[None]), self._settings
-        doubted = doubt(chance_to_agree(fitted[None], settings), lie.mahalanobis(missed, fitted[None]), settings)
-        return Comparison(
-            distance=lie.mahalanobis(missed, covariance[None]).item(),
-            misfit_m=float(np.linalg.norm(misfit[:3, 3])),
-            chance=chance_to_agree(covariance[None], settings).item(),
-            doubt=doubted.item(),
-            of_map=float(np.trace(np.linalg.solve(covariance, predicted.covariance))) / len(covariance),
-        )
+            return Comparison(0.0, 0.0, 1.0, 1.0)
+        covariance = predicted.covariance + self.scale.closures**2 * tracked.covariance
+        distance = lie.mahalanobis(lie.log(misfit[None]), covariance[None])
+        chance = chance_to_agree(covariance[None], self._settings)
+        doubted = doubt(chance, distance, self._settings)
+        return Comparison(distance.item(), float(np.linalg.norm(misfit[:3, 3])), chance.item(), doubted.item())
 
     def _believe(self, rows: Iterable[int]) -> set[int]:
         """Groups around `rows` that no chance explains and that the map does not contradict."""
@@ -375,7 +334,6 @@ class Judge:
     def _accept(self, reasons: dict[int, str]) -> bool:
         for row, reason in reasons.items():
             verdict = self.closures[row].verdict
-            self._fit.accepted(row, self._agreement.place_of[row])
             self._note(row, State.ACCEPTED, reason, verdict.residual**2, verdict.residual_m)
         if reasons:
             self._solve()

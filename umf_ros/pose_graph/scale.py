@@ -19,7 +19,9 @@ _GRID = np.exp(np.linspace(np.log(1 / 64), np.log(64), 33))
 _ALIAS_SIGMAS = np.array([[0.5] * 3 + [5.0] * 3, [1.5] * 3 + [50.0] * 3])
 _IN_PLANE, _OUT_OF_PLANE = np.array([2, 3, 4]), np.array([0, 1, 5])
 _OUTLIERS = 0.5
-_NATS_PER_FACTOR = 5.0
+# loops share closures and odometry, so that together they say less than their sum: to trust odometry more than
+# stated takes more than to trust it less
+_NATS_PER_FACTOR, _NATS_TO_TRUST = 5.0, 20.0
 _FEWEST_LOOPS = 10
 _TOLERANCE = np.log(1.8)
 _SAME_UNITS = np.log(4.0)
@@ -60,11 +62,13 @@ class ScaleEstimator:
 
         def merit(choice: tuple[int, int, int]) -> float:
             factors, row, column = choice
-            return float(likelihood[row, column]) - _NATS_PER_FACTOR * factors
+            trusting = _NATS_TO_TRUST - _NATS_PER_FACTOR if row < one else 0.0
+            return float(likelihood[row, column]) - _NATS_PER_FACTOR * factors - trusting
 
         best, plain = max(of_odometry + of_closures, key=merit), max(of_odometry, key=merit)
         believed = best[2] <= one or self._widely_better(best[1:], plain[1:])
-        row, column = best[1:] if believed else plain[1:]
+        # closures that are about as stated are taken as stated, and odometry is judged by that
+        row, column = best[1:] if believed and _settle(_GRID[best[2]]) != 1 else plain[1:]
         odometry_factor, closures_factor = float(_GRID[row]), float(_GRID[column])
         if one not in (row, column) and abs(np.log(odometry_factor / closures_factor)) < _SAME_UNITS:
             # rather other units than two mistakes: what counts is the ratio, and that is as stated
