@@ -10,6 +10,7 @@ from tiny_worlds import BODY_T_CAMERA, CAMERA, TINY, world_arrays
 
 from umf_ros.datasets.sample import Sample
 from umf_ros.datasets.simulated import SimulatedWorld
+from umf_ros.networks.presets import PRESETS
 from umf_ros.training.views import View, ViewMaker
 
 
@@ -40,6 +41,20 @@ def plain_view(pose: np.ndarray) -> View:
 
 def write_world(path: Path, seed: int, count: int = 24, **changes: object) -> None:
     np.savez(path, **(world_arrays(count, seed) | changes))
+
+
+@pytest.fixture(autouse=True)
+def tiny_preset(monkeypatch):
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two worlds of 40 frames."""
+    (tmp_path / "worlds").mkdir()
+    for seed in (1, 2):
+        write_world(tmp_path / "worlds" / f"world_{seed:05d}.npz", seed, count=40)
+    return tmp_path / "worlds"
 
 
 @pytest.fixture

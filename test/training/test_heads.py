@@ -10,27 +10,14 @@ from training.conftest import write_world
 
 from umf_ros.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.errors import ConfigError
-from umf_ros.networks.presets import PRESETS
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights, read_card, save_weights
+from umf_ros.training.batches import stack_views
 from umf_ros.training.config import load_training
 from umf_ros.training.heads import HeadFitter, pool_world
 from umf_ros.training.labels import Rule
 from umf_ros.training.run import train
-from umf_ros.training.validation import describe
-
-
-@pytest.fixture(autouse=True)
-def tiny_preset(monkeypatch):
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
-
-
-@pytest.fixture
-def folder(tmp_path):
-    (tmp_path / "worlds").mkdir()
-    for seed in (1, 2):
-        write_world(tmp_path / "worlds" / f"world_{seed:05d}.npz", seed, count=40)
-    return tmp_path / "worlds"
+from umf_ros.training.views import ViewMaker
 
 
 @pytest.fixture
@@ -52,13 +39,14 @@ def silent(_):
 def test_what_is_pooled_becomes_the_descriptor_of_the_whole_network(network, world, mirror):
     rows = np.array([0, 3, 7])
     found = pool_world(network, world, rows, mirror, Rule())
-    if not mirror:
-        wanted = describe(network, world, rows)
-        for mode, values in wanted.items():
-            again = network.fusion.unite(found.pooled[mode], *found.present[mode]).descriptor
-            np.testing.assert_allclose(again.detach().numpy(), values, atol=1e-5)
-    plain = pool_world(network, world, rows, False, Rule()).pooled["fused"]
-    assert torch.equal(found.pooled["fused"].image, plain.image) != mirror
+    inputs = stack_views([ViewMaker(TINY).plain(world.sample(int(row)), mirror) for row in rows], TINY)
+    features, every, none = network.encode(inputs), torch.ones(3, dtype=torch.bool), torch.zeros(3, dtype=torch.bool)
+    for mode, there in {"fused": (every, every), "image": (every, none), "cloud": (none, every)}.items():
+        frames = found.frames[mode]
+        again = network.fusion.unite(frames.pooled, frames.images, frames.clouds).descriptor
+        torch.testing.assert_close(again, network.fuse(features, *there).descriptor, atol=1e-5, rtol=0)
+    plain = pool_world(network, world, rows, False, Rule()).frames["fused"]
+    assert torch.equal(found.frames["fused"].pooled.image, plain.pooled.image) != mirror
 
 
 def test_right_near_and_wrong_are_told_by_pass_distance_and_heading(network, world):
@@ -100,6 +88,11 @@ def test_heads_repeat_themselves_from_their_seed(folder, tmp_path, network):
         )
         found.append(copy.fusion.image_head.weight.detach().clone())
     assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
+
+
+def test_heads_need_both_modalities(folder):
+    with pytest.raises(ConfigError, match="branch must be both"):
+        settings_for(folder, branch="image", local_pairs=0)
 
 
 def test_heads_are_not_resumed(folder, tmp_path):

@@ -14,7 +14,6 @@ from training.conftest import write_world
 
 from umf_ros.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.errors import ConfigError, UmfError, WeightsError
-from umf_ros.networks.presets import PRESETS
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights, read_card
 from umf_ros.training.batches import BatchMaker
@@ -29,19 +28,6 @@ from umf_ros.training.validation import validate
 from umf_ros.training.views import Augmentation, ViewMaker
 
 RULE = Rule(positive_m=5)
-
-
-@pytest.fixture(autouse=True)
-def tiny_preset(monkeypatch):
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
-
-
-@pytest.fixture
-def folder(tmp_path):
-    (tmp_path / "worlds").mkdir()
-    for seed in (1, 2):
-        write_world(tmp_path / "worlds" / f"world_{seed:05d}.npz", seed)
-    return tmp_path / "worlds"
 
 
 def settings_for(folder, **changes):

@@ -64,9 +64,11 @@ class TrainingSettings(Group):
     device: str = Field("auto", description="torch device; auto: a GPU when there is one")
 
     @model_validator(mode="after")
-    def _local_heads_need_both(self) -> Self:
+    def _some_need_both(self) -> Self:
         if self.branch != "both" and self.local_pairs:
             raise ValueError(f"local_pairs must be 0 where only the {self.branch} branch learns")
+        if self.branch != "both" and self.stage == "heads":
+            raise ValueError(f"heads weigh both modalities: branch must be both, not {self.branch}")
         return self
 
 

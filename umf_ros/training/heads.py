@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +20,16 @@ from torch import Tensor
 
 from umf_ros.datasets.sample import SampleSequence
 from umf_ros.errors import ConfigError
-from umf_ros.networks.fusion import Pooled
-from umf_ros.networks.umf import UMF, to_device
-from umf_ros.training.batches import stack_views
+from umf_ros.evaluation.protocol import NEAR_M
+from umf_ros.networks.umf import UMF
 from umf_ros.training.config import TrainingSettings
-from umf_ros.training.labels import Rule, distances, places_of
+from umf_ros.training.labels import Rule, distances, label, places_of
 from umf_ros.training.losses import neighbourhood_components
 from umf_ros.training.schedule import append_row, learning_rate
 from umf_ros.training.trainer import Progress, Worlds
-from umf_ros.training.validation import MODES, Results, mean_of, validate
-from umf_ros.training.views import ViewMaker
+from umf_ros.training.validation import MODES, PooledFrames, Results, mean_of, pool, validate
 
-NEAR_M = 5.0
 MARGIN_M, MARGIN_DEG = 2.0, 5.0
-_FRAMES = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +37,12 @@ class PooledWorld:
     """A world, or its mirror image, as the network pools its frames.
 
     Attributes:
-        pooled: by mode.
-        present: by mode the frames' images and scans that it uses, (N,) bool each.
+        frames: by mode.
         right, near, wrong: (N, N) bool: true matches in another pass, those of them within 5 m, and what must
             not be retrieved; a reference that misses the rule by little is none of them.
     """
 
-    pooled: dict[str, Pooled]
-    present: dict[str, tuple[Tensor, Tensor]]
+    frames: dict[str, PooledFrames]
     right: Tensor
     near: Tensor
     wrong: Tensor
@@ -57,43 +51,17 @@ class PooledWorld:
 def pool_world(
     network: UMF, sequence: SampleSequence, rows: NDArray[np.int64], mirror: bool, rule: Rule, half: bool = False
 ) -> PooledWorld:
-    """Run the network up to the pooling on the frames `rows` (N,) of a world, or of its mirror image.
-
-    Args:
-        network: is switched to evaluation.
-        sequence: the world.
-        rows: (N,) which frames.
-        mirror: take their mirror images.
-        rule: what is a true match.
-        half: run in bfloat16 mixed precision.
-    """
-    device = next(network.parameters()).device
-    maker = ViewMaker(network.config)
-    pooled: dict[str, list[Pooled]] = {mode: [] for mode in MODES}
-    present: dict[str, list[tuple[Tensor, Tensor]]] = {mode: [] for mode in MODES}
-    network.eval()
-    for start in range(0, len(rows), _FRAMES):
-        views = [maker.plain(sequence.sample(int(row)), mirror) for row in rows[start : start + _FRAMES]]
-        with torch.no_grad(), torch.autocast(device.type, torch.bfloat16, enabled=half):
-            inputs = to_device(stack_views(views, network.config), device)
-            features = network.encode(inputs)
-            images, clouds = inputs.image_present, inputs.coarse_mask.any(1)
-            nothing = torch.zeros_like(images)
-            for mode, there in zip(MODES, ((images, clouds), (images, nothing), (nothing, clouds)), strict=True):
-                pooled[mode].append(network.pool(features, *there))
-                present[mode].append(there)
+    """Pool the frames `rows` (N,) of a world, or their mirror images, and tell which are the same place by `rule`."""
     places = places_of(0, np.asarray(sequence.world_T_body)[rows])
-    metres, turn = distances(places, places)
     passage = np.asarray(sequence.pass_index)[rows]
     other_pass = passage[:, None] != passage[None]
-    right = (metres < rule.positive_m) & (turn < np.radians(rule.positive_deg)) & other_pass
-    alike = (metres < rule.positive_m + MARGIN_M) & (turn < np.radians(rule.positive_deg + MARGIN_DEG))
-    kinds = right, right & (metres < NEAR_M), ~alike & other_pass
-    return PooledWorld(
-        {mode: Pooled(*map(torch.cat, zip(*parts, strict=True))) for mode, parts in pooled.items()},
-        {mode: (torch.cat([a for a, _ in parts]), torch.cat([b for _, b in parts])) for mode, parts in present.items()},
-        *(torch.from_numpy(kind).to(device) for kind in kinds),
-    )
+    wider = replace(rule, positive_m=rule.positive_m + MARGIN_M, positive_deg=rule.positive_deg + MARGIN_DEG)
+    right = label(places, places, rule)[0] & other_pass
+    near = right & (distances(places, places)[0] < NEAR_M)
+    wrong = ~label(places, places, wider)[0] & other_pass
+    device = next(network.parameters()).device
+    kinds = (torch.from_numpy(kind).to(device) for kind in (right, near, wrong))
+    return PooledWorld(pool(network, sequence, rows, mirror, half), *kinds)
 
 
 class HeadFitter:
@@ -166,9 +134,9 @@ class HeadFitter:
         settings = self._settings
         losses: dict[str, Tensor] = {}
         for mode in MODES:
-            images, clouds = world.present[mode]
-            there = (images | clouds)[:, None]
-            descriptor = self._network.fusion.unite(world.pooled[mode], images, clouds).descriptor
+            frames = world.frames[mode]
+            there = (frames.images | frames.clouds)[:, None]
+            descriptor = self._network.fusion.unite(frames.pooled, frames.images, frames.clouds).descriptor
             similarity = descriptor @ descriptor.T
             losses[mode] = neighbourhood_components(similarity, world.right & there, world.wrong)
             if mode == "fused":

@@ -14,10 +14,10 @@ from umf_ros.errors import ConfigError
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import save_weights
 from umf_ros.training.config import TrainingSettings
-from umf_ros.training.distributed import Team, join_team
+from umf_ros.training.distributed import join_team
 from umf_ros.training.heads import HeadFitter
 from umf_ros.training.setup import check_preset, common_card, earlier_runs, make_network, open_worlds, write_settings
-from umf_ros.training.trainer import Progress, Trainer, Worlds
+from umf_ros.training.trainer import Progress, Trainer
 from umf_ros.training.validation import figures
 
 
@@ -48,26 +48,21 @@ def train(settings: TrainingSettings, output: Path, resume: bool, report: Callab
     with join_team(settings.device) as team:
         network = make_network(settings.preset, settings.start, settings.image_size)
         unseen = validation.refresh if validation else list
-        trainer = _trainer(settings, network, training.refresh, unseen, output, team)
-        if isinstance(trainer, HeadFitter):
+        trainer: Trainer | HeadFitter
+        if settings.stage == "heads":
             if resume or team.size > 1:
                 raise ConfigError("stage: heads take minutes in one process: nothing to resume, nothing to share")
-        elif resume:
-            trainer.resume()
+            trainer = HeadFitter(network.to(team.device), settings, training.refresh, unseen, output)
+        else:
+            trainer = Trainer(network, settings, training.refresh, unseen, output, team)
+            if resume:
+                trainer.resume()
 
         def keep(best: UMF, summary: dict[str, Any]) -> None:
             save_weights(best, weights, summary | _card(settings, best, training.worlds, trainer))
 
         trainer.run(report, keep)
     return weights
-
-
-def _trainer(
-    settings: TrainingSettings, network: UMF, training: Worlds, validation: Worlds, folder: Path, team: Team
-) -> Trainer | HeadFitter:
-    if settings.stage == "heads":
-        return HeadFitter(network.to(team.device), settings, training, validation, folder)
-    return Trainer(network, settings, training, validation, folder, team)
 
 
 def _card(

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor, nn
 
 from umf_ros.datasets.sample import SampleSequence
-from umf_ros.evaluation.scores import Scores
 from umf_ros.networks.umf import UMF, to_device
 from umf_ros.training.batches import BatchMaker, TrainingBatch
 from umf_ros.training.checkpoint import resuming, save_checkpoint
@@ -24,7 +23,7 @@ from umf_ros.training.labels import Rule
 from umf_ros.training.objective import Bank, Objective
 from umf_ros.training.sampler import PairSampler
 from umf_ros.training.schedule import append_row, learning_rate
-from umf_ros.training.validation import MODES, mean_of, validate
+from umf_ros.training.validation import MODES, Results, mean_of, validate
 from umf_ros.training.views import Augmentation, ViewMaker
 
 Worlds = Callable[[], Sequence[SampleSequence]]
@@ -68,7 +67,7 @@ class Trainer:
         team: Team,
     ) -> None:
         self.progress = Progress(batch=settings.batch)
-        self.results: dict[str, dict[str, Scores]] = {}
+        self.results: Results = {}
         self._settings, self._team, self._folder = settings, team, folder
         self._training, self._validation = training, validation
         self._network = network.to(team.device)
