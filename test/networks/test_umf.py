@@ -39,10 +39,10 @@ def test_a_rock_moved_sideways_changes_the_descriptor(network):
     assert (network(batch).descriptor - network(mirrored).descriptor).norm() > 1e-4
 
 
-@pytest.mark.parametrize("backbone", ["resnet18", "resnet34", "resnet50", "mobile"])
-def test_every_parameter_learns(backbone):
+@pytest.mark.parametrize(("backbone", "blocks"), [("resnet18", 0), ("resnet34", 2), ("resnet50", 0), ("mobile", 1)])
+def test_every_parameter_learns(backbone, blocks):
     """The reference's optimiser forgets its heads."""
-    network = UMF(replace(TINY, backbone=backbone)).train()
+    network = UMF(replace(TINY, backbone=backbone, voxel_blocks=blocks)).train()
     batch = some_input(TINY, 3)
     features = network.encode(batch)
     fused = network.fuse(features, torch.tensor([True, True, False]), torch.tensor([True, False, True])).descriptor
@@ -130,9 +130,9 @@ def test_a_preset_survives_its_own_card(name):
 
 
 def test_the_default_networks_fit_a_rover():
-    """Less than ten megabytes in half precision; the mobile one is smaller still, and both describe alike."""
+    """Less than twenty megabytes in half precision; the mobile one is smaller still, and both describe alike."""
     light, mobile = UMF(PRESETS["umf_light"]), UMF(PRESETS["umf_mobile"])
-    assert 3.0e6 < count_parameters(light) < 5.0e6
+    assert 3.0e6 < count_parameters(light) < 10.0e6
     assert count_parameters(mobile) < 0.7 * count_parameters(light)
     assert light.config.descriptor == mobile.config.descriptor == 256
 

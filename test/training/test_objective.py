@@ -251,6 +251,26 @@ def test_heads_that_are_not_wanted_are_not_asked(batch):
     assert set(plain) == {"fused", "image", "cloud", "graded", "total", "active"}
 
 
+def test_neighbours_are_sought_in_other_passes_and_the_near_ones_first(batch):
+    plain = replace(batch, local_rows=batch.local_rows[:0])
+    rule = Rule(positive_m=20, negative_m=30, between_passes=True)
+    metres = torch.tensor([0, 0, 100, 150, 4, 15, 102, 400.0])
+    position = np.stack([metres.numpy(), np.zeros(8)], axis=1)
+    passage = np.array([0, 0, 0, 1, 1, 1, 1, 0])
+    places = Places(np.zeros(8, int), position, np.zeros(8), passage)
+    torch.manual_seed(0)
+    network = UMF(TINY).eval()
+    chosen = settings(loss="neighbourhood", bank=0)
+    found, fused = Objective(network, chosen, rule)(replace(plain, places=places), YES, YES, Bank(0, TINY.descriptor))
+    apart = (metres[:, None] - metres).abs()
+    other = torch.from_numpy(passage[:, None] != passage)
+    right, wrong = (apart < 20) & other, (apart > 30) & other
+    wanted = neighbourhood_components(fused @ fused.T, right, wrong)
+    assert right.any() and found["fused"].item() == pytest.approx(wanted.item(), rel=1e-5)
+    graded = neighbourhood_components(fused @ fused.T, right & (apart < 5), right & (apart >= 5))
+    assert graded.item() > 0 and found["graded"].item() == pytest.approx(graded.item(), rel=1e-5)
+
+
 def test_a_missing_image_has_no_part_in_the_image_loss(batch):
     """Not even by what stands in its place."""
     there = torch.tensor([True] * 6 + [False] * 2)
@@ -303,7 +323,7 @@ def test_a_bank_of_lookalikes_raises_the_loss(batch):
     plain = replace(batch, local_rows=batch.local_rows[:0])
     network, without = evaluate(plain, settings())
     descriptors = network(batch.input).descriptor
-    elsewhere = Places(batch.places.world + 100, batch.places.position, batch.places.heading)
+    elsewhere = replace(batch.places, world=batch.places.world + 100)
     bank = Bank(100, TINY.descriptor)
     bank.add(descriptors, elsewhere)
     _, found = evaluate(plain, settings(), bank=bank)

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 import torch
 import typer
 import yaml
-from tiny_worlds import TINY, pose_at
+from tiny_worlds import TINY, pose_at, some_input
 from training.conftest import write_world
 from typer.testing import CliRunner
 
@@ -179,6 +180,7 @@ def test_one_process_is_a_team_that_leads_itself(monkeypatch):
 
 TWO = """
 import sys
+from dataclasses import replace
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 import torch
@@ -349,6 +351,26 @@ def test_a_run_of_one_kind_does_not_resume_from_the_other(folder, tmp_path):
         umf("train", folder, "--out", tmp_path, "--preset", "tiny", "--steps", 1, "--resume")
     with pytest.raises(WeightsError, match="of another run"):
         umf("pretrain", "lidar", folder, "--out", tmp_path, "--preset", "tiny", "--steps", 1, "--batch", 2, "--resume")
+
+
+def test_a_deeper_network_starts_as_the_one_it_grew_from(tmp_path, monkeypatch):
+    torch.manual_seed(6)
+    shallow = UMF(TINY).eval()
+    save_weights(shallow, tmp_path / "shallow.safetensors", {})
+    monkeypatch.setitem(PRESETS, "deep", replace(TINY, backbone="resnet34", voxel_blocks=2))
+    monkeypatch.setitem(PRESETS, "bottleneck", replace(TINY, backbone="resnet50"))
+    deep = make_network("deep", str(tmp_path / "shallow.safetensors")).eval()
+    batch = some_input(TINY)
+    found, wanted = deep(batch), load_weights(tmp_path / "shallow.safetensors")(batch)
+    torch.testing.assert_close(found.descriptor, wanted.descriptor, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(found.cloud.descriptors, wanted.cloud.descriptors, atol=1e-5, rtol=1e-4)
+    new = sum(value.numel() for value in deep.parameters()) - sum(value.numel() for value in shallow.parameters())
+    assert new > 0
+    with pytest.raises(ConfigError, match="is not a bottleneck"):
+        make_network("bottleneck", str(tmp_path / "shallow.safetensors"))
+    save_weights(deep, tmp_path / "deep.safetensors", {})
+    with pytest.raises(ConfigError, match="is not a tiny"):
+        make_network("tiny", str(tmp_path / "deep.safetensors"))
 
 
 def test_weights_of_another_network_do_not_start_a_run(tmp_path):

@@ -78,6 +78,20 @@ def test_half_of_a_batch_is_of_one_world_and_much_of_it_of_one_stretch():
         assert len({anchor.mirror for anchor, _ in pairs[:8]}) == 1
 
 
+def test_a_whole_world_gives_all_pairs_from_all_over_it():
+    drives = [straight(100) for _ in range(3)]
+    sampler, rng = PairSampler(drives, Rule(positive_m=5, between_passes=True), whole=True), np.random.default_rng(0)
+    seen = set()
+    for _ in range(20):
+        pairs = sampler.draw(60, rng)
+        assert len({(draw.sequence, draw.mirror) for pair in pairs for draw in pair}) == 1
+        assert len({anchor.index for anchor, _ in pairs}) == 60
+        along = [drives[0].world_T_body[anchor.index, 0, 3] for anchor, _ in pairs]
+        assert np.ptp(along) > 800 and np.bincount(np.array(along, int) // 250, minlength=4).min() > 5
+        seen.add(pairs[0][0].sequence)
+    assert seen == {0, 1, 2}
+
+
 def test_a_world_with_a_single_revisit_is_drawn_over_and_over():
     lonely = straight(2)
     lonely.world_T_body[1, 0, 3] = 500.0  # only the other place is seen twice
@@ -98,10 +112,11 @@ def test_mirrored_as_often_as_wanted(chance):
 
 
 def test_a_mirrored_world_keeps_its_distances_and_turns_its_headings():
-    drive = Drive(np.stack([pose_at(1, 2, 10), pose_at(4, -2, 50)]), np.zeros(2, int))
+    drive = Drive(np.stack([pose_at(1, 2, 10), pose_at(4, -2, 50)]), np.array([0, 3]))
     plain, mirrored = (places_drawn([Draw(0, 0, flip), Draw(0, 1, flip)], [drive]) for flip in (False, True))
     np.testing.assert_allclose(distances(plain, plain), distances(mirrored, mirrored))
     np.testing.assert_allclose(mirrored.heading, -plain.heading)
+    assert plain.passage.tolist() == [0, 3]
     assert np.isinf(distances(plain, mirrored)[0]).all()
 
 
@@ -124,9 +139,22 @@ def test_what_counts_as_the_same_place(metres, degrees, positive, negative):
     assert (bool(found[0][0, 0]), bool(found[1][0, 0])) == (positive, negative)
 
 
+def test_pairs_of_one_pass_are_neutral_where_passes_are_compared():
+    poses = np.stack([pose_at(x, 0) for x in (0, 1, 2, 500, 501)])
+    places = places_of(0, poses, np.array([0, 0, 1, 0, 1]))
+    positive, negative = label(places, places, Rule(between_passes=True))
+    assert positive[0].tolist() == [False, False, True, False, False]
+    assert negative[0].tolist() == [False, False, False, False, True]
+    elsewhere = places_of(1, poses[:1])
+    assert label(places, elsewhere, Rule(between_passes=True))[1].all()  # another world is another pass
+
+
 def test_distances_are_those_of_every_pair():
     rng = np.random.default_rng(0)
-    a, b = (Places(rng.integers(2, size=n), rng.normal(size=(n, 2)), rng.uniform(-4, 4, n)) for n in (5, 7))
+    a, b = (
+        Places(rng.integers(2, size=n), rng.normal(size=(n, 2)), rng.uniform(-4, 4, n), np.zeros(n, int))
+        for n in (5, 7)
+    )
     metres, turn = distances(a, b)
     for i in range(5):
         for j in range(7):

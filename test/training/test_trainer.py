@@ -109,7 +109,9 @@ def test_frozen_encoders_stay(folder, tmp_path):
     )  # fmt: skip
     trainer.run(silent, lambda *_: None)
     moved = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
-    assert not [name for name in moved if "encoder" in name]  # running statistics included
+    fine = ("pyramid.fine", "laterals.0", "laterals.1", "voxel_encoder.fine", "up_fine")  # of the local features
+    encoders = {name for name in moved if "encoder" in name}  # running statistics included
+    assert encoders and not [name for name in encoders if not any(part in name for part in fine)]
     assert "fusion.image_head.weight" in moved
 
 
@@ -128,6 +130,15 @@ def test_one_branch_learns_and_leaves_the_other_as_it_was(folder, tmp_path, bran
     assert not [name for name in moved if other in name or "cross" in name or "absent" in name or "local" in name]
     idle = [n for n, p in network.named_parameters() if p.requires_grad and p.grad is None]
     assert idle == []
+
+
+def test_neighbours_are_drawn_from_whole_worlds(folder, tmp_path):
+    """Every row finds its place in the other pass, and a nearer and a farther one."""
+    settings = settings_for(folder, loss="neighbourhood", local_pairs=0, batch=24, steps=2, modality_dropout=0.0)
+    losses = []
+    trainer = Trainer(UMF(TINY), settings, WorldFolder(folder).refresh, list, tmp_path, Team(0, 1, torch.device("cpu")))
+    trainer.run(lambda progress: losses.append(progress.losses), lambda *_: None)
+    assert all(found[name] > 0.1 for found in losses for name in ("fused", "image", "cloud", "graded"))
 
 
 def test_a_run_leaves_weights_card_log_and_settings(folder, tmp_path):

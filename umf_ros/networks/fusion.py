@@ -73,13 +73,6 @@ class GeneralisedMean(nn.Module):
         return (powered.sum(1) / weight.sum(1)).pow(1 / self.exponent)
 
 
-class Pooled(NamedTuple):
-    """What the fusion transformer makes of a batch, before the fully connected layers; (B, C) each."""
-
-    image: Tensor
-    cloud: Tensor
-
-
 class Fused(NamedTuple):
     """Descriptors of a batch.
 
@@ -94,7 +87,7 @@ class Fused(NamedTuple):
     image: Tensor
     cloud: Tensor
     weights: Tensor
-    attention: list[dict[str, Tensor]] = []  # noqa: RUF012 - a named tuple's, never written to
+    attention: list[dict[str, Tensor]]
 
 
 class Fusion(nn.Module):
@@ -116,26 +109,12 @@ class Fusion(nn.Module):
 
     def forward(self, image: Tokens, cloud: Tokens, image_present: Tensor, cloud_present: Tensor) -> Fused:
         """Fuse tokens of which the absent rows (present: (B,) bool) hold the learned token alone."""
-        pooled, maps = self.pool(image, cloud)
-        return self.unite(pooled, image_present, cloud_present)._replace(attention=maps)
-
-    def pool(self, image: Tokens, cloud: Tokens) -> tuple[Pooled, list[dict[str, Tensor]]]:
-        """Transform and pool the tokens; also the attention maps of every layer."""
         maps = []
         for layer in self.layers:
             image, cloud, attention = layer(image, cloud)
             maps.append(attention)
         seen = self.image_pool(Tokens(self.image_norm(image.values), image.mask))
         felt = self.cloud_pool(Tokens(self.cloud_norm(cloud.values), cloud.mask))
-        return Pooled(seen, felt), maps
-
-    def heads(self) -> list[nn.Module]:
-        """What comes after the pooling."""
-        return [self.image_head, self.cloud_head, self.weigh]
-
-    def unite(self, pooled: Pooled, image_present: Tensor, cloud_present: Tensor) -> Fused:
-        """Descriptors from what was pooled, with the modalities that are present (B,) bool."""
-        seen, felt = pooled
         with torch.autocast(seen.device.type, enabled=False):
             image_half = nn.functional.normalize(self.image_head(seen.float()), dim=-1)
             cloud_half = nn.functional.normalize(self.cloud_head(felt.float()), dim=-1)
@@ -147,4 +126,4 @@ class Fusion(nn.Module):
             # not quite zero: the root's slope must stay finite
             shares = (weights + 1e-12).sqrt()
             descriptor = torch.cat([image_half * shares[:, :1], cloud_half * shares[:, 1:]], dim=-1)
-            return Fused(nn.functional.normalize(descriptor, dim=-1), image_half, cloud_half, weights)
+            return Fused(nn.functional.normalize(descriptor, dim=-1), image_half, cloud_half, weights, maps)

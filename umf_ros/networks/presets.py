@@ -20,6 +20,7 @@ class NetworkConfig:
         image_size: height and width of the network's input, multiples of 32.
         pyramid: channels of the image feature pyramid.
         voxel_channels: channels of the voxel encoder at 20^3, 10^3 and 5^3 cells.
+        voxel_blocks: residual blocks of the voxel encoder at 10^3 and at 5^3 cells.
         tokens: width of the fusion transformer.
         heads, layers, feedforward: of the fusion transformer.
         descriptor: length of the global descriptor.
@@ -35,6 +36,7 @@ class NetworkConfig:
     image_size: tuple[int, int] = (96, 128)
     pyramid: int = 96
     voxel_channels: tuple[int, int, int] = (24, 64, 128)
+    voxel_blocks: int = 0
     tokens: int = 128
     heads: int = 4
     layers: int = 1
@@ -77,7 +79,7 @@ class NetworkConfig:
 
 PRESETS: dict[str, NetworkConfig] = {
     # the horizon and the rocks under a moved sun need these pixels: at 128 x 96 the image alone finds a tenth less
-    "umf_light": NetworkConfig(image_size=(160, 224)),
+    "umf_light": NetworkConfig(backbone="resnet34", image_size=(160, 224), voxel_blocks=2),
     "umf_mobile": NetworkConfig(backbone="mobile", width=24),
     "umf_resnet50": NetworkConfig(
         backbone="resnet50",

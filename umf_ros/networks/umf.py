@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from umf_ros.networks.fusion import AbsentToken, Fused, Fusion, Pooled, Tokens
+from umf_ros.networks.fusion import AbsentToken, Fused, Fusion, Tokens
 from umf_ros.networks.image_encoder import ImageEncoder
 from umf_ros.networks.local_features import CloudLocal, ImageLocal, LocalMap
 from umf_ros.networks.positions import image_positions, sine_encoding, voxel_positions
@@ -134,15 +134,9 @@ class UMF(nn.Module):
 
     def fuse(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> Fused:
         """Descriptors and attention maps, with the modalities that are present (B,) bool."""
-        return self.fusion(*self._complete(features, image_present, cloud_present), image_present, cloud_present)
-
-    def pool(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> Pooled:
-        """What `fuse` makes the descriptors of."""
-        return self.fusion.pool(*self._complete(features, image_present, cloud_present))[0]
-
-    def _complete(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> tuple[Tokens, Tokens]:
-        """Tokens of both modalities; what is absent is replaced."""
-        return self.absent_image(features.image, image_present), self.absent_cloud(features.cloud, cloud_present)
+        image = self.absent_image(features.image, image_present)
+        cloud = self.absent_cloud(features.cloud, cloud_present)
+        return self.fusion(image, cloud, image_present, cloud_present)
 
     def branch_layers(self, branch: Literal["image", "cloud"]) -> list[nn.Module]:
         """What belongs to one modality alone on the way to the descriptor."""

@@ -35,6 +35,19 @@ def conv_block(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> n
     return nn.Sequential(conv, nn.BatchNorm3d(outputs), nn.ReLU())
 
 
+class ResidualBlock3d(nn.Module):
+    """Two convolutions beside a shortcut."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        second = nn.Conv3d(channels, channels, 3, padding=1, bias=False)
+        self.layers = nn.Sequential(conv_block(channels, channels), second, nn.BatchNorm3d(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, X, Y, Z) to the same shape; `x` is not negative."""
+        return F.relu(x + self.layers(x))
+
+
 class VoxelEncoder(nn.Module):
     """Encoder at 20^3, 10^3 and 5^3 cells with a top-down decoder."""
 
@@ -42,8 +55,8 @@ class VoxelEncoder(nn.Module):
         super().__init__()
         fine, middle, deep = config.voxel_channels
         self.stem = nn.Sequential(conv_block(FEATURES * 8, fine, 1), conv_block(fine, fine))
-        self.down = nn.Sequential(conv_block(fine, middle, stride=2), conv_block(middle, middle))
-        self.bottom = nn.Sequential(conv_block(middle, deep, stride=2), conv_block(deep, deep))
+        self.down = _stage(fine, middle, config.voxel_blocks)
+        self.bottom = _stage(middle, deep, config.voxel_blocks)
         self.up_middle = nn.Conv3d(deep, middle, 1)
         self.up_fine = nn.Conv3d(middle, fine, 1)
         self.coarse = nn.Conv3d(middle, config.tokens, 1)
@@ -83,6 +96,12 @@ class VoxelEncoder(nn.Module):
         own = family.gather(3, child[..., None, None].expand(-1, -1, FEATURES, 1)).squeeze(3).to(context.dtype)
         place = F.one_hot(child, 8).to(context.dtype)
         return self.fine(torch.cat([context, own, place], dim=-1))
+
+
+def _stage(inputs: int, outputs: int, blocks: int) -> nn.Sequential:
+    """Half the resolution."""
+    further = (ResidualBlock3d(outputs) for _ in range(blocks))
+    return nn.Sequential(conv_block(inputs, outputs, stride=2), conv_block(outputs, outputs), *further)
 
 
 def _double(cells: Tensor) -> Tensor:

@@ -26,7 +26,10 @@ class TrainingSettings(Group):
     validation_stride: int = Field(2, ge=1, description="every how many frames are used in the validations on the way")
     patience: int = Field(0, ge=0, description="validations without progress before stopping; 0: never")
     seed: int = Field(0, ge=0, description="of weights, batches and augmentation")
-    loss: Literal["multi_similarity", "triplet"] = Field("multi_similarity", description="on the descriptors")
+    loss: Literal["multi_similarity", "triplet", "neighbourhood"] = Field(
+        "multi_similarity",
+        description="on the descriptors; neighbourhood: every batch from all over one world, of some hundred frames",
+    )
     batch: int = Field(32, ge=4, description="frames per step and process, half of them positives of the others")
     batch_limit: int = Field(88, ge=4, description="largest batch of the triplet loss's growing batches")
     batch_growth: float = Field(1.4, ge=1, description="factor when too few triplets are active")
@@ -53,11 +56,7 @@ class TrainingSettings(Group):
     branch: Branch = Field(
         "both", description="image or cloud: that branch alone learns, the other one is neither run nor changed"
     )
-    stage: Literal["network", "heads"] = Field(
-        "network",
-        description="heads: the layers after the pooling alone, each step on a whole world; minutes, and the last run",
-    )
-    freeze_encoders: bool = Field(False, description="train fusion and heads only (thesis 4.6)")
+    freeze_encoders: bool = Field(False, description="train fusion and local features only (thesis 4.6)")
     start: str = Field("", description="weights to start from")
     half: bool = Field(True, description="bfloat16 mixed precision")
     threads: int = Field(1, ge=1, description="threads per process")
@@ -67,8 +66,6 @@ class TrainingSettings(Group):
     def _some_need_both(self) -> Self:
         if self.branch != "both" and self.local_pairs:
             raise ValueError(f"local_pairs must be 0 where only the {self.branch} branch learns")
-        if self.branch != "both" and self.stage == "heads":
-            raise ValueError(f"heads weigh both modalities: branch must be both, not {self.branch}")
         return self
 
 

@@ -15,13 +15,15 @@ class Rule:
     """Distances in metres, headings in degrees; what is neither positive nor negative is neutral.
 
     The thesis takes every pair beyond 30 deg for different. Two views 40 deg apart still share half of
-    their field, so in training the band up to `negative_deg` stays neutral.
+    their field, so in training the band up to `negative_deg` stays neutral. With `between_passes`, pairs
+    of one pass are neutral too.
     """
 
     positive_m: float = 12.0
     positive_deg: float = 30.0
     negative_m: float = 60.0
     negative_deg: float = 60.0
+    between_passes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,17 +34,25 @@ class Places:
         world: (B,) int, places of different worlds are different.
         position: (B, 2) metres.
         heading: (B,) radians.
+        passage: (B,) int, in which pass of its world.
     """
 
     world: NDArray[np.int64]
     position: Array
     heading: Array
+    passage: NDArray[np.int64]
 
 
-def places_of(world: int, world_T_body: Array) -> Places:
-    """Places of (N, 4, 4) poses in one world."""
+def places_of(world: int, world_T_body: Array, passage: NDArray[np.int64] | None = None) -> Places:
+    """Places of (N, 4, 4) poses in one world; without `passage` (N,) they are of one pass."""
     heading = np.arctan2(world_T_body[:, 1, 0], world_T_body[:, 0, 0])
-    return Places(np.full(len(world_T_body), world), world_T_body[:, :2, 3], heading)
+    count = len(world_T_body)
+    return Places(
+        np.full(count, world),
+        world_T_body[:, :2, 3],
+        heading,
+        np.zeros(count, np.int64) if passage is None else passage,
+    )
 
 
 def distances(a: Places, b: Places) -> tuple[Array, Array]:
@@ -57,4 +67,7 @@ def label(a: Places, b: Places, rule: Rule) -> tuple[NDArray[np.bool_], NDArray[
     metres, turn = distances(a, b)
     positive = (metres < rule.positive_m) & (turn < np.radians(rule.positive_deg))
     negative = (metres > rule.negative_m) | (turn > np.radians(rule.negative_deg))
+    if rule.between_passes:
+        apart = (a.world[:, None] != b.world[None]) | (a.passage[:, None] != b.passage[None])
+        positive, negative = positive & apart, negative & apart
     return positive, negative

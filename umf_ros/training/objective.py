@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from umf_ros.evaluation.protocol import NEAR_M
 from umf_ros.networks.umf import UMF, Features
 from umf_ros.training.batches import TrainingBatch
 from umf_ros.training.config import TrainingSettings
@@ -19,7 +20,7 @@ from umf_ros.training.local_losses import (
     super_contrastive,
     wasted_saliency,
 )
-from umf_ros.training.losses import batch_hard_triplet, graded, multi_similarity
+from umf_ros.training.losses import batch_hard_triplet, graded, multi_similarity, neighbourhood_components
 
 
 class Bank:
@@ -28,7 +29,7 @@ class Bank:
     def __init__(self, size: int, dimension: int) -> None:
         self._size = size
         self.descriptors = torch.zeros(0, dimension)
-        self.places = Places(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
+        self.places = Places(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
 
     def add(self, descriptors: Tensor, places: Places) -> None:
         """Remember a batch, forgetting the oldest."""
@@ -40,18 +41,18 @@ class Bank:
 
     def state(self) -> dict[str, Tensor]:
         """For a checkpoint."""
-        arrays = {"world": self.places.world, "position": self.places.position, "heading": self.places.heading}
+        arrays = {field.name: getattr(self.places, field.name) for field in fields(Places)}
         return {"descriptors": self.descriptors} | {name: torch.from_numpy(array) for name, array in arrays.items()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Inverse of `state`."""
         self.descriptors = state["descriptors"]
-        self.places = Places(*(state[name].numpy() for name in ("world", "position", "heading")))
+        self.places = Places(*(state[field.name].numpy() for field in fields(Places)))
 
 
 def _join(a: Places, b: Places, kept: int) -> Places:
-    world, position = np.concatenate([a.world, b.world]), np.concatenate([a.position, b.position])
-    return Places(world[-kept:], position[-kept:], np.concatenate([a.heading, b.heading])[-kept:])
+    joined = (np.concatenate([getattr(a, field.name), getattr(b, field.name)]) for field in fields(Places))
+    return Places(*(values[-kept:] for values in joined))
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +171,7 @@ class Objective(nn.Module):
         losses: dict[str, Tensor] = {}
         losses["fused"], active = self._metric(similarity, relations.positive & shared, relations.negative & shared)
         comparable = relations.comparable & shared[:, :count]
-        losses["graded"] = graded(similarity[:, :count], relations.metres, comparable)
+        losses["graded"] = self._graded(similarity[:, :count], relations, comparable)
         for name, (descriptor, there) in alone.items():
             both = there[:, None] & there[None]
             positive, negative = relations.positive[:, :count] & both, relations.negative[:, :count] & both
@@ -181,7 +182,16 @@ class Objective(nn.Module):
     def _metric(self, similarity: Tensor, positive: Tensor, negative: Tensor) -> tuple[Tensor, Tensor]:
         if self._settings.loss == "triplet":
             return batch_hard_triplet(similarity, positive, negative)
+        if self._settings.loss == "neighbourhood":
+            return neighbourhood_components(similarity, positive, negative), similarity.new_ones(())
         return multi_similarity(similarity, positive, negative), similarity.new_ones(())
+
+    def _graded(self, similarity: Tensor, relations: Relations, comparable: Tensor) -> Tensor:
+        if self._settings.loss != "neighbourhood":
+            return graded(similarity, relations.metres, comparable)
+        right = relations.positive[:, : len(similarity)] & comparable
+        near = right & (relations.metres < NEAR_M)
+        return neighbourhood_components(similarity, near, right & ~near)
 
     def _local(self, features: Features, batch: TrainingBatch, negative: Tensor) -> dict[str, Tensor]:
         rows, share = batch.local_rows, self._settings.local_gradient

@@ -10,12 +10,10 @@ import torch
 
 from umf_ros.datasets.sample import SampleSequence
 from umf_ros.datasets.simulated import WorldFolder
-from umf_ros.errors import ConfigError
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import save_weights
 from umf_ros.training.config import TrainingSettings
 from umf_ros.training.distributed import join_team
-from umf_ros.training.heads import HeadFitter
 from umf_ros.training.setup import check_preset, common_card, earlier_runs, make_network, open_worlds, write_settings
 from umf_ros.training.trainer import Progress, Trainer
 from umf_ros.training.validation import figures
@@ -34,7 +32,7 @@ def train(settings: TrainingSettings, output: Path, resume: bool, report: Callab
         Path of the weights.
 
     Raises:
-        ConfigError: unknown preset, worlds without revisits, or heads to be resumed.
+        ConfigError: unknown preset, or worlds without revisits.
         OutputError: the folder cannot be written.
         WeightsError: nothing to resume from, or weights to start from that do not fit.
     """
@@ -48,15 +46,9 @@ def train(settings: TrainingSettings, output: Path, resume: bool, report: Callab
     with join_team(settings.device) as team:
         network = make_network(settings.preset, settings.start, settings.image_size)
         unseen = validation.refresh if validation else list
-        trainer: Trainer | HeadFitter
-        if settings.stage == "heads":
-            if resume or team.size > 1:
-                raise ConfigError("stage: heads take minutes in one process: nothing to resume, nothing to share")
-            trainer = HeadFitter(network.to(team.device), settings, training.refresh, unseen, output)
-        else:
-            trainer = Trainer(network, settings, training.refresh, unseen, output, team)
-            if resume:
-                trainer.resume()
+        trainer = Trainer(network, settings, training.refresh, unseen, output, team)
+        if resume:
+            trainer.resume()
 
         def keep(best: UMF, summary: dict[str, Any]) -> None:
             save_weights(best, weights, summary | _card(settings, best, training.worlds, trainer))
@@ -69,7 +61,7 @@ def _card(
     settings: TrainingSettings,
     network: UMF,
     training: Sequence[SampleSequence],
-    trainer: Trainer | HeadFitter,
+    trainer: Trainer,
 ) -> dict[str, Any]:
     folders = {name: Path(getattr(settings, name)).name for name in ("train", "validation", "start")}
     return common_card(settings.preset, network, training, trainer.progress.seconds) | {

@@ -28,13 +28,21 @@ class PairSampler:
     farther off; a pair of another world is told apart by its ground alone. Hard worlds are drawn twice
     as often as easy ones. Positives come from another pass.
 
+    Args:
+        sequences: the worlds.
+        rule: what a positive is.
+        mirror: chance of a world to be mirrored.
+        whole: take all pairs from all over one world instead, as the database of a rover will hold them.
+
     Raises:
         ConfigError: no sequence has a revisit.
     """
 
-    def __init__(self, sequences: Sequence[SampleSequence], rule: Rule, mirror: float = 0.5) -> None:
+    def __init__(
+        self, sequences: Sequence[SampleSequence], rule: Rule, mirror: float = 0.5, whole: bool = False
+    ) -> None:
         self._sequences = sequences
-        self._mirror = mirror
+        self._mirror, self._whole = mirror, whole
         self._positives = [_positives(sequence, rule) for sequence in sequences]
         self._usable = [np.flatnonzero([len(row) > 0 for row in rows]) for rows in self._positives]
         weight = np.array([0.0 if not len(self._usable[k]) else _weight(s) for k, s in enumerate(sequences)])
@@ -45,11 +53,17 @@ class PairSampler:
     def draw(self, pairs: int, rng: np.random.Generator) -> list[tuple[Draw, Draw]]:
         """`pairs` anchor-positive pairs."""
         drawn = []
-        for count in (pairs // 2, pairs - pairs // 2):
+        draw = self._anywhere if self._whole else self._stretch
+        for count in (pairs,) if self._whole else (pairs // 2, pairs - pairs // 2):
             world = int(rng.choice(len(self._chance), p=self._chance))
             mirror = bool(rng.random() < self._mirror)
-            drawn += [self._pair(world, index, mirror, rng) for index in self._stretch(world, count, rng)]
+            drawn += [self._pair(world, index, mirror, rng) for index in draw(world, count, rng)]
         return drawn
+
+    def _anywhere(self, world: int, count: int, rng: np.random.Generator) -> list[int]:
+        """Places of a world, as different ones as there are."""
+        usable = self._usable[world]
+        return rng.choice(usable, count, replace=len(usable) < count).tolist()
 
     def _stretch(self, world: int, count: int, rng: np.random.Generator) -> list[int]:
         """Half of them within 80 m of a random place, half anywhere in the world."""
@@ -69,7 +83,7 @@ def _weight(sequence: SampleSequence) -> float:
 
 
 def _positives(sequence: SampleSequence, rule: Rule) -> list[np.ndarray]:
-    places = places_of(0, np.asarray(sequence.world_T_body))
+    places = places_of(0, np.asarray(sequence.world_T_body), np.asarray(sequence.pass_index))
     positive, _ = label(places, places, rule)
     other_pass = positive & (sequence.pass_index[:, None] != sequence.pass_index[None])
     return [np.flatnonzero(row) for row in other_pass]
@@ -82,4 +96,5 @@ def places_drawn(draws: Sequence[Draw], sequences: Sequence[SampleSequence]) -> 
     places = places_of(0, poses)
     world = np.array([2 * draw.sequence + draw.mirror for draw in draws])
     position = places.position * np.stack([np.ones_like(flip), flip], axis=1)
-    return Places(world, position, places.heading * flip)
+    passage = np.array([sequences[draw.sequence].pass_index[draw.index] for draw in draws])
+    return Places(world, position, places.heading * flip, passage)

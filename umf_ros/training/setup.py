@@ -13,12 +13,15 @@ from typing import Any
 import torch
 import yaml
 from pydantic import BaseModel
+from torch import nn
 
 from umf_ros.datasets.sample import SampleSequence
 from umf_ros.datasets.simulated import WorldFolder
 from umf_ros.errors import ConfigError, OutputError
+from umf_ros.networks.image_encoder import ResidualBlock
 from umf_ros.networks.presets import PRESETS
 from umf_ros.networks.umf import UMF, channels_last, count_parameters
+from umf_ros.networks.voxel_encoder import ResidualBlock3d
 from umf_ros.networks.weights import load_weights, read_card
 
 
@@ -50,7 +53,10 @@ def open_worlds(folder: str, setting: str) -> WorldFolder:
 
 
 def make_network(preset: str, start: str, image_size: tuple[int, int] | None = None) -> UMF:
-    """A fresh network to train, or one that starts from weights, perhaps trained at another image size.
+    """A fresh network to train, or one that starts from weights.
+
+    The weights may be those of another image size, and of fewer residual blocks: the further ones begin
+    by changing nothing.
 
     Args:
         preset: its name.
@@ -67,11 +73,32 @@ def make_network(preset: str, start: str, image_size: tuple[int, int] | None = N
     network = UMF(config)
     if start:
         trained = load_weights(Path(start))
-        if replace(trained.config, image_size=config.image_size) != config:
+        grown = {name: getattr(config, name) for name in ("image_size", "backbone", "voxel_blocks")}
+        if replace(trained.config, **grown) != config or not _grow(network, trained):
             raise ConfigError(f"start: {start} is not a {preset}")
-        network.load_state_dict(trained.state_dict())
     channels_last(network)
     return network.train()
+
+
+def _grow(network: UMF, trained: UMF) -> bool:
+    """Fill a network from one that may lack some of its residual blocks; False where more differs than that."""
+    known, wanted = trained.state_dict(), network.state_dict()
+    new = []
+    for name, module in network.named_modules():
+        if isinstance(module, ResidualBlock | ResidualBlock3d) and not any(key.startswith(f"{name}.") for key in known):
+            new.append(f"{name}.")
+            _silence(module)
+    old = {key for key in wanted if not key.startswith(tuple(new))}
+    if known.keys() != old or any(known[key].shape != wanted[key].shape for key in known):
+        return False
+    network.load_state_dict(known, strict=False)
+    return True
+
+
+def _silence(block: ResidualBlock | ResidualBlock3d) -> None:
+    """Make a residual block the identity: its last normalisation lets nothing through."""
+    norms = [layer for layer in block.layers.modules() if isinstance(layer, nn.BatchNorm2d | nn.BatchNorm3d)]
+    nn.init.zeros_(norms[-1].weight)
 
 
 def earlier_runs(start: str) -> list[dict[str, Any]]:

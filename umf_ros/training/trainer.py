@@ -26,6 +26,9 @@ from umf_ros.training.schedule import append_row, learning_rate
 from umf_ros.training.validation import MODES, Results, mean_of, validate
 from umf_ros.training.views import Augmentation, ViewMaker
 
+WHOLE_WORLD = Rule(negative_m=14.0, negative_deg=35.0, between_passes=True)
+"""A later pass looks for itself in an earlier one, and all that is not the place may be taken for it."""
+
 Worlds = Callable[[], Sequence[SampleSequence]]
 
 
@@ -71,7 +74,8 @@ class Trainer:
         self._settings, self._team, self._folder = settings, team, folder
         self._training, self._validation = training, validation
         self._network = network.to(team.device)
-        self._rule = Rule()
+        self._whole = settings.loss == "neighbourhood"
+        self._rule = WHOLE_WORLD if self._whole else Rule()
         self._bank = Bank(settings.bank, network.config.descriptor)
         objective: nn.Module = Objective(self._network, settings, self._rule).to(team.device)
         self._trained = _choose_parameters(network, settings)
@@ -117,7 +121,7 @@ class Trainer:
         rng = np.random.default_rng([settings.seed, epoch, self._team.rank])
         sequences = self._training()
         augmentation = Augmentation()
-        sampler = PairSampler(sequences, self._rule, augmentation.mirror)
+        sampler = PairSampler(sequences, self._rule, augmentation.mirror, self._whole)
         maker = BatchMaker(
             sequences, ViewMaker(self._network.config, augmentation), settings.local_pairs, settings.local_matches
         )
@@ -219,9 +223,12 @@ def _choose_parameters(network: UMF, settings: TrainingSettings) -> list[nn.Para
         network.requires_grad_(False)
         for layer in network.branch_layers(settings.branch):
             layer.requires_grad_(True)
-    frozen: list[nn.Module] = []
     if settings.freeze_encoders:
-        frozen += [network.image_encoder, network.voxel_encoder]
+        for encoder in (network.image_encoder, network.voxel_encoder):
+            encoder.requires_grad_(False)
+            for layer in encoder.fine_layers():  # they belong to the local features
+                layer.requires_grad_(True)
+    frozen: list[nn.Module] = []
     if not settings.weight_super or not settings.local_pairs:
         frozen += [network.super_image, network.super_cloud]
     if not settings.local_pairs:

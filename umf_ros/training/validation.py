@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from umf_ros.datasets.sample import SampleSequence
 from umf_ros.evaluation.protocol import place_recognition
 from umf_ros.evaluation.retrieval import rank
 from umf_ros.evaluation.scores import Scores, score
-from umf_ros.networks.fusion import Pooled
 from umf_ros.networks.umf import UMF, to_device
 from umf_ros.training.batches import stack_views
 from umf_ros.training.views import ViewMaker
@@ -28,63 +25,27 @@ Results = dict[str, dict[str, Scores]]
 _FIGURES = ("queries", "recall1", "recall5", "recall1_within_5m", "recall_at_precision1")
 
 
-@dataclass(frozen=True, slots=True)
-class PooledFrames:
-    """N frames as the network pools them, and which of their images and scans (N,) bool it used."""
-
-    pooled: Pooled
-    images: Tensor
-    clouds: Tensor
-
-
-def pool(
-    network: UMF,
-    sequence: SampleSequence,
-    rows: NDArray[np.int64],
-    mirror: bool = False,
-    half: bool = False,
-    batch: int = 32,
-) -> dict[str, PooledFrames]:
-    """Run the network up to the pooling on some samples of a sequence, by mode: fused, image, cloud.
-
-    Args:
-        network: is switched to evaluation.
-        sequence: where the samples are.
-        rows: (N,) which ones.
-        mirror: take their mirror images.
-        half: run in bfloat16 mixed precision.
-        batch: frames at a time.
-    """
-    device = next(network.parameters()).device
-    maker = ViewMaker(network.config)
-    found: dict[str, list[PooledFrames]] = {mode: [] for mode in MODES}
-    network.eval()
-    for start in range(0, len(rows), batch):
-        views = [maker.plain(sequence.sample(int(row)), mirror) for row in rows[start : start + batch]]
-        with torch.no_grad(), torch.autocast(device.type, torch.bfloat16, enabled=half):
-            inputs = to_device(stack_views(views, network.config), device)
-            features = network.encode(inputs)
-            images, clouds = inputs.image_present, inputs.coarse_mask.any(1)
-            nothing = torch.zeros_like(images)
-            for mode, there in zip(MODES, ((images, clouds), (images, nothing), (nothing, clouds)), strict=True):
-                found[mode].append(PooledFrames(network.pool(features, *there), *there))
-    return {mode: _joined(parts) for mode, parts in found.items()}
-
-
-def _joined(parts: Sequence[PooledFrames]) -> PooledFrames:
-    pooled = Pooled(*(torch.cat(values) for values in zip(*(part.pooled for part in parts), strict=True)))
-    return PooledFrames(pooled, torch.cat([part.images for part in parts]), torch.cat([part.clouds for part in parts]))
-
-
 def describe(
     network: UMF, sequence: SampleSequence, rows: NDArray[np.int64], batch: int = 32
 ) -> dict[str, NDArray[np.float32]]:
     """Descriptors (N, D) of some samples of a sequence, by mode: fused, image, cloud."""
-    with torch.no_grad():
-        return {
-            mode: network.fusion.unite(frames.pooled, frames.images, frames.clouds).descriptor.cpu().numpy()
-            for mode, frames in pool(network, sequence, rows, batch=batch).items()
-        }
+    device = next(network.parameters()).device
+    maker = ViewMaker(network.config)
+    found: dict[str, list[NDArray[np.float32]]] = {mode: [] for mode in MODES}
+    network.eval()
+    for start in range(0, len(rows), batch):
+        views = [maker.plain(sequence.sample(int(row))) for row in rows[start : start + batch]]
+        with torch.inference_mode():
+            inputs = to_device(stack_views(views, network.config), device)
+            present = inputs.coarse_mask.any(1)
+            features = network.encode(inputs)
+            nothing = torch.zeros_like(present)
+            fused = network.fuse(features, inputs.image_present, present)
+            image = network.fuse(features, inputs.image_present, nothing)
+            cloud = network.fuse(features, nothing, present)
+        for mode, result in zip(MODES, (fused, image, cloud), strict=True):
+            found[mode].append(result.descriptor.float().cpu().numpy())
+    return {mode: np.concatenate(parts) for mode, parts in found.items()}
 
 
 def validate(network: UMF, sequences: Sequence[SampleSequence], stride: int = 1) -> Results:

@@ -62,9 +62,9 @@ class ViewMaker:
         self.config = config
         self._augmentation = augmentation
 
-    def plain(self, sample: Sample, mirror: bool = False) -> View:
-        """The view without augmentation, mirrored left to right on request."""
-        return self._make(sample, None, mirror)
+    def plain(self, sample: Sample) -> View:
+        """The view without augmentation."""
+        return self._make(sample, None, False)
 
     def varied(self, sample: Sample, rng: np.random.Generator, mirror: bool = False) -> View:
         """A randomly augmented view, mirrored left to right on request: a world of its own."""
