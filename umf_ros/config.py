@@ -201,7 +201,7 @@ def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:
     Raises:
         ConfigError: the file cannot be read, or a name, type or value is wrong.
     """
-    values = _read_yaml(Path(path)) if path else {}
+    values = _node_parameters(read_values(Path(path)), path) if path else {}
     for name, value in overrides.items():
         if value is not None:
             _set(values, name.split("__"), value)
@@ -217,7 +217,7 @@ def parse_settings(values: dict[str, Any]) -> Settings:
     try:
         return Settings.model_validate(values)
     except ValidationError as error:
-        raise ConfigError("; ".join(_explain(problem) for problem in error.errors())) from None
+        raise ConfigError(problems(error)) from None
 
 
 def dump_settings(settings: Settings) -> str:
@@ -242,21 +242,35 @@ def _set(values: dict[str, Any], path: list[str], value: Any) -> None:
     values[path[-1]] = value
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> Any:
+    """What a YAML file holds; None where it is empty.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+
+
+def read_values(path: Path) -> dict[str, Any]:
+    """The names and values of a YAML file; none where it is empty.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds something else.
+    """
+    content = read_yaml(path)
     if content is None:
         return {}
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: expected names and values, found a {type(content).__name__}")
-    return _node_parameters(content, path)
+    return content
 
 
-def _node_parameters(content: dict[str, Any], path: Path) -> dict[str, Any]:
+def _node_parameters(content: dict[str, Any], path: str | Path) -> dict[str, Any]:
     """Take the settings out of a ROS parameter file; a plain file is its own settings."""
     blocks = [block for block in content.values() if isinstance(block, dict) and "ros__parameters" in block]
     if not blocks:
@@ -272,8 +286,15 @@ def _node_parameters(content: dict[str, Any], path: Path) -> dict[str, Any]:
 NODE_ONLY = frozenset({"use_sim_time", "results_dir"})
 
 
+def problems(error: ValidationError) -> str:
+    """Every wrong value and what is wrong with it, on one line."""
+    return "; ".join(_explain(problem) for problem in error.errors())
+
+
 def _explain(problem: Any) -> str:
     name = ".".join(str(part) for part in problem["loc"])
+    if not name:  # of several values together
+        return str(problem["msg"]).removeprefix("Value error, ")
     if problem["type"] == "extra_forbidden":
         return f"unknown parameter {name}"
     return f"{name}: {problem['msg'][0].lower()}{problem['msg'][1:]} (got {problem['input']!r})"

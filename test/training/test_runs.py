@@ -79,10 +79,10 @@ def test_the_command_line_overrules_the_file(tmp_path):
     [
         (b"- a\n- b\n", "expected names and values, found a list"),
         (b"steps", "expected names and values, found a str"),
-        (b"steps: [1", "cannot read"),
-        (b"train: \xff\xfe", "cannot read"),
+        (b"steps: [1", "not valid YAML"),
+        (b"train: \xff\xfe", "not valid YAML"),
         (b"steps: 0\nbatch: 2\n", "steps: .*; batch: "),
-        (b"speed: 3\n", "speed: extra"),
+        (b"speed: 3\n", "unknown parameter speed"),
         (b"loss: hinge\n", "loss: "),
         (b"1: 2\n", "1: "),
     ],

@@ -23,7 +23,7 @@ from umf_ros.training.labels import Rule
 from umf_ros.training.objective import Bank, Objective
 from umf_ros.training.run import train
 from umf_ros.training.sampler import PairSampler, places_drawn
-from umf_ros.training.trainer import Trainer
+from umf_ros.training.trainer import Trainer, _rule
 from umf_ros.training.validation import validate
 from umf_ros.training.views import Augmentation, ViewMaker
 
@@ -267,3 +267,23 @@ def test_wrong_settings_and_missing_data(folder, tmp_path):
         train(settings_for(tmp_path / "empty"), tmp_path / "run", False, silent)
     with pytest.raises(WeightsError, match="resume"):
         train(settings_for(folder), tmp_path / "fresh", True, silent)
+
+
+def test_what_is_the_same_place_depends_on_the_data_set(folder):
+    kinds = [_rule(settings_for(folder, **chosen)) for chosen in ({}, {"rule": "robotcar"}, {"loss": "neighbourhood"})]
+    thesis, robotcar, whole = kinds
+    assert (thesis.positive_m, thesis.positive_deg, thesis.between_passes) == (12, 30, False)
+    assert (robotcar.positive_m, robotcar.positive_deg, robotcar.negative_m) == (10, 180, 50)
+    assert (whole.positive_m, whole.negative_m, whole.negative_deg, whole.between_passes) == (12, 14, 35, True)
+
+
+def test_a_list_of_sequences_trains_and_is_named_in_the_card(folder, tmp_path):
+    (tmp_path / "data.yaml").write_text(f"- worlds: {folder}\n")
+    settings = settings_for(tmp_path / "data.yaml", validation=str(tmp_path / "data.yaml"), steps=1, validate_epochs=1)
+    path = train(settings, tmp_path / "run", resume=False, report=silent)
+    card = read_card(path)
+    assert card["training_worlds"] == ["world_00001", "world_00002"] and set(card["validation"]) == {
+        *card["training_worlds"]
+    }
+    with pytest.raises(UmfError, match="nowhere"):
+        train(settings_for(tmp_path / "nowhere.yaml", steps=1), tmp_path / "b", resume=False, report=silent)

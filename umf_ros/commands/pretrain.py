@@ -21,7 +21,10 @@ _LIDAR = f"Pretrain the voxel encoder: guess hidden voxels, most of them near th
 @app.command("lidar", help=_LIDAR)
 def command(
     context: typer.Context,
-    data: Annotated[Path, typer.Argument(help="Folder of worlds (.npz shards); no revisits or poses are needed.")],
+    data: Annotated[
+        Path,
+        typer.Argument(help="Folder of simulated worlds, or a YAML file that lists sequences; no revisits are needed."),
+    ],
     out: Annotated[
         Path | None,
         typer.Option(help="Folder of the run: weights, card, log, pictures, checkpoint; default: runs/pretrain_NAME."),

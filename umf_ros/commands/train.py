@@ -11,14 +11,14 @@ import typer
 
 
 def command(
-    train: Annotated[str, typer.Argument(help="Folder of training worlds (.npz shards).")],
+    train: Annotated[str, typer.Argument(help="Folder of simulated worlds, or a YAML file that lists sequences.")],
     out: Annotated[Path, typer.Option(help="Folder of the run: weights, card, log, checkpoint.")] = Path("runs/train"),
-    validation: Annotated[str | None, typer.Option(help="Folder of validation worlds.")] = None,
+    validation: Annotated[str | None, typer.Option(help="The same, for validation.")] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of training settings.")] = None,
     preset: Annotated[str | None, typer.Option(help="Network: umf_light, umf_mobile or umf_resnet50.")] = None,
     steps: Annotated[int | None, typer.Option(help="Optimiser steps in all.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of weights, batches and augmentation.")] = None,
-    loss: Annotated[str | None, typer.Option(help="multi_similarity or triplet.")] = None,
+    loss: Annotated[str | None, typer.Option(help="multi_similarity, triplet or neighbourhood.")] = None,
     start: Annotated[str | None, typer.Option(help="Weights to start from.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads per process.")] = None,
     device: Annotated[str | None, typer.Option(help="torch device, or auto.")] = None,

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
-import yaml
 from pydantic import Field, ValidationError, model_validator
 
-from umf_ros.config import Group
+from umf_ros.config import Group, problems, read_values
 from umf_ros.errors import ConfigError
 from umf_ros.networks.umf import Branch
 
@@ -18,8 +17,8 @@ class TrainingSettings(Group):
 
     preset: str = Field("umf_light", description="network, by name")
     image_size: tuple[int, int] | None = Field(None, description="height and width of the input; null: the preset's")
-    train: str = Field(description="folder of training worlds")
-    validation: str = Field("", description="folder of validation worlds; empty: no validation, no early stopping")
+    train: str = Field(description="folder of simulated worlds, or YAML file that lists sequences")
+    validation: str = Field("", description="the same, for validation; empty: no validation, no early stopping")
     steps: int = Field(4000, ge=1, description="optimiser steps in all")
     epoch_steps: int = Field(150, ge=1, description="steps between checkpoints; new worlds are picked up there")
     validate_epochs: int = Field(3, ge=1, description="epochs between validations")
@@ -29,6 +28,9 @@ class TrainingSettings(Group):
     loss: Literal["multi_similarity", "triplet", "neighbourhood"] = Field(
         "multi_similarity",
         description="on the descriptors; neighbourhood: every batch from all over one world, of some hundred frames",
+    )
+    rule: Literal["s3li", "robotcar"] = Field(
+        "s3li", description="same place: within 12 m and 30 deg, or within 10 m whatever the heading (thesis 5.1)"
     )
     batch: int = Field(32, ge=4, description="frames per step and process, half of them positives of the others")
     batch_limit: int = Field(88, ge=4, description="largest batch of the triplet loss's growing batches")
@@ -75,25 +77,9 @@ def load_training(path: Path | None, **overrides: object) -> TrainingSettings:
     Raises:
         ConfigError: unreadable file, unknown name or wrong value.
     """
-    values = _read_yaml(path) if path else {}
+    values = read_values(path) if path else {}
     values |= {name: value for name, value in overrides.items() if value is not None}
     try:
         return TrainingSettings.model_validate(values)
     except ValidationError as error:
         raise ConfigError(problems(error)) from None
-
-
-def problems(error: ValidationError) -> str:
-    """Every wrong setting and what is wrong with it, on one line."""
-    found = [(".".join(map(str, item["loc"])), item["msg"].lower()) for item in error.errors()]
-    return "; ".join(f"{name}: {text}" if name else text for name, text in found)
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot read {path}: {' '.join(str(error).split())}") from None
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path}: expected names and values, found a {type(values).__name__}")
-    return values

@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
+from umf_ros.datasets.listed import open_source
 from umf_ros.datasets.sample import SampleSequence
-from umf_ros.datasets.simulated import WorldFolder
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import save_weights
 from umf_ros.training.config import TrainingSettings
@@ -40,7 +40,7 @@ def train(settings: TrainingSettings, output: Path, resume: bool, report: Callab
     torch.set_num_threads(settings.threads)
     torch.manual_seed(settings.seed)
     training = open_worlds(settings.train, "train")
-    validation = WorldFolder(Path(settings.validation)) if settings.validation else None
+    validation = open_source(Path(settings.validation)) if settings.validation else None
     write_settings(settings, output / "training.yaml")
     weights = output / f"{settings.preset}.safetensors"
     with join_team(settings.device) as team:

@@ -15,8 +15,8 @@ import yaml
 from pydantic import BaseModel
 from torch import nn
 
+from umf_ros.datasets.listed import Source, open_source
 from umf_ros.datasets.sample import SampleSequence
-from umf_ros.datasets.simulated import WorldFolder
 from umf_ros.errors import ConfigError, OutputError
 from umf_ros.networks.image_encoder import ResidualBlock
 from umf_ros.networks.presets import PRESETS
@@ -35,21 +35,21 @@ def check_preset(name: str) -> None:
         raise ConfigError(f"preset: unknown network {name}; known: {', '.join(PRESETS)}")
 
 
-def open_worlds(folder: str, setting: str) -> WorldFolder:
-    """The worlds to learn from.
+def open_worlds(where: str, setting: str) -> Source:
+    """What to learn from.
 
     Args:
-        folder: where they are.
-        setting: which setting names the folder.
+        where: folder of simulated worlds, or YAML file that lists sequences.
+        setting: which setting names it.
 
     Raises:
-        ConfigError: there are none in it.
-        UmfError: it is no folder, or a world in it is damaged.
+        ConfigError: there is nothing in it.
+        UmfError: it does not exist, or something in it is damaged.
     """
-    worlds = WorldFolder(Path(folder))
-    if not worlds.refresh():
-        raise ConfigError(f"{setting}: there are no worlds in {folder}")
-    return worlds
+    source = open_source(Path(where))
+    if not source.refresh():
+        raise ConfigError(f"{setting}: there are no worlds in {where}")
+    return source
 
 
 def make_network(preset: str, start: str, image_size: tuple[int, int] | None = None) -> UMF:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from umf_ros.datasets.sample import SampleSequence
+from umf_ros.evaluation.protocol import ROBOTCAR_RULE, THESIS_RULE
 from umf_ros.networks.umf import UMF, to_device
 from umf_ros.training.batches import BatchMaker, TrainingBatch
 from umf_ros.training.checkpoint import resuming, save_checkpoint
@@ -26,8 +27,7 @@ from umf_ros.training.schedule import append_row, learning_rate
 from umf_ros.training.validation import MODES, Results, mean_of, validate
 from umf_ros.training.views import Augmentation, ViewMaker
 
-WHOLE_WORLD = Rule(negative_m=14.0, negative_deg=35.0, between_passes=True)
-"""A later pass looks for itself in an earlier one, and all that is not the place may be taken for it."""
+MARGIN_M, MARGIN_DEG = 2.0, 5.0
 
 Worlds = Callable[[], Sequence[SampleSequence]]
 
@@ -75,7 +75,7 @@ class Trainer:
         self._training, self._validation = training, validation
         self._network = network.to(team.device)
         self._whole = settings.loss == "neighbourhood"
-        self._rule = WHOLE_WORLD if self._whole else Rule()
+        self._rule = _rule(settings)
         self._bank = Bank(settings.bank, network.config.descriptor)
         objective: nn.Module = Objective(self._network, settings, self._rule).to(team.device)
         self._trained = _choose_parameters(network, settings)
@@ -176,7 +176,8 @@ class Trainer:
     def _validate(self, keep: Callable[[UMF, dict[str, Any]], None]) -> None:
         progress = self.progress
         summary: dict[str, Any] = {"steps": progress.step}
-        self.results = validate(self._network, self._validation(), self._settings.validation_stride)
+        true = ROBOTCAR_RULE if self._settings.rule == "robotcar" else THESIS_RULE
+        self.results = validate(self._network, self._validation(), self._settings.validation_stride, true)
         if not any(found.queries for by_mode in self.results.values() for found in by_mode.values()):
             keep(self._network, summary)  # nothing to compare by: the latest is the best
             return
@@ -215,6 +216,16 @@ class Trainer:
         row["learning_rate"], row["batch"] = round(self._learning_rate(), 7), self.progress.batch
         append_row(self._folder / "log.csv", row)
         self.results = {}
+
+
+def _rule(settings: TrainingSettings) -> Rule:
+    """What is the same place, and what is not."""
+    rule = ROBOTCAR_RULE if settings.rule == "robotcar" else Rule()
+    if settings.loss != "neighbourhood":
+        return rule
+    # a later pass looks for itself in an earlier one, and all that is not the place may be taken for it
+    close = {"negative_m": rule.positive_m + MARGIN_M, "negative_deg": rule.positive_deg + MARGIN_DEG}
+    return replace(rule, between_passes=True, **close)
 
 
 def _choose_parameters(network: UMF, settings: TrainingSettings) -> list[nn.Parameter]:

@@ -10,11 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from umf_ros.datasets.sample import SampleSequence
-from umf_ros.evaluation.protocol import place_recognition
+from umf_ros.evaluation.protocol import THESIS_RULE, place_recognition
 from umf_ros.evaluation.retrieval import rank
 from umf_ros.evaluation.scores import Scores, score
 from umf_ros.networks.umf import UMF, to_device
 from umf_ros.training.batches import stack_views
+from umf_ros.training.labels import Rule
 from umf_ros.training.views import ViewMaker
 
 MODES = ("fused", "image", "cloud")
@@ -48,7 +49,7 @@ def describe(
     return {mode: np.concatenate(parts) for mode, parts in found.items()}
 
 
-def validate(network: UMF, sequences: Sequence[SampleSequence], stride: int = 1) -> Results:
+def validate(network: UMF, sequences: Sequence[SampleSequence], stride: int = 1, rule: Rule = THESIS_RULE) -> Results:
     """Retrieval by sequence and mode; every `stride`-th sample is used.
 
     Queries of a pass in the opposite direction have no true match and do not count.
@@ -56,7 +57,7 @@ def validate(network: UMF, sequences: Sequence[SampleSequence], stride: int = 1)
     results = {}
     for sequence in sequences:
         rows = np.arange(0, len(sequence), stride)
-        task = place_recognition(np.asarray(sequence.world_T_body)[rows], np.asarray(sequence.pass_index)[rows])
+        task = place_recognition(np.asarray(sequence.world_T_body)[rows], np.asarray(sequence.pass_index)[rows], rule)
         results[sequence.name] = {
             mode: score(task, rank(found[task.queries] @ found[task.references].T))
             for mode, found in describe(network, sequence, rows).items()

@@ -7,9 +7,8 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from umf_ros.config import Group
+from umf_ros.config import Group, problems
 from umf_ros.errors import ConfigError
-from umf_ros.training.config import problems
 
 
 class PretrainingSettings(Group):
@@ -17,7 +16,7 @@ class PretrainingSettings(Group):
 
     modality: Literal["image", "lidar"] = Field(description="encoder that is trained")
     preset: str = Field("umf_light", description="network, by name")
-    data: str = Field(description="folder of worlds")
+    data: str = Field(description="folder of simulated worlds, or YAML file that lists sequences")
     start: str = Field("", description="weights to start from, as of the other encoder's pretraining")
     steps: int = Field(2000, ge=1, description="optimiser steps in all")
     epoch_steps: int = Field(100, ge=1, description="steps between checkpoints; new worlds are picked up there")
