@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from umf_ros.datasets.recorded import course, stretches, travelled
+from umf_ros.datasets.recorded import course, detours, travelled
 
 
 def test_a_rover_heads_where_it_drives() -> None:
@@ -26,7 +26,7 @@ def test_a_standing_rover_has_a_heading_all_the_same() -> None:
     assert np.isfinite(course(np.zeros((4, 3)))).all()
 
 
-def test_a_path_is_cut_into_stretches() -> None:
-    path = np.stack([np.arange(0, 100, 10.0), np.zeros(10), np.zeros(10)], axis=1)
-    assert travelled(path)[-1] == 90
-    assert stretches(path).tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3]
+def test_a_drive_is_a_pass_later_after_a_detour() -> None:
+    path = np.stack([np.arange(0, 130, 30.0), np.zeros(5), np.zeros(5)], axis=1)
+    assert travelled(path)[-1] == 120
+    assert detours(path).tolist() == [0, 0.5, 1, 1.5, 2]

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from umf_ros.config import Loop
-from umf_ros.evaluation.protocol import ROBOTCAR_RULE, loop_closure, place_recognition, recall_by_yaw
+from umf_ros.evaluation.protocol import ROBOTCAR_RULE, loop_closure, place_recognition, recall_by_yaw, revisits
 from umf_ros.evaluation.retrieval import rank
 from umf_ros.evaluation.scores import score
 from umf_ros.geometry import make_pose
@@ -71,6 +71,15 @@ def test_a_match_lies_back_along_the_path_where_the_path_is_known() -> None:
     assert slow.admissible.sum() == 0
     unknown = loop_closure(stamps, truth, np.full(8, np.nan), GAPS)
     assert unknown.admissible.sum(axis=1).tolist() == [0, 0, 1, 2, 3, 4, 5, 6]
+
+
+def test_a_recording_is_asked_for_its_past_but_not_the_way_just_driven() -> None:
+    truth = poses((0, 0, 0), (30, 0, 0), (60, 0, 0), (30, 30, 90), (1, 0, 0), (31, 0, 0))
+    task = revisits(truth, np.array([0, 0.5, 1, 1.5, 2, 2.5]))
+    assert np.argwhere(task.positive).tolist() == [[4, 0], [5, 1]]
+    assert task.admissible.sum(axis=1).tolist() == [0, 0, 1, 2, 3, 4]
+    found = score(task, rank(np.eye(6)[::-1], task.admissible))
+    assert found.queries == 2
 
 
 def test_revisits_in_the_opposite_direction_are_a_bin_of_their_own() -> None:

@@ -99,6 +99,18 @@ def test_a_world_with_a_single_revisit_is_drawn_over_and_over():
     assert {anchor.index for anchor, _ in pairs} == {0, 2} and len(pairs) == 8
 
 
+def test_the_way_just_driven_is_no_revisit():
+    """The passes of a drive without beginning or end are fractions."""
+    drive = straight(4)
+    drive.pass_index = np.arange(8) * 0.26
+    assert {(anchor.index, found.index) for anchor, found in draws(PairSampler([drive], RULE), 20)} == {
+        pair for row in range(4) for pair in ((row, row + 4), (row + 4, row))
+    }
+    drive.pass_index = np.arange(8) * 0.24
+    with pytest.raises(ConfigError, match="visited twice"):
+        PairSampler([drive], RULE)
+
+
 def test_every_positive_is_drawn_some_time():
     sampler = PairSampler([straight(3, passes=4)], RULE)
     partners = {pair[1].index for pair in draws(sampler, 60) if pair[0].index == 0}

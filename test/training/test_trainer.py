@@ -256,7 +256,7 @@ def test_foreign_shards(tmp_path):
 def test_wrong_settings_and_missing_data(folder, tmp_path):
     with pytest.raises(ConfigError, match="learning_rate"):
         load_training(None, train="x", learning_rate=-1)
-    with pytest.raises(ConfigError, match="extra"):
+    with pytest.raises(ConfigError, match="unknown parameter teh_steps"):
         load_training(None, train="x", teh_steps=1)
     with pytest.raises(ConfigError, match="local_pairs must be 0"):
         load_training(None, train="x", branch="image", local_pairs=4)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from umf_ros.datasets.sample import Sample
 from umf_ros.geometry import Array
 
-STRETCH_M = 30.0
-"""A recording is cut into stretches this long, and each counts as a pass: what lies within one is no revisit."""
+DETOUR_M = 60.0
+"""What lies less than this back along the way is no revisit."""
 BASELINE_M = 1.0
 """Way before and after a place that says where the rover was heading."""
 
@@ -24,14 +24,14 @@ class RecordedSequence:
         name: unique.
         place: sequences of one place share its coordinates.
         world_T_body: (N, 4, 4).
-        pass_index: (N,).
+        pass_index: (N,), of one drive: `detours`.
         load: makes the sample at an index.
     """
 
     setting = "real"
 
     def __init__(
-        self, name: str, place: str, world_T_body: Array, pass_index: NDArray[np.int64], load: Callable[[int], Sample]
+        self, name: str, place: str, world_T_body: Array, pass_index: NDArray, load: Callable[[int], Sample]
     ) -> None:
         self.name, self.place = name, place
         self.world_T_body, self.pass_index = world_T_body, pass_index
@@ -50,9 +50,9 @@ def travelled(positions: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
 
 
-def stretches(positions: Array) -> NDArray[np.int64]:
-    """(N,) number of the stretch of the path each of (N, 3) positions lies in."""
-    return (travelled(positions) // STRETCH_M).astype(np.int64)
+def detours(positions: Array) -> Array:
+    """(N,) passes of one drive through (N, 3) positions: a detour later it is the next one."""
+    return travelled(positions) / DETOUR_M
 
 
 def course(positions: Array) -> Array:

@@ -18,7 +18,7 @@ from umf_ros.bags.rtklib import east_north_up
 from umf_ros.bags.trajectories import read_ground_truth, read_odometry
 from umf_ros.config import Settings
 from umf_ros.datasets.pickles import load_data_frame
-from umf_ros.datasets.recorded import RecordedSequence, course, poses_of, stretches, travelled
+from umf_ros.datasets.recorded import RecordedSequence, course, detours, poses_of, travelled
 from umf_ros.datasets.sample import Sample
 from umf_ros.embedding.images import shrink
 from umf_ros.errors import BagError, UmfError
@@ -76,7 +76,7 @@ def read_bag(
         raise BagError(f"the ground truth of {bag} covers {len(kept)} samples; do the clocks agree?")
     poses = _poses(kept, positions, known)
     samples = [_sample(*pair) for pair in zip(kept, poses, strict=True)]
-    return RecordedSequence(bag.stem, bag.stem, poses, stretches(positions), samples.__getitem__)
+    return RecordedSequence(bag.stem, bag.stem, poses, detours(positions), samples.__getitem__)
 
 
 def read_toolkit(pickles: Sequence[Path], images: Path | None = None, dataset: str = "s3li-etna") -> RecordedSequence:
@@ -100,7 +100,7 @@ def read_toolkit(pickles: Sequence[Path], images: Path | None = None, dataset: s
     rows = [(table, row) for table in tables for row in range(len(table["img_path"]))]
     passes = [np.full(len(part), number) for number, part in enumerate(positions)]
     if len(tables) == 1:
-        passes = [stretches(positions[0])]
+        passes = [detours(positions[0])]
 
     def load(index: int) -> Sample:
         table, row = rows[index]

@@ -41,7 +41,8 @@ class SampleSequence(Protocol):
         name: for people, unique.
         place: sequences of one place share its coordinates and this name.
         world_T_body: (N, 4, 4) true poses.
-        pass_index: (N,) which traverse of the place a sample belongs to, from 0.
+        pass_index: (N,) which traverse of the place a sample belongs to, from 0; fractions count on along a
+            drive without beginning or end. Two passes differ by one at least.
         setting: "easy", "hard" or "real".
     """
 

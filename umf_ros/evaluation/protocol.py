@@ -69,6 +69,18 @@ def place_recognition(world_T_body: Array, pass_index: Indices, rule: Rule = THE
     return _task(world_T_body, queries, references, everything, rule)
 
 
+def revisits(world_T_body: Array, pass_index: NDArray, rule: Rule = THESIS_RULE) -> Task:
+    """Each sample of a recording against all earlier passes.
+
+    Args:
+        world_T_body: (N, 4, 4) true poses.
+        pass_index: (N,) which pass a sample belongs to; two passes differ by one at least.
+        rule: what is a true match.
+    """
+    every = np.arange(len(pass_index))
+    return _task(world_T_body, every, every, pass_index[:, None] - pass_index[None] >= 1, rule)
+
+
 def loop_closure(
     stamps: NDArray[np.int64],
     world_T_body: Array,

@@ -34,25 +34,21 @@ class Places:
         world: (B,) int, places of different worlds are different.
         position: (B, 2) metres.
         heading: (B,) radians.
-        passage: (B,) int, in which pass of its world.
+        passage: (B,) in which pass of its world; two passes differ by one at least.
     """
 
     world: NDArray[np.int64]
     position: Array
     heading: Array
-    passage: NDArray[np.int64]
+    passage: Array
 
 
-def places_of(world: int, world_T_body: Array, passage: NDArray[np.int64] | None = None) -> Places:
+def places_of(world: int, world_T_body: Array, passage: NDArray | None = None) -> Places:
     """Places of (N, 4, 4) poses in one world; without `passage` (N,) they are of one pass."""
     heading = np.arctan2(world_T_body[:, 1, 0], world_T_body[:, 0, 0])
     count = len(world_T_body)
-    return Places(
-        np.full(count, world),
-        world_T_body[:, :2, 3],
-        heading,
-        np.zeros(count, np.int64) if passage is None else passage,
-    )
+    passage = np.zeros(count) if passage is None else passage.astype(float)
+    return Places(np.full(count, world), world_T_body[:, :2, 3], heading, passage)
 
 
 def distances(a: Places, b: Places) -> tuple[Array, Array]:
@@ -68,6 +64,6 @@ def label(a: Places, b: Places, rule: Rule) -> tuple[NDArray[np.bool_], NDArray[
     positive = (metres < rule.positive_m) & (turn < np.radians(rule.positive_deg))
     negative = (metres > rule.negative_m) | (turn > np.radians(rule.negative_deg))
     if rule.between_passes:
-        apart = (a.world[:, None] != b.world[None]) | (a.passage[:, None] != b.passage[None])
+        apart = (a.world[:, None] != b.world[None]) | (np.abs(a.passage[:, None] - b.passage[None]) >= 1)
         positive, negative = positive & apart, negative & apart
     return positive, negative

@@ -29,7 +29,7 @@ class Bank:
     def __init__(self, size: int, dimension: int) -> None:
         self._size = size
         self.descriptors = torch.zeros(0, dimension)
-        self.places = Places(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
+        self.places = Places(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
     def add(self, descriptors: Tensor, places: Places) -> None:
         """Remember a batch, forgetting the oldest."""

@@ -85,7 +85,7 @@ def _weight(sequence: SampleSequence) -> float:
 def _positives(sequence: SampleSequence, rule: Rule) -> list[np.ndarray]:
     places = places_of(0, np.asarray(sequence.world_T_body), np.asarray(sequence.pass_index))
     positive, _ = label(places, places, rule)
-    other_pass = positive & (sequence.pass_index[:, None] != sequence.pass_index[None])
+    other_pass = positive & (np.abs(sequence.pass_index[:, None] - sequence.pass_index[None]) >= 1)
     return [np.flatnonzero(row) for row in other_pass]
 
 
@@ -96,5 +96,5 @@ def places_drawn(draws: Sequence[Draw], sequences: Sequence[SampleSequence]) -> 
     places = places_of(0, poses)
     world = np.array([2 * draw.sequence + draw.mirror for draw in draws])
     position = places.position * np.stack([np.ones_like(flip), flip], axis=1)
-    passage = np.array([sequences[draw.sequence].pass_index[draw.index] for draw in draws])
+    passage = np.array([sequences[draw.sequence].pass_index[draw.index] for draw in draws], float)
     return Places(world, position, places.heading * flip, passage)

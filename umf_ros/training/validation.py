@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from umf_ros.datasets.sample import SampleSequence
-from umf_ros.evaluation.protocol import THESIS_RULE, place_recognition
+from umf_ros.evaluation.protocol import THESIS_RULE, place_recognition, revisits
 from umf_ros.evaluation.retrieval import rank
 from umf_ros.evaluation.scores import Scores, score
 from umf_ros.networks.umf import UMF, to_device
@@ -52,14 +52,16 @@ def describe(
 def validate(network: UMF, sequences: Sequence[SampleSequence], stride: int = 1, rule: Rule = THESIS_RULE) -> Results:
     """Retrieval by sequence and mode; every `stride`-th sample is used.
 
+    In a simulated world later passes are asked for the first, in a recording each sample for all earlier passes.
     Queries of a pass in the opposite direction have no true match and do not count.
     """
     results = {}
     for sequence in sequences:
         rows = np.arange(0, len(sequence), stride)
-        task = place_recognition(np.asarray(sequence.world_T_body)[rows], np.asarray(sequence.pass_index)[rows], rule)
+        protocol = revisits if sequence.setting == "real" else place_recognition
+        task = protocol(np.asarray(sequence.world_T_body)[rows], np.asarray(sequence.pass_index)[rows], rule)
         results[sequence.name] = {
-            mode: score(task, rank(found[task.queries] @ found[task.references].T))
+            mode: score(task, rank(found[task.queries] @ found[task.references].T, task.admissible))
             for mode, found in describe(network, sequence, rows).items()
         }
     return results
