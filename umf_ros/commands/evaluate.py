@@ -17,7 +17,12 @@ Optional = typer.Option
 
 
 def command(
-    bag: Annotated[Path | None, typer.Argument(help="Recording with ground truth: mcap, db3 folder or .bag.")] = None,
+    data: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Recording with ground truth: mcap, db3 folder or .bag; or a YAML file that lists sequences."
+        ),
+    ] = None,
     worlds: Annotated[str | None, Optional(help="Instead of a recording: test or validation worlds.")] = None,
     seed: Annotated[int | None, Optional(min=0, help="First of the four worlds' seeds.")] = None,
     quick: Annotated[bool, Optional("--quick", help="A smaller sample of every world.")] = False,
@@ -33,22 +38,26 @@ def command(
         str, Optional(help="Whose poses --odometry holds: body, imu, camera or lidar (S3LI's Eval/BASALT: imu).")
     ] = "body",
     ground_truth: Annotated[Path | None, Optional(help="Truth as RTKLIB .pos or TUM file.")] = None,
+    rule: Annotated[str, Optional(help="What is the same place in listed sequences: s3li or robotcar.")] = "s3li",
 ) -> None:
     """Recall, precision, rerankers, lost modalities and cost.
 
-    On a recording every keyframe is asked for its own past. On four simulated worlds of different families
+    On a recording every keyframe is asked for its own past; of listed sequences (docs/training.md) every sample,
+    for the global descriptors alone. On four simulated worlds of different families
     a second drive on an offset path under another sun is asked for the first; the default seeds of the
     test worlds are never trained or tuned on.
     """
-    if (bag is None) == (worlds is None):
+    if (data is None) == (worlds is None):
         raise ConfigError("expected either a recording or --worlds test|validation")
     if methods not in ("umf", "all"):
         raise ConfigError(f"--methods: expected umf or all, not {methods!r}")
     if worlds is not None:
         figures = _on_worlds(worlds, seed, quick, methods == "all", weights, out)
+    elif data is not None and data.suffix in (".yaml", ".yml"):
+        figures = _on_sequences(data, rule, weights, out)
     else:
-        assert bag is not None
-        figures = _on_recording(bag, config, dataset, embedder, weights, odometry, odometry_frame, ground_truth, out)
+        assert data is not None
+        figures = _on_recording(data, config, dataset, embedder, weights, odometry, odometry_frame, ground_truth, out)
     if json_file is not None:
         import json
 
@@ -159,6 +168,37 @@ def _on_recording(
         console.print(note, markup=False)
     console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
     return result.flat()
+
+
+def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> dict[str, float | int | None]:
+    from rich.console import Console
+
+    from umf_ros.datasets.listed import SequenceList
+    from umf_ros.embedding.umf_embedder import DEFAULT_WEIGHTS
+    from umf_ros.evaluation.markdown import print_table, to_markdown
+    from umf_ros.evaluation.protocol import RULES
+    from umf_ros.networks.weights import load_weights
+    from umf_ros.resources import find
+    from umf_ros.results.folder import create_run_folder, write_atomically
+    from umf_ros.training.validation import means, table, validate
+
+    if rule not in RULES:
+        raise ConfigError(f"--rule: expected {' or '.join(RULES)}, not {rule!r}")
+    console = Console()
+    network = load_weights(weights or find(DEFAULT_WEIGHTS))
+    results = validate(network, SequenceList(listing).worlds, rule=RULES[rule])
+    if not any(found.queries for by_mode in results.values() for found in by_mode.values()):
+        raise ConfigError(f"{listing}: no place is visited twice")
+    folder = create_run_folder(out)
+    shown = table(results)
+    title = "Place recognition by the global descriptor"
+    notes = [
+        f"{listing}: samples with a true match in an earlier pass are asked for it; same place by the rule {rule}."
+    ]
+    write_atomically(folder / "evaluation.md", to_markdown("Evaluation on sequences", notes, {title: shown}, {}))
+    print_table(console, title, shown)
+    console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
+    return means(results)
 
 
 def _bar(console: Console) -> Progress:

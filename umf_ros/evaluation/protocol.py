@@ -14,6 +14,7 @@ from umf_ros.training.labels import Rule, distances, label, places_of
 
 THESIS_RULE = Rule(positive_m=12.0, positive_deg=30.0, negative_m=60.0, negative_deg=30.0)
 ROBOTCAR_RULE = Rule(positive_m=10.0, positive_deg=180.0, negative_m=50.0, negative_deg=180.0)
+RULES = {"s3li": THESIS_RULE, "robotcar": ROBOTCAR_RULE}
 NEAR_M = 5.0
 OPPOSITE_DEG = 150.0
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from umf_ros.datasets.sample import SampleSequence
-from umf_ros.evaluation.protocol import ROBOTCAR_RULE, THESIS_RULE
+from umf_ros.evaluation.protocol import ROBOTCAR_RULE, RULES
 from umf_ros.networks.umf import UMF, to_device
 from umf_ros.training.batches import BatchMaker, TrainingBatch
 from umf_ros.training.checkpoint import resuming, save_checkpoint
@@ -176,12 +176,12 @@ class Trainer:
     def _validate(self, keep: Callable[[UMF, dict[str, Any]], None]) -> None:
         progress = self.progress
         summary: dict[str, Any] = {"steps": progress.step}
-        true = ROBOTCAR_RULE if self._settings.rule == "robotcar" else THESIS_RULE
-        self.results = validate(self._network, self._validation(), self._settings.validation_stride, true)
+        settings = self._settings
+        self.results = validate(self._network, self._validation(), settings.validation_stride, RULES[settings.rule])
         if not any(found.queries for by_mode in self.results.values() for found in by_mode.values()):
             keep(self._network, summary)  # nothing to compare by: the latest is the best
             return
-        mode = "fused" if self._settings.branch == "both" else self._settings.branch
+        mode = "fused" if settings.branch == "both" else settings.branch
         progress.recall = mean_of(self.results, mode, "recall1")
         score = progress.recall + mean_of(self.results, mode, "recall1_within_5m")
         progress.stale = 0 if score > progress.best else progress.stale + 1

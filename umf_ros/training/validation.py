@@ -77,3 +77,20 @@ def mean_of(results: Results, mode: str, name: str) -> float:
     """Mean over the worlds of one number of one mode."""
     values = [getattr(by_mode[mode], name) for by_mode in results.values() if by_mode[mode].queries]
     return float(np.mean(values)) if values else float("nan")
+
+
+def table(results: Results) -> tuple[list[str], list[list[str]]]:
+    """A row per sequence and mode."""
+    head = ["sequence, modality", "queries", "R@1 %", "R@5 %", "top 1 %", "within 5 m %"]
+    rows = []
+    for name, by_mode in results.items():
+        for mode, found in by_mode.items():
+            shares = found.recall1, found.recall5, found.recall_top_percent, found.recall1_within_5m
+            rows.append([f"{name}, {mode}", str(found.queries), *(f"{100 * share:.1f}" for share in shares)])
+    return head, rows
+
+
+def means(results: Results) -> dict[str, float | int | None]:
+    """Means over the sequences by name."""
+    names = ("recall1", "recall5", "recall_top_percent", "recall1_within_5m")
+    return {f"{name}_{mode}_mean": round(mean_of(results, mode, name), 4) for mode in MODES for name in names}
