@@ -92,7 +92,7 @@ class Verification(Group):
         "ransac", description="how local features reorder the candidates"
     )
     rerank_weight: float = Field(
-        0.03,
+        0.02,
         ge=0,
         le=1000,
         description="what e times as many inliers weigh against cosine similarity; 1000: inliers alone (thesis)",
