@@ -180,7 +180,6 @@ def test_one_process_is_a_team_that_leads_itself(monkeypatch):
 
 TWO = """
 import sys
-from dataclasses import replace
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 import torch

@@ -180,14 +180,14 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     from umf_ros.networks.weights import load_weights
     from umf_ros.resources import find
     from umf_ros.results.folder import create_run_folder, write_atomically
-    from umf_ros.training.validation import means, table, validate
+    from umf_ros.training.validation import answerable, means, table, validate
 
     if rule not in RULES:
         raise ConfigError(f"--rule: expected {' or '.join(RULES)}, not {rule!r}")
     console = Console()
     network = load_weights(weights or find(DEFAULT_WEIGHTS))
     results = validate(network, SequenceList(listing).worlds, rule=RULES[rule])
-    if not any(found.queries for by_mode in results.values() for found in by_mode.values()):
+    if not answerable(results):
         raise ConfigError(f"{listing}: no place is visited twice")
     folder = create_run_folder(out)
     shown = table(results)

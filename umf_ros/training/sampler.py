@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -84,9 +84,8 @@ def _weight(sequence: SampleSequence) -> float:
 
 def _positives(sequence: SampleSequence, rule: Rule) -> list[np.ndarray]:
     places = places_of(0, np.asarray(sequence.world_T_body), np.asarray(sequence.pass_index))
-    positive, _ = label(places, places, rule)
-    other_pass = positive & (np.abs(sequence.pass_index[:, None] - sequence.pass_index[None]) >= 1)
-    return [np.flatnonzero(row) for row in other_pass]
+    positive, _ = label(places, places, replace(rule, between_passes=True))
+    return [np.flatnonzero(row) for row in positive]
 
 
 def places_drawn(draws: Sequence[Draw], sequences: Sequence[SampleSequence]) -> Places:

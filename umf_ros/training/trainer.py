@@ -24,7 +24,7 @@ from umf_ros.training.labels import Rule
 from umf_ros.training.objective import Bank, Objective
 from umf_ros.training.sampler import PairSampler
 from umf_ros.training.schedule import append_row, learning_rate
-from umf_ros.training.validation import MODES, Results, mean_of, validate
+from umf_ros.training.validation import MODES, Results, answerable, mean_of, validate
 from umf_ros.training.views import Augmentation, ViewMaker
 
 MARGIN_M, MARGIN_DEG = 2.0, 5.0
@@ -178,7 +178,7 @@ class Trainer:
         summary: dict[str, Any] = {"steps": progress.step}
         settings = self._settings
         self.results = validate(self._network, self._validation(), settings.validation_stride, RULES[settings.rule])
-        if not any(found.queries for by_mode in self.results.values() for found in by_mode.values()):
+        if not answerable(self.results):
             keep(self._network, summary)  # nothing to compare by: the latest is the best
             return
         mode = "fused" if settings.branch == "both" else settings.branch

@@ -13,6 +13,7 @@ from umf_ros.datasets.sample import SampleSequence
 from umf_ros.evaluation.protocol import THESIS_RULE, place_recognition, revisits
 from umf_ros.evaluation.retrieval import rank
 from umf_ros.evaluation.scores import Scores, score
+from umf_ros.evaluation.summary import percent
 from umf_ros.networks.umf import UMF, to_device
 from umf_ros.training.batches import stack_views
 from umf_ros.training.labels import Rule
@@ -67,6 +68,11 @@ def validate(network: UMF, sequences: Sequence[SampleSequence], stride: int = 1,
     return results
 
 
+def answerable(results: Results) -> bool:
+    """Whether any place of these sequences is visited twice."""
+    return any(found.queries for by_mode in results.values() for found in by_mode.values())
+
+
 def figures(found: Scores) -> dict[str, float | None]:
     """The figures that a card keeps, by name; None for what could not be measured."""
     values = {name: getattr(found, name) for name in _FIGURES}
@@ -86,7 +92,7 @@ def table(results: Results) -> tuple[list[str], list[list[str]]]:
     for name, by_mode in results.items():
         for mode, found in by_mode.items():
             shares = found.recall1, found.recall5, found.recall_top_percent, found.recall1_within_5m
-            rows.append([f"{name}, {mode}", str(found.queries), *(f"{100 * share:.1f}" for share in shares)])
+            rows.append([f"{name}, {mode}", str(found.queries), *map(percent, shares)])
     return head, rows
 
 
