@@ -39,6 +39,7 @@ def run(*arguments: str) -> str:
         (["--worlds", "test", "--methods", "some"], "expected umf or all"),
         (["nowhere.mcap"], "no recording"),
         (["nowhere.yaml"], "cannot read nowhere.yaml"),
+        (["nowhere.yaml", "--odometry", "a.tum"], "are of recordings, not of a list"),
         (["nowhere.yaml", "--rule", "kitti"], "expected s3li or robotcar, not 'kitti'"),
     ],
 )

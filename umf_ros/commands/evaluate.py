@@ -54,6 +54,8 @@ def command(
     if worlds is not None:
         figures = _on_worlds(worlds, seed, quick, methods == "all", weights, out)
     elif data is not None and data.suffix in (".yaml", ".yml"):
+        if config or embedder or odometry or ground_truth:
+            raise ConfigError("--config, --embedder, --odometry and --ground-truth are of recordings, not of a list")
         figures = _on_sequences(data, rule, weights, out)
     else:
         assert data is not None
