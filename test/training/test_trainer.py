@@ -176,6 +176,12 @@ def test_a_run_repeats_itself_and_resumes_as_if_never_stopped(folder, tmp_path):
     assert not torch.allclose(weights_of(whole), weights_of(other))
 
 
+def test_batches_made_by_other_processes_are_the_same(folder, tmp_path):
+    here = train(settings_for(folder), tmp_path / "here", False, silent)
+    ahead = train(settings_for(folder, workers=3), tmp_path / "ahead", False, silent)
+    torch.testing.assert_close(weights_of(here), weights_of(ahead), rtol=0, atol=0)
+
+
 def test_training_lowers_the_loss(world, folder, tmp_path):
     """Of a batch that is the same before and after: those on the way are not equally hard."""
     torch.manual_seed(0)

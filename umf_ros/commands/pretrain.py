@@ -38,6 +38,7 @@ def command(
     batch: Annotated[int | None, typer.Option(help="Frames per step.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of weights, batches and masks.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes that prepare batches ahead, for a GPU.")] = None,
     device: Annotated[str | None, typer.Option(help="torch device, or auto.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
 ) -> None:
@@ -49,7 +50,7 @@ def command(
     modality = str(context.info_name)
     out = out or Path(f"runs/pretrain_{modality}")
     chosen = {"preset": preset, "mask_ratio": mask_ratio, "start": start, "steps": steps, "batch": batch}
-    settings = make_settings(modality, data, **chosen, seed=seed, threads=threads, device=device)
+    settings = make_settings(modality, data, **chosen, seed=seed, threads=threads, workers=workers, device=device)
     with step_bar("pretraining", settings.steps) as show:
 
         def report(progress: Progress) -> None:

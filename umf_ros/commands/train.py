@@ -21,6 +21,7 @@ def command(
     loss: Annotated[str | None, typer.Option(help="multi_similarity, triplet or neighbourhood.")] = None,
     start: Annotated[str | None, typer.Option(help="Weights to start from.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads per process.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes that prepare batches ahead, for a GPU.")] = None,
     device: Annotated[str | None, typer.Option(help="torch device, or auto.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
 ) -> None:
@@ -30,7 +31,7 @@ def command(
     from umf_ros.training.trainer import Progress
 
     chosen = {"preset": preset, "steps": steps, "seed": seed, "loss": loss, "start": start}
-    chosen |= {"threads": threads, "device": device, "validation": validation, "train": train}
+    chosen |= {"threads": threads, "workers": workers, "device": device, "validation": validation, "train": train}
     settings = load_training(config, **chosen)
     with step_bar("training", settings.steps) as show:
 

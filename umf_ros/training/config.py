@@ -62,6 +62,7 @@ class TrainingSettings(Group):
     start: str = Field("", description="weights to start from")
     half: bool = Field(True, description="bfloat16 mixed precision")
     threads: int = Field(1, ge=1, description="threads per process")
+    workers: int = Field(0, ge=0, description="processes that prepare batches ahead; 0: the training one itself")
     device: str = Field("auto", description="torch device; auto: a GPU when there is one")
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -16,11 +16,12 @@ from torch import Tensor, nn
 from umf_ros.datasets.sample import SampleSequence
 from umf_ros.evaluation.protocol import ROBOTCAR_RULE, RULES
 from umf_ros.networks.umf import UMF, to_device
-from umf_ros.training.batches import BatchMaker, TrainingBatch
+from umf_ros.training.batches import BatchMaker, TrainingBatch, thick, thin
 from umf_ros.training.checkpoint import resuming, save_checkpoint
 from umf_ros.training.config import TrainingSettings
 from umf_ros.training.distributed import Team
 from umf_ros.training.labels import Rule
+from umf_ros.training.loading import made_ahead
 from umf_ros.training.objective import Bank, Objective
 from umf_ros.training.sampler import PairSampler
 from umf_ros.training.schedule import append_row, learning_rate
@@ -48,8 +49,8 @@ class Progress:
 class Trainer:
     """Trains a network on simulated or recorded worlds.
 
-    Everything random in an epoch follows from the seed, the epoch and the rank, and checkpoints are
-    taken between epochs: a resumed run repeats an uninterrupted one.
+    Everything random in a step follows from the seed, the step and the rank: a resumed run repeats an
+    uninterrupted one, and so does one whose batches are made by other processes.
 
     Args:
         network: trained in place.
@@ -77,6 +78,7 @@ class Trainer:
         self._whole = settings.loss == "neighbourhood"
         self._rule = _rule(settings)
         self._bank = Bank(settings.bank, network.config.descriptor)
+        self._sampler: tuple[int, PairSampler] | None = None
         objective: nn.Module = Objective(self._network, settings, self._rule).to(team.device)
         self._trained = _choose_parameters(network, settings)
         if team.size > 1:
@@ -118,28 +120,41 @@ class Trainer:
     def _epoch(self, report: Callable[[Progress], None]) -> None:
         settings, progress = self._settings, self.progress
         epoch = progress.step // settings.epoch_steps
-        rng = np.random.default_rng([settings.seed, epoch, self._team.rank])
-        sequences = self._training()
-        augmentation = Augmentation()
-        sampler = PairSampler(sequences, self._rule, augmentation.mirror, self._whole)
-        maker = BatchMaker(
-            sequences, ViewMaker(self._network.config, augmentation), settings.local_pairs, settings.local_matches
-        )
+        steps = range(progress.step, min((epoch + 1) * settings.epoch_steps, settings.steps))
         sums: dict[str, list[float]] = {}
-        end = min((epoch + 1) * settings.epoch_steps, settings.steps)
-        while progress.step < end:
-            started = time.perf_counter()
-            losses = self._step(maker.make(sampler.draw(progress.batch // 2, rng), rng), rng)
-            for name, value in losses.items():
+        started = time.perf_counter()
+        for batch in made_ahead(self._make_batches(), steps, settings.workers):
+            for name, value in self._step(batch).items():
                 sums.setdefault(name, []).append(value)
             progress.losses = {name: float(np.mean(values[-50:])) for name, values in sums.items()}
-            progress.seconds += time.perf_counter() - started
+            started, before = time.perf_counter(), started
+            progress.seconds += started - before
             progress.step += 1
             report(progress)
         if settings.loss == "triplet" and progress.losses["active"] < settings.active_share:
             progress.batch = min(int(progress.batch * settings.batch_growth) // 2 * 2, settings.batch_limit)
 
-    def _step(self, batch: TrainingBatch, rng: np.random.Generator) -> dict[str, float]:
+    def _make_batches(self) -> Callable[[int], TrainingBatch]:
+        """What makes the batch of a step from the worlds that there are now."""
+        settings, augmentation, pairs = self._settings, Augmentation(), self.progress.batch // 2
+        sequences = self._training()
+        if self._sampler is None or self._sampler[0] != len(sequences):  # to find all revisits takes its time
+            self._sampler = len(sequences), PairSampler(sequences, self._rule, augmentation.mirror, self._whole)
+        _, sampler = self._sampler
+        views = ViewMaker(self._network.config, augmentation)
+        maker = BatchMaker(sequences, views, settings.local_pairs, settings.local_matches)
+
+        def make(step: int) -> TrainingBatch:
+            rng = self._luck(step, "batch")
+            batch = maker.make(sampler.draw(pairs, rng), rng)
+            return replace(batch, input=thin(batch.input)) if settings.workers else batch
+
+        return make
+
+    def _luck(self, step: int, purpose: Literal["batch", "dropout"]) -> np.random.Generator:
+        return np.random.default_rng([self._settings.seed, step, self._team.rank, purpose == "dropout"])
+
+    def _step(self, batch: TrainingBatch) -> dict[str, float]:
         self._network.train()
         if self._settings.freeze_encoders:  # their running statistics too
             self._network.image_encoder.eval()
@@ -148,7 +163,7 @@ class Trainer:
             group["lr"] = self._learning_rate()
         device = self._team.device
         batch = _move(batch, device)
-        present = self._drop(batch, rng)
+        present = self._drop(batch)
         bank = self._bank if self.progress.step >= self._settings.bank_from_step else Bank(0, self._bank_width())
         with torch.autocast(device.type, torch.bfloat16, enabled=self._settings.half):
             losses, fused = self._objective(batch, *present, bank)
@@ -166,8 +181,9 @@ class Trainer:
         settings = self._settings
         return learning_rate(settings.learning_rate, settings.warmup_steps, self.progress.step, settings.steps)
 
-    def _drop(self, batch: TrainingBatch, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    def _drop(self, batch: TrainingBatch) -> tuple[Tensor, Tensor]:
         """Modality dropout: which rows keep their image and which their scan, never losing both."""
+        rng = self._luck(self.progress.step, "dropout")
         luck = torch.from_numpy(rng.random(len(batch.places.world))).to(self._team.device)
         chance = self._settings.modality_dropout
         image, cloud = batch.input.image_present, batch.input.coarse_mask.any(1)
@@ -253,5 +269,5 @@ def _choose_parameters(network: UMF, settings: TrainingSettings) -> list[nn.Para
 def _move(batch: TrainingBatch, device: torch.device) -> TrainingBatch:
     names = ("local_rows", "cells", "voxels", "useful_cells")
     return replace(
-        batch, input=to_device(batch.input, device), **{name: getattr(batch, name).to(device) for name in names}
+        batch, input=thick(to_device(batch.input, device)), **{name: getattr(batch, name).to(device) for name in names}
     )

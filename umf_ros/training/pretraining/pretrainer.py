@@ -16,8 +16,9 @@ from umf_ros.datasets.sample import SampleSequence
 from umf_ros.errors import ConfigError
 from umf_ros.networks.umf import UMF
 from umf_ros.training.checkpoint import resuming, save_checkpoint
+from umf_ros.training.loading import made_ahead
 from umf_ros.training.pretraining.settings import PretrainingSettings
-from umf_ros.training.pretraining.tasks import make_task
+from umf_ros.training.pretraining.tasks import Inputs, make_task
 from umf_ros.training.schedule import append_row, learning_rate
 from umf_ros.training.views import Augmentation, View, ViewMaker
 
@@ -43,8 +44,8 @@ class Progress:
 class Pretrainer:
     """Trains one encoder of a network without labels.
 
-    Everything random in an epoch follows from the seed and the epoch, and checkpoints are taken
-    between epochs: a resumed run repeats an uninterrupted one.
+    Everything random in a step follows from the seed and the step: a resumed run repeats an
+    uninterrupted one, and so does one whose batches are made by other processes.
 
     Args:
         network: its encoder is trained in place.
@@ -94,14 +95,20 @@ class Pretrainer:
     def _epoch(self, report: Callable[[Progress], None]) -> None:
         settings, progress = self._settings, self.progress
         epoch = progress.step // settings.epoch_steps
-        rng = np.random.default_rng([settings.seed, epoch])
+        steps = range(progress.step, min((epoch + 1) * settings.epoch_steps, settings.steps))
         sequences = self._sequences()
         losses: list[float] = []
-        while progress.step < min((epoch + 1) * settings.epoch_steps, settings.steps):
-            started = time.perf_counter()
-            losses.append(self._step(self._take(sequences, settings.batch, rng), rng))
+        started = time.perf_counter()
+
+        def make(step: int) -> Inputs:
+            rng = np.random.default_rng([settings.seed, step])
+            return self._task.prepare(self._take(sequences, settings.batch, rng), rng)
+
+        for inputs in made_ahead(make, steps, settings.workers):
+            losses.append(self._step(inputs))
             progress.loss = float(np.mean(losses))
-            progress.seconds += time.perf_counter() - started
+            started, before = time.perf_counter(), started
+            progress.seconds += started - before
             progress.step += 1
             report(progress)
 
@@ -119,17 +126,20 @@ class Pretrainer:
                 return views
         raise ConfigError(f"data: next to no sample has what {self._settings.modality} pretraining needs")
 
-    def _step(self, views: Sequence[View], rng: np.random.Generator) -> float:
+    def _step(self, inputs: Inputs) -> float:
         model, settings = self._task.model.train(), self._settings
         for group in self._optimiser.param_groups:
             group["lr"] = self._learning_rate()
         with torch.autocast(self._device.type, torch.bfloat16, enabled=settings.half):
-            loss = self._task.loss(views, rng)
+            loss = self._task.loss(self._moved(inputs))
         self._optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 5.0)
         self._optimiser.step()
         return float(loss.detach())
+
+    def _moved(self, inputs: Inputs) -> Inputs:
+        return inputs[0].to(self._device), inputs[1].to(self._device)
 
     def _learning_rate(self) -> float:
         settings = self._settings
@@ -141,7 +151,8 @@ class Pretrainer:
         views = self._take(self._sequences(), EXAMPLES, rng)
         self._task.model.eval()
         with torch.inference_mode():
-            self._task.draw(views, rng, self._folder / f"reconstructions_{self.progress.step:06d}.png")
+            inputs = self._moved(self._task.prepare(views, rng))
+            self._task.draw(inputs, self._folder / f"reconstructions_{self.progress.step:06d}.png")
 
     def _state(self) -> dict[str, Any]:
         return {

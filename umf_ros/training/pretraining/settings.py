@@ -32,6 +32,7 @@ class PretrainingSettings(Group):
     decoder_width: int = Field(64, ge=8, description="channels of the decoder, which is thrown away afterwards")
     half: bool = Field(True, description="bfloat16 mixed precision")
     threads: int = Field(1, ge=1, description="threads")
+    workers: int = Field(0, ge=0, description="processes that prepare batches ahead; 0: the training one itself")
     device: str = Field("auto", description="torch device; auto: a GPU when there is one")
 
     @model_validator(mode="after")

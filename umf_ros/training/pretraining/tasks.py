@@ -21,6 +21,9 @@ from umf_ros.training.pretraining.settings import PretrainingSettings
 from umf_ros.training.pretraining.sparse import hide
 from umf_ros.training.views import View
 
+Inputs = tuple[Tensor, Tensor]
+"""What an encoder is given, and a mask over it."""
+
 
 class Task(Protocol):
     """One way of hiding and predicting."""
@@ -34,11 +37,15 @@ class Task(Protocol):
         """The modality of a sample that is used, or None when the sample lacks it."""
         ...
 
-    def loss(self, views: Sequence[View], rng: np.random.Generator) -> Tensor:
-        """Loss of a batch with freshly drawn masks."""
+    def prepare(self, views: Sequence[View], rng: np.random.Generator) -> Inputs:
+        """A batch with freshly drawn masks."""
         ...
 
-    def draw(self, views: Sequence[View], rng: np.random.Generator, path: Path) -> None:
+    def loss(self, inputs: Inputs) -> Tensor:
+        """Loss of a batch."""
+        ...
+
+    def draw(self, inputs: Inputs, path: Path) -> None:
         """Draw what is given, what is shown to the encoder, and what it makes of it."""
         ...
 
@@ -54,14 +61,18 @@ class PaintImages:
         """The image alone."""
         return None if sample.image is None else replace(sample, points=None, intensity=None)
 
-    def loss(self, views: Sequence[View], rng: np.random.Generator) -> Tensor:
-        """Squared error of the hidden patches, each normalised."""
-        image, visible = self._prepare(views, rng)
-        return self.model(image, visible)[0]
+    def prepare(self, views: Sequence[View], rng: np.random.Generator) -> Inputs:
+        """Images, and which of their patches are visible."""
+        image = torch.from_numpy(np.stack([view.image for view in views]))[:, None]
+        return image, visible_patches(len(views), self._size, self._ratio, rng)
 
-    def draw(self, views: Sequence[View], rng: np.random.Generator, path: Path) -> None:
+    def loss(self, inputs: Inputs) -> Tensor:
+        """Squared error of the hidden patches, each normalised."""
+        return self.model(*inputs)[0]
+
+    def draw(self, inputs: Inputs, path: Path) -> None:
         """Image, visible patches, painted image, and the normalised patches wanted and painted."""
-        image, visible = self._prepare(views, rng)
+        image, visible = inputs
         _, painting = self.model(image, visible)
         wanted = unpatch(normalised(patches(image)), self._size)
         low = image.amin(dim=(2, 3), keepdim=True)
@@ -73,12 +84,6 @@ class PaintImages:
             "patches, painted": torch.where(hide(torch.ones_like(image), visible) > 0, wanted, painting),
         }
         save_images(path, [(name, values[:, 0].float().cpu().numpy()) for name, values in shown.items()])
-
-    def _prepare(self, views: Sequence[View], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-        device = self.model.head.weight.device
-        image = torch.from_numpy(np.stack([view.image for view in views]))[:, None]
-        visible = visible_patches(len(views), self._size, self._ratio, rng)
-        return image.to(device), visible.to(device)
 
 
 class GuessOccupancy:
@@ -93,23 +98,22 @@ class GuessOccupancy:
         """The scan alone."""
         return None if sample.points is None else replace(sample, image=None)
 
-    def loss(self, views: Sequence[View], rng: np.random.Generator) -> Tensor:
-        """Binary cross-entropy of the occupancy."""
-        return self.model(*self._prepare(views, rng))[0]
+    def prepare(self, views: Sequence[View], rng: np.random.Generator) -> Inputs:
+        """Grids, and which of their voxels are hidden."""
+        grid = torch.from_numpy(np.stack([view.scan.grid for view in views]))
+        return grid, hidden_voxels(occupancy(grid), self._ratios, rng)
 
-    def draw(self, views: Sequence[View], rng: np.random.Generator, path: Path) -> None:
+    def loss(self, inputs: Inputs) -> Tensor:
+        """Binary cross-entropy of the occupancy."""
+        return self.model(*inputs)[0]
+
+    def draw(self, inputs: Inputs, path: Path) -> None:
         """Occupancy, what of it is visible, and what is predicted, from above."""
-        grid, hidden = self._prepare(views, rng)
+        grid, hidden = inputs
         _, logits = self.model(grid, hidden)
         occupied = occupancy(grid)
         shown = {"scan": occupied, "visible": occupied & ~hidden, "predicted": logits.sigmoid()}
         save_occupancy(path, [(name, unfold(values.float()).cpu().numpy()) for name, values in shown.items()])
-
-    def _prepare(self, views: Sequence[View], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-        grid = torch.from_numpy(np.stack([view.scan.grid for view in views]))
-        hidden = hidden_voxels(occupancy(grid), self._ratios, rng)
-        device = self.model.head.weight.device
-        return grid.to(device), hidden.to(device)
 
 
 def make_task(network: UMF, settings: PretrainingSettings) -> Task:

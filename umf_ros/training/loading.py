@@ -1,0 +1,46 @@
+"""Batches made ahead of their use by worker processes, so that a GPU need not wait for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Generic, TypeVar
+
+import cv2
+from torch.utils.data import DataLoader, Dataset
+
+Item = TypeVar("Item")
+
+
+class _ByStep(Dataset[Item], Generic[Item]):
+    def __init__(self, make: Callable[[int], Item]) -> None:
+        self._make = make
+
+    def __getitem__(self, step: int) -> Item:
+        return self._make(step)
+
+
+def made_ahead(make: Callable[[int], Item], steps: range, workers: int) -> Iterator[Item]:
+    """What `make` makes of every step, in order.
+
+    Args:
+        make: must depend on nothing but the step; called in a copy of this process.
+        steps: what to make.
+        workers: processes; 0: this one, when an item is asked for.
+    """
+    if not workers:
+        return map(make, steps)
+    cv2.setNumThreads(0)  # its threads would not be there in a copy, which would wait for them for ever
+    loader = DataLoader(
+        _ByStep(make),
+        batch_size=None,
+        sampler=steps,
+        num_workers=min(workers, len(steps)),
+        prefetch_factor=2,
+        multiprocessing_context="fork",
+        collate_fn=_as_it_is,
+    )
+    return iter(loader)
+
+
+def _as_it_is(item: Item) -> Item:
+    return item
