@@ -3,7 +3,8 @@
 `python benchmarks/pretraining.py [--quick] [--seed N] [--json FILE] [--folder FOLDER]`
 
 Simulates training and validation worlds (those in the folder are kept), pretrains both encoders
-without labels, then trains two networks alike but for where they start, with several seeds.
+without labels, then trains two networks alike but for where they start, with several seeds. Only the
+first `--labelled` worlds are used with their poses: pretraining is for recordings that have none.
 """
 
 from __future__ import annotations
@@ -38,44 +39,54 @@ def main(
     quick: Annotated[bool, typer.Option("--quick", help="Few worlds and steps: does it run?")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Other worlds and weights.")] = 0,
     folder: Annotated[Path, typer.Option(help="Keeps worlds and runs.")] = Path("runs/pretraining"),
+    worlds: Annotated[int, typer.Option(min=1, help="Worlds to pretrain on.")] = 16,
+    labelled: Annotated[int, typer.Option(min=1, help="How many of them fine-tuning sees.")] = 4,
+    pretraining_steps: Annotated[int, typer.Option(min=1, help="Steps of pretraining, for each encoder.")] = 2000,
     steps: Annotated[int, typer.Option(min=1, help="Fine-tuning steps.")] = 500,
     repeats: Annotated[int, typer.Option(min=1, help="Fine-tuning runs of each kind, with different seeds.")] = 2,
+    workers: Annotated[int, typer.Option(min=0, help="Processes that prepare batches ahead, for a GPU.")] = 0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
 ) -> None:
     """Fine-tune from random and from pretrained encoders, and compare recall on validation worlds."""
     console = Console()
-    worlds, held_out = (1, 1) if quick else (16, 4)
+    held_out = 4
     if quick:
-        steps, repeats = 20, 1
+        worlds, labelled, held_out, pretraining_steps, steps, repeats = 1, 1, 1, 20, 20, 1
     train_folder, validation_folder = folder / "train", folder / "validation"
     first, unseen = TRAINING.start + 100 * seed, VALIDATION.start + 100 * seed
     simulate.command(shards=train_folder, worlds=f"{first}:{first + worlds}")
     simulate.command(shards=validation_folder, worlds=f"{unseen}:{unseen + held_out}")
     validation = WorldFolder(validation_folder).refresh()
+    few = folder / "labelled"
+    few.mkdir(exist_ok=True)
+    for path in sorted(train_folder.glob("*.npz"))[:labelled]:
+        (few / path.name).unlink(missing_ok=True)
+        (few / path.name).symlink_to(path.resolve())
     columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
     found: dict[str, list[Results]] = {"random": [], "pretrained": []}
     with Progress(*columns, console=console, transient=True) as bars:
-        bar = bars.add_task("", total=2 * steps * (1 + repeats))
-        start = _pretrained(train_folder, folder, steps, seed, _advance(bars, bar, "pretraining"))
+        bar = bars.add_task("", total=2 * (pretraining_steps + steps * repeats))
+        common = {"steps": pretraining_steps, "seed": seed, "workers": workers}
+        common["epoch_steps"] = max(pretraining_steps // 5, 1)
+        start = _pretrained(train_folder, folder, common, _advance(bars, bar, "pretraining"))
         for number in range(repeats):
             for kind, weights in (("random", ""), ("pretrained", str(start))):
-                settings = load_training(
-                    None, train=str(train_folder), steps=steps, seed=seed + number, start=weights, **FINE_TUNING
-                )
+                chosen = {"steps": steps, "seed": seed + number, "start": weights, "workers": workers}
+                settings = load_training(None, train=str(few), **chosen, **FINE_TUNING)
                 tuned = train(settings, folder / f"{kind}_{number}", False, _advance(bars, bar, f"training, {kind}"))
                 found[kind].append(validate(load_weights(tuned), validation))
     rows = [_row(kind, mode, runs) for mode in MODES for kind, runs in found.items()]
-    title = f"Recall on {held_out} worlds never seen, after {steps} steps on {worlds}; mean of {repeats} runs"
+    title = f"Recall on {held_out} worlds never seen, after {steps} steps on {labelled}; mean of {repeats} runs"
     print_table(console, title, (["encoders at first", *FIGURES, "R@1 of each run"], rows))
     figures = {f"recall1_{mode}_{kind}": _mean(runs, mode, "recall1") for mode in MODES for kind, runs in found.items()}
     if json_file:
         json_file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
 
 
-def _pretrained(data: Path, folder: Path, steps: int, seed: int, report: Callable[[object], None]) -> Path:
+def _pretrained(data: Path, folder: Path, common: dict[str, int], report: Callable[[object], None]) -> Path:
     """Weights whose image encoder, then whose voxel encoder has been pretrained."""
-    image = pretrain(make_settings("image", data, steps=steps, seed=seed), folder / "image", False, report)
-    settings = make_settings("lidar", data, steps=steps, seed=seed, start=str(image))
+    image = pretrain(make_settings("image", data, **common), folder / "image", False, report)
+    settings = make_settings("lidar", data, **common, start=str(image))
     return pretrain(settings, folder / "lidar", False, report)
 
 

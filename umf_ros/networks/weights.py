@@ -1,10 +1,10 @@
-"""Weights on disk: a safetensors file in half precision, and a JSON card beside it."""
+"""Weights on disk: a safetensors file in half precision or in eight bits, and a JSON card beside it."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -15,15 +15,31 @@ from umf_ros.errors import OutputError, WeightsError
 from umf_ros.networks.presets import NetworkConfig
 from umf_ros.networks.umf import UMF, channels_last
 
+Precision = Literal["half", "int8"]
+SCALE = ".scale"
+"""End of the name of what the eight bits of another tensor are to be multiplied with."""
+SMALL = 4096
+"""Tensors with fewer values are kept in half precision."""
 
-def save_weights(network: UMF, path: Path, card: dict[str, Any]) -> None:
-    """Write the weights, rounded to half precision, and `<name>.json` with the card and the architecture.
+
+def save_weights(network: UMF, path: Path, card: dict[str, Any], precision: Precision = "half") -> None:
+    """Write the weights, rounded, and `<name>.json` with the card and the architecture.
+
+    Args:
+        network: whose weights.
+        path: the `.safetensors` to write.
+        card: what is to be said of them.
+        precision: "int8" keeps eight bits of the large tensors and a scale for every output channel,
+            half the size of half precision.
 
     Raises:
         OutputError: the files cannot be written.
     """
     architecture = network.config.as_dict()
-    tensors = {name: _halve(value) for name, value in network.state_dict().items()}
+    tensors: dict[str, Tensor] = {}
+    for name, value in network.state_dict().items():
+        coarse = precision == "int8" and value.is_floating_point() and value.ndim > 1 and value.numel() >= SMALL
+        tensors |= _quantise(name, value) if coarse else {name: _halve(value)}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         save_file(tensors, path, metadata={"architecture": json.dumps(architecture)})
@@ -85,7 +101,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
         with safe_open(path, framework="pt") as stream:
             metadata = stream.metadata() or {}
-            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118 (not a mapping)
+            tensors = _restore({name: stream.get_tensor(name) for name in stream.keys()})  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError, ValueError) as error:
         raise WeightsError(f"{path} is truncated or not a safetensors file: {' '.join(str(error).split())}") from None
     if "architecture" not in metadata:
@@ -94,6 +110,23 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         return dict(json.loads(metadata["architecture"])), tensors
     except (TypeError, ValueError):
         raise WeightsError(f"{path} holds weights of another architecture: it does not say which clearly") from None
+
+
+def _quantise(name: str, value: Tensor) -> dict[str, Tensor]:
+    value = value.detach().cpu().float()
+    largest = value.abs().amax(dim=tuple(range(1, value.ndim)), keepdim=True)
+    scale = (largest / 127).clamp(min=1e-12)
+    return {name: (value / scale).round().to(torch.int8).contiguous(), name + SCALE: scale.contiguous()}
+
+
+def _restore(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The weights without their scales, which are multiplied in."""
+    scales = {name: value for name, value in tensors.items() if name.endswith(SCALE)}
+    return {
+        name: value * scales[name + SCALE] if name + SCALE in scales else value
+        for name, value in tensors.items()
+        if name not in scales
+    }
 
 
 def _halve(value: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
 import cv2
+import torch
 from torch.utils.data import DataLoader, Dataset
 
 Item = TypeVar("Item")
@@ -30,6 +31,7 @@ def made_ahead(make: Callable[[int], Item], steps: range, workers: int) -> Itera
     if not workers:
         return map(make, steps)
     cv2.setNumThreads(0)  # its threads would not be there in a copy, which would wait for them for ever
+    torch.sparse.check_sparse_tensor_invariants.disable()  # or torch warns that they are not checked
     loader = DataLoader(
         _ByStep(make),
         batch_size=None,

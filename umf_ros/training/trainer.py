@@ -29,6 +29,8 @@ from umf_ros.training.validation import MODES, Results, answerable, mean_of, val
 from umf_ros.training.views import Augmentation, ViewMaker
 
 MARGIN_M, MARGIN_DEG = 2.0, 5.0
+MOMENTUM = 0.02
+"""Share of a batch in the running statistics where each batch is of one world."""
 
 Worlds = Callable[[], Sequence[SampleSequence]]
 
@@ -84,6 +86,8 @@ class Trainer:
         if team.size > 1:
             objective = nn.parallel.DistributedDataParallel(objective)
         self._objective = objective
+        if self._whole:
+            _slow_statistics(self._network)
         self._optimiser = torch.optim.AdamW(self._trained, settings.learning_rate, weight_decay=settings.weight_decay)
 
     def run(self, report: Callable[[Progress], None], keep: Callable[[UMF, dict[str, Any]], None]) -> None:
@@ -242,6 +246,13 @@ def _rule(settings: TrainingSettings) -> Rule:
     # a later pass looks for itself in an earlier one, and all that is not the place may be taken for it
     close = {"negative_m": rule.positive_m + MARGIN_M, "negative_deg": rule.positive_deg + MARGIN_DEG}
     return replace(rule, between_passes=True, **close)
+
+
+def _slow_statistics(network: UMF) -> None:
+    """A batch of one world is no sample of all worlds: it takes the mean over many."""
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d | nn.BatchNorm3d):
+            module.momentum = MOMENTUM
 
 
 def _choose_parameters(network: UMF, settings: TrainingSettings) -> list[nn.Parameter]:
