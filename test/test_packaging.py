@@ -45,6 +45,8 @@ def test_everything_is_installed_to_share(install: Path) -> None:
         "launch/loop_closure.launch.py",
         "models/umf_light.safetensors",
         "models/umf_light.json",
+        "models/umf_resnet50.safetensors",
+        "models/umf_resnet50.json",
     ):
         assert (share / path).is_file(), path
     assert (install / "share" / "ament_index" / "resource_index" / "packages" / "umf_ros").is_file()

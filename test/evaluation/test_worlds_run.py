@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +11,8 @@ import pytest
 from landmarks import LineWorld, frame_of
 from tiny_worlds import TINY
 
-from umf_ros.evaluation import latency, worlds_run
-from umf_ros.evaluation.latency import cost_of_preset, cost_of_weights
+from umf_ros.evaluation import worlds_run
+from umf_ros.evaluation.latency import cost_of_weights
 from umf_ros.evaluation.worlds_run import PICTURES, WorldsRun
 from umf_ros.frames import Frame
 from umf_ros.networks.umf import UMF, count_parameters
@@ -43,8 +42,8 @@ def textured(stamp: int) -> Frame:
 def test_tables_figures_and_pictures_of_a_small_network(
     weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # the thesis's network takes a minute to convert; how it is timed has its own test
-    monkeypatch.setattr(worlds_run, "cost_of_preset", lambda _, frames, repeats: cost_of_weights(weights, frames, 1))
+    # the thesis's network takes a minute to convert
+    monkeypatch.setattr(worlds_run, "cost_of_weights", lambda _, frames, repeats: cost_of_weights(weights, frames, 1))
     told: list[tuple[str, int]] = []
     run = WorldsRun(weights, [LineWorld()], 1, True, lambda what, done: told.append((what, done)))  # type: ignore[list-item]
     summary = run.run()
@@ -60,13 +59,3 @@ def test_tables_figures_and_pictures_of_a_small_network(
     line = LineWorld()
     assert sum(done for what, done in told if what == line.name) == len(line) + line.revisits
     assert [what for what, _ in told[-2:]] == ["taking times", "drawing"]
-
-
-def test_a_preset_is_timed_with_random_weights_that_leave_no_trace(
-    own_cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(latency.PRESETS, "tiny", TINY)
-    found = cost_of_preset("tiny", [textured(stamp) for stamp in range(2)], repeats=1)
-    assert found.name == "tiny" and found.parameters == count_parameters(UMF(TINY))
-    assert found.eager_ms > 0 and found.fast_ms > 0
-    assert not own_cache.exists() and os.environ["XDG_CACHE_HOME"] == str(own_cache)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -8,8 +10,9 @@ from safetensors.torch import load_file, save_file
 from tiny_worlds import TINY, some_input
 
 from umf_ros.errors import OutputError, WeightsError
-from umf_ros.networks.presets import NetworkConfig
-from umf_ros.networks.weights import load_weights, read_card, save_weights
+from umf_ros.networks.presets import PRESETS, NetworkConfig
+from umf_ros.networks.umf import UMF
+from umf_ros.networks.weights import SHIPPED, load_weights, locate_weights, read_card, save_weights
 
 
 @pytest.fixture
@@ -35,6 +38,34 @@ def test_weights_come_back(network, weights):
 
 def test_weights_are_half_precision(weights):
     assert load_file(weights)["fusion.image_head.weight"].dtype == torch.float16
+
+
+def test_eight_bits_take_half_the_space_and_say_nearly_the_same(tmp_path):
+    torch.manual_seed(0)
+    network = UMF(replace(TINY, width=32, tokens=64)).eval()
+    paths = {name: tmp_path / f"{name}.safetensors" for name in ("half", "int8")}
+    for name, path in paths.items():
+        save_weights(network, path, {}, name)
+    assert paths["int8"].stat().st_size < 0.62 * paths["half"].stat().st_size
+    stored = load_file(paths["int8"])
+    assert stored["fusion.image_head.bias"].dtype == torch.float16
+    large = [name for name, value in stored.items() if value.dtype == torch.int8]
+    assert large and all(stored[name].abs().max() == 127 for name in large)
+    restored = load_weights(paths["int8"])
+    for name in large:
+        wanted, found = network.state_dict()[name], restored.state_dict()[name]
+        step = wanted.abs().amax(dim=tuple(range(1, wanted.ndim)), keepdim=True) / 127
+        assert ((wanted - found).abs() <= 0.501 * step).all()
+    batch = some_input(network.config)
+    assert (network(batch).descriptor * restored(batch).descriptor).sum(-1).min() > 0.999
+
+
+def test_shipped_weights_are_known_by_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert locate_weights(None) == locate_weights(Path("umf_light"))
+    for name in SHIPPED:
+        assert load_weights(locate_weights(Path(name))).config == PRESETS[name]
+    assert locate_weights(tmp_path / "umf_light") == tmp_path / "umf_light"
 
 
 def test_missing(tmp_path):

@@ -27,7 +27,7 @@ def command(
     seed: Annotated[int | None, Optional(min=0, help="First of the four worlds' seeds.")] = None,
     quick: Annotated[bool, Optional("--quick", help="A smaller sample of every world.")] = False,
     methods: Annotated[str, Optional(help="umf, or all: methods that need no training too.")] = "umf",
-    weights: Annotated[Path | None, Optional(help="Weights of the network; default: the shipped ones.")] = None,
+    weights: Annotated[Path | None, Optional(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
     json_file: Annotated[Path | None, Optional("--json", help="Write the figures here too.")] = None,
     out: Annotated[Path, Optional(help="Where results/<timestamp> goes.")] = Path("results"),
     config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording.")] = None,
@@ -96,7 +96,7 @@ def _on_worlds(
         notes = [
             f"Worlds: {names}; hard setting (offset path up to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing)"
             f"{', quick' if quick else ''}. A match is true within 12 m and 30 deg (thesis 5.1.2). Times are "
-            "medians on this machine, as busy as it was; the ResNet-50 network has random weights."
+            "medians on this machine, as busy as it was."
         ]
         run.write(summary, folder, notes)
     for title, table in summary.tables().items():
@@ -176,18 +176,16 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     from rich.console import Console
 
     from umf_ros.datasets.listed import SequenceList
-    from umf_ros.embedding.umf_embedder import DEFAULT_WEIGHTS
     from umf_ros.evaluation.markdown import print_table, to_markdown
     from umf_ros.evaluation.protocol import RULES
-    from umf_ros.networks.weights import load_weights
-    from umf_ros.resources import find
+    from umf_ros.networks.weights import load_weights, locate_weights
     from umf_ros.results.folder import create_run_folder, write_atomically
     from umf_ros.training.validation import answerable, means, table, validate
 
     if rule not in RULES:
         raise ConfigError(f"--rule: expected {' or '.join(RULES)}, not {rule!r}")
     console = Console()
-    network = load_weights(weights or find(DEFAULT_WEIGHTS))
+    network = load_weights(locate_weights(weights))
     results = validate(network, SequenceList(listing).worlds, rule=RULES[rule])
     if not answerable(results):
         raise ConfigError(f"{listing}: no place is visited twice")

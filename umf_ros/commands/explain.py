@@ -23,7 +23,7 @@ def command(
     config: Annotated[Path | None, Optional(help="Parameter file (YAML).")] = None,
     dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
     embedder: Annotated[str | None, Optional(help="umf, or a baseline.")] = None,
-    weights: Annotated[Path | None, Optional(help="Weights of the network; default: the shipped ones.")] = None,
+    weights: Annotated[Path | None, Optional(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
 ) -> None:
     """Show both images with their matching features, both scans aligned, and the decision's numbers."""
     from rich.console import Console

@@ -10,7 +10,7 @@ import typer
 
 def command(
     out: Annotated[Path, typer.Argument(help="File to write, such as umf_light.xml; its .bin goes beside it.")],
-    weights: Annotated[Path | None, typer.Option(help="Weights (.safetensors); default: the shipped ones.")] = None,
+    weights: Annotated[Path | None, typer.Option(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
     super_features: Annotated[bool, typer.Option("--super-features", help="Include the super-features.")] = False,
 ) -> None:
     """Export a network to OpenVINO."""
@@ -19,14 +19,12 @@ def command(
     from umf_ros.embedding.export import convert, inputs_by_name, save
     from umf_ros.embedding.inputs import blank_input
     from umf_ros.embedding.runtimes import Flat
-    from umf_ros.embedding.umf_embedder import DEFAULT_WEIGHTS
     from umf_ros.errors import ConfigError
-    from umf_ros.networks.weights import load_weights
-    from umf_ros.resources import find
+    from umf_ros.networks.weights import load_weights, locate_weights
 
     if out.suffix != ".xml":
         raise ConfigError(f"{out}: OpenVINO's files end in .xml")
-    network = load_weights(weights or find(DEFAULT_WEIGHTS))
+    network = load_weights(locate_weights(weights))
     model = convert(Flat(network, super_features), inputs_by_name(blank_input(network.config)))
     save(model, out)
     megabytes = out.with_suffix(".bin").stat().st_size / 1e6

@@ -16,7 +16,7 @@ def command(
     out: Annotated[Path, Optional(help="Where results/<timestamp> goes.")] = Path("results"),
     dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
     embedder: Annotated[str | None, Optional(help="umf, or a baseline.")] = None,
-    weights: Annotated[Path | None, Optional(help="Weights of the network; default: the shipped ones.")] = None,
+    weights: Annotated[Path | None, Optional(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
     odometry: Annotated[Path | None, Optional(help="Odometry as a TUM file, where the bag has none.")] = None,
     odometry_frame: Annotated[
         str, Optional(help="Whose poses --odometry holds: body, imu, camera or lidar (S3LI's Eval/BASALT: imu).")

@@ -13,10 +13,8 @@ from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_sal
 from umf_ros.embedding.runtimes import Outputs, make_runtime
 from umf_ros.embedding.voxels import VoxelScan
 from umf_ros.frames import Embedding, Frame, LocalFeatures, Points, SuperFeatures
-from umf_ros.networks.weights import load_weights
-from umf_ros.resources import find
+from umf_ros.networks.weights import load_weights, locate_weights
 
-DEFAULT_WEIGHTS = "models/umf_light.safetensors"
 KEYPOINTS = 400
 # of the fair share of attention; the cap decides in a rich view, this in a poor one
 MIN_SALIENCY = 0.01
@@ -29,7 +27,7 @@ class UmfEmbedder:
     features at the mean of the points of a voxel.
 
     Args:
-        weights: safetensors file, or None for the shipped ones.
+        weights: safetensors file or name of shipped weights, or None for the default.
         runtime: auto, torch or openvino.
         device: torch device.
         threads: of the network; 0: as many as there are cores.
@@ -48,7 +46,7 @@ class UmfEmbedder:
         threads: int = 0,
         super_features: bool = False,
     ) -> None:
-        path = weights or find(DEFAULT_WEIGHTS)
+        path = locate_weights(weights)
         network = load_weights(path)
         # descriptors of other weights are another language: the name tells them apart
         self.name = f"{path.stem}-{hashlib.sha256(path.read_bytes()).hexdigest()[:8]}"

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.embedding.umf_embedder import DEFAULT_WEIGHTS, UmfEmbedder
+from umf_ros.embedding.umf_embedder import UmfEmbedder
 from umf_ros.frames import Frame
-from umf_ros.networks.presets import PRESETS
-from umf_ros.networks.umf import UMF, count_parameters
-from umf_ros.networks.weights import load_weights, save_weights
-from umf_ros.resources import find
+from umf_ros.networks.umf import count_parameters
+from umf_ros.networks.weights import load_weights, locate_weights
 from umf_ros.sensors.calibration import load_calibration
 
 WARM_UP = 3
@@ -66,21 +60,12 @@ def measure(embedder: Embedder, frames: Sequence[Frame], repeats: int) -> float:
     return 1e3 * float(np.median(took))
 
 
-def cost_of_weights(path: Path | None, frames: Sequence[Frame], repeats: int) -> Cost:
-    """Cost of a weights file, the shipped one for None."""
-    path = path or find(DEFAULT_WEIGHTS)
+def cost_of_weights(weights: Path, frames: Sequence[Frame], repeats: int) -> Cost:
+    """Cost of a weights file, or of shipped weights by name."""
+    path = locate_weights(weights)
     eager = measure(UmfEmbedder(path, runtime="torch"), frames, repeats)
     fast = measure(UmfEmbedder(path), frames, repeats)
     return Cost(path.stem, count_parameters(load_weights(path)), eager, fast)
-
-
-def cost_of_preset(preset: str, frames: Sequence[Frame], repeats: int) -> Cost:
-    """Cost of a preset with random weights: what it finds is nonsense, how long it takes is not."""
-    torch.manual_seed(0)
-    with tempfile.TemporaryDirectory() as folder, _cache_in(folder):
-        path = Path(folder) / f"{preset}.safetensors"
-        save_weights(UMF(PRESETS[preset]), path, {"weights": "random"})
-        return cost_of_weights(path, frames, repeats)
 
 
 def at_full_size(frame: Frame) -> Frame:
@@ -90,17 +75,3 @@ def at_full_size(frame: Frame) -> Frame:
         return frame
     left = cv2.resize(frame.left, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR).astype(np.uint8)
     return replace(frame, left=left, camera=camera)
-
-
-@contextmanager
-def _cache_in(folder: str) -> Iterator[None]:
-    """Keep converted networks that nobody will want again out of the user's cache."""
-    before = os.environ.get("XDG_CACHE_HOME")
-    os.environ["XDG_CACHE_HOME"] = folder
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["XDG_CACHE_HOME"]
-        else:
-            os.environ["XDG_CACHE_HOME"] = before

@@ -11,19 +11,18 @@ import numpy as np
 from umf_ros.config import Embedding, Verification
 from umf_ros.embedding import METHODS, make_embedder
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.embedding.umf_embedder import DEFAULT_WEIGHTS, UmfEmbedder
+from umf_ros.embedding.umf_embedder import UmfEmbedder
 from umf_ros.evaluation.attention_plots import look, plot_keypoints, plot_superfeatures
 from umf_ros.evaluation.curve_plots import plot_precision_recall, plot_recall
 from umf_ros.evaluation.embedding_plots import plot_embeddings
-from umf_ros.evaluation.latency import at_full_size, cost_of_preset, cost_of_weights
+from umf_ros.evaluation.latency import at_full_size, cost_of_weights
 from umf_ros.evaluation.markdown import to_markdown
 from umf_ros.evaluation.scores import Scores
 from umf_ros.evaluation.summary import WorldsSummary
 from umf_ros.evaluation.world_evaluation import WorldEvaluation, WorldResult
 from umf_ros.evaluation.worlds import TestWorld
 from umf_ros.frames import Frame
-from umf_ros.networks.weights import load_weights
-from umf_ros.resources import find
+from umf_ros.networks.weights import load_weights, locate_weights
 from umf_ros.results.folder import write_atomically
 
 RERANKED = ("fused", "superfeatures both", "ransac both")
@@ -42,7 +41,7 @@ class WorldsRun:
     """Evaluates one network on some worlds and fills a results folder.
 
     Args:
-        weights: safetensors file, or None for the shipped ones.
+        weights: safetensors file or name of shipped weights, or None for the default.
         worlds: to drive through.
         repeats: how often each frame is embedded when time is taken.
         others: whether to compare with the methods that need no training.
@@ -57,7 +56,7 @@ class WorldsRun:
         others: bool,
         report: Callable[[str, int], None],
     ) -> None:
-        self._weights = weights or find(DEFAULT_WEIGHTS)
+        self._weights = locate_weights(weights)
         self._worlds, self._repeats, self._report = worlds, repeats, report
         self._embedder = UmfEmbedder(self._weights, super_features=True)
         names = [name for name in METHODS if name != "umf"] if others else []
@@ -76,7 +75,7 @@ class WorldsRun:
         seen = [frame for result in results for pair in result.examples for frame in pair]
         frames = [at_full_size(frame) for frame in seen[:TIMED_FRAMES]]
         default = cost_of_weights(self._weights, frames, self._repeats)
-        return WorldsSummary(results, baselines, default, cost_of_preset("umf_resnet50", frames, self._repeats))
+        return WorldsSummary(results, baselines, default, cost_of_weights(Path("umf_resnet50"), frames, self._repeats))
 
     def write(self, summary: WorldsSummary, folder: Path, notes: list[str]) -> None:
         """Write tables, figures and pictures.

@@ -14,7 +14,10 @@ from torch import Tensor
 from umf_ros.errors import OutputError, WeightsError
 from umf_ros.networks.presets import NetworkConfig
 from umf_ros.networks.umf import UMF, channels_last
+from umf_ros.resources import find
 
+SHIPPED = ("umf_light", "umf_resnet50")
+DEFAULT = "umf_light"
 Precision = Literal["half", "int8"]
 SCALE = ".scale"
 """End of the name of what the eight bits of another tensor are to be multiplied with."""
@@ -48,6 +51,12 @@ def save_weights(network: UMF, path: Path, card: dict[str, Any], precision: Prec
         path.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
     except (OSError, SafetensorError) as error:
         raise OutputError(f"cannot write {path}: {error}") from None
+
+
+def locate_weights(weights: Path | None) -> Path:
+    """A weights file: as given, one of the shipped by its name, or for None the shipped default."""
+    name = DEFAULT if weights is None else str(weights)
+    return find(f"models/{name}.safetensors") if name in SHIPPED else Path(name)
 
 
 def load_weights(path: Path) -> UMF:
