@@ -115,6 +115,20 @@ def test_frozen_encoders_stay(folder, tmp_path):
     assert "fusion.image_head.weight" in moved
 
 
+def test_fixed_statistics_stay_while_the_encoders_learn(folder, tmp_path):
+    torch.manual_seed(3)
+    network = UMF(TINY)
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    trainer = Trainer(
+        network, settings_for(folder, fixed_statistics=True, steps=2), WorldFolder(folder).refresh, list, tmp_path,
+        Team(0, 1, torch.device("cpu")),
+    )  # fmt: skip
+    trainer.run(silent, lambda *_: None)
+    moved = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
+    assert not [name for name in moved if "running" in name or "tracked" in name]
+    assert {"image_encoder", "voxel_encoder"} <= {name.split(".")[0] for name in moved}
+
+
 @pytest.mark.parametrize(("branch", "other"), [("image", "voxel_encoder"), ("cloud", "image_encoder")])
 def test_one_branch_learns_and_leaves_the_other_as_it_was(folder, tmp_path, branch, other):
     torch.manual_seed(4)

@@ -59,6 +59,9 @@ class TrainingSettings(Group):
         "both", description="image or cloud: that branch alone learns, the other one is neither run nor changed"
     )
     freeze_encoders: bool = Field(False, description="train fusion and local features only (thesis 4.6)")
+    fixed_statistics: bool = Field(
+        False, description="normalise as the weights to start from do, not by each batch; so with frozen encoders"
+    )
     start: str = Field("", description="weights to start from")
     half: bool = Field(True, description="bfloat16 mixed precision")
     threads: int = Field(1, ge=1, description="threads per process")

@@ -160,7 +160,7 @@ class Trainer:
 
     def _step(self, batch: TrainingBatch) -> dict[str, float]:
         self._network.train()
-        if self._settings.freeze_encoders:  # their running statistics too
+        if self._settings.freeze_encoders or self._settings.fixed_statistics:
             self._network.image_encoder.eval()
             self._network.voxel_encoder.eval()
         for group in self._optimiser.param_groups:
