@@ -39,7 +39,10 @@ def run(*arguments: str) -> str:
         (["--worlds", "test", "--methods", "some"], "expected umf or all"),
         (["nowhere.mcap"], "no recording"),
         (["nowhere.yaml"], "cannot read nowhere.yaml"),
-        (["nowhere.yaml", "--odometry", "a.tum"], "are of recordings, not of a list"),
+        (["nowhere.yaml", "--odometry", "a.tum"], "a list of sequences has no use for --odometry"),
+        (["nowhere.yaml", "--methods", "all", "--seed", "0"], "a list of sequences has no use for --seed, --methods"),
+        (["--worlds", "test", "--rule", "robotcar", "--config", "a"], "simulated worlds have no use for --rule, --con"),
+        (["nowhere.mcap", "--quick"], "a recording has no use for --quick"),
         (["nowhere.yaml", "--rule", "kitti"], "expected s3li or robotcar, not 'kitti'"),
     ],
 )

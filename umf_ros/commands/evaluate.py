@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -47,18 +48,24 @@ def command(
     a second drive on an offset path under another sun is asked for the first; the default seeds of the
     test worlds are never trained or tuned on.
     """
+    from umf_ros.datasets.listed import is_list
+
     if (data is None) == (worlds is None):
         raise ConfigError("expected either a recording or --worlds test|validation")
     if methods not in ("umf", "all"):
         raise ConfigError(f"--methods: expected umf or all, not {methods!r}")
-    if worlds is not None:
-        figures = _on_worlds(worlds, seed, quick, methods == "all", weights, out)
-    elif data is not None and data.suffix in (".yaml", ".yml"):
-        if config or embedder or odometry or ground_truth:
-            raise ConfigError("--config, --embedder, --odometry and --ground-truth are of recordings, not of a list")
+    of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick, "--methods": methods != "umf"}
+    of_lists: dict[str, object] = {"--rule": rule != "s3li"}
+    of_recordings: dict[str, object] = {"--config": config, "--dataset": dataset != "auto", "--embedder": embedder}
+    of_recordings |= {"--odometry": odometry, "--ground-truth": ground_truth}
+    if data is None:
+        _refuse("simulated worlds", of_lists | of_recordings)
+        figures = _on_worlds(str(worlds), seed, quick, methods == "all", weights, out)
+    elif is_list(data):
+        _refuse("a list of sequences", of_worlds | of_recordings)
         figures = _on_sequences(data, rule, weights, out)
     else:
-        assert data is not None
+        _refuse("a recording", of_worlds | of_lists)
         figures = _on_recording(data, config, dataset, embedder, weights, odometry, odometry_frame, ground_truth, out)
     if json_file is not None:
         import json
@@ -66,6 +73,13 @@ def command(
         from umf_ros.results.folder import write_atomically
 
         write_atomically(json_file, json.dumps(figures, indent=2) + "\n")
+
+
+def _refuse(data: str, options: Mapping[str, object]) -> None:
+    """An option that would be ignored is a mistake, and said to be one."""
+    given = [name for name, value in options.items() if value]
+    if given:
+        raise ConfigError(f"{data} {'has' if data.startswith('a ') else 'have'} no use for {', '.join(given)}")
 
 
 def _on_worlds(

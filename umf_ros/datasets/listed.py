@@ -141,6 +141,11 @@ class SequenceList:
         return self.worlds
 
 
+def is_list(path: Path) -> bool:
+    """Whether a path names a list of sequences, and not data."""
+    return path.suffix in (".yaml", ".yml")
+
+
 def open_source(path: Path) -> Source:
     """A folder of simulated worlds, or a YAML file that lists sequences.
 
@@ -148,7 +153,7 @@ def open_source(path: Path) -> Source:
         ConfigError: the file is no such list.
         UmfError: there is no folder, or a sequence is missing or damaged.
     """
-    return SequenceList(path) if path.suffix in (".yaml", ".yml") else WorldFolder(path)
+    return SequenceList(path) if is_list(path) else WorldFolder(path)
 
 
 def _entries(path: Path) -> list[Entry]:
