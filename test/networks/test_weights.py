@@ -47,6 +47,7 @@ def test_eight_bits_take_half_the_space_and_say_nearly_the_same(tmp_path):
     for name, path in paths.items():
         save_weights(network, path, {}, name)
     assert paths["int8"].stat().st_size < 0.62 * paths["half"].stat().st_size
+    assert [read_card(path)["precision"] for path in paths.values()] == ["half", "int8"]
     stored = load_file(paths["int8"])
     assert stored["fusion.image_head.bias"].dtype == torch.float16
     large = [name for name, value in stored.items() if value.dtype == torch.int8]

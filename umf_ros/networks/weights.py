@@ -47,7 +47,7 @@ def save_weights(network: UMF, path: Path, card: dict[str, Any], precision: Prec
         path.parent.mkdir(parents=True, exist_ok=True)
         save_file(tensors, path, metadata={"architecture": json.dumps(architecture)})
         path.chmod(0o644)
-        text = json.dumps(card | {"architecture": architecture}, indent=2, ensure_ascii=False)
+        text = json.dumps(card | {"precision": precision, "architecture": architecture}, indent=2, ensure_ascii=False)
         path.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
     except (OSError, SafetensorError) as error:
         raise OutputError(f"cannot write {path}: {error}") from None

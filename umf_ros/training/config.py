@@ -10,6 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 from umf_ros.config import Group, problems, read_values
 from umf_ros.errors import ConfigError
 from umf_ros.networks.umf import Branch
+from umf_ros.networks.weights import Precision
 
 
 class TrainingSettings(Group):
@@ -64,6 +65,9 @@ class TrainingSettings(Group):
     )
     start: str = Field("", description="weights to start from")
     half: bool = Field(True, description="bfloat16 mixed precision")
+    stored: Precision = Field(
+        "half", description="numbers in the weights file; int8 takes half the space of half precision"
+    )
     threads: int = Field(1, ge=1, description="threads per process")
     workers: int = Field(0, ge=0, description="processes that prepare batches ahead; 0: the training one itself")
     device: str = Field("auto", description="torch device; auto: a GPU when there is one")

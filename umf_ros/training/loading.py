@@ -9,15 +9,20 @@ import cv2
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from umf_ros.errors import UmfError
+
 Item = TypeVar("Item")
 
 
-class _ByStep(Dataset[Item], Generic[Item]):
+class _ByStep(Dataset[Item | UmfError], Generic[Item]):
     def __init__(self, make: Callable[[int], Item]) -> None:
         self._make = make
 
-    def __getitem__(self, step: int) -> Item:
-        return self._make(step)
+    def __getitem__(self, step: int) -> Item | UmfError:
+        try:
+            return self._make(step)
+        except UmfError as error:  # the loader would wrap it in a trace of the other process
+            return error
 
 
 def made_ahead(make: Callable[[int], Item], steps: range, workers: int) -> Iterator[Item]:
@@ -27,9 +32,13 @@ def made_ahead(make: Callable[[int], Item], steps: range, workers: int) -> Itera
         make: must depend on nothing but the step; called in a copy of this process.
         steps: what to make.
         workers: processes; 0: this one, when an item is asked for.
+
+    Raises:
+        UmfError: what `make` raises.
     """
     if not workers:
-        return map(make, steps)
+        yield from map(make, steps)
+        return
     cv2.setNumThreads(0)  # its threads would not be there in a copy, which would wait for them for ever
     torch.sparse.check_sparse_tensor_invariants.disable()  # or torch warns that they are not checked
     loader = DataLoader(
@@ -41,8 +50,11 @@ def made_ahead(make: Callable[[int], Item], steps: range, workers: int) -> Itera
         multiprocessing_context="fork",
         collate_fn=_as_it_is,
     )
-    return iter(loader)
+    for item in loader:
+        if isinstance(item, UmfError):
+            raise item
+        yield item
 
 
-def _as_it_is(item: Item) -> Item:
+def _as_it_is(item: object) -> object:
     return item

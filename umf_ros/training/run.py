@@ -51,7 +51,8 @@ def train(settings: TrainingSettings, output: Path, resume: bool, report: Callab
             trainer.resume()
 
         def keep(best: UMF, summary: dict[str, Any]) -> None:
-            save_weights(best, weights, summary | _card(settings, best, training.worlds, trainer))
+            card = summary | _card(settings, best, training.worlds, trainer)
+            save_weights(best, weights, card, settings.stored)
 
         trainer.run(report, keep)
     return weights
