@@ -39,11 +39,11 @@ def main(
     quick: Annotated[bool, typer.Option("--quick", help="Few worlds and steps: does it run?")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Other worlds and weights.")] = 0,
     folder: Annotated[Path, typer.Option(help="Keeps worlds and runs.")] = Path("runs/pretraining"),
-    worlds: Annotated[int, typer.Option(min=1, help="Worlds to pretrain on.")] = 16,
+    worlds: Annotated[int, typer.Option(min=1, help="Worlds to pretrain on.")] = 40,
     labelled: Annotated[int, typer.Option(min=1, help="How many of them fine-tuning sees.")] = 4,
-    pretraining_steps: Annotated[int, typer.Option(min=1, help="Steps of pretraining, for each encoder.")] = 2000,
-    steps: Annotated[int, typer.Option(min=1, help="Fine-tuning steps.")] = 500,
-    repeats: Annotated[int, typer.Option(min=1, help="Fine-tuning runs of each kind, with different seeds.")] = 2,
+    pretraining_steps: Annotated[int, typer.Option(min=1, help="Steps of pretraining, for each encoder.")] = 1200,
+    steps: Annotated[int, typer.Option(min=1, help="Fine-tuning steps.")] = 200,
+    repeats: Annotated[int, typer.Option(min=1, help="Fine-tuning runs of each kind, with different seeds.")] = 3,
     workers: Annotated[int, typer.Option(min=0, help="Processes that prepare batches ahead, for a GPU.")] = 0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
 ) -> None:
@@ -76,7 +76,10 @@ def main(
                 tuned = train(settings, folder / f"{kind}_{number}", False, _advance(bars, bar, f"training, {kind}"))
                 found[kind].append(validate(load_weights(tuned), validation))
     rows = [_row(kind, mode, runs) for mode in MODES for kind, runs in found.items()]
-    title = f"Recall on {held_out} worlds never seen, after {steps} steps on {labelled}; mean of {repeats} runs"
+    title = (
+        f"Recall on {held_out} worlds never seen, after {steps} steps on {labelled} worlds with poses, "
+        f"of {worlds} pretrained on; mean of {repeats} runs"
+    )
     print_table(console, title, (["encoders at first", *FIGURES, "R@1 of each run"], rows))
     figures = {f"recall1_{mode}_{kind}": _mean(runs, mode, "recall1") for mode in MODES for kind, runs in found.items()}
     if json_file:
