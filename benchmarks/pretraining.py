@@ -59,9 +59,11 @@ def main(
     validation = WorldFolder(validation_folder).refresh()
     few = folder / "labelled"
     few.mkdir(exist_ok=True)
-    for path in sorted(train_folder.glob("*.npz"))[:labelled]:
-        (few / path.name).unlink(missing_ok=True)
-        (few / path.name).symlink_to(path.resolve())
+    for link in few.glob("*.npz"):  # of an earlier call
+        link.unlink()
+    for world in range(first, first + min(labelled, worlds)):
+        name = f"world_{world:05d}.npz"
+        (few / name).symlink_to((train_folder / name).resolve())
     columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
     found: dict[str, list[Results]] = {"random": [], "pretrained": []}
     with Progress(*columns, console=console, transient=True) as bars:

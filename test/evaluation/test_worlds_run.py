@@ -59,3 +59,9 @@ def test_tables_figures_and_pictures_of_a_small_network(
     line = LineWorld()
     assert sum(done for what, done in told if what == line.name) == len(line) + line.revisits
     assert [what for what, _ in told[-2:]] == ["taking times", "drawing"]
+
+
+def test_a_network_is_timed_in_both_runtimes(weights: Path) -> None:
+    found = cost_of_weights(weights, [textured(stamp) for stamp in range(2)], repeats=1)
+    assert found.name == weights.stem and found.parameters == count_parameters(UMF(TINY))
+    assert found.eager_ms > 0 and found.fast_ms > 0

@@ -102,16 +102,18 @@ def test_what_only_local_features_teach_is_switched_off_without_them(folder, tmp
     assert not network.image_encoder.pyramid.fine.weight.requires_grad
 
 
-def test_frozen_encoders_stay(folder, tmp_path):
+def learned_by(folder, out, **changes):
+    """A network after two steps, and the names of what they changed."""
     torch.manual_seed(3)
     network = UMF(TINY)
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    trainer = Trainer(
-        network, settings_for(folder, freeze_encoders=True, steps=2), WorldFolder(folder).refresh, list, tmp_path,
-        Team(0, 1, torch.device("cpu")),
-    )  # fmt: skip
-    trainer.run(silent, lambda *_: None)
-    moved = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
+    settings, team = settings_for(folder, steps=2, **changes), Team(0, 1, torch.device("cpu"))
+    Trainer(network, settings, WorldFolder(folder).refresh, list, out, team).run(silent, lambda *_: None)
+    return network, {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
+
+
+def test_frozen_encoders_stay(folder, tmp_path):
+    _, moved = learned_by(folder, tmp_path, freeze_encoders=True)
     fine = ("pyramid.fine", "laterals.0", "laterals.1", "voxel_encoder.fine", "up_fine")  # of the local features
     encoders = {name for name in moved if "encoder" in name}  # running statistics included
     assert encoders and not [name for name in encoders if not any(part in name for part in fine)]
@@ -119,30 +121,14 @@ def test_frozen_encoders_stay(folder, tmp_path):
 
 
 def test_fixed_statistics_stay_while_the_encoders_learn(folder, tmp_path):
-    torch.manual_seed(3)
-    network = UMF(TINY)
-    before = {name: value.clone() for name, value in network.state_dict().items()}
-    trainer = Trainer(
-        network, settings_for(folder, fixed_statistics=True, steps=2), WorldFolder(folder).refresh, list, tmp_path,
-        Team(0, 1, torch.device("cpu")),
-    )  # fmt: skip
-    trainer.run(silent, lambda *_: None)
-    moved = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
+    _, moved = learned_by(folder, tmp_path, fixed_statistics=True)
     assert not [name for name in moved if "running" in name or "tracked" in name]
     assert {"image_encoder", "voxel_encoder"} <= {name.split(".")[0] for name in moved}
 
 
 @pytest.mark.parametrize(("branch", "other"), [("image", "voxel_encoder"), ("cloud", "image_encoder")])
 def test_one_branch_learns_and_leaves_the_other_as_it_was(folder, tmp_path, branch, other):
-    torch.manual_seed(4)
-    network = UMF(TINY)
-    before = {name: value.clone() for name, value in network.state_dict().items()}
-    trainer = Trainer(
-        network, settings_for(folder, branch=branch, local_pairs=0, steps=2), WorldFolder(folder).refresh, list,
-        tmp_path, Team(0, 1, torch.device("cpu")),
-    )  # fmt: skip
-    trainer.run(silent, lambda *_: None)
-    moved = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
+    network, moved = learned_by(folder, tmp_path, branch=branch, local_pairs=0)
     assert f"fusion.{branch}_head.weight" in moved and f"fusion.layers.0.{branch}_self.attention.query.weight" in moved
     assert not [name for name in moved if other in name or "cross" in name or "absent" in name or "local" in name]
     idle = [n for n, p in network.named_parameters() if p.requires_grad and p.grad is None]
