@@ -17,13 +17,13 @@ from scipy.spatial.transform import Rotation
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.frames import Frame, Image, Keyframe, StereoCamera
 from umf_ros.geometry import Array, make_pose, relative, rotation_angle, transform
+from umf_ros.lab.simulation.camera import TRAINING_SIZE, resized
+from umf_ros.lab.simulation.families import FAMILIES
+from umf_ros.lab.simulation.passes import SETTINGS, plan_passes
+from umf_ros.lab.simulation.shards import Survey
+from umf_ros.lab.simulation.world import World, ground
 from umf_ros.loop_detector import make_keyframe
 from umf_ros.sensors.calibration import Calibration, load_calibration
-from umf_ros.simulation.camera import TRAINING_SIZE, resized
-from umf_ros.simulation.families import FAMILIES
-from umf_ros.simulation.passes import SETTINGS, plan_passes
-from umf_ros.simulation.shards import Survey
-from umf_ros.simulation.world import World, ground
 from umf_ros.verification.lifting import project
 
 SPEED_M_S = 1.0

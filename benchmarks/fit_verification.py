@@ -28,12 +28,12 @@ from umf_ros.config import Embedding as EmbeddingSettings
 from umf_ros.embedding import make_embedder
 from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array
+from umf_ros.lab.simulation.seeds import VALIDATION
+from umf_ros.lab.training.acceptance_fit import Example, fit_logistic, fit_spread, inside_ellipsoid, scale_spread
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.simulation.seeds import VALIDATION
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import MEASURES, Calibration, load_calibration, measure, save_calibration
 from umf_ros.verification.evidence import Evidence
-from umf_ros.verification.fitting import Example, fit_logistic, fit_spread, inside_ellipsoid, scale_spread
 
 RIGHT_M, RIGHT_DEG = 0.4, 3.0
 EXAMINED = 5  # candidates per query: what retrieval offers first

@@ -24,13 +24,13 @@ import numpy as np
 
 from umf_ros.config import PoseGraph as Settings
 from umf_ros.geometry import Array
+from umf_ros.lab.simulation.pose_graphs import WORLDS, Kind, World, WorldClosure, rover_loops, with_wrong_closures
 from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.condensed import Edge, between
 from umf_ros.pose_graph.g2o import read_g2o
 from umf_ros.pose_graph.graph import PoseGraph
 from umf_ros.pose_graph.replay import PERIOD_NS, as_recording
-from umf_ros.pose_graph.synthetic import WORLDS, Kind, World, WorldClosure, rover_loops, with_wrong_closures
 
 FIRST_SEED = 20_000
 MOST_CLOSURES_OF_A_FILE = 1500

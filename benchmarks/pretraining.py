@@ -19,16 +19,16 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from umf_ros.commands import simulate
-from umf_ros.datasets.simulated import WorldFolder
-from umf_ros.evaluation.markdown import print_table
+from umf_ros.lab.commands import simulate
+from umf_ros.lab.datasets.simulated import WorldFolder
+from umf_ros.lab.evaluation.markdown import print_table
+from umf_ros.lab.simulation.seeds import TRAINING, VALIDATION
+from umf_ros.lab.training.config import load_training
+from umf_ros.lab.training.pretraining.run import pretrain
+from umf_ros.lab.training.pretraining.settings import make_settings
+from umf_ros.lab.training.run import train
+from umf_ros.lab.training.validation import MODES, Results, mean_of, validate
 from umf_ros.networks.weights import load_weights
-from umf_ros.simulation.seeds import TRAINING, VALIDATION
-from umf_ros.training.config import load_training
-from umf_ros.training.pretraining.run import pretrain
-from umf_ros.training.pretraining.settings import make_settings
-from umf_ros.training.run import train
-from umf_ros.training.validation import MODES, Results, mean_of, validate
 
 FIGURES = {"R@1": "recall1", "R@5": "recall5", "top 1 %": "recall_top_percent", "within 5 m": "recall1_within_5m"}
 # what trains the global descriptors alone: local features have no part in the table

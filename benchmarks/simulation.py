@@ -18,16 +18,16 @@ from rich.table import Table
 
 from umf_ros.frames import Image, StereoCamera
 from umf_ros.geometry import Array, heading, invert, relative, transform, wrap_angle
-from umf_ros.simulation.camera import Picture
-from umf_ros.simulation.families import FAMILIES
-from umf_ros.simulation.lidar import PERIOD_NS, Lidar
-from umf_ros.simulation.passes import SETTINGS, plan_passes
-from umf_ros.simulation.presets import DEMO, ETNA
-from umf_ros.simulation.seeds import TEST
-from umf_ros.simulation.sequences import etna_surveys
-from umf_ros.simulation.simulator import Simulator
-from umf_ros.simulation.survey import Survey
-from umf_ros.simulation.world import World, ground
+from umf_ros.lab.simulation.camera import Picture
+from umf_ros.lab.simulation.families import FAMILIES
+from umf_ros.lab.simulation.lidar import PERIOD_NS, Lidar
+from umf_ros.lab.simulation.passes import SETTINGS, plan_passes
+from umf_ros.lab.simulation.presets import DEMO, ETNA
+from umf_ros.lab.simulation.seeds import TEST
+from umf_ros.lab.simulation.sequences import etna_surveys
+from umf_ros.lab.simulation.simulator import Simulator
+from umf_ros.lab.simulation.survey import Survey
+from umf_ros.lab.simulation.world import World, ground
 
 WORLDS = 4
 NEAR_M, NEAR_DEG = 12.0, 30.0

@@ -32,10 +32,10 @@ from umf_ros.config import Embedding as EmbeddingSettings
 from umf_ros.embedding import make_embedder
 from umf_ros.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.geometry import Array, heading, wrap_angle
+from umf_ros.lab.simulation.seeds import TEST
+from umf_ros.lab.training.acceptance_fit import inside_ellipsoid
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.simulation.seeds import TEST
 from umf_ros.verification import Verifier
-from umf_ros.verification.fitting import inside_ellipsoid
 
 WRONG_M, WRONG_DEG = 1.0, 5.0
 STRICT_M = 0.5

@@ -13,7 +13,7 @@ from umf_ros.frames import Embedding, Frame, Keyframe, LocalFeatures, StereoCame
 from umf_ros.geometry import make_pose
 
 if TYPE_CHECKING:
-    from umf_ros.simulation.relief import Relief
+    from umf_ros.lab.simulation.relief import Relief
 
 # a shell that starts the tests in the background has them ignore Ctrl-C, which some of them press
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -76,10 +76,10 @@ def rng() -> np.random.Generator:
 def mini_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fast drive around a small loop, one and a half times, in a world no one trained or tuned on."""
     from umf_ros.bags.writer import BagWriter
-    from umf_ros.simulation.presets import DEMO, Preset, gentle_loop
-    from umf_ros.simulation.recording import record, write_side_files
-    from umf_ros.simulation.route import Walker
-    from umf_ros.simulation.simulator import Simulator
+    from umf_ros.lab.simulation.presets import DEMO, Preset, gentle_loop
+    from umf_ros.lab.simulation.recording import record, write_side_files
+    from umf_ros.lab.simulation.route import Walker
+    from umf_ros.lab.simulation.simulator import Simulator
 
     def plan(relief: Relief, rng: np.random.Generator) -> Walker:
         return Walker(gentle_loop(relief, 30.0, rng), rng).forward(29).forward(20, lateral_m=0.5)

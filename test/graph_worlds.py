@@ -10,12 +10,12 @@ import numpy as np
 
 from umf_ros.config import PoseGraph as Settings
 from umf_ros.geometry import Array, make_pose
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, World, WorldClosure
 from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.closures import ClosureVerdict, State, TrackedClosure
 from umf_ros.pose_graph.condensed import Edge, between
 from umf_ros.pose_graph.graph import PoseGraph
 from umf_ros.pose_graph.odometry import OdometryChain
-from umf_ros.pose_graph.synthetic import PERIOD_NS, World, WorldClosure
 
 SETTINGS = Settings(keyframe_spacing_m=1e-6, max_gap_s=1.5)
 LAP = 100

@@ -8,9 +8,9 @@ import numpy as np
 from conftest import CAMERA
 from scipy.spatial.transform import Rotation
 
-from umf_ros.evaluation.worlds import FIRST, OPPOSITE, REVISIT, SAME_LIGHT, Visit
 from umf_ros.frames import Embedding, Frame, LocalFeatures, SuperFeatures
 from umf_ros.geometry import Array, make_pose
+from umf_ros.lab.evaluation.worlds import FIRST, OPPOSITE, REVISIT, SAME_LIGHT, Visit
 
 SPACING_M = 8.0
 PLACES = 12

@@ -5,26 +5,29 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from importlib import import_module
 from typing import Annotated, NoReturn
 
 import typer
 
 from umf_ros import __version__
-from umf_ros.commands import (
-    demo,
-    doctor,
-    evaluate,
-    explain,
-    export,
-    graph,
-    play,
-    pretrain,
-    replay,
-    report,
-    simulate,
-    train,
-)
 from umf_ros.errors import UmfError
+
+COMMANDS = {
+    "demo": "umf_ros.lab.commands.demo",
+    "simulate": "umf_ros.lab.commands.simulate",
+    "replay": "umf_ros.commands.replay",
+    "play": "umf_ros.commands.play",
+    "report": "umf_ros.commands.report",
+    "evaluate": "umf_ros.lab.commands.evaluate",
+    "explain": "umf_ros.commands.explain",
+    "train": "umf_ros.lab.commands.train",
+    "export": "umf_ros.commands.export",
+    "doctor": "umf_ros.commands.doctor",
+    "pretrain": "umf_ros.lab.commands.pretrain",
+    "graph": "umf_ros.commands.graph",
+}
+"""The module of every subcommand, by name: those of the lab are known here by their names alone."""
 
 app = typer.Typer(
     name="umf",
@@ -35,18 +38,19 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("demo")(demo.command)
-app.command("simulate")(simulate.command)
-app.command("replay")(replay.command)
-app.command("play")(play.command)
-app.command("report")(report.command)
-app.command("evaluate")(evaluate.command)
-app.command("explain")(explain.command)
-app.command("train")(train.command)
-app.command("export")(export.command)
-app.command("doctor")(doctor.command)
-app.add_typer(pretrain.app, name="pretrain")
-app.add_typer(graph.app, name="graph")
+
+
+def _register() -> None:
+    """Add every subcommand: a module offers either `command` or, for a group of them, `app`."""
+    for name, module_name in COMMANDS.items():
+        module = import_module(module_name)
+        if hasattr(module, "app"):
+            app.add_typer(module.app, name=name)
+        else:
+            app.command(name)(module.command)
+
+
+_register()
 
 
 def _print_version(wanted: bool) -> None:

@@ -1,18 +1,19 @@
 """Every setting of the package: one source for node parameters, command line and documentation.
 
 Settings are nested; a node parameter's name is the path with dots, as in `keyframe.min_translation_m`.
-Numbers carry their unit in the name.
+Numbers carry their unit in the name. Shipped files are found in the checkout or in an installed share folder.
 """
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from umf_ros.errors import ConfigError
+from umf_ros.errors import ConfigError, UmfError
 
 
 class Group(BaseModel):
@@ -298,3 +299,24 @@ def _explain(problem: Any) -> str:
     if problem["type"] == "extra_forbidden":
         return f"unknown parameter {name}"
     return f"{name}: {problem['msg'][0].lower()}{problem['msg'][1:]} (got {problem['input']!r})"
+
+
+def share_folders() -> list[Path]:
+    """Folders that can hold `config/` and `models/`, the most specific first."""
+    checkout = Path(__file__).resolve().parent.parent
+    folders = [checkout] if (checkout / "package.xml").is_file() else []
+    # <prefix>/lib/python3.x/site-packages/umf_ros -> <prefix>/share/umf_ros
+    folders += [parent / "share" / "umf_ros" for parent in Path(__file__).resolve().parents]
+    return [*folders, Path(sys.prefix) / "share" / "umf_ros"]
+
+
+def find(relative: str) -> Path:
+    """Path of a shipped file, such as `config/calibration/simulated.yaml`.
+
+    Raises:
+        UmfError: no such file is installed.
+    """
+    for folder in share_folders():
+        if (folder / relative).exists():
+            return folder / relative
+    raise UmfError(f"{relative} is not installed with umf_ros; reinstall the package")

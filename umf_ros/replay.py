@@ -11,7 +11,7 @@ from umf_ros.loop_detector import Detection, LoopDetector
 from umf_ros.pose_graph.graph import PoseGraph
 from umf_ros.pose_graph.restarts import RestartGuard
 from umf_ros.pose_graph.results import write_results
-from umf_ros.results.recorder import RunRecorder
+from umf_ros.runs.recorder import RunRecorder
 
 
 class Replay:

@@ -24,11 +24,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from umf_ros.bags.frames import FrameReader, read_frames
 from umf_ros.bags.images import read_left_images
-from umf_ros.bags.presets import detect_dataset
+from umf_ros.bags.presets import TOPICS, detect_dataset
 from umf_ros.bags.reader import open_bag
 from umf_ros.config import load_settings
 from umf_ros.errors import BagError
-from umf_ros.topics import TOPICS
 from umf_ros.trajectory import Trajectory
 
 ENTRIES = traverse(3.0)

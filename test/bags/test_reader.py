@@ -21,12 +21,11 @@ from recordings import (
 )
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.bags.presets import detect_dataset, settings_for
+from umf_ros.bags.presets import TOPICS, detect_dataset, settings_for, topics_of
 from umf_ros.bags.reader import open_bag
 from umf_ros.config import load_settings
 from umf_ros.errors import BagError
 from umf_ros.sensors.messages import decode_cloud, decode_image, decode_odometry, stamp_ns
-from umf_ros.topics import TOPICS, topics_of
 
 ENTRIES = traverse(1.0)
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from command_line import only_line, umf
 
-from umf_ros import __version__, doctor
+from umf_ros import __version__
+from umf_ros.commands import checks
 
 COMMANDS = ["demo", "simulate", "replay", "play", "report", "evaluate", "explain", "train", "export", "doctor"]
 GROUPS = {"pretrain": ["image", "lidar"], "graph": ["optimize", "plot"]}
@@ -130,7 +131,7 @@ def test_ctrl_c_is_status_130(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted() -> list[object]:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(doctor, "checks", interrupted)
+    monkeypatch.setattr(checks, "checks", interrupted)
     ended = umf("doctor")
     assert ended.status == 130 and "Traceback" not in ended.text
 
@@ -148,8 +149,8 @@ def test_play_hands_the_recording_to_the_player() -> None:
 
 
 def test_advice_keeps_its_brackets(monkeypatch: pytest.MonkeyPatch) -> None:
-    finding = doctor.Finding("ROS 2 Python", False, "[Errno 2] not there", "pip install 'ros-rclpy[fastrtps]==7.1.6'")
-    monkeypatch.setattr(doctor, "checks", lambda: [("ROS 2 Python", lambda: finding)])
+    finding = checks.Finding("ROS 2 Python", False, "[Errno 2] not there", "pip install 'ros-rclpy[fastrtps]==7.1.6'")
+    monkeypatch.setattr(checks, "checks", lambda: [("ROS 2 Python", lambda: finding)])
     ended = umf("doctor")
     assert ended.status == 1
     assert "pip install 'ros-rclpy[fastrtps]==7.1.6'" in ended.out and "[Errno 2] not there" in ended.out

@@ -12,9 +12,9 @@ from typer.testing import CliRunner, Result
 from umf_ros.commands.graph import MOST_ROWS, app
 from umf_ros.errors import OutputError, UmfError
 from umf_ros.geometry import relative
+from umf_ros.lab.simulation.pose_graphs import World
 from umf_ros.pose_graph.condensed import Edge
 from umf_ros.pose_graph.g2o import read_g2o, write_g2o
-from umf_ros.pose_graph.synthetic import World
 
 RIGHT = closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0)
 

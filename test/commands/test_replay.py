@@ -20,7 +20,7 @@ from recordings import ODOMETRY, TRUTH, traverse, write_mcap
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
 from umf_ros.geometry import invert, relative, rotation_angle
-from umf_ros.results.tables import read_closures
+from umf_ros.runs.tables import read_closures
 
 FILES = (
     "summary.json closures.csv candidates.csv trajectory_odometry.tum trajectory_optimized.tum graph.g2o "

@@ -22,7 +22,7 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.frames import Candidate, Frame, LoopClosure, Verdict
 from umf_ros.geometry import Array, make_pose, relative
 from umf_ros.loop_detector import Detection
-from umf_ros.results.recorder import RunRecorder
+from umf_ros.runs.recorder import RunRecorder
 from umf_ros.trajectory import Trajectory, write_tum
 
 LATENCY = {"embed": 30.0, "query": 1.0, "verify": 9.0, "total": 40.0}

@@ -19,12 +19,12 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, PointCloud2
 
 from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import open_bag
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.intake import Intake, wanted_inputs
 from umf_ros.sensors.messages import decode_cloud, decode_image, stamp_ns
 from umf_ros.sensors.synchronizer import Synchronizer
-from umf_ros.topics import topics_of
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:

@@ -7,9 +7,9 @@ import pytest
 from graph_worlds import SETTINGS, chain_of, closing, lap_pairs, tracked, two_laps
 
 from umf_ros.config import PoseGraph as Settings
+from umf_ros.lab.simulation.pose_graphs import World
 from umf_ros.pose_graph.agreement import Agreement, chance_to_agree, doubt
 from umf_ros.pose_graph.ends import ClosureEnds, Scale
-from umf_ros.pose_graph.synthetic import World
 
 ASIDE = (4.0, 3.0, 0.0)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from graph_worlds import SETTINGS, chain_of, closing, lap_pairs, tracked, two_laps
 
+from umf_ros.lab.simulation.pose_graphs import World
 from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.ends import ClosureEnds, Cycles, Scale, cycles
 from umf_ros.pose_graph.odometry import OdometryChain
-from umf_ros.pose_graph.synthetic import World
 
 
 def ends_of(world: World) -> ClosureEnds:

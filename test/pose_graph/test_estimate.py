@@ -8,11 +8,11 @@ import pytest
 from graph_worlds import chain_of, rms, two_laps
 
 from umf_ros.geometry import Array
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS
 from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.condensed import Edge, between, odometry_edges
 from umf_ros.pose_graph.estimate import SessionEstimate
 from umf_ros.pose_graph.shape import Shape
-from umf_ros.pose_graph.synthetic import PERIOD_NS
 
 WORLD = two_laps(3)
 CHAIN = chain_of(WORLD)

@@ -12,11 +12,11 @@ from typer.testing import CliRunner, Result
 from umf_ros.commands.graph import app
 from umf_ros.errors import GraphError, OutputError, UmfError
 from umf_ros.geometry import heading
+from umf_ros.lab.simulation.pose_graphs import World, rover_loops, with_wrong_closures
 from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.condensed import Edge
 from umf_ros.pose_graph.g2o import read_g2o, write_g2o
 from umf_ros.pose_graph.replay import as_recording
-from umf_ros.pose_graph.synthetic import World, rover_loops, with_wrong_closures
 
 
 def edges(count: int, planar: bool) -> list[Edge]:

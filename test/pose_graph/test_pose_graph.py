@@ -13,13 +13,13 @@ from umf_ros.config import PoseGraph as Settings
 from umf_ros.errors import GraphError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, make_pose
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops, with_wrong_closures
 from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.g2o import read_g2o
 from umf_ros.pose_graph.graph import PoseGraph
 from umf_ros.pose_graph.results import write_results
 from umf_ros.pose_graph.sessions import Sessions
-from umf_ros.pose_graph.synthetic import PERIOD_NS, rover_loops, with_wrong_closures
 
 WORLD = with_wrong_closures(rover_loops(300, 12), 0.3, "groups", 1)
 

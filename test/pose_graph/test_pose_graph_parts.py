@@ -9,10 +9,10 @@ from graph_worlds import SETTINGS, drive
 
 from umf_ros.config import PoseGraph as Settings
 from umf_ros.geometry import Array, relative
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.condensed import Edge, between
 from umf_ros.pose_graph.odometry import OdometryChain, OdometryLog
-from umf_ros.pose_graph.synthetic import PERIOD_NS, rover_loops
 
 WORLD = rover_loops(300, 12)
 

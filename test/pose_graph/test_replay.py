@@ -14,6 +14,7 @@ from graph_worlds import LAP, SETTINGS, accepted, closing, feed_odometry, lap_pa
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.errors import OutputError
 from umf_ros.geometry import make_pose, relative
+from umf_ros.lab.simulation.pose_graphs import World
 from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.condensed import Edge
@@ -22,7 +23,6 @@ from umf_ros.pose_graph.graph import PoseGraph
 from umf_ros.pose_graph.picture import draw
 from umf_ros.pose_graph.replay import PERIOD_NS, Recording, as_recording, drive
 from umf_ros.pose_graph.results import VERDICT_COLUMNS, verdict_table, write_results
-from umf_ros.pose_graph.synthetic import World
 
 WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))
 

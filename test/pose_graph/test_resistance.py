@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from graph_worlds import SETTINGS, accepted, batch_optimum, drive, feed_odometry, right, rms
 
+from umf_ros.lab.simulation.pose_graphs import Kind, World, garage, rover_loops, sphere, with_wrong_closures
 from umf_ros.pose_graph.ends import Scale
 from umf_ros.pose_graph.graph import PoseGraph
-from umf_ros.pose_graph.synthetic import Kind, World, garage, rover_loops, sphere, with_wrong_closures
 
 ROVER = rover_loops(400, 11)
 

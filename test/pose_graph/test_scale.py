@@ -7,10 +7,10 @@ import pytest
 from graph_worlds import SETTINGS, drive, feed_odometry
 
 from umf_ros.geometry import Array
+from umf_ros.lab.simulation.pose_graphs import rover_loops, with_wrong_closures
 from umf_ros.pose_graph.ends import Cycles, Scale
 from umf_ros.pose_graph.graph import PoseGraph
 from umf_ros.pose_graph.scale import ScaleEstimator
-from umf_ros.pose_graph.synthetic import rover_loops, with_wrong_closures
 
 
 def covariances(rng: np.random.Generator, count: int, turn_rad: float, metres: float) -> Array:

@@ -9,9 +9,9 @@ import pytest
 from graph_worlds import SETTINGS, accepted, closing, feed_odometry, lap_pairs, rms, two_laps
 
 from umf_ros.config import PoseGraph as Settings
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, World
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.graph import PoseGraph
-from umf_ros.pose_graph.synthetic import PERIOD_NS, World
 
 TURN = np.array([0, 0, np.deg2rad(0.3), 0.03, 0, 0])
 """What odometry with a bias gets wrong per metre."""

@@ -9,10 +9,10 @@ import pytest
 from graph_worlds import LAP, SETTINGS, accepted, closing, feed_odometry, lap_pairs, rms, two_laps
 
 from umf_ros.geometry import Array
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, World
 from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.graph import PoseGraph
-from umf_ros.pose_graph.synthetic import PERIOD_NS, World
 
 GAUGE = lie.exp(np.array([[0.05, -0.1, 2.5, 40, -25, 3]]))[0]
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from umf_ros.errors import ConfigError
+from umf_ros.lab.training.acceptance_fit import Example, fit_logistic, fit_spread, inside_ellipsoid, scale_spread
 from umf_ros.verification.acceptance import MEASURES, Calibration, load_calibration, measure, save_calibration
 from umf_ros.verification.covariance import Spread, covariance_of
-from umf_ros.verification.fitting import Example, fit_logistic, fit_spread, inside_ellipsoid, scale_spread
 
 GOOD = {
     "similarity": 0.8,

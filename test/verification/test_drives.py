@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.frames import Frame, StereoCamera
 from umf_ros.geometry import Array, make_pose, relative
-from umf_ros.simulation.families import FAMILIES
+from umf_ros.lab.simulation.families import FAMILIES
 
 SQUARE = StereoCamera(224, 224, 190.0, 190.0, 112.0, 112.0, 0.2)
 WALL_M = 12.0

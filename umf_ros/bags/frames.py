@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import Bag, RawMessage, decode
 from umf_ros.config import Settings, Topics
 from umf_ros.errors import BagError, MessageError
@@ -15,7 +16,6 @@ from umf_ros.sensors.counters import InputCounter
 from umf_ros.sensors.intake import Intake, wanted_inputs
 from umf_ros.sensors.messages import stamp_ns
 from umf_ros.sensors.synchronizer import Input, Synchronizer
-from umf_ros.topics import topics_of
 from umf_ros.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)

@@ -6,13 +6,24 @@ from pathlib import Path
 from typing import Any, Literal
 
 from umf_ros.bags.reader import Bag
-from umf_ros.config import Settings, load_settings
+from umf_ros.config import Settings, Topics, load_settings
 from umf_ros.errors import BagError
-from umf_ros.topics import TOPICS
 
 Dataset = Literal["simulated", "s3li-etna", "s3li-vulcano"]
 
 GROUND_TRUTH_TOPIC = "/ground_truth/pose"
+
+TOPICS: dict[str, Topics] = {
+    "simulated": Topics(),
+    "s3li-etna": Topics(),
+    "s3li-vulcano": Topics(
+        left_image="/g319c_left/image_raw",
+        right_image="/g319c_right/image_raw",
+        # not in the recordings; what the data set's own node publishes there is no standard camera_info
+        left_info="",
+        right_info="",
+    ),
+}
 
 
 def detect_dataset(bag: Bag) -> Dataset:
@@ -50,3 +61,10 @@ def settings_for(bag: Bag, config: Path | None, dataset: str, **overrides: Any) 
     if named is None and not settings.model_fields_set & {"dataset", "topics"}:
         settings = settings.model_copy(update={"dataset": detect_dataset(bag)})
     return settings
+
+
+def topics_of(settings: Settings) -> Topics:
+    """Input topics: those of the data set, except where the settings differ from the defaults."""
+    defaults = Topics().model_dump()
+    own = {name: topic for name, topic in settings.topics.model_dump().items() if topic != defaults[name]}
+    return TOPICS[settings.dataset].model_copy(update=own)

@@ -11,12 +11,12 @@ def command() -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from umf_ros import doctor
+    from umf_ros.commands import checks
 
     console = Console()
-    findings: list[doctor.Finding] = []
+    findings: list[checks.Finding] = []
     with console.status("") as status:
-        for name, check in doctor.checks():
+        for name, check in checks.checks():
             status.update(f"Checking {name}")
             findings.append(check())
     table = Table("", "", "found", box=None, pad_edge=False, show_header=False)

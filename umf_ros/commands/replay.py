@@ -38,9 +38,9 @@ def command(
     from umf_ros.commands.progress import WARNING, FrameProgress, stop_on_interrupt, undisturbed
     from umf_ros.loop_detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
-    from umf_ros.results.folder import create_run_folder
-    from umf_ros.results.recorder import count_drops
-    from umf_ros.results.report import finish_run
+    from umf_ros.runs.folder import create_run_folder
+    from umf_ros.runs.recorder import count_drops
+    from umf_ros.runs.report import finish_run
 
     console = Console()
     recording = open_bag(bag)

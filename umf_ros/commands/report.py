@@ -17,6 +17,6 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
-    from umf_ros.results.report import finish_run
+    from umf_ros.runs.report import finish_run
 
     finish_run(folder, open_bag(bag), Console(), ground_truth)

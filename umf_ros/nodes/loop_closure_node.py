@@ -15,6 +15,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
+from umf_ros.bags.presets import topics_of
 from umf_ros.config import Settings
 from umf_ros.errors import OutputError, UmfError
 from umf_ros.frames import Frame, LoopClosure
@@ -26,12 +27,11 @@ from umf_ros.nodes.diagnostics import OK, WARN, InputWatch, memory_mb, status
 from umf_ros.nodes.parameters import declare
 from umf_ros.nodes.process import run
 from umf_ros.nodes.qos import sensor_qos
-from umf_ros.results.recorder import RunRecorder, count_drops
+from umf_ros.nodes.worker import Worker
+from umf_ros.runs.recorder import RunRecorder, count_drops
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.intake import Intake, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
-from umf_ros.topics import topics_of
-from umf_ros.worker import Worker
 
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
 INTAKE_QUEUE = 400

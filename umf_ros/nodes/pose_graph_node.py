@@ -21,6 +21,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from umf_ros.bags.presets import topics_of
 from umf_ros.errors import MessageError, UmfError
 from umf_ros.geometry import Array
 from umf_ros.nodes import pose_graph_messages as messages
@@ -29,14 +30,13 @@ from umf_ros.nodes.diagnostics import OK, WARN, InputWatch, status
 from umf_ros.nodes.parameters import declare
 from umf_ros.nodes.process import run
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
+from umf_ros.nodes.worker import Worker
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.graph import PoseGraph
 from umf_ros.pose_graph.restarts import RestartGuard
 from umf_ros.pose_graph.results import write_results
-from umf_ros.results.folder import check_writable
+from umf_ros.runs.folder import check_writable
 from umf_ros.sensors.messages import stamp_ns
-from umf_ros.topics import topics_of
-from umf_ros.worker import Worker
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works

@@ -10,11 +10,10 @@ import numpy as np
 import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from umf_ros.config import Group
+from umf_ros.config import Group, find
 from umf_ros.errors import CalibrationError
 from umf_ros.frames import StereoCamera
 from umf_ros.geometry import Array, from_quaternion
-from umf_ros.resources import find
 from umf_ros.sensors.rectification import RawCamera, StereoRectifier
 
 

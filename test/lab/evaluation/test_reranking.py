@@ -1,0 +1,125 @@
+"""What reranking makes of a ranking, with local features that belong to their places."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from landmarks import PLACES, LandmarkEmbedder, at, frame_of
+
+from umf_ros.config import Verification
+from umf_ros.frames import Keyframe
+from umf_ros.lab.evaluation.embedded import MODES, PlaceCollection, as_keyframe
+from umf_ros.lab.evaluation.reranking import METHODS, TOP_K, Evidence, gather_evidence, recall1_by_candidates
+from umf_ros.lab.evaluation.retrieval import NOTHING, Ranking, rank
+
+ASKED = [0, 3, 6]  # the places of the queries; to their descriptors 3 looks like 9, and 6 like 11
+
+
+def keyframes(first_stamp: int, places: list[int]) -> list[Keyframe]:
+    collection = PlaceCollection(LandmarkEmbedder())
+    for number, place in enumerate(places):
+        collection.add(frame_of(first_stamp + number, place))
+    return collection.keyframes
+
+
+@pytest.fixture(scope="module")
+def gathered() -> tuple[Ranking, np.ndarray, Evidence, list[int]]:
+    queries, references = keyframes(1000, ASKED), keyframes(0, list(range(PLACES)))
+    similarity = np.array([[q.embedding.descriptor @ r.embedding.descriptor for r in references] for q in queries])
+    reports: list[int] = []
+    ranking = rank(similarity)
+    evidence = gather_evidence(queries, references, ranking, similarity, Verification(), lambda: reports.append(1))
+    return ranking, similarity, evidence, reports
+
+
+def test_every_method_scores_every_candidate_and_every_query_is_reported(gathered) -> None:
+    ranking, _, evidence, reports = gathered
+    assert set(evidence.scores) == set(METHODS) and len(METHODS) == 6
+    assert {scores.shape for scores in evidence.scores.values()} == {(3, min(TOP_K, PLACES))}
+    assert len(reports) == 3 == len(ranking.order)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_local_features_know_the_place(gathered, method: str) -> None:
+    ranking, _, evidence, _ = gathered
+    assert [int(row) for row in ranking.order[:, 0]] == [0, 9, 11]
+    assert [int(row) for row in evidence.ranking(ranking, method).order[:, 0]] == ASKED
+
+
+def test_counts_of_both_modalities_are_evidence_beside_the_similarity(gathered) -> None:
+    ranking, similarity, evidence, _ = gathered
+    before = np.take_along_axis(similarity, ranking.order, axis=1)
+    gained = {method: (scores - before) / Verification().rerank_weight for method, scores in evidence.scores.items()}
+    for name in ("superfeatures", "ransac"):
+        both, image, cloud = (gained[f"{name} {part}"] for part in ("both", "image", "lidar"))
+        np.testing.assert_allclose(both, image + cloud, atol=1e-9)
+        for counts in (np.expm1(image), np.expm1(cloud)):
+            np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
+    # all twelve super-features of a place are its own
+    right = [list(row).index(place) for row, place in zip(ranking.order, ASKED, strict=True)]
+    np.testing.assert_allclose(np.expm1(gained["superfeatures image"][[0, 1, 2], right]), 12)
+
+
+def test_only_the_first_candidates_are_reordered(gathered) -> None:
+    ranking, _, evidence, _ = gathered
+    for count in (1, 2, 5):
+        after = evidence.ranking(ranking, "ransac both", count)
+        assert np.array_equal(after.order[:, count:], ranking.order[:, count:])
+        assert np.array_equal(np.sort(after.order[:, :count]), np.sort(ranking.order[:, :count]))
+    assert np.array_equal(evidence.ranking(ranking, "ransac both", 1).order, ranking.order)
+
+
+def test_recall_grows_when_the_right_place_comes_among_the_candidates(gathered) -> None:
+    ranking, _, evidence, _ = gathered
+    positive = np.arange(PLACES)[None] == np.array(ASKED)[:, None]
+    where = [list(row).index(place) + 1 for row, place in zip(ranking.order, ASKED, strict=True)]
+    curve = recall1_by_candidates(ranking, evidence, "ransac both", positive)
+    expected = [sum(place <= count for place in where) / 3 for count in range(1, TOP_K + 1)]
+    np.testing.assert_allclose(curve, expected)
+    assert curve[0] == pytest.approx(1 / 3) and curve[-1] == 1.0
+
+
+def test_queries_without_a_true_match_do_not_count_for_the_curve(gathered) -> None:
+    ranking, _, evidence, _ = gathered
+    positive = np.zeros((3, PLACES), bool)
+    positive[0, 0] = True
+    assert recall1_by_candidates(ranking, evidence, "ransac both", positive).tolist() == [1.0] * TOP_K
+
+
+def test_a_query_with_fewer_candidates_is_reranked_among_them() -> None:
+    queries, references = keyframes(1000, [3, 5]), keyframes(0, list(range(PLACES)))
+    similarity = np.array([[q.embedding.descriptor @ r.embedding.descriptor for r in references] for q in queries])
+    admissible = np.zeros((2, PLACES), bool)
+    admissible[0, [3, 9, 10]] = True
+    ranking = rank(similarity, admissible)
+    evidence = gather_evidence(queries, references, ranking, similarity, Verification())
+    after = evidence.ranking(ranking, "ransac both")
+    assert after.order[0, 0] == 3 and set(after.order[0, :3]) == {3, 9, 10}
+    assert set(after.order[0, 3:]) == {NOTHING} == set(after.order[1])
+    assert after.score[1] == -np.inf
+    assert not evidence.scores["ransac both"][1].any()
+
+
+def test_modes_take_one_sensor_away_and_nothing_else() -> None:
+    frame = frame_of(5, 2)
+    seen = {mode: change(frame) for mode, change in MODES.items()}
+    assert seen["fused"] is frame
+    assert seen["image"].points is None and seen["image"].intensity is None and seen["image"].left is frame.left
+    assert seen["lidar"].left is None and seen["lidar"].points is frame.points
+    black, empty = seen["image black"].left, seen["cloud empty"].points
+    assert black is not None and not black.any() and black.shape == frame.left.shape
+    assert seen["image black"].points is frame.points
+    assert empty is not None and empty.shape == (0, 3) and seen["cloud empty"].left is frame.left
+    assert {changed.stamp_ns for changed in seen.values()} == {5}
+
+
+def test_a_keyframe_of_the_evaluation_keeps_what_retrieval_needs() -> None:
+
+    frame = replace(frame_of(5, 2), odom_T_body=at(2), session=3)
+    embedding = LandmarkEmbedder().embed(frame)
+    keyframe = as_keyframe(frame, embedding, 12.5)
+    assert (keyframe.stamp_ns, keyframe.travelled_m, keyframe.session) == (5, 12.5, 3)
+    assert keyframe.embedding is embedding and keyframe.odom_T_body is frame.odom_T_body
+    assert keyframe.points.shape == (0, 3)

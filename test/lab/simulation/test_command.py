@@ -1,0 +1,63 @@
+"""What `umf simulate` refuses, each with one clear line and nothing left behind."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+import pytest
+from processes import wait_until
+
+from umf_ros.errors import UmfError
+from umf_ros.lab.commands.simulate import command
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({"seed": -1}, "seed -1 is not between"),
+        ({"preset": "olympus"}, "unknown preset 'olympus'"),
+        ({"family": "venus"}, "unknown family 'venus'"),
+        ({"aliasing": 2.0}, "aliasing 2.0 is not between"),
+        ({"image_rate": 0.0}, "image rate 0 Hz is not between"),
+        ({"duration": 1e9}, "duration 1e\\+09 s is not between"),
+    ],
+)
+def test_impossible_drives(tmp_path, options, line):
+    with pytest.raises(UmfError, match=line) as raised:
+        command(tmp_path / "drive.mcap", **options)
+    assert "\n" not in str(raised.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_places_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file" / "drive.mcap", tmp_path / "drive.bag"):
+        with pytest.raises(UmfError, match="cannot write"):
+            command(out)
+
+
+def test_without_a_place_to_write_it_says_what_is_missing():
+    with pytest.raises(UmfError, match=r"OUT\.mcap"):
+        command(None)
+
+
+@pytest.mark.parametrize("worlds", ["5:2", "abc", "-3:2"])
+def test_seeds_that_hold_no_world(tmp_path, worlds):
+    with pytest.raises(UmfError, match="seeds"):
+        command(shards=tmp_path, worlds=worlds)
+
+
+def test_unknown_sequences(tmp_path):
+    with pytest.raises(UmfError, match="etna, thesis"):
+        command(shards=tmp_path, sequences="luna")
+
+
+def test_a_terminated_simulation_leaves_nothing(tmp_path):
+    command = [sys.executable, "-m", "umf_ros.cli", "simulate", str(tmp_path / "a.mcap"), "--duration", "60"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        assert wait_until(lambda: any(file.stat().st_size for file in tmp_path.glob(".a.mcap.*")), 120)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 143
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import csv
+import json
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from conftest import make_frame, make_keyframe
+
+from umf_ros.config import Settings, load_settings
+from umf_ros.errors import OutputError, UmfError
+from umf_ros.frames import Candidate, LoopClosure, Verdict
+from umf_ros.geometry import make_pose
+from umf_ros.loop_detector import Detection
+from umf_ros.runs import recorder as recorder_module
+from umf_ros.runs.recorder import RunRecorder, count_drops, read_summary
+from umf_ros.runs.tables import read_closures
+from umf_ros.sensors.counters import SURPLUS, InputCounter
+from umf_ros.sensors.synchronizer import INPUTS
+
+COUNTS = ["frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected"]
+OTHERS = ["latency_ms", "drops", "realtime_factor", "peak_rss_mb", "seed", "version", "weights"]
+KEYS = [*COUNTS, "ground_truth", *OTHERS]
+
+
+def accepted(query_ns: int, match_ns: int) -> Verdict:
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    closure = LoopClosure(
+        query_ns, match_ns, make_pose(turn, [1.5, -0.25, 0.125]), np.diag([4, 1, 1, 0.25, 1, 1]), 0.97
+    )
+    pixels = np.array([[1, 2, 3, 4], [5, 6, 7, 8]], np.float32)
+    return Verdict(Candidate(0, match_ns, 0.8), "accepted", {"inliers_image": 31}, closure, pixels)
+
+
+def detection(stamp_s: float, verdicts: list[Verdict]) -> Detection:
+    latency = {"embed": 10.0, "query": 1.0, "verify": stamp_s, "total": 11 + stamp_s}
+    return Detection(round(stamp_s * 1e9), make_keyframe(stamp_s, stamp_s), verdicts, latency)
+
+
+def record_a_little(folder: Path) -> RunRecorder:
+    recorder = RunRecorder(folder, Settings(), "some_weights")
+    rejected = Verdict(Candidate(1, 5, 0.4), "few inliers", {"inliers_image": 3})
+    recorder.record(make_frame(1), Detection(10**9))
+    recorder.record(make_frame(2), detection(2, []))
+    recorder.record(
+        replace(make_frame(40), left=np.zeros((2, 2), np.uint8)), detection(40, [accepted(40, 2), rejected])
+    )
+    return recorder
+
+
+def test_the_summary_has_its_stable_keys_and_counts(tmp_path: Path) -> None:
+    recorder = record_a_little(tmp_path)
+    counters = {name: InputCounter(received=9, used=2) for name in INPUTS}
+    counters["right"].dropped.update({"size": 3, SURPLUS: 4})
+    recorder.write_summary(count_drops(counters, worker=1))
+    summary = read_summary(tmp_path)
+    assert list(summary) == KEYS
+    assert [summary[key] for key in KEYS[:6]] == [3, 1, 2, 1, 1, 1]
+    assert summary["drops"] == {"image": 3, "cloud": 0, "odometry": 0, "worker": 1}
+    assert summary["latency_ms"]["verify"] == {"p50": 21.0, "p95": pytest.approx(38.1), "max": 40.0}
+    assert summary["ground_truth"] is None and summary["weights"] == "some_weights"
+    assert summary["realtime_factor"] > 1  # 39 recorded seconds in a moment
+
+
+def test_an_empty_run_is_valid_json(tmp_path: Path) -> None:
+    RunRecorder(tmp_path, Settings(), "w").write_summary({})
+    text = (tmp_path / "summary.json").read_text()
+    assert json.loads(text, parse_constant=pytest.fail)["latency_ms"]["embed"]["p50"] is None
+
+
+def test_tables_are_complete_before_anything_is_closed(tmp_path: Path) -> None:
+    record_a_little(tmp_path)
+    with (tmp_path / "candidates.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["reason"] for row in rows] == ["accepted", "few inliers"]
+    assert json.loads(rows[1]["numbers"]) == {"inliers_image": 3}
+    with (tmp_path / "inliers.csv").open() as file:
+        assert [float(row["match_v"]) for row in csv.DictReader(file)] == [4, 8]
+    with (tmp_path / "keyframes.csv").open() as file:
+        assert [row["stamp_ns"] for row in csv.DictReader(file)] == ["2000000000", "40000000000"]
+
+
+def test_closures_survive_the_table(tmp_path: Path) -> None:
+    record_a_little(tmp_path)
+    (closure,) = read_closures(tmp_path / "closures.csv")
+    expected = accepted(40, 2).closure
+    assert expected is not None
+    assert (closure.query_stamp_ns, closure.match_stamp_ns, closure.probability) == (40, 2, 0.97)
+    np.testing.assert_allclose(closure.match_T_query, expected.match_T_query, atol=1e-9)
+    np.testing.assert_allclose(closure.covariance, expected.covariance)
+
+
+def test_the_effective_settings_are_written_first(tmp_path: Path) -> None:
+    settings = load_settings(None, loop__top_k=3)
+    RunRecorder(tmp_path, settings, "w")
+    assert load_settings(tmp_path / "config.yaml") == settings
+
+
+def test_a_folder_that_is_gone_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="cannot write"):
+        RunRecorder(tmp_path / "gone", Settings(), "w")
+
+
+def test_the_realtime_factor_is_recorded_time_by_elapsed_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A looped bag starts over: its second lap counts like the first, and the jump back does not."""
+    now_s = [50.0]
+    monkeypatch.setattr(recorder_module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    recorder = RunRecorder(tmp_path, Settings(), "w")
+    for session in range(2):
+        for second in (100, 110, 130):
+            recorder.record(make_frame(second, session=session), Detection(second * 10**9))
+    now_s[0] += 20.0
+    assert recorder.summary({})["realtime_factor"] == 3.0
+
+
+def test_the_summary_can_be_written_again_as_the_run_goes_on(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, Settings(), "w")
+    for count in range(1, 4):
+        recorder.record(make_frame(count), detection(count, []))
+        recorder.write_summary({"worker": count})
+        summary = read_summary(tmp_path)
+        assert summary["keyframes"] == count and summary["drops"] == {"worker": count}
+        assert summary["peak_rss_mb"] > 20 and summary["seed"] == 0
+    assert sorted(path.name for path in tmp_path.glob("summary*")) == ["summary.json"]
+
+
+def test_a_keyframe_that_was_asked_and_found_nothing_is_no_query(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, Settings(), "w")
+    rejected = Verdict(Candidate(1, 5, 0.4), "few inliers", {})
+    recorder.record(make_frame(1), detection(1, []))
+    recorder.record(make_frame(2), detection(2, [rejected, rejected]))
+    recorder.record(make_frame(60), detection(60, [accepted(60, 2), accepted(60, 3), rejected]))
+    summary = recorder.summary({})
+    assert (summary["keyframes"], summary["queries"]) == (3, 2)
+    assert (summary["closures_published"], summary["closures_rejected"]) == (2, 3)
+
+
+@pytest.mark.parametrize("content", ["", "[1, 2]", '{"frames": 3}', '{"closures_published": '])
+def test_a_foreign_summary_is_one_clear_line(tmp_path: Path, content: str) -> None:
+    (tmp_path / "summary.json").write_text(content)
+    with pytest.raises(UmfError, match=r"summary\.json is not the summary of a run"):
+        read_summary(tmp_path)
+
+
+def test_the_summary_can_be_written_while_the_run_goes_on_in_another_thread(tmp_path: Path) -> None:
+    """The live node's timer writes it while the worker records."""
+    recorder = RunRecorder(tmp_path, Settings(), "w")
+    errors: list[Exception] = []
+
+    def record() -> None:
+        try:
+            for count in range(1500):
+                recorder.record(make_frame(count), detection(count, []))
+        except Exception as error:
+            errors.append(error)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # threads take turns as often as they can
+    try:
+        worker = threading.Thread(target=record)
+        worker.start()
+        while worker.is_alive():
+            recorder.summary({})
+    finally:
+        sys.setswitchinterval(interval)
+    assert errors == [] and recorder.summary({})["keyframes"] == 1500

@@ -1,0 +1,138 @@
+"""The tables of a run: what is written is what is read, whatever happens in between."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from umf_ros.errors import OutputError, UmfError
+from umf_ros.frames import Candidate, LoopClosure, Verdict
+from umf_ros.geometry import make_pose
+from umf_ros.runs.tables import (
+    CANDIDATES,
+    CLOSURES,
+    INLIERS,
+    Table,
+    candidate_row,
+    closure_row,
+    inlier_rows,
+    read_closures,
+    read_table,
+)
+
+QUERY_NS, MATCH_NS = 1_667_000_100_123_456_789, 1_667_000_000_000_000_001
+
+
+def closure(seed: int = 0, probability: float = 0.97) -> LoopClosure:
+    rng = np.random.default_rng(seed)
+    pose = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 9, 3))
+    root = rng.standard_normal((6, 6))
+    return LoopClosure(QUERY_NS + seed, MATCH_NS + seed, pose, root @ root.T + np.eye(6), probability)
+
+
+def written(path: Path, rows: list[list[object]], columns: list[str] = CLOSURES) -> Path:
+    table = Table(path, columns)
+    table.append(rows)
+    table.close()
+    return path
+
+
+def test_a_row_of_closures_by_hand(tmp_path: Path) -> None:
+    quarter = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [1.5, -0.25, 0])
+    found = LoopClosure(QUERY_NS, MATCH_NS, quarter, np.diag([4, 1, 0.25, 0.01, 0.04, 0.09]), 0.97)
+    with written(tmp_path / "closures.csv", [closure_row(found, 0.8125)]).open() as file:
+        (row,) = csv.DictReader(file)
+    assert (row["query_stamp_ns"], row["match_stamp_ns"]) == (str(QUERY_NS), str(MATCH_NS))
+    assert [row[name] for name in ("x_m", "y_m", "z_m")] == ["1.5", "-0.25", "0"]
+    assert [float(row[name]) for name in ("qx", "qy", "qz", "qw")] == pytest.approx([0, 0, 0.5**0.5, 0.5**0.5])
+    sigmas = [float(row[f"sigma_{name}"]) for name in ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")]
+    assert sigmas == pytest.approx([2, 1, 0.5, 0.1, 0.2, 0.3])
+    assert (row["probability"], row["similarity"]) == ("0.97", "0.8125")
+
+
+def test_closures_come_back_as_they_were(tmp_path: Path) -> None:
+    put = [closure(seed, 0.9 + 0.01 * seed) for seed in range(8)]
+    got = read_closures(written(tmp_path / "closures.csv", [closure_row(one, 0.5) for one in put]))
+    assert [(one.query_stamp_ns, one.match_stamp_ns) for one in got] == [
+        (one.query_stamp_ns, one.match_stamp_ns) for one in put
+    ]
+    for ours, theirs in zip(got, put, strict=True):
+        np.testing.assert_allclose(ours.match_T_query, theirs.match_T_query, atol=1e-7)
+        # the table keeps one sigma per axis
+        np.testing.assert_allclose(np.diag(ours.covariance), np.diag(theirs.covariance), rtol=1e-7)
+        assert np.count_nonzero(ours.covariance) == 6
+        assert ours.probability == pytest.approx(theirs.probability)
+
+
+def test_a_table_without_rows_holds_no_closure(tmp_path: Path) -> None:
+    assert read_closures(written(tmp_path / "closures.csv", [])) == []
+
+
+def test_a_reason_may_hold_anything(tmp_path: Path) -> None:
+    reason = 'turned too far, "31 deg"\n; gave up'
+    verdict = Verdict(Candidate(3, MATCH_NS, 0.123456789), reason, {"overlap": 1 / 3, "residual_m": float("inf")})
+    path = written(tmp_path / "candidates.csv", [candidate_row(QUERY_NS, verdict)], CANDIDATES)
+    (row,) = read_table(path, dict)
+    assert row["reason"] == reason and row["similarity"] == "0.123457"
+    assert json.loads(row["numbers"]) == {"overlap": 0.333333, "residual_m": float("inf")}
+
+
+def test_inliers_are_pixels_to_a_tenth(tmp_path: Path) -> None:
+    pixels = np.array([[1.26, 2, 3, 687.98], [0, 0, 0, 0]], np.float32)
+    verdict = Verdict(Candidate(0, MATCH_NS, 0.5), "accepted", closure=closure(), inlier_pixels=pixels)
+    path = written(tmp_path / "inliers.csv", inlier_rows(QUERY_NS, verdict), INLIERS)
+    rows = read_table(path, lambda row: (int(row["query_stamp_ns"]), *(float(row[name]) for name in INLIERS[2:])))
+    assert rows == [(QUERY_NS, 1.3, 2, 3, 688.0), (QUERY_NS, 0, 0, 0, 0)]
+
+
+def test_rows_are_there_before_the_table_is_closed(tmp_path: Path) -> None:
+    table = Table(tmp_path / "a.csv", ["a", "b"])
+    assert (tmp_path / "a.csv").read_bytes() == b"a,b\r\n"
+    for count in range(1, 4):
+        table.append([[count, count]] * 2)
+        assert len((tmp_path / "a.csv").read_text().splitlines()) == 1 + 2 * count
+    table.close()
+
+
+class FullDisk(io.StringIO):
+    """A file on a disk with no room left."""
+
+    def flush(self) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "open", lambda *_, **__: FullDisk())
+    with pytest.raises(OutputError, match=r"cannot write .*a\.csv: No space left on device$"):
+        Table(tmp_path / "a.csv", ["a"])
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        ("query_stamp_ns,match_stamp_ns\n1,2\n", 2),
+        (",".join(CLOSURES) + "\n" + ",".join(["1"] * 17) + "\n" + "1,2,3\n", 3),
+        (",".join(CLOSURES) + "\n" + ",".join(["one"] * 17) + "\n", 2),
+        (",".join(CLOSURES) + "\n" + ",".join(["1"] * 2 + ["0"] * 15) + "\n", 2),  # no unit quaternion
+    ],
+)
+def test_the_line_that_is_damaged_is_named(tmp_path: Path, content: str, line: int) -> None:
+    path = tmp_path / "closures.csv"
+    path.write_text(content)
+    if line == 3:
+        path.write_text(content.replace(",".join(["1"] * 17), ",".join(["1"] * 2 + ["0"] * 6 + ["1"] * 9)))
+    with pytest.raises(UmfError, match=rf"closures\.csv, line {line}: not a row of this table") as caught:
+        read_closures(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UmfError, match=r"cannot read .*closures\.csv: No such file"):
+        read_closures(tmp_path / "closures.csv")

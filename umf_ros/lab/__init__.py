@@ -1,0 +1,1 @@
+"""What makes and judges the runtime: simulation, data sets, training, evaluation."""

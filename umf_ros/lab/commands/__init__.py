@@ -1,0 +1,1 @@
+"""Subcommands of `umf` that need the lab."""

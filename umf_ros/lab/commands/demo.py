@@ -1,0 +1,43 @@
+"""`umf demo`: simulate a traverse, run the real graph on it over DDS, show what came out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(
+    seed: Annotated[int, typer.Option(min=0, help="World and traverse.")] = 1,
+    out: Annotated[Path, typer.Option(help="Where results/<timestamp> goes.")] = Path("results"),
+    bag: Annotated[Path | None, typer.Option(help="Play this recording instead of simulating one.")] = None,
+    rate: Annotated[float, typer.Option(min=0.1, max=10, help="Speed of the player.")] = 1.0,
+    duration: Annotated[
+        float | None, typer.Option(min=10, help="Seconds to simulate; default: the whole traverse.")
+    ] = None,
+) -> None:
+    """Simulate a short traverse, play it to the live nodes over DDS, and write a report.
+
+    Bag player, loop_closure_node and pose_graph_node run as separate processes, as next to a rover.
+    """
+    from rich.console import Console
+
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.commands.progress import undisturbed
+    from umf_ros.lab.commands import simulate
+    from umf_ros.nodes.live_graph import LiveGraph
+    from umf_ros.runs.folder import check_writable, create_run_folder
+    from umf_ros.runs.report import finish_run
+
+    console = Console()
+    check_writable(out)
+    if bag is None:
+        bag = Path("data") / f"demo_seed{seed}.mcap"
+        simulate.command(bag, preset="demo", seed=seed, duration=duration)
+    recording = open_bag(bag)
+    folder = create_run_folder(out)
+    with LiveGraph(folder, console) as graph:
+        graph.play(bag, recording.duration_s, rate)
+    with undisturbed():
+        finish_run(folder, recording, console)

@@ -1,0 +1,222 @@
+"""`umf evaluate`: how well places are recognised, on a recording or on simulated worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from umf_ros.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
+Optional = typer.Option
+
+
+def command(
+    data: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Recording with ground truth: mcap, db3 folder or .bag; or a YAML file that lists sequences."
+        ),
+    ] = None,
+    worlds: Annotated[str | None, Optional(help="Instead of a recording: test or validation worlds.")] = None,
+    seed: Annotated[int | None, Optional(min=0, help="First of the four worlds' seeds.")] = None,
+    quick: Annotated[bool, Optional("--quick", help="A smaller sample of every world.")] = False,
+    methods: Annotated[str, Optional(help="umf, or all: methods that need no training too.")] = "umf",
+    weights: Annotated[Path | None, Optional(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
+    json_file: Annotated[Path | None, Optional("--json", help="Write the figures here too.")] = None,
+    out: Annotated[Path, Optional(help="Where results/<timestamp> goes.")] = Path("results"),
+    config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording.")] = None,
+    dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
+    embedder: Annotated[str | None, Optional(help="umf, or a baseline, for a recording.")] = None,
+    odometry: Annotated[Path | None, Optional(help="Odometry as a TUM file, where the recording has none.")] = None,
+    odometry_frame: Annotated[
+        str, Optional(help="Whose poses --odometry holds: body, imu, camera or lidar (S3LI's Eval/BASALT: imu).")
+    ] = "body",
+    ground_truth: Annotated[Path | None, Optional(help="Truth as RTKLIB .pos or TUM file.")] = None,
+    rule: Annotated[str, Optional(help="What is the same place in listed sequences: s3li or robotcar.")] = "s3li",
+) -> None:
+    """Recall, precision, rerankers, lost modalities and cost.
+
+    On a recording every keyframe is asked for its own past; of listed sequences (docs/training.md) every sample,
+    for the global descriptors alone. On four simulated worlds of different families
+    a second drive on an offset path under another sun is asked for the first; the default seeds of the
+    test worlds are never trained or tuned on.
+    """
+    from umf_ros.lab.datasets.listed import is_list
+
+    if (data is None) == (worlds is None):
+        raise ConfigError("expected either a recording or --worlds test|validation")
+    if methods not in ("umf", "all"):
+        raise ConfigError(f"--methods: expected umf or all, not {methods!r}")
+    of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick, "--methods": methods != "umf"}
+    of_lists: dict[str, object] = {"--rule": rule != "s3li"}
+    of_recordings: dict[str, object] = {"--config": config, "--dataset": dataset != "auto", "--embedder": embedder}
+    of_recordings |= {"--odometry": odometry, "--ground-truth": ground_truth}
+    if data is None:
+        _refuse("simulated worlds", of_lists | of_recordings)
+        figures = _on_worlds(str(worlds), seed, quick, methods == "all", weights, out)
+    elif is_list(data):
+        _refuse("a list of sequences", of_worlds | of_recordings)
+        figures = _on_sequences(data, rule, weights, out)
+    else:
+        _refuse("a recording", of_worlds | of_lists)
+        figures = _on_recording(data, config, dataset, embedder, weights, odometry, odometry_frame, ground_truth, out)
+    if json_file is not None:
+        import json
+
+        from umf_ros.runs.folder import write_atomically
+
+        write_atomically(json_file, json.dumps(figures, indent=2) + "\n")
+
+
+def _refuse(data: str, options: Mapping[str, object]) -> None:
+    """An option that would be ignored is a mistake, and said to be one."""
+    given = [name for name, value in options.items() if value]
+    if given:
+        raise ConfigError(f"{data} {'has' if data.startswith('a ') else 'have'} no use for {', '.join(given)}")
+
+
+def _on_worlds(
+    name: str, seed: int | None, quick: bool, others: bool, weights: Path | None, out: Path
+) -> dict[str, float | int | None]:
+    from rich.console import Console
+
+    from umf_ros.lab.evaluation.markdown import print_table
+    from umf_ros.lab.evaluation.world_evaluation import work
+    from umf_ros.lab.evaluation.worlds import FIRST_SEEDS, FULL, QUICK, test_worlds
+    from umf_ros.lab.evaluation.worlds_run import WorldsRun
+    from umf_ros.runs.folder import create_run_folder
+
+    if name not in FIRST_SEEDS:
+        raise ConfigError(f"--worlds: expected {' or '.join(FIRST_SEEDS)}, not {name!r}")
+    console = Console()
+    chosen = test_worlds(FIRST_SEEDS[name] if seed is None else seed, QUICK if quick else FULL)
+    with _bar(console) as bar:
+        task = bar.add_task("", total=sum(work(world) for world in chosen))
+
+        def report(what: str, done: int) -> None:
+            bar.update(task, description=what, advance=done)
+
+        run = WorldsRun(weights, chosen, 3 if quick else 10, others, report)
+        folder = create_run_folder(out)
+        summary = run.run()
+        names = ", ".join(world.name for world in chosen)
+        notes = [
+            f"Worlds: {names}; hard setting (offset path up to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing)"
+            f"{', quick' if quick else ''}. A match is true within 12 m and 30 deg (thesis 5.1.2). Times are "
+            "medians on this machine, as busy as it was."
+        ]
+        run.write(summary, folder, notes)
+    for title, table in summary.tables().items():
+        print_table(console, title, table)
+    console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
+    return {**summary.flat()}
+
+
+def _on_recording(
+    bag: Path,
+    config: Path | None,
+    dataset: str,
+    embedder: str | None,
+    weights: Path | None,
+    odometry: Path | None,
+    odometry_frame: str,
+    ground_truth: Path | None,
+    out: Path,
+) -> dict[str, float | int | None]:
+    from rich.console import Console
+
+    from umf_ros.bags.frames import FrameReader
+    from umf_ros.bags.presets import settings_for
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.bags.trajectories import read_ground_truth, read_odometry
+    from umf_ros.commands.progress import WARNING
+    from umf_ros.embedding import make_embedder
+    from umf_ros.frames import Frame
+    from umf_ros.lab.evaluation.bag_run import BagEvaluation, write_bag_result
+    from umf_ros.lab.evaluation.markdown import print_table
+    from umf_ros.runs.folder import create_run_folder
+
+    console = Console()
+    recording = open_bag(bag)
+    settings = settings_for(
+        recording,
+        config,
+        dataset,
+        embedding__method=embedder,
+        embedding__weights=str(weights) if weights else None,
+    )
+    truth = read_ground_truth(recording, ground_truth)
+    if truth is None:
+        raise ConfigError(f"{bag} holds no ground truth; name a file with --ground-truth")
+    path = read_odometry(odometry, odometry_frame, settings) if odometry else None
+    frames = FrameReader(recording, settings, path, warn=lambda text: console.print(text, **WARNING))
+    evaluation = BagEvaluation(settings, make_embedder(settings.embedding, super_features=True))
+    folder = create_run_folder(out)
+    with _bar(console) as bar:
+        task = bar.add_task("embedding", total=recording.duration_s)
+        start_ns: list[int] = []
+
+        def show(frame: Frame, keyframes: int) -> None:
+            start_ns.append(frame.stamp_ns)
+            done_s = (frame.stamp_ns - start_ns[0]) * 1e-9
+            bar.update(task, completed=done_s, description=f"{keyframes} keyframes")
+
+        evaluation.remember(frames, show)
+        bar.update(task, description="reranking")
+        result = evaluation.judge(truth)
+    notes = [
+        f"{bag}: every keyframe against those at least {settings.loop.min_time_gap_s:g} s older and "
+        f"{settings.loop.min_travel_m:g} m back along the path. {result.keyframes} keyframes with a true pose, "
+        f"{result.scores['fused'].queries} of them revisits; the others can only be wrong."
+    ]
+    if not truth.has_orientation:
+        notes.append("The truth has no headings: a match is true within 12 m, whatever its heading.")
+    write_bag_result(folder, result, notes)
+    print_table(console, "Loop-closure protocol", result.table())
+    for note in notes:
+        console.print(note, markup=False)
+    console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
+    return result.flat()
+
+
+def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> dict[str, float | int | None]:
+    from rich.console import Console
+
+    from umf_ros.lab.datasets.listed import SequenceList
+    from umf_ros.lab.evaluation.markdown import print_table, to_markdown
+    from umf_ros.lab.evaluation.protocol import RULES
+    from umf_ros.lab.training.validation import answerable, means, table, validate
+    from umf_ros.networks.weights import load_weights, locate_weights
+    from umf_ros.runs.folder import create_run_folder, write_atomically
+
+    if rule not in RULES:
+        raise ConfigError(f"--rule: expected {' or '.join(RULES)}, not {rule!r}")
+    console = Console()
+    network = load_weights(locate_weights(weights))
+    results = validate(network, SequenceList(listing).worlds, rule=RULES[rule])
+    if not answerable(results):
+        raise ConfigError(f"{listing}: no place is visited twice")
+    folder = create_run_folder(out)
+    shown = table(results)
+    title = "Place recognition by the global descriptor"
+    notes = [
+        f"{listing}: samples with a true match in an earlier pass are asked for it; same place by the rule {rule}."
+    ]
+    write_atomically(folder / "evaluation.md", to_markdown("Evaluation on sequences", notes, {title: shown}, {}))
+    print_table(console, title, shown)
+    console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
+    return means(results)
+
+
+def _bar(console: Console) -> Progress:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %")
+    return Progress(*columns, TimeRemainingColumn(), console=console, transient=True)

@@ -1,0 +1,144 @@
+"""`umf simulate`: a drive through a planetary world as a bag, as training shards, or as a picture to look at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from umf_ros.errors import ConfigError, OutputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from umf_ros.lab.simulation.survey import Survey
+
+
+def command(
+    out: Annotated[Path | None, typer.Argument(help="The .mcap to write.", show_default=False)] = None,
+    preset: Annotated[
+        str,
+        typer.Option(help="demo, vulcano, traverse_1, traverse_2, loops, crater, crater_inout, mapping or landmarks."),
+    ] = "demo",
+    seed: Annotated[int, typer.Option(help="World, route, light and noise.")] = 1,
+    duration: Annotated[float | None, typer.Option(help="Seconds; default: the whole drive.")] = None,
+    family: Annotated[
+        str | None,
+        typer.Option(help="etna, moon, canyon, terrain, dunes, mesa, mounds or random; default: the preset's."),
+    ] = None,
+    aliasing: Annotated[float | None, typer.Option(help="How much the world repeats itself, 0 to 1.")] = None,
+    image_rate: Annotated[
+        float | None, typer.Option(help="Images per second, up to 30; default: one near each scan.")
+    ] = None,
+    truth: Annotated[bool, typer.Option("--truth", help="Add depth, semantic and instance maps.")] = False,
+    shards: Annotated[
+        Path | None, typer.Option(help="Write training shards to this folder instead; those there are kept.")
+    ] = None,
+    worlds: Annotated[str, typer.Option(help="Seeds of the shards, as first:last+1.")] = "0:8",
+    sequences: Annotated[str, typer.Option(help="Shards of named sequences instead: etna (7) or thesis (13).")] = "",
+    contact_sheet: Annotated[Path | None, typer.Option(help="Write a PNG of 24 frames and 6 scans instead.")] = None,
+    workers: Annotated[int, typer.Option(min=1, max=64, help="Threads that render.")] = 2,
+) -> None:
+    """Simulate a rover with S3LI's sensors: stereo, LiDAR, IMU, odometry, GNSS and ground truth.
+
+    Beside OUT.mcap come OUT.odometry.tum and OUT.pos, as beside S3LI's bags. The same seed gives the same bytes.
+    """
+    from rich.console import Console
+
+    console = Console()
+    if contact_sheet is not None:
+        _write_contact_sheet(contact_sheet, seed, family or "etna", console)
+    elif shards is not None:
+        _write_shards(shards, worlds, sequences, seed, workers, console)
+    elif out is not None:
+        _write_bag(out, preset, seed, duration, family, aliasing, image_rate, truth, workers, console)
+    else:
+        raise ConfigError("say where to write: OUT.mcap, --shards DIR or --contact-sheet OUT.png")
+
+
+def _write_bag(
+    out: Path,
+    preset: str,
+    seed: int,
+    duration: float | None,
+    family: str | None,
+    aliasing: float | None,
+    image_rate: float | None,
+    truth: bool,
+    workers: int,
+    console: Console,
+) -> None:
+    from umf_ros.bags.writer import BagWriter
+    from umf_ros.lab.simulation.presets import find_preset
+    from umf_ros.lab.simulation.recording import record, write_side_files
+    from umf_ros.lab.simulation.simulator import Simulator
+
+    if out.suffix != ".mcap":
+        raise OutputError(f"cannot write {out}: the name must end in .mcap")
+    chosen = find_preset(preset)
+    with BagWriter(out) as bag, _progress(console) as progress:
+        task = progress.add_task("building the world", total=None)
+        simulator = Simulator(chosen, seed, duration, image_rate, family, aliasing)
+        progress.update(task, description="simulating scans", total=len(simulator.scan_stamps_ns))
+        record(simulator, bag, workers, truth, lambda done: progress.update(task, completed=done))
+    write_side_files(simulator, out)
+    size = out.stat().st_size / 1e6
+    scans = len(simulator.scan_stamps_ns)
+    console.print(f"{out}: {simulator.duration_s:.0f} s, {scans} scans, {size:.0f} MB", markup=False, soft_wrap=True)
+
+
+def _write_shards(folder: Path, worlds: str, sequences: str, seed: int, workers: int, console: Console) -> None:
+    from umf_ros.lab.simulation.sequences import SEQUENCES
+    from umf_ros.lab.simulation.survey import shard_plan, survey_world
+
+    with _progress(console) as progress:
+        if sequences:
+            if sequences not in SEQUENCES:
+                raise ConfigError(f"unknown sequences {sequences!r}; expected one of {', '.join(SEQUENCES)}")
+            for name, survey in SEQUENCES[sequences](seed):
+                path = folder / f"{name}.npz"
+                if not path.exists():
+                    _write_shard(path, survey, "hard", workers, progress)
+            return
+        for world in _seed_range(worlds):
+            family, setting = shard_plan(world)
+            path = folder / f"world_{world:05d}.npz"
+            if not path.exists():
+                _write_shard(path, survey_world(world, family, setting), setting, workers, progress)
+
+
+def _write_shard(path: Path, survey: Survey, setting: str, workers: int, progress: Progress) -> None:
+    from umf_ros.lab.simulation.shards import write_shard
+
+    task = progress.add_task(path.stem, total=len(survey))
+    write_shard(path, survey, setting, workers, lambda done: progress.update(task, completed=done))
+
+
+def _write_contact_sheet(path: Path, seed: int, family: str, console: Console) -> None:
+    from umf_ros.lab.simulation.contact_sheet import contact_sheet
+    from umf_ros.lab.simulation.survey import survey_world
+
+    with console.status(f"drawing {family} {seed}"):
+        contact_sheet(survey_world(seed, family, "hard"), path)
+    what = "frames of the first pass above those of the revisit, then scans from ahead and from above"
+    console.print(f"{path}: {what}", markup=False, soft_wrap=True)
+
+
+def _progress(console: Console) -> Progress:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console, transient=True)
+
+
+def _seed_range(text: str) -> range:
+    first, _, last = text.partition(":")
+    try:
+        seeds = range(int(first), int(last or int(first) + 1))
+    except ValueError:
+        raise ConfigError(f"seeds {text!r} are not of the form first:last+1") from None
+    if seeds.start < 0 or not seeds:
+        raise ConfigError(f"seeds {text!r} hold no world")
+    return seeds

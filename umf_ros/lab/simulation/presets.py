@@ -1,0 +1,168 @@
+"""What `umf simulate` can drive: the demo, S3LI's sequences and the thesis's synthetic list."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from umf_ros.errors import ConfigError
+from umf_ros.geometry import Array
+from umf_ros.lab.simulation import rig
+from umf_ros.lab.simulation.odometry import Drift
+from umf_ros.lab.simulation.relief import Relief
+from umf_ros.lab.simulation.rig import Layout
+from umf_ros.lab.simulation.route import Route, Walker
+from umf_ros.lab.simulation.seeds import check_seed
+
+Plan = Callable[[Relief, np.random.Generator], Walker]
+
+
+@dataclass(frozen=True, slots=True)
+class Preset:
+    """A drive to simulate.
+
+    Attributes:
+        summary: one line for a person.
+        plan: lays the route on a relief.
+        length_m: where the route is cut.
+        samples: frames of its training shard.
+        family: kind of world.
+        aliasing: how much the world repeats itself, 0 to 1.
+        speed_m_s: of the rover on even ground.
+        swing_deg: how far the heading swings to both sides.
+        tilt_deg: standard deviation of the swaying.
+        sun_deg: how far the sun moves from start to end.
+        drift: how the odometry goes wrong.
+        layout: what the cameras publish.
+        shared: whether its world holds all of S3LI Etna's sequences.
+    """
+
+    summary: str
+    plan: Plan
+    length_m: float
+    samples: int
+    family: str = "etna"
+    aliasing: float = 0.3
+    speed_m_s: float = 1.0
+    swing_deg: float = 6.0
+    tilt_deg: float = 1.0
+    sun_deg: float = 60.0
+    drift: Drift = field(default_factory=Drift)
+    layout: Layout = rig.ETNA
+    shared: bool = False
+
+    def route(self, relief: Relief, seed: int) -> Route:
+        """The route on a relief."""
+        walker = self.plan(relief, np.random.default_rng([check_seed(seed), 10]))
+        return walker.route(self.swing_deg, self.length_m)
+
+    def clearing(self, relief: Relief, seed: int) -> Array:
+        """(N, 2) places that no rock may block."""
+        drives = ETNA.values() if self.shared else (self,)
+        return np.concatenate([drive.route(relief, seed).path for drive in drives])
+
+
+def _demo(relief: Relief, rng: np.random.Generator) -> Walker:
+    return Walker(gentle_loop(relief, 44.0, rng), rng).forward(42).forward(58, lateral_m=0.7)
+
+
+def _traverse_1(relief: Relief, rng: np.random.Generator) -> Walker:
+    return Walker(relief.trail, rng).forward(200).forward(40, lateral_m=3).turn_back().forward(200, lateral_m=3)
+
+
+def _traverse_2(relief: Relief, rng: np.random.Generator) -> Walker:
+    return Walker(relief.trail, rng).forward(110, lateral_m=2).cross(50).turn_back().forward(150, lateral_m=3)
+
+
+def _loops(relief: Relief, rng: np.random.Generator) -> Walker:
+    return Walker(gentle_loop(relief, 180.0, rng), rng).forward(180).forward(500, lateral_m=3)
+
+
+def _crater(relief: Relief, rng: np.random.Generator) -> Walker:
+    return Walker(relief.trail, rng).forward(420).forward(700, lateral_m=4)
+
+
+def _crater_inout(relief: Relief, rng: np.random.Generator) -> Walker:
+    walker = Walker(relief.trail, rng).forward(430).cross(120).forward(300, lateral_m=4)
+    return walker.turn_back().forward(700, lateral_m=4)
+
+
+def _mapping(relief: Relief, rng: np.random.Generator) -> Walker:
+    walker = Walker(gentle_loop(relief, 60.0, rng), rng).forward(60).forward(70, lateral_m=3)
+    return walker.turn_back().forward(120, lateral_m=3)
+
+
+def _landmarks(relief: Relief, rng: np.random.Generator) -> Walker:
+    return (
+        Walker(relief.trail, rng).forward(60).cross(100).forward(60, lateral_m=2).cross(130).forward(300, lateral_m=3)
+    )
+
+
+DEMO = Preset(
+    "a short loop driven twice, with strong odometry drift",
+    _demo,
+    length_m=95,
+    samples=200,
+    speed_m_s=1.3,
+    swing_deg=2.0,
+    tilt_deg=0.7,
+    sun_deg=40,
+    drift=Drift(scale=0.03, turn_deg_m=0.3, walk_deg_sqrt_m=0.6, height_sqrt_m=0.01),
+)
+
+ETNA = {
+    name: Preset(summary, plan, length_m, samples, shared=True)
+    for name, summary, plan, length_m, samples in (
+        ("traverse_1", "out and back", _traverse_1, 371, 726),
+        ("traverse_2", "along the trail, across it and back", _traverse_2, 300, 642),
+        ("loops", "three laps of one loop", _loops, 587, 858),
+        ("crater", "around the crater, two and a half times", _crater, 1010, 1148),
+        ("crater_inout", "around the crater, across it and back the other way", _crater_inout, 1338, 1590),
+        ("mapping", "a small area from all sides", _mapping, 242, 696),
+        ("landmarks", "figures of eight between landmarks", _landmarks, 482, 960),
+    )
+}
+"""S3LI Etna's sequences by name: their lengths in metres and samples, laid over one world."""
+
+
+def gentle_loop(relief: Relief, length_m: float, rng: np.random.Generator) -> Array:
+    """(N, 2) closed curve of about a length, where the ground is the least steep of some tries."""
+    best, least = relief.trail, np.inf
+    for _ in range(24):
+        corners, radius = 7, length_m / (2 * np.pi)
+        angle = np.linspace(0, 2 * np.pi, corners + 1) + rng.uniform(0, 2 * np.pi)
+        reach = radius * rng.uniform(0.8, 1.2, corners)
+        corner = reach[:, None] * np.stack([np.cos(angle[:-1]), np.sin(angle[:-1])], 1)
+        corner += relief.trail[rng.integers(len(relief.trail))] * max(0.0, 1 - 0.9 * radius / 60)
+        closed = np.vstack([corner, corner[:1]])
+        curve = CubicSpline(np.linspace(0, 1, corners + 1), closed, bc_type="periodic")(np.linspace(0, 1, 1500)[:-1])
+        steepness = _steepness(relief, curve)
+        if steepness < least:
+            best, least = curve, steepness
+    return best
+
+
+def _steepness(relief: Relief, curve: Array) -> float:
+    """Height difference per metre along a curve, the worst stretches counting most."""
+    height = relief.height(*curve.T)
+    run = np.linalg.norm(np.diff(curve, axis=0), axis=1)
+    return float(np.sqrt(np.mean((np.diff(height) / np.maximum(run, 1e-3)) ** 2)))
+
+
+VULCANO = replace(DEMO, summary="the demo's loop with raw colour cameras that distort", layout=rig.VULCANO)
+
+PRESETS: dict[str, Preset] = {"demo": DEMO, "vulcano": VULCANO, **ETNA}
+
+
+def find_preset(name: str) -> Preset:
+    """A preset by name.
+
+    Raises:
+        ConfigError: there is none of that name.
+    """
+    if name not in PRESETS:
+        raise ConfigError(f"unknown preset {name!r}; expected one of {', '.join(PRESETS)}")
+    return PRESETS[name]

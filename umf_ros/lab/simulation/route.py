@@ -1,0 +1,148 @@
+"""A continuous drive: laps along a trail with offsets, cuts across it and turns back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from umf_ros.geometry import Array
+from umf_ros.lab.simulation.passes import resample
+
+STEP_M = 0.25
+_EASE_M = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """A path with a heading.
+
+    Attributes:
+        path: (N, 2) places, m.
+        yaw: (N,) heading of the rover, rad; near the direction of the path.
+        travelled: (N,) metres along the path.
+        labels: (N,) what makes each place a revisit: first, offset, opposite or crossing.
+    """
+
+    path: Array
+    yaw: Array
+    travelled: Array
+    labels: list[str]
+
+    @property
+    def length_m(self) -> float:
+        """Length of the path."""
+        return float(self.travelled[-1])
+
+    def legs(self) -> list[tuple[str, float, float]]:
+        """Label, first and last metre of each part."""
+        legs: list[tuple[str, float, float]] = []
+        for label, metre in zip(self.labels, self.travelled, strict=True):
+            start = legs.pop()[1] if legs and legs[-1][0] == label else float(metre)
+            legs.append((label, start, float(metre)))
+        return legs
+
+
+class Walker:
+    """Lays a route along a closed trail, move by move."""
+
+    def __init__(self, trail: Array, rng: np.random.Generator) -> None:
+        self._points, self._heading = resample(trail, STEP_M)
+        self._rng = rng
+        self._at, self._direction, self._offset = 0, 1, 0.0
+        self._path: list[Array] = []
+        self._labels: list[str] = []
+        self._visited = np.zeros(len(self._points), bool)
+
+    @property
+    def trail_m(self) -> float:
+        """Length of the trail."""
+        return len(self._points) * STEP_M
+
+    def forward(self, length_m: float, lateral_m: float = 0.0) -> Walker:
+        """Follow the trail, up to `lateral_m` beside it; labels itself by whether the place is new."""
+        count = round(length_m / STEP_M)
+        ease = np.clip(np.arange(count) * STEP_M / _EASE_M, 0, 1)
+        ease = ease * ease * (3 - 2 * ease)
+        waves = np.arange(count) * STEP_M / 45 * 2 * np.pi
+        wobble = sum(np.sin(k * waves + self._rng.uniform(0, 2 * np.pi)) for k in (1, 2.3)) / 2
+        offset = self._offset * (1 - ease) + lateral_m * wobble * ease
+        index = (self._at + self._direction * np.arange(count)) % len(self._points)
+        normal = np.stack([-np.sin(self._heading[index]), np.cos(self._heading[index])], 1)
+        again = "offset" if self._direction > 0 else "opposite"
+        self._append(self._points[index] + offset[:, None] * normal)
+        fresh = ~self._visited[index]
+        fresh &= np.isin(np.arange(count), np.unique(index, return_index=True)[1])  # a move may be longer than a lap
+        self._labels += ["first" if new else again for new in fresh]
+        self._visited[index] = True
+        self._at, self._offset = int(index[-1] + self._direction) % len(self._points), float(offset[-1])
+        return self
+
+    def turn_back(self, radius_m: float = 2.5) -> Walker:
+        """A narrow turn towards the trail; what follows is driven in the opposite direction."""
+        place, ahead = self._pose()
+        side = np.array([-ahead[1], ahead[0]])
+        left = 1.0 if self._offset * self._direction <= 0 else -1.0
+        angle = np.linspace(0, np.pi, max(round(np.pi * radius_m / STEP_M), 2))[1:, None]
+        self._append(place + radius_m * (np.sin(angle) * ahead + left * (1 - np.cos(angle)) * side))
+        self._labels += ["opposite"] * len(angle)
+        self._offset += 2 * radius_m * left * self._direction
+        self._direction *= -1
+        self._at = int(self._at + self._direction) % len(self._points)
+        return self
+
+    def cross(self, distance_m: float) -> Walker:
+        """Leave the trail to the inside, cross it `distance_m` further on and come back to it from outside."""
+        place, ahead = self._pose()
+        crossing = int(self._at + self._direction * distance_m / STEP_M) % len(self._points)
+        joining = int(crossing + self._direction * 24 / STEP_M) % len(self._points)
+        outward = np.array([np.sin(self._heading[crossing]), -np.cos(self._heading[crossing])])
+        onward = self._direction * self._along(crossing)
+        middle = 0.5 * (place + 6 * ahead + self._points[crossing] - 10 * outward)
+        corners = [
+            place,
+            place + 6 * ahead,
+            middle,
+            self._points[crossing],
+            self._points[crossing] + 9 * outward + 9 * onward,
+            self._points[joining],
+        ]
+        lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+        end = self._direction * self._along(joining)
+        curve = CubicSpline(lengths, np.array(corners), bc_type=((1, ahead), (1, end)))
+        points = curve(np.arange(STEP_M, lengths[-1], STEP_M))
+        self._append(points)
+        self._labels += ["crossing"] * len(points)
+        self._at, self._offset = joining, 0.0
+        return self
+
+    def route(self, swing_deg: float, length_m: float | None = None) -> Route:
+        """The route so far, its heading swinging to both sides of the path.
+
+        Args:
+            swing_deg: how far, deg.
+            length_m: cut here; None keeps all.
+        """
+        path = gaussian_filter1d(np.concatenate(self._path), 4, axis=0, mode="nearest")
+        travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+        keep = slice(0, int(np.searchsorted(travelled, length_m or np.inf)) + 1)
+        along = np.gradient(path, axis=0)
+        yaw = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))
+        swing = np.sin(travelled * 2 * np.pi / 37 + self._rng.uniform(0, 2 * np.pi))
+        swing += 0.5 * np.sin(travelled * 2 * np.pi / 13 + self._rng.uniform(0, 2 * np.pi))
+        yaw += np.radians(swing_deg) * swing / 1.5
+        return Route(path[keep], yaw[keep], travelled[keep], self._labels[keep])
+
+    def _append(self, points: Array) -> None:
+        self._path.append(points)
+
+    def _along(self, index: int) -> Array:
+        return np.array([np.cos(self._heading[index]), np.sin(self._heading[index])])
+
+    def _pose(self) -> tuple[Array, Array]:
+        """Where the route ends, and the unit vector in which it goes on."""
+        last = self._path[-1]
+        step = last[-1] - last[-2]
+        return last[-1], step / np.linalg.norm(step)

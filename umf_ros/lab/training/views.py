@@ -1,0 +1,149 @@
+"""A sample as the network sees it, augmented or not, with the geometry that was done to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from umf_ros.embedding.images import is_blank, shrink, standardise
+from umf_ros.embedding.inputs import prepare_scan
+from umf_ros.embedding.voxels import VoxelScan
+from umf_ros.frames import Image, Points
+from umf_ros.geometry import Array, invert, make_pose, transform
+from umf_ros.lab.datasets.sample import Sample
+from umf_ros.networks.presets import NetworkConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Augmentation:
+    """How strongly views are varied; lengths in metres, angles in degrees, standard deviations unless said."""
+
+    mirror: float = 0.5
+    yaw_deg: float = 3.0
+    tilt_deg: float = 1.0
+    shift_m: float = 0.2
+    drop_points: float = 0.3
+    erase: float = 0.1
+    image_roll_deg: float = 2.0
+    image_scale: float = 0.06
+    image_shift: float = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A sample, preprocessed.
+
+    Attributes:
+        sample: where it comes from.
+        image: (H, W) float32, standardised; zeros without an image.
+        image_present: whether there is one.
+        scan: the voxelised scan, empty without one.
+        input_T_pixel: (3, 3) maps a pixel (u, v, 1) of the full-resolution image to one of `image`.
+        body_T_view: maps the points of `scan` back to the body frame; not a rotation where mirrored.
+    """
+
+    sample: Sample
+    image: NDArray[np.float32]
+    image_present: bool
+    scan: VoxelScan
+    input_T_pixel: Array
+    body_T_view: Array
+
+
+class ViewMaker:
+    """Turns samples into views for one network."""
+
+    def __init__(self, config: NetworkConfig, augmentation: Augmentation | None = None) -> None:
+        self.config = config
+        self._augmentation = augmentation
+
+    def plain(self, sample: Sample) -> View:
+        """The view without augmentation."""
+        return self._make(sample, None, False)
+
+    def varied(self, sample: Sample, rng: np.random.Generator, mirror: bool = False) -> View:
+        """A randomly augmented view, mirrored left to right on request: a world of its own."""
+        return self._make(sample, rng, mirror)
+
+    def _make(self, sample: Sample, rng: np.random.Generator | None, mirror: bool) -> View:
+        image, input_T_pixel, present = self._image(sample, rng, mirror)
+        view_T_body: Array = np.diag([1.0, -1.0, 1.0, 1.0]) if mirror else np.eye(4)
+        points, intensity = sample.points, sample.intensity
+        if points is None:
+            points, intensity = np.empty((0, 3), np.float32), None
+        if rng is not None and self._augmentation is not None:
+            view_T_body = _random_motion(rng, self._augmentation) @ view_T_body
+            points, intensity = _thin(points, intensity, rng, self._augmentation)
+        scan = prepare_scan(transform(view_T_body, points), intensity, self.config)
+        return View(sample, image, present, scan, input_T_pixel, np.linalg.inv(view_T_body))
+
+    def _image(
+        self, sample: Sample, rng: np.random.Generator | None, mirror: bool
+    ) -> tuple[NDArray[np.float32], Array, bool]:
+        height, width = self.config.image_size
+        input_T_pixel = _scaling(width / sample.camera.width, height / sample.camera.height)
+        if sample.image is None or is_blank(sample.image):
+            return np.zeros((height, width), np.float32), input_T_pixel, False
+        image = shrink(sample.image, (height, width))
+        if mirror:
+            image = np.ascontiguousarray(image[:, ::-1])
+            input_T_pixel = np.array([[-1.0, 0, width - 1], [0, 1, 0], [0, 0, 1]]) @ input_T_pixel
+        if rng is None or self._augmentation is None:
+            return standardise(image), input_T_pixel, True
+        values, motion = _vary_image(image, rng, self._augmentation)
+        return standardise(values * 255), motion @ input_T_pixel, True
+
+
+def _scaling(across: float, down: float) -> Array:
+    """Change of resolution; pixel (0, 0) is the centre of the upper left pixel."""
+    return np.array([[across, 0, across / 2 - 0.5], [0, down, down / 2 - 0.5], [0, 0, 1]])
+
+
+def _random_motion(rng: np.random.Generator, strength: Augmentation) -> Array:
+    angles = rng.normal(0, [strength.yaw_deg, strength.tilt_deg, strength.tilt_deg])
+    shift = rng.normal(0, [strength.shift_m, strength.shift_m, strength.shift_m / 2])
+    return make_pose(Rotation.from_euler("zyx", angles, degrees=True).as_matrix(), shift)
+
+
+def _thin(
+    points: Points, intensity: Points | None, rng: np.random.Generator, strength: Augmentation
+) -> tuple[Points, Points | None]:
+    """Drop points at random, and sometimes a whole sector, as behind a blocked view."""
+    keep = rng.random(len(points)) >= rng.uniform(0, strength.drop_points)
+    if rng.random() < strength.erase:
+        azimuth = np.arctan2(points[:, 1], points[:, 0])
+        keep &= np.abs(azimuth - rng.uniform(-0.6, 0.6)) > rng.uniform(0.03, 0.12)
+    return points[keep], None if intensity is None else intensity[keep]
+
+
+def _vary_image(image: Image, rng: np.random.Generator, strength: Augmentation) -> tuple[NDArray[np.float32], Array]:
+    height, width = image.shape
+    values: NDArray[Any] = image.astype(np.float32) / 255
+    values = np.clip(values * rng.uniform(0.7, 1.35) + rng.uniform(-0.08, 0.08), 0, 1) ** rng.uniform(0.75, 1.3)
+    centre = (width / 2 - 0.5, height / 2 - 0.5)
+    scale = 1 + rng.uniform(-strength.image_scale, strength.image_scale)
+    motion = np.eye(3)
+    motion[:2] = cv2.getRotationMatrix2D(centre, rng.normal(0, strength.image_roll_deg), scale)
+    motion[:2, 2] += rng.normal(0, strength.image_shift, 2) * width
+    values = cv2.warpAffine(values, motion[:2], (width, height), borderMode=cv2.BORDER_REPLICATE)
+    values += rng.normal(0, 0.012, values.shape).astype(np.float32)
+    if rng.random() < strength.erase:
+        rows, columns = (rng.uniform(0.1, 0.4, 2) * (height, width)).astype(int)
+        top, left = rng.integers(height - rows), rng.integers(width - columns)
+        values[top : top + rows, left : left + columns] = rng.uniform(0.1, 0.6)
+    return values.astype(np.float32), motion
+
+
+def view_points(view: View) -> Points:
+    """(V, 3) centroids of the view's voxels in the body frame of its sample."""
+    return transform(view.body_T_view, view.scan.centroids)
+
+
+def relative_pose(anchor: View, other: View) -> Array:
+    """`other_T_anchor` of the two bodies."""
+    return invert(other.sample.world_T_body) @ anchor.sample.world_T_body

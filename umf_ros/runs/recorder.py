@@ -1,0 +1,147 @@
+"""Writes what a detector finds, as it finds it, for the live node and the replay alike."""
+
+from __future__ import annotations
+
+import json
+import resource
+import time
+from array import array
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from umf_ros import __version__
+from umf_ros.config import Settings, dump_settings
+from umf_ros.errors import UmfError
+from umf_ros.frames import Frame
+from umf_ros.loop_detector import Detection
+from umf_ros.runs import tables
+from umf_ros.runs.folder import write_atomically
+from umf_ros.sensors.counters import InputCounter
+from umf_ros.sensors.synchronizer import Input
+
+STAGES = ("embed", "query", "verify", "total")
+
+
+class RunRecorder:
+    """Fills a run folder: `config.yaml` at once, tables row by row, `summary.json` on `write_summary`.
+
+    Args:
+        folder: an existing, writable folder.
+        settings: the effective settings.
+        weights: name of the network's weights, for the summary.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path, settings: Settings, weights: str) -> None:
+        self.folder = folder
+        self._settings = settings
+        self._weights = weights
+        write_atomically(folder / "config.yaml", dump_settings(settings))
+        self._closures = tables.Table(folder / "closures.csv", tables.CLOSURES)
+        self._candidates = tables.Table(folder / "candidates.csv", tables.CANDIDATES)
+        self._keyframes = tables.Table(folder / "keyframes.csv", tables.KEYFRAMES)
+        self._inliers = tables.Table(folder / "inliers.csv", tables.INLIERS)
+        self._latency = {stage: array("f") for stage in STAGES}
+        self._counts = dict.fromkeys(("frames", "pairs", "keyframes", "queries", "closures", "rejected"), 0)
+        self._started = time.monotonic()
+        self._recorded_ns = 0
+        self._last_stamp_ns: int | None = None
+
+    def record(self, frame: Frame, detection: Detection) -> None:
+        """Write down what became of one frame."""
+        self._count_frame(frame)
+        keyframe = detection.keyframe
+        if keyframe is None:
+            return
+        self._counts["keyframes"] += 1
+        self._counts["queries"] += bool(detection.verdicts)
+        self._keyframes.append([[keyframe.stamp_ns, keyframe.session, f"{keyframe.travelled_m:.4f}"]])
+        self._candidates.append([tables.candidate_row(keyframe.stamp_ns, verdict) for verdict in detection.verdicts])
+        for verdict in detection.verdicts:
+            if verdict.closure is None:
+                self._counts["rejected"] += 1
+                continue
+            self._counts["closures"] += 1
+            self._closures.append([tables.closure_row(verdict.closure, verdict.candidate.similarity)])
+            self._inliers.append(tables.inlier_rows(keyframe.stamp_ns, verdict))
+        for stage, milliseconds in detection.latency_ms.items():
+            self._latency[stage].append(milliseconds)
+
+    def summary(self, drops: Mapping[str, int]) -> dict[str, Any]:
+        """What `summary.json` holds; `ground_truth` is filled in by the report."""
+        counts = self._counts
+        elapsed_s = time.monotonic() - self._started
+        return {
+            "frames": counts["frames"],
+            "pairs": counts["pairs"],
+            "keyframes": counts["keyframes"],
+            "queries": counts["queries"],
+            "closures_published": counts["closures"],
+            "closures_rejected": counts["rejected"],
+            "ground_truth": None,
+            "latency_ms": {stage: _percentiles(values) for stage, values in self._latency.items()},
+            "drops": dict(drops),
+            "realtime_factor": round(self._recorded_ns * 1e-9 / max(elapsed_s, 1e-9), 3),
+            "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            "seed": self._settings.verification.seed,
+            "version": __version__,
+            "weights": self._weights,
+        }
+
+    def write_summary(self, drops: Mapping[str, int]) -> None:
+        """Write `summary.json`; may be called again as the run goes on."""
+        write_summary(self.folder, self.summary(drops))
+
+    def close(self) -> None:
+        """Close the tables."""
+        for table in (self._closures, self._candidates, self._keyframes, self._inliers):
+            table.close()
+
+    def _count_frame(self, frame: Frame) -> None:
+        self._counts["frames"] += 1
+        self._counts["pairs"] += frame.left is not None and frame.points is not None
+        if self._last_stamp_ns is not None:
+            self._recorded_ns += max(0, frame.stamp_ns - self._last_stamp_ns)
+        self._last_stamp_ns = frame.stamp_ns
+
+
+def count_drops(counters: Mapping[Input, InputCounter], worker: int = 0) -> dict[str, int]:
+    """The `drops` entry of the summary: messages lost for a reason that should not happen, by input."""
+    lost = {name: counters[name].lost for name in ("cloud", "odometry")}
+    return {"image": counters["left"].lost + counters["right"].lost, **lost, "worker": worker}
+
+
+def write_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Write `summary.json` in one step."""
+    write_atomically(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """Read the folder's `summary.json`.
+
+    Raises:
+        UmfError: it is missing, or not what a run writes.
+    """
+    path = folder / "summary.json"
+    if not path.is_file():
+        raise UmfError(f"{folder} holds no finished run: summary.json is missing")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        content = None
+    if not isinstance(content, dict) or "closures_published" not in content:
+        raise UmfError(f"{path} is not the summary of a run")
+    return content
+
+
+def _percentiles(values: array[float]) -> dict[str, float | None]:
+    if not values:
+        return {"p50": None, "p95": None, "max": None}
+    copied = values[:]  # numpy would lock the array itself, and another thread appends to it
+    p50, p95 = np.percentile(copied, [50, 95])
+    return {"p50": round(float(p50), 3), "p95": round(float(p95), 3), "max": round(max(copied), 3)}
