@@ -13,7 +13,7 @@ from umf_ros.embedding.baselines import ThumbnailEmbedder
 from umf_ros.errors import UmfError
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array, make_pose
-from umf_ros.lab.evaluation.bag_run import BagEvaluation, BagResult, write_bag_result
+from umf_ros.lab.evaluation.bag_run import BagEvaluation, BagResult
 from umf_ros.trajectory import Trajectory
 
 LAPS = 2
@@ -85,9 +85,9 @@ def test_the_second_lap_is_recognised(settings: Settings) -> None:
 def test_confused_places_are_missed_and_won_back(settings: Settings) -> None:
     result = evaluate(settings, Confused(), truth())
     assert result.scores["fused"].recall1 < 1.0 and result.scores["ransac both"].recall1 == 1.0
-    flat = result.flat()
-    assert flat["recall1"] == round(result.scores["fused"].recall1, 4) and flat["recall1_ransac"] == 1.0
-    assert flat["queries"] == PLACES
+    figures = result.figures()
+    assert figures["recall1"] == round(result.scores["fused"].recall1, 4) and figures["recall1_ransac"] == 1.0
+    assert figures["queries"] == PLACES
 
 
 def test_a_truth_of_positions_alone(settings: Settings) -> None:
@@ -112,7 +112,7 @@ def test_a_truth_of_another_time_is_an_error(settings: Settings) -> None:
 
 def test_results_are_written(settings: Settings, tmp_path: Path) -> None:
     result = evaluate(settings, Confused(), truth())
-    write_bag_result(tmp_path, result, ["a note"])
-    assert json.loads((tmp_path / "evaluation.json").read_text()) == result.flat()
+    report = result.write(tmp_path, ["a note"])
+    assert json.loads((tmp_path / "evaluation.json").read_text()) == result.figures() == report.figures
     text = (tmp_path / "evaluation.md").read_text()
     assert "superfeatures lidar" in text and "a note" in text and (tmp_path / "recall.png").stat().st_size > 5000

@@ -1,4 +1,4 @@
-"""Where the network looks: attention on images and voxels, and key-points (thesis figures 5.5 to 5.8)."""
+"""What the network makes of places: descriptors in the plane, attention and key-points (thesis figures 5.5 to 5.11)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from sklearn.decomposition import PCA
+from sklearn.manifold import TSNE
 from torch import Tensor
 
 from umf_ros.embedding.embedder import Embedder
@@ -21,12 +23,16 @@ from umf_ros.embedding.images import is_blank
 from umf_ros.embedding.inputs import pack, prepare_image, prepare_scan
 from umf_ros.frames import Embedding, Frame, Image, Points
 from umf_ros.geometry import Array
+from umf_ros.lab.evaluation.retrieval import Indices
 from umf_ros.networks.attention import received
 from umf_ros.networks.umf import UMF, NetworkOutput
 from umf_ros.verification.matching import eligible_superfeatures
 
 SHOWN = 3
 """Super-features drawn per pair."""
+
+PERPLEXITY = 20.0
+"""How many neighbours count in t-SNE, roughly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +99,40 @@ def plot_keypoints(path: Path, seen: Sequence[Seen]) -> None:
     figure.tight_layout()
     figure.savefig(path, dpi=90)
     plt.close(figure)
+
+
+def plot_embeddings(path: Path, descriptors: Array, world_T_body: Array, pass_index: Indices, title: str) -> None:
+    """Draw where samples were taken and where their descriptors lie; equal colours are equal places.
+
+    Args:
+        path: PNG to write.
+        descriptors: (N, D).
+        world_T_body: (N, 4, 4).
+        pass_index: (N,) shown as the shape of the marker: dots for the first, crosses for the others.
+        title: of the picture.
+    """
+    positions, later = world_T_body[:, :2, 3], pass_index > 0
+    middle = positions.mean(axis=0)
+    # a trail is closed: its places are told apart by their direction from its middle
+    hue = np.arctan2(*(positions - middle).T[::-1])
+    figure, panels = plt.subplots(1, 3, figsize=(14, 4.8), layout="constrained")
+    maps = {"places [m]": positions, "PCA": PCA(2).fit_transform(descriptors), "t-SNE": tsne(descriptors)}
+    for panel, (name, points) in zip(panels, maps.items(), strict=True):
+        for chosen, marker, size, label in ((~later, "o", 14, "first pass"), (later, "x", 20, "later passes")):
+            colours = {"c": hue[chosen], "cmap": "hsv", "vmin": -np.pi, "vmax": np.pi}
+            panel.scatter(*points[chosen].T, marker=marker, s=size, linewidths=0.9, label=label, **colours)
+        panel.set_title(name)
+        panel.set_aspect("equal", adjustable="datalim")
+    panels[0].legend(fontsize=9)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def tsne(descriptors: Array) -> Array:
+    """(N, 2) t-SNE of (N, D) descriptors, repeatable; a third of a few samples are neighbours at most."""
+    perplexity = min(PERPLEXITY, max((len(descriptors) - 1) / 3, 1.0))
+    return TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(descriptors)
 
 
 def _shared(query: Seen, match: Seen, name: str) -> list[int]:
