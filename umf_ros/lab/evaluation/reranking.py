@@ -13,7 +13,7 @@ from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array
 from umf_ros.lab.evaluation.retrieval import NOTHING, Mask, Ranking
 from umf_ros.lab.evaluation.retrieval import rerank as reorder
-from umf_ros.verification.reranking import Ranked, rerank, weigh
+from umf_ros.verification.rerank import RankedCandidate, rerank, weigh
 
 TOP_K = 20
 """Candidates that are reranked (thesis 5.5.2)."""
@@ -92,16 +92,15 @@ def _count(
         "superfeatures image": {item.candidate.index: item.score for item in super_image[0]},
         "superfeatures lidar": {item.candidate.index: item.score for item in super_cloud[0]},
     }
-    numbers = {item.candidate.index: item.numbers for item in ransac[0]}
     return pairs | {
-        "ransac image": {column: value["inliers_image"] for column, value in numbers.items()},
-        "ransac lidar": {column: value["inliers_cloud"] for column, value in numbers.items()},
+        "ransac image": {item.candidate.index: float(item.inliers_image) for item in ransac[0]},
+        "ransac lidar": {item.candidate.index: float(item.inliers_cloud) for item in ransac[0]},
     }
 
 
 def _timed(
     query: Keyframe, found: list[tuple[Candidate, Keyframe]], settings: Verification, method: str, modalities: str
-) -> tuple[list[Ranked], float]:
+) -> tuple[list[RankedCandidate], float]:
     chosen = settings.model_copy(update={"rerank": method, "modalities": modalities})
     started = time.perf_counter()
     ranked = rerank(query, found, chosen)
