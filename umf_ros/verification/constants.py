@@ -43,6 +43,8 @@ PLANE_SIGMA_M = 1.2  # by hand: relief is what rises above a plane about this wi
 PLANE_RIDGE_M2 = 0.3  # keeps the slope of that plane finite where the neighbours lie on a line
 MAX_RELIEF_M = 0.2  # by hand: one boulder must not outvote a field
 MIN_CELLS = 50  # by hand: shared cells below which a fit means nothing
+MIN_NEIGHBOURHOOD = 0.25  # by hand: weight of the occupied cells around one, of all, below which it has no relief
+SETTLE_MEDIANS, SETTLE_M = 2.5, 0.05  # by hand: cells that a plane between two maps is fitted to lie so near to it
 MAX_SLOPE = 0.3  # by hand: of one map against the other, rad
 
 # registration
@@ -66,11 +68,14 @@ MIN_RESIDUAL_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanne
 NO_FIT_M = 0.3  # stands for the residual where nothing overlaps
 MIN_SURFACE_NOISE_M = 0.003  # synthetic scans have none
 AGREEMENT_PIXELS = 0.04  # of the image's width, around the place where a feature should reappear; by hand
+AGREEMENT_ROWS = 0.1  # of the image's height: features are compared with their like: sky, horizon, foreground; by hand
 AGREEMENT_M = 1.0  # geometry: a voxel
+AGREEMENT_RANGE, AGREEMENT_RANGE_M = 0.25, 1.0  # by hand: likewise, share of the range and what is added to it
 AGREEMENT_PEERS = 8  # by hand: features a comparison needs
 AGREEMENT_COMPARED = 400  # strongest features of a side that are compared: bounds time and memory
 
 # temporal memory
 MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of keyframes
 ODOMETRY_REACH_M = 15.0  # by hand: odometry is trusted over this distance
+PRIOR_M = 1.0  # by hand: standard deviation of what odometry predicts before any way is driven
 AGREE_M, AGREE_RAD = 0.5, 0.05  # by hand: two findings this near are one

@@ -30,10 +30,13 @@ from umf_ros.verification.constants import (
     MAX_SHIFT,
     MAX_SLOPE,
     MIN_CELLS,
+    MIN_NEIGHBOURHOOD,
     PLANE_RIDGE_M2,
     PLANE_SIGMA_M,
     RANGE_M,
     ROWS,
+    SETTLE_M,
+    SETTLE_MEDIANS,
 )
 
 Grid = NDArray[np.float32]
@@ -168,7 +171,7 @@ def _relief(height: Grid, known: NDArray[np.bool_]) -> Grid:
     determinant = xx * yy - xy**2
     plane = mean_z + (xz * yy - yz * xy) / determinant * (x - mean_x) + (yz * xx - xz * xy) / determinant * (y - mean_y)
     relief = np.clip(height - plane, -MAX_RELIEF_M, MAX_RELIEF_M).astype(np.float32)
-    return np.where(known & (weight > 0.25), relief, np.nan).astype(np.float32)
+    return np.where(known & (weight > MIN_NEIGHBOURHOOD), relief, np.nan).astype(np.float32)
 
 
 def _blur(values: Grid) -> Grid:
@@ -204,7 +207,7 @@ def _settle(match: ElevationMap, query: ElevationMap, heading: float, shift: Arr
         kept = design[keep]
         plane = np.linalg.solve(kept.T @ kept + 1e-3 * np.eye(3), kept.T @ offset[keep])
         residual = np.abs(offset - design @ plane)
-        keep = residual <= max(2.5 * float(np.median(residual)), 0.05)
+        keep = residual <= max(SETTLE_MEDIANS * float(np.median(residual)), SETTLE_M)
     lift, slope_x, slope_y = plane
     tilt = Rotation.from_rotvec(np.clip([slope_y, -slope_x, 0.0], -MAX_SLOPE, MAX_SLOPE)).as_matrix()
     return make_pose(np.eye(3), [0, 0, lift]) @ make_pose(tilt, [0, 0, 0]) @ planar

@@ -27,6 +27,7 @@ from umf_ros.verification.constants import (
     ODOMETRY_REACH_M,
     PIXEL_THRESHOLD,
     POINT_THRESHOLD_M,
+    PRIOR_M,
 )
 from umf_ros.verification.elevation_map import MapFit, TurnedMap, evaluate, search
 from umf_ros.verification.ransac import fit_rigid
@@ -189,7 +190,7 @@ def prior_sigmas(query: Keyframe, match: Keyframe, match_T_query: Array, drift: 
         return float("nan")
     predicted = relative(match.odom_T_body, query.odom_T_body)
     driven = abs(query.travelled_m - match.travelled_m)
-    return float(np.linalg.norm(predicted[:3, 3] - match_T_query[:3, 3]) / (1.0 + drift * driven))
+    return float(np.linalg.norm(predicted[:3, 3] - match_T_query[:3, 3]) / (PRIOR_M + drift * driven))
 
 
 def _distinct(fits: list[MapFit]) -> list[MapFit]:

@@ -1,8 +1,8 @@
 """Every test of a hypothesis, and the typed numbers that the tests give.
 
-A new test is three steps: a function here that looks at an `AlignedHypothesis`, a field of `Measurement` that
-`measure` fills with it, and a `Criterion` in `acceptance` that says which values speak for a closure. Its weight is
-0 until `benchmarks/fit_verification.py` has fitted one.
+A new test is three steps: a function of what an `AlignedHypothesis` holds, a field of `Measurement` that `measure`
+fills with it, and a `Criterion` in `acceptance` that says which values speak for a closure. Its weight is 0 until
+`benchmarks/fit_verification.py` has fitted one.
 """
 
 from __future__ import annotations
@@ -20,6 +20,9 @@ from umf_ros.verification.constants import (
     AGREEMENT_M,
     AGREEMENT_PEERS,
     AGREEMENT_PIXELS,
+    AGREEMENT_RANGE,
+    AGREEMENT_RANGE_M,
+    AGREEMENT_ROWS,
     INLIER_M,
     MIN_SURFACE_NOISE_M,
     NO_FIT_M,
@@ -162,19 +165,17 @@ def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) ->
 def image_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
     """Whether the query's image features reappear where the pose says, in standard deviations of chance.
 
-    Each lifted feature of the query is projected into the match's image. Of the match's features at
-    about the same row, is the one at that place among the most similar? Only ranks are used, so
-    the number means the same for any weights. NaN where nothing can be compared.
+    Each lifted feature of the query is projected into the match's image. Of the match's features at about the same
+    row, is the one at that place among the most similar? Ranks mean the same for any weights. NaN without any.
     """
     ours, theirs = query.embedding.image, match.embedding.image
     if ours is None or theirs is None:
         return float("nan")
     ours, theirs, camera = strongest(ours, AGREEMENT_COMPARED), strongest(theirs, AGREEMENT_COMPARED), match.camera
     pixels, depth = camera.project(transform(pose, ours.points.astype(float)), match.body_T_camera)
-    # row bands: sky, horizon and foreground look different in every place
     offset = pixels[:, None] - theirs.positions[None].astype(float)
     distance = np.hypot(offset[..., 0], offset[..., 1])
-    peers = (np.abs(offset[..., 1]) < 0.1 * camera.height) & (depth > 0)[:, None]
+    peers = (np.abs(offset[..., 1]) < AGREEMENT_ROWS * camera.height) & (depth > 0)[:, None]
     return _rank_agreement(ours, theirs, distance, AGREEMENT_PIXELS * camera.width, peers)
 
 
@@ -188,14 +189,14 @@ def cloud_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
     distance = np.linalg.norm(moved[:, None] - theirs.positions[None], axis=2)
     range_ours = np.linalg.norm(moved, axis=1)[:, None]
     range_theirs = np.linalg.norm(theirs.positions, axis=1)[None]
-    peers = np.abs(range_ours - range_theirs) < 0.25 * range_theirs + 1.0
+    peers = np.abs(range_ours - range_theirs) < AGREEMENT_RANGE * range_theirs + AGREEMENT_RANGE_M
     return _rank_agreement(ours, theirs, distance, AGREEMENT_M, peers)
 
 
 def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan, query: PreparedScan) -> Measurement:
     """Tests of how two scans fit."""
     fit = evaluate(match.elevation, query.elevation, alignment.pose)
-    size = np.abs(alignment.residuals) if len(alignment.residuals) else np.full(1, NO_FIT_M)
+    size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, NO_FIT_M)
     return replace(
         known,
         kind=SCAN,
@@ -242,9 +243,8 @@ def _rank_agreement(ours: LocalFeatures, theirs: LocalFeatures, distance: Array,
     usable = (distance[rows, nearest] < reach) & (peers.sum(axis=1) >= AGREEMENT_PEERS)
     if not usable.any():
         return float("nan")
-    rows, nearest = rows[usable], nearest[usable]
-    similarity = similarities(ours.descriptors[rows], theirs.descriptors)
-    own = similarity[np.arange(len(rows)), nearest]
+    similarity = similarities(ours.descriptors[rows[usable]], theirs.descriptors)
+    own = similarity[np.arange(len(similarity)), nearest[usable]]
     below = ((similarity < own[:, None]) & peers[usable]).sum(axis=1)
     rank = below / np.maximum(peers[usable].sum(axis=1) - 1, 1)
-    return float((np.minimum(rank, 1).mean() - 0.5) * np.sqrt(12 * len(rows)))
+    return float((np.minimum(rank, 1).mean() - 0.5) * np.sqrt(12 * len(similarity)))

@@ -138,8 +138,8 @@ class CovarianceModel:
         return np.diag([self.floor_m**2] * 3 + [np.radians(self.floor_deg) ** 2] * 3)
 
 
+# a fixed yardstick of what a pose is known to: refitting the covariance must not move the decision
 NOMINAL = CovarianceModel(NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG)
-"""What a pose is known to by a fixed yardstick: refitting the covariance must not move the decision."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +198,6 @@ def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
     offset = moved - match.points[index]
     residual = np.einsum("ij,ij->i", offset, normals)
     solid = np.einsum("ij,ij->i", normals, normals) > 0.5
-    # a counterpart lies within reach along the surface: the spacing of far returns is wider than the noise
     close = solid & (squared < FINE_REACH_M**2)
     seen = solid & (squared < COARSE_REACH_M**2)
     arm = np.cross(moved[close] - pose[:3, 3], normals[close])
