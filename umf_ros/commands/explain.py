@@ -31,8 +31,8 @@ def command(
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.presets import settings_for
     from umf_ros.bags.reader import open_bag
+    from umf_ros.commands.explanation import draw, explain
     from umf_ros.loop_detector import make_detector_embedder, make_keyframe
-    from umf_ros.verification.explanation import draw, explain
 
     console = Console()
     moments = [_moment(text) for text in (query, match)]
@@ -51,8 +51,8 @@ def command(
     explanation = explain(query_keyframe, match_keyframe, settings.verification)
     draw(explanation, frames[0].left, frames[1].left, out)
     console.print(explanation.verdict, highlight=False)
-    if explanation.evidence is not None:
-        for name, value in explanation.evidence.numbers.items():
+    if explanation.best is not None:
+        for name, value in explanation.best.measurement.numbers.items():
             console.print(f"  {name:22} {value:.4g}", highlight=False)
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
 

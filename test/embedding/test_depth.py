@@ -2,14 +2,14 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from scenes import BODY_T_CAMERA, CAMERA
+from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import Embedding, Frame, LocalFeatures
-from umf_ros.geometry import transform
-from umf_ros.verification import lift, thin_scan
-from umf_ros.verification.lifting import project
-from umf_ros.verification.stereo import disparities
+from umf_ros.embedding.depth import disparities, lift
+from umf_ros.frames import Embedding, Frame, LocalFeatures, StereoCamera
+from umf_ros.geometry import make_pose, transform
 
+CAMERA = StereoCamera(688, 512, 579.488, 579.488, 342.133, 255.806, 0.2003)
+BODY_T_CAMERA = make_pose(Rotation.from_euler("ZYX", [-90, 0, -96], degrees=True).as_matrix(), [0.3, 0.1, 1.1])
 WALL_M = 8.0
 
 
@@ -56,7 +56,7 @@ def wall(depth: float) -> np.ndarray:
 
 def depths(found: Embedding) -> np.ndarray:
     assert found.image is not None
-    return project(found.image.points.astype(float), CAMERA, BODY_T_CAMERA)[1]
+    return CAMERA.project(found.image.points.astype(float), BODY_T_CAMERA)[1]
 
 
 def test_disparity_is_found_to_a_fraction_of_a_pixel() -> None:
@@ -103,22 +103,10 @@ def test_lifted_points_project_back_onto_their_pixels() -> None:
     pixels = np.array([[200.0, 50.0], [600.0, 150.0]])
     lifted = lift(frame(wall(WALL_M)), embedding(pixels)).image
     assert lifted is not None
-    np.testing.assert_allclose(project(lifted.points.astype(float), CAMERA, BODY_T_CAMERA)[0], pixels, atol=0.01)
+    np.testing.assert_allclose(CAMERA.project(lifted.points.astype(float), BODY_T_CAMERA)[0], pixels, atol=0.01)
 
 
 def test_frames_without_scan_or_pair_leave_depths_unknown() -> None:
     found = lift(frame(None, left=texture()), embedding(grid()))
     assert found.image is not None and np.isnan(found.image.points).all()
     assert lift(frame(wall(5.0)), Embedding(np.ones(4, np.float32))).image is None
-
-
-def test_thinning_keeps_one_mean_per_cube() -> None:
-    pair = np.array([[5.0, 0.1, 0.1], [5.1, 0.12, 0.12], [9.0, 0, 0], [60.0, 0, 0]], np.float32)
-    thinned = thin_scan(pair, 0.5)
-    assert len(thinned) == 2
-    np.testing.assert_allclose(np.sort(thinned[:, 0]), [5.05, 9.0], atol=1e-5)
-
-
-def test_thinning_nothing_gives_nothing() -> None:
-    for empty in (None, np.empty((0, 3), np.float32), np.full((3, 3), 90, np.float32)):
-        assert thin_scan(empty).shape == (0, 3)

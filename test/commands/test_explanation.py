@@ -9,9 +9,9 @@ import pytest
 from command_line import umf
 from scenes import landscape, pose_at, take
 
+from umf_ros.commands.explanation import Explanation, draw, explain
 from umf_ros.config import Verification
 from umf_ros.errors import OutputError
-from umf_ros.verification.explanation import Explanation, draw, explain
 
 GROUND = landscape(20)
 
@@ -22,26 +22,26 @@ def explained(same: bool) -> Explanation:
     return explain(query, take(ground, pose_at(ground, -15.0, 0.0, 0.0), 10.0), Verification())
 
 
-def test_same_place_is_explained_by_arguments_that_add_up() -> None:
+def test_same_place_is_explained_by_contributions_that_add_up() -> None:
     found = explained(same=True)
     assert found.verdict.startswith("accepted")
-    odds = sum(found.arguments.values())
-    assert found.probability == pytest.approx(1 / (1 + np.exp(-odds)))
-    assert found.arguments["bias"] < 0 < found.arguments["residual_like_noise"]
+    odds = sum(found.contributions.values())
+    assert found.best is not None and found.best.probability == pytest.approx(1 / (1 + np.exp(-odds)))
+    assert found.contributions["bias"] < 0 < found.contributions["residual_like_noise"]
     assert len(found.pixels) > 10
 
 
 def test_other_place_is_rejected_with_its_numbers() -> None:
     found = explained(same=False)
     assert found.verdict.startswith("rejected")
-    assert found.evidence is None or found.evidence.numbers["residual_m"] > 0.01
+    assert found.best is None or found.best.measurement.residual_m > 0.01
 
 
 def test_picture_is_written_with_and_without_images_and_pose(tmp_path: Path) -> None:
     found = explained(same=True)
     image = np.full((found.query.camera.height, found.query.camera.width), 120, np.uint8)
     draw(found, image, None, tmp_path / "pair.png")
-    nothing = replace(found, evidence=None, probability=0.0, arguments={}, pixels=np.empty((0, 4), np.float32))
+    nothing = replace(found, best=None, contributions={}, pixels=np.empty((0, 4), np.float32))
     draw(nothing, None, None, tmp_path / "nothing.png")
     for name in ("pair.png", "nothing.png"):
         picture = cv2.imread(str(tmp_path / name))

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,17 +7,14 @@ import pytest
 from scenes import landscape, pose_at, take, without_image, without_scan
 
 from umf_ros.config import Verification
-from umf_ros.frames import Candidate, Keyframe, LocalFeatures
+from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array, make_pose, relative, rotation_angle
-from umf_ros.verification.features import (
-    cloud_agreement,
+from umf_ros.verification.hypotheses import (
     consistent_pixels,
-    image_agreement,
     pose_from_pixels,
     pose_from_points,
 )
-from umf_ros.verification.matching import strongest
-from umf_ros.verification.reranking import Ranked, rerank
+from umf_ros.verification.rerank import RankedCandidate, rerank
 
 GROUND = landscape(20)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
@@ -27,7 +23,7 @@ QUERY, MATCH = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
 OTHER = take(landscape(99), pose_at(landscape(99), -15.0, 0.0, 0.0), 20.0)
 
 
-def paired(match: Keyframe) -> Ranked:
+def paired(match: Keyframe) -> RankedCandidate:
     return rerank(QUERY, [(Candidate(0, match.stamp_ns, 0.5), match)], Verification())[0]
 
 
@@ -64,46 +60,6 @@ def test_nothing_to_match_gives_no_pose() -> None:
     assert pose_from_points(QUERY, paired(bare), 200, seed=0) is None
     assert pose_from_pixels(QUERY, paired(bare), 200) is None
     assert consistent_pixels(QUERY, paired(bare), TRUE).shape == (0, 4)
-
-
-@pytest.mark.parametrize("agreement", [image_agreement, cloud_agreement])
-def test_agreement_is_far_beyond_chance_at_the_true_pose_only(agreement) -> None:
-    beside = TRUE @ make_pose(np.eye(3), [0.0, 5.0, 0.0])
-    assert agreement(QUERY, MATCH, TRUE) > 5.0
-    assert agreement(QUERY, MATCH, beside) < 3.0
-    assert abs(agreement(QUERY, OTHER, TRUE)) < 3.0
-
-
-def few(features: LocalFeatures | None, count: int) -> LocalFeatures:
-    assert features is not None
-    return strongest(features, count)
-
-
-@pytest.mark.parametrize("count", [0, 3])
-def test_agreement_of_next_to_nothing_is_unknown_rather_than_bad(count: int) -> None:
-    embedding = replace(
-        MATCH.embedding, image=few(MATCH.embedding.image, count), cloud=few(MATCH.embedding.cloud, count)
-    )
-    match = replace(MATCH, embedding=embedding)
-    assert math.isnan(image_agreement(QUERY, match, TRUE))
-    assert math.isnan(cloud_agreement(QUERY, match, TRUE))
-    assert math.isnan(image_agreement(QUERY, without_image(MATCH), TRUE))
-    assert math.isnan(cloud_agreement(without_scan(QUERY), MATCH, TRUE))
-
-
-def test_agreement_does_not_depend_on_the_scale_of_the_descriptors() -> None:
-    """Other weights spread similarities differently; only their order may count."""
-
-    def squeezed(keyframe: Keyframe) -> Keyframe:
-        image = keyframe.embedding.image
-        assert image is not None
-        common = 3.0 * np.ones((1, image.descriptors.shape[1])) / np.sqrt(image.descriptors.shape[1])
-        rows = image.descriptors + common
-        unit = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16)
-        return replace(keyframe, embedding=replace(keyframe.embedding, image=replace(image, descriptors=unit)))
-
-    plain, crowded = image_agreement(QUERY, MATCH, TRUE), image_agreement(squeezed(QUERY), squeezed(MATCH), TRUE)
-    assert crowded == pytest.approx(plain, rel=0.2)
 
 
 def test_consistent_pixels_obey_the_pose_and_vanish_with_a_wrong_one() -> None:

@@ -1,6 +1,6 @@
-"""Where two scans of terrain could fit: an exhaustive search over heading and position.
+"""Elevation maps of scans, and where two of them could fit: an exhaustive search over heading and position.
 
-A scan becomes a bird's-eye map of *relief*: the height of each cell above a plane fitted to its
+A scan becomes a bird's-eye map of heights, and of *relief*: the height of each cell above a plane fitted to its
 neighbourhood. Relief keeps rocks, ripples and rims, and forgets the rover's own height and tilt as
 well as the slope that every cell of a hillside shares. Two maps are compared by normalised
 cross-correlation over all shifts at once (FFT), for a fan of headings. Unlike features it needs no
@@ -21,23 +21,30 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.frames import Points
 from umf_ros.geometry import Array, make_pose, transform
-
-CELL_M = 0.5
-ROWS, COLUMNS = 72, 96  # 36 m along, 48 m across
-BEHIND = 12  # cells kept free behind the body for rotated and shifted maps
-RANGE_M = 28.0
-SHIFT = 12  # cells, 6 m to every side
-HEADINGS = np.radians(np.arange(-36.0, 37.0, 6.0))  # half a step is within reach of the alignment
-PLANE_SIGMA_M = 1.2
-MAX_RELIEF_M = 0.2  # one boulder must not outvote a field
-MIN_CELLS = 50  # shared cells below which a fit means nothing
+from umf_ros.verification.constants import (
+    BEHIND,
+    CELL_M,
+    COLUMNS,
+    HEADINGS,
+    MAX_RELIEF_M,
+    MAX_SHIFT,
+    MAX_SLOPE,
+    MIN_CELLS,
+    MIN_NEIGHBOURHOOD,
+    PLANE_RIDGE_M2,
+    PLANE_SIGMA_M,
+    RANGE_M,
+    ROWS,
+    SETTLE_M,
+    SETTLE_MEDIANS,
+)
 
 Grid = NDArray[np.float32]
 Cells = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class MapFit:
     """One way two maps could fit.
 
     Attributes:
@@ -56,8 +63,8 @@ class Fit:
         return self.correlation * float(np.sqrt(self.cells))
 
 
-class TerrainMap:
-    """The relief seen by one scan."""
+class ElevationMap:
+    """Heights and relief seen by one scan."""
 
     def __init__(self, points: Points) -> None:
         """Args: points (M, 3) m, body frame; those behind the body are not used."""
@@ -78,11 +85,11 @@ class TerrainMap:
         return scipy.fft.rfft2(np.stack([relief, relief**2, known.astype(np.float32)]))
 
 
-class Fan:
+class TurnedMap:
     """A query's map turned to every heading: spectra (3, headings, ...), conjugated; made once per query."""
 
-    def __init__(self, terrain: TerrainMap) -> None:
-        x, y = terrain.cells[:, 0], terrain.cells[:, 1]
+    def __init__(self, elevation: ElevationMap) -> None:
+        x, y = elevation.cells[:, 0], elevation.cells[:, 1]
         cos, sin = np.cos(HEADINGS)[:, None], np.sin(HEADINGS)[:, None]
         rows, columns = _indices(cos * x - sin * y, sin * x + cos * y)
         inside = (rows >= 0) & (rows < ROWS) & (columns >= 0) & (columns < COLUMNS)
@@ -90,41 +97,41 @@ class Fan:
         keys = (heading[inside] * ROWS + rows[inside]) * COLUMNS + columns[inside]
         size = len(HEADINGS) * ROWS * COLUMNS
         count = np.bincount(keys, minlength=size)
-        total = np.bincount(keys, np.broadcast_to(terrain.values, rows.shape)[inside], size)
+        total = np.bincount(keys, np.broadcast_to(elevation.values, rows.shape)[inside], size)
         relief = (total / np.maximum(count, 1)).astype(np.float32)
         stack = np.stack([relief, relief**2, (count > 0).astype(np.float32)])
-        self.terrain = terrain
+        self.elevation = elevation
         self.spectra: NDArray[Any] = scipy.fft.rfft2(stack.reshape(3, len(HEADINGS), ROWS, COLUMNS)).conj()
 
 
-def search(match: TerrainMap, fan: Fan, peaks: int = 2) -> list[Fit]:
-    """The best fits of the fan's map within 6 m and 36 deg, best first, each in a basin of its own."""
-    if min(len(match.values), len(fan.terrain.values)) < MIN_CELLS:
+def search(match: ElevationMap, turned: TurnedMap, peaks: int = 2) -> list[MapFit]:
+    """The best fits of the turned map within 6 m and 36 deg, best first, each in a basin of its own."""
+    if min(len(match.values), len(turned.elevation.values)) < MIN_CELLS:
         return []
-    correlation, cells = _correlate_everywhere(match, fan)
+    correlation, cells = _correlate_everywhere(match, turned)
     score = np.where(cells >= MIN_CELLS, correlation * np.sqrt(np.maximum(cells, 0)), -np.inf)
     fits = []
     for _ in range(peaks):
         heading, row, column = np.unravel_index(int(score.argmax()), score.shape)
         if not score[heading, row, column] > 0:
             break
-        shift = (np.array([row, column]) - SHIFT) * CELL_M
-        pose = _settle(match, fan.terrain, float(HEADINGS[heading]), shift)
-        fits.append(Fit(pose, float(correlation[heading, row, column]), float(cells[heading, row, column])))
+        shift = (np.array([row, column]) - MAX_SHIFT) * CELL_M
+        pose = _settle(match, turned.elevation, float(HEADINGS[heading]), shift)
+        fits.append(MapFit(pose, float(correlation[heading, row, column]), float(cells[heading, row, column])))
         score[max(heading - 1, 0) : heading + 2, max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4] = -np.inf
     return fits
 
 
-def evaluate(match: TerrainMap, query: TerrainMap, pose: Array) -> Fit:
+def evaluate(match: ElevationMap, query: ElevationMap, pose: Array) -> MapFit:
     """How well the maps fit at one pose; a correlation of 0 where too few cells are shared."""
     ours, theirs = _shared(match.relief, query, pose)
     if len(ours) < MIN_CELLS / 2:
-        return Fit(pose, 0.0, float(len(ours)))
+        return MapFit(pose, 0.0, float(len(ours)))
     norm = float(np.sqrt((ours**2).sum() * (theirs**2).sum()))
-    return Fit(pose, float((ours * theirs).sum()) / max(norm, 1e-9), float(len(ours)))
+    return MapFit(pose, float((ours * theirs).sum()) / max(norm, 1e-9), float(len(ours)))
 
 
-def shared_relief(match: TerrainMap, query: TerrainMap, pose: Array) -> float:
+def shared_relief(match: ElevationMap, query: ElevationMap, pose: Array) -> float:
     """Standard deviation in metres of the match's relief over the shared cells: what there is to hold on to."""
     theirs = _shared(match.relief, query, pose)[1]
     return float(theirs.std()) if len(theirs) else 0.0
@@ -158,14 +165,13 @@ def _relief(height: Grid, known: NDArray[np.bool_]) -> Grid:
         return _blur(mask * values.astype(np.float32)) / weight
 
     mean_x, mean_y, mean_z = mean(x), mean(y), mean(height)
-    ridge = 0.3  # m^2: keeps the slope finite where the neighbours lie on a line
-    xx, yy = mean(x * x) - mean_x**2 + ridge, mean(y * y) - mean_y**2 + ridge
+    xx, yy = mean(x * x) - mean_x**2 + PLANE_RIDGE_M2, mean(y * y) - mean_y**2 + PLANE_RIDGE_M2
     xy = mean(x * y) - mean_x * mean_y
     xz, yz = mean(x * height) - mean_x * mean_z, mean(y * height) - mean_y * mean_z
     determinant = xx * yy - xy**2
     plane = mean_z + (xz * yy - yz * xy) / determinant * (x - mean_x) + (yz * xx - xz * xy) / determinant * (y - mean_y)
     relief = np.clip(height - plane, -MAX_RELIEF_M, MAX_RELIEF_M).astype(np.float32)
-    return np.where(known & (weight > 0.25), relief, np.nan).astype(np.float32)
+    return np.where(known & (weight > MIN_NEIGHBOURHOOD), relief, np.nan).astype(np.float32)
 
 
 def _blur(values: Grid) -> Grid:
@@ -176,17 +182,17 @@ def _blur(values: Grid) -> Grid:
     return blurred
 
 
-def _correlate_everywhere(match: TerrainMap, fan: Fan) -> tuple[Grid, Grid]:
+def _correlate_everywhere(match: ElevationMap, turned: TurnedMap) -> tuple[Grid, Grid]:
     """Correlation and shared cells (headings, shifts, shifts)."""
-    theirs, ours = match.spectra, fan.spectra
+    theirs, ours = match.spectra, turned.spectra
     products = np.stack([theirs[0] * ours[0], theirs[1] * ours[2], theirs[2] * ours[1], theirs[2] * ours[2]])
-    window = np.arange(-SHIFT, SHIFT + 1)
+    window = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
     sums = scipy.fft.irfft2(products, s=(ROWS, COLUMNS))[:, :, window][..., window]
     energy = np.sqrt(np.maximum(sums[1], 1e-4) * np.maximum(sums[2], 1e-4))
     return sums[0] / energy, sums[3]
 
 
-def _settle(match: TerrainMap, query: TerrainMap, heading: float, shift: Array) -> Array:
+def _settle(match: ElevationMap, query: ElevationMap, heading: float, shift: Array) -> Array:
     """Full pose of a planar fit: height and tilt from the height differences of the shared cells."""
     planar = make_pose(Rotation.from_rotvec([0, 0, heading]).as_matrix(), [*shift, 0.0])
     moved = transform(planar, query.cells)
@@ -201,9 +207,9 @@ def _settle(match: TerrainMap, query: TerrainMap, heading: float, shift: Array) 
         kept = design[keep]
         plane = np.linalg.solve(kept.T @ kept + 1e-3 * np.eye(3), kept.T @ offset[keep])
         residual = np.abs(offset - design @ plane)
-        keep = residual <= max(2.5 * float(np.median(residual)), 0.05)
+        keep = residual <= max(SETTLE_MEDIANS * float(np.median(residual)), SETTLE_M)
     lift, slope_x, slope_y = plane
-    tilt = Rotation.from_rotvec(np.clip([slope_y, -slope_x, 0.0], -0.3, 0.3)).as_matrix()
+    tilt = Rotation.from_rotvec(np.clip([slope_y, -slope_x, 0.0], -MAX_SLOPE, MAX_SLOPE)).as_matrix()
     return make_pose(np.eye(3), [0, 0, lift]) @ make_pose(tilt, [0, 0, 0]) @ planar
 
 
@@ -216,7 +222,7 @@ def _look_up(grid: Grid, places: Array) -> Array:
     return values
 
 
-def _shared(relief: Grid, query: TerrainMap, pose: Array) -> tuple[Array, Array]:
+def _shared(relief: Grid, query: ElevationMap, pose: Array) -> tuple[Array, Array]:
     theirs = _look_up(relief, transform(pose, query.cells))
     known = np.isfinite(theirs)
     return query.values[known].astype(float), theirs[known]

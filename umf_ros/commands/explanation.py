@@ -12,10 +12,9 @@ from umf_ros.config import Verification
 from umf_ros.errors import OutputError
 from umf_ros.frames import Candidate, Image, Keyframe, Points
 from umf_ros.geometry import transform
-from umf_ros.verification.acceptance import load_calibration, measure
-from umf_ros.verification.evidence import Evidence
-from umf_ros.verification.features import consistent_pixels
-from umf_ros.verification.verifier import Verifier
+from umf_ros.verification.acceptance import load_acceptance
+from umf_ros.verification.hypotheses import consistent_pixels
+from umf_ros.verification.verifier import JudgedHypothesis, Verifier
 
 MOST_LINES = 60
 
@@ -27,50 +26,42 @@ class Explanation:
     Attributes:
         query: the later keyframe.
         match: the earlier one.
-        evidence: of the most probable pose, or None when no pose fits.
-        probability: that the pose is right; 0 without one.
-        threshold: from which a closure is published.
-        arguments: log-odds that each measure contributes, by name; "bias" is what has to be overcome.
+        best: the most probable hypothesis, or None when no pose fits.
+        threshold: probability from which a closure is published.
+        contributions: log-odds that each criterion adds, by name; "bias" is what has to be overcome.
         pixels: (K, 4) feature pairs that obey the pose.
     """
 
     query: Keyframe
     match: Keyframe
-    evidence: Evidence | None
-    probability: float
+    best: JudgedHypothesis | None
     threshold: float
-    arguments: dict[str, float]
+    contributions: dict[str, float]
     pixels: Points
 
     @property
     def verdict(self) -> str:
         """One line for a person."""
-        if self.evidence is None:
+        if self.best is None:
             return "rejected: no pose fits"
-        word = "accepted" if self.probability >= self.threshold else "rejected"
-        return f"{word}: probability {self.probability:.3f}, {self.threshold:g} is needed"
+        word = "accepted" if self.best.probability >= self.threshold else "rejected"
+        return f"{word}: probability {self.best.probability:.3f}, {self.threshold:g} is needed"
 
 
 def explain(query: Keyframe, match: Keyframe, settings: Verification) -> Explanation:
     """Examine one pair on its own, without the support of neighbouring keyframes."""
     similarity = float(query.embedding.descriptor @ match.embedding.descriptor)
     examined = Verifier(settings).examine(query, [(Candidate(0, match.stamp_ns, similarity), match)])
-    calibration = load_calibration(settings.calibration)
-    odds = [calibration.probability(evidence.numbers, evidence.kind) for evidence in examined]
-    if not odds:
-        nothing = np.empty((0, 4), np.float32)
-        return Explanation(query, match, None, 0.0, settings.min_probability, {}, nothing)
-    best = int(np.argmax(odds))
-    evidence = examined[best]
-    model = calibration.models[evidence.kind]
-    measures = measure(evidence.numbers, evidence.kind)
-    arguments = {name: weight * measures[name] for name, weight in model.weights.items()} | {"bias": model.bias}
-    pixels = consistent_pixels(query, evidence.proposal.ranked, evidence.pose)
-    return Explanation(query, match, evidence, odds[best], settings.min_probability, arguments, pixels)
+    if not examined:
+        return Explanation(query, match, None, settings.min_probability, {}, np.empty((0, 4), np.float32))
+    best = max(examined, key=lambda one: one.probability)
+    contributions = load_acceptance(settings.calibration).contributions(best.measurement)
+    pixels = consistent_pixels(query, best.aligned.hypothesis.ranked, best.aligned.pose)
+    return Explanation(query, match, best, settings.min_probability, contributions, pixels)
 
 
 def draw(explanation: Explanation, query_image: Image | None, match_image: Image | None, path: Path) -> None:
-    """Write the picture: images with inlier lines, aligned scans from above and from the side, arguments.
+    """Write the picture: images with inlier lines, aligned scans from above and from the side, contributions.
 
     Raises:
         OutputError: the file cannot be written.
@@ -84,7 +75,7 @@ def draw(explanation: Explanation, query_image: Image | None, match_image: Image
     _draw_images(figure.add_subplot(grid[0, :]), explanation, query_image, match_image)
     _draw_scans(figure.add_subplot(grid[1, 0]), explanation, 1, "left [m]", "from above")
     _draw_scans(figure.add_subplot(grid[1, 1]), explanation, 2, "up [m]", "from the side")
-    _draw_arguments(figure.add_subplot(grid[1, 2]), explanation)
+    _draw_contributions(figure.add_subplot(grid[1, 2]), explanation)
     stamps = f"query {explanation.query.stamp_ns}   match {explanation.match.stamp_ns}"
     figure.suptitle(f"{explanation.verdict}\n{stamps}", fontsize=14)
     try:
@@ -107,8 +98,8 @@ def _draw_images(axes: Any, explanation: Explanation, query: Image | None, match
 
 def _draw_scans(axes: Any, explanation: Explanation, height_axis: int, label: str, title: str) -> None:
     match, query = explanation.match.points, explanation.query.points
-    if explanation.evidence is not None:
-        query = transform(explanation.evidence.pose, query)
+    if explanation.best is not None:
+        query = transform(explanation.best.aligned.pose, query)
         title += ", aligned"
     for points, colour, name in ((match, "tab:blue", "match"), (query, "tab:orange", "query")):
         axes.scatter(points[:, 0], points[:, height_axis], s=1.2, c=colour, label=name, linewidths=0)
@@ -117,9 +108,9 @@ def _draw_scans(axes: Any, explanation: Explanation, height_axis: int, label: st
     axes.legend(loc="upper left", markerscale=6)
 
 
-def _draw_arguments(axes: Any, explanation: Explanation) -> None:
-    names = sorted(explanation.arguments, key=lambda name: explanation.arguments[name])
-    values = [explanation.arguments[name] for name in names]
+def _draw_contributions(axes: Any, explanation: Explanation) -> None:
+    names = sorted(explanation.contributions, key=lambda name: explanation.contributions[name])
+    values = [explanation.contributions[name] for name in names]
     colours = ["tab:red" if value < 0 else "tab:green" for value in values]
     axes.barh([name.replace("_", " ") for name in names], values, color=colours)
     axes.axvline(0, color="black", linewidth=0.8)

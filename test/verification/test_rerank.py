@@ -8,7 +8,13 @@ from scenes import landscape, pose_at, take, without_image, without_scan
 
 from umf_ros.config import Verification
 from umf_ros.frames import Candidate, Keyframe, SuperFeatures
-from umf_ros.verification.reranking import Ranked, rerank
+from umf_ros.verification.rerank import (
+    RankedCandidate,
+    eligible_superfeatures,
+    mutual_neighbours,
+    rerank,
+    similarities,
+)
 
 GROUND = landscape(20)
 QUERY = take(GROUND, pose_at(GROUND, -14.0, 1.2, 6.0), 100.0)
@@ -25,7 +31,7 @@ def offered(*keyframes: Keyframe, similarity: float = 0.5) -> list[tuple[Candida
     return [(Candidate(n, keyframe.stamp_ns, similarity), keyframe) for n, keyframe in enumerate(keyframes)]
 
 
-def stamps(ranked: list[Ranked]) -> list[int]:
+def stamps(ranked: list[RankedCandidate]) -> list[int]:
     return [item.candidate.stamp_ns for item in ranked]
 
 
@@ -60,8 +66,8 @@ def test_score_counts_the_inliers_of_both_modalities() -> None:
     found = rerank(QUERY, offered(SAME), RANSAC)[0]
     assert found.image is not None and found.cloud is not None
     assert found.score == found.image.count + found.cloud.count
-    assert found.numbers["inliers_image"] == found.image.count > 30
-    assert found.numbers["inliers_cloud"] == found.cloud.count > 20
+    assert found.inliers_image == found.image.count > 30
+    assert found.inliers_cloud == found.cloud.count > 20
 
 
 @pytest.mark.parametrize("modalities", ["image", "cloud"])
@@ -78,7 +84,7 @@ def test_one_modality_is_blind_for_the_other(modalities: str) -> None:
 def test_a_missing_modality_on_one_side_counts_nothing(absent: str) -> None:
     partial = without_image(SAME) if absent == "image" else without_scan(SAME)
     ranked = rerank(QUERY, offered(partial), RANSAC)[0]
-    assert ranked.numbers[f"inliers_{absent}"] == 0
+    assert getattr(ranked, f"inliers_{absent}") == 0
     assert ranked.score > 0
 
 
@@ -97,12 +103,16 @@ def test_same_seed_same_ranking_and_another_seed_other_samples() -> None:
         assert one.image.model.tobytes() == two.image.model.tobytes()
     other = rerank(QUERY, candidates, Verification(seed=4))
     assert other[0].keyframe is SAME
-    assert other[0].numbers != first[0].numbers or other[1].numbers != first[1].numbers
+    counts = [[(item.inliers_image, item.inliers_cloud) for item in ranking[:2]] for ranking in (first, other)]
+    assert counts[0] != counts[1]
+
+
+def unit(rows: np.ndarray) -> np.ndarray:
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16)
 
 
 def supers(rows: np.ndarray) -> SuperFeatures:
-    unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    return SuperFeatures(unit.astype(np.float16), np.ones(len(rows), np.float32))
+    return SuperFeatures(unit(rows), np.ones(len(rows), np.float32))
 
 
 def with_supers(keyframe: Keyframe, image: np.ndarray, cloud: np.ndarray) -> Keyframe:
@@ -124,3 +134,46 @@ def test_superfeatures_are_counted_by_modality(modalities: str, expected: int) -
 
 def test_no_candidates_no_ranking() -> None:
     assert rerank(QUERY, [], RANSAC) == []
+
+
+def test_mutual_neighbours_need_both_directions() -> None:
+    # row 0 prefers column 0, but column 0 prefers row 1
+    similarity = np.array([[0.8, 0.1], [0.9, 0.2], [0.1, 0.7]])
+    assert mutual_neighbours(similarity).tolist() == [[1, 0], [2, 1]]
+
+
+def test_mutual_neighbours_of_nothing_are_none() -> None:
+    assert mutual_neighbours(np.empty((0, 5))).shape == (0, 2)
+    assert mutual_neighbours(np.empty((5, 0))).shape == (0, 2)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(10, 12), (700, 900), (0, 5), (5, 0)])
+def test_similarities_are_cosines_however_many_features_there_are(ours: int, theirs: int) -> None:
+    rng = np.random.default_rng(0)
+    query, match = unit(rng.standard_normal((ours, 64))), unit(rng.standard_normal((theirs, 64)))
+    found = similarities(query, match)
+    assert found.shape == (ours, theirs) and found.dtype == np.float32
+    np.testing.assert_allclose(found, query.astype(float) @ match.astype(float).T, atol=1e-5)
+
+
+def test_identical_superfeatures_all_match() -> None:
+    features = supers(np.eye(6) + 0.01)
+    assert eligible_superfeatures(features, features).tolist() == list(range(6))
+
+
+def test_superfeatures_of_different_ids_do_not_match() -> None:
+    features = np.eye(4)
+    assert len(eligible_superfeatures(supers(features), supers(features[[1, 0, 3, 2]]))) == 0
+
+
+def test_ratio_test_compares_distances_and_keeps_the_distinct() -> None:
+    query = np.eye(3)
+    # ID 0 stays distinct; for ID 1 a second feature is almost as near as the right one
+    match = np.array([[1, 0, 0], [0, 1, 0.9], [0, 0.85, 1]])
+    assert eligible_superfeatures(supers(query), supers(match), ratio=0.9).tolist() == [0, 1, 2]
+    assert eligible_superfeatures(supers(query), supers(match), ratio=0.5).tolist() == [0]
+
+
+def test_ratio_test_rejects_what_is_near_everything() -> None:
+    match = np.ones((3, 3)) + 0.01 * np.eye(3)
+    assert len(eligible_superfeatures(supers(np.eye(3)), supers(match))) == 0

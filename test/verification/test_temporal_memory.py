@@ -9,7 +9,8 @@ from scenes import BODY_T_CAMERA, CAMERA, landscape, pose_at
 
 from umf_ros.frames import Embedding, Keyframe
 from umf_ros.geometry import make_pose, relative
-from umf_ros.verification.history import MEMORY, History, prior_sigmas
+from umf_ros.verification.constants import MEMORY_KEYFRAMES
+from umf_ros.verification.hypotheses import TemporalMemory, prior_sigmas
 
 GROUND = landscape(0, bumps=1)
 
@@ -35,57 +36,57 @@ def pair(step: float) -> tuple[Keyframe, Keyframe, np.ndarray]:
 
 
 def test_a_place_recognised_again_is_supported() -> None:
-    history = History()
+    memory = TemporalMemory()
     for step in (0.0, 1.0, 2.0):
         query, match, pose = pair(step)
-        assert history.support(query, match, pose) == step
-        history.remember(query, [(match, pose, False)])
+        assert memory.support(query, match, pose) == step
+        memory.remember(query, [(match, pose, False)])
 
 
 def test_a_pose_that_does_not_follow_is_not_supported() -> None:
-    history = History()
+    memory = TemporalMemory()
     query, match, pose = pair(0.0)
-    history.remember(query, [(match, pose, True)])
+    memory.remember(query, [(match, pose, True)])
     query, match, pose = pair(1.0)
-    assert history.support(query, match, pose @ make_pose(np.eye(3), [0, 1.2, 0])) == 0
+    assert memory.support(query, match, pose @ make_pose(np.eye(3), [0, 1.2, 0])) == 0
 
 
 def test_support_counts_keyframes_not_findings() -> None:
-    history = History()
+    memory = TemporalMemory()
     query, match, pose = pair(0.0)
-    history.remember(query, [(match, pose, False), (replace(match, stamp_ns=match.stamp_ns + 1), pose, False)])
-    assert history.support(*pair(1.0)) == 1
+    memory.remember(query, [(match, pose, False), (replace(match, stamp_ns=match.stamp_ns + 1), pose, False)])
+    assert memory.support(*pair(1.0)) == 1
 
 
 def test_memory_is_short_and_can_be_cleared() -> None:
-    history = History()
-    history.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
-    assert history.support(*pair(0.5)) == 1
-    for _ in range(MEMORY):
-        history.remember(pair(0.0)[0], [])
-    assert history.support(*pair(0.5)) == 0
-    history.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
-    history.reset()
-    assert history.support(*pair(0.5)) == 0
+    memory = TemporalMemory()
+    memory.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
+    assert memory.support(*pair(0.5)) == 1
+    for _ in range(MEMORY_KEYFRAMES):
+        memory.remember(pair(0.0)[0], [])
+    assert memory.support(*pair(0.5)) == 0
+    memory.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
+    memory.reset()
+    assert memory.support(*pair(0.5)) == 0
 
 
 @pytest.mark.parametrize("change", [{"odom_T_body": None}, {"session": 7}])
 def test_without_odometry_or_across_sessions_there_is_no_support(change: dict[str, object]) -> None:
-    history = History()
-    history.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
+    memory = TemporalMemory()
+    memory.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
     query, match, pose = pair(1.0)
-    assert history.support(replace(query, **change), match, pose) == 0
-    assert history.expected_distance(replace(query, **change), match) == math.inf
+    assert memory.support(replace(query, **change), match, pose) == 0
+    assert memory.expected_distance(replace(query, **change), match) == math.inf
 
 
 def test_expected_place_needs_an_accepted_closure() -> None:
-    history = History()
+    memory = TemporalMemory()
     query, match, pose = pair(0.0)
-    history.remember(query, [(match, pose, False)])
-    assert history.expected_distance(*pair(1.0)[:2]) == math.inf
-    history.remember(query, [(match, pose, True)])
+    memory.remember(query, [(match, pose, False)])
+    assert memory.expected_distance(*pair(1.0)[:2]) == math.inf
+    memory.remember(query, [(match, pose, True)])
     query, match, pose = pair(1.0)
-    assert history.expected_distance(query, match) == pytest.approx(np.linalg.norm(pose[:3, 3]), abs=1e-6)
+    assert memory.expected_distance(query, match) == pytest.approx(np.linalg.norm(pose[:3, 3]), abs=1e-6)
 
 
 def test_prior_is_soft_after_a_long_way_and_unknown_without_odometry() -> None:

@@ -8,17 +8,25 @@ from scenes import landscape, pose_at, take
 from scipy.spatial.transform import Rotation
 
 from umf_ros.geometry import Array, invert, make_pose, relative, rotation_angle, transform
-from umf_ros.verification.covariance import SEARCH_M, Spread, covariance_of, information
-from umf_ros.verification.registration import Alignment, Surface, align, inspect
+from umf_ros.verification.constants import SEARCH_M
+from umf_ros.verification.registration import (
+    Alignment,
+    CovarianceModel,
+    PreparedScan,
+    align_scans,
+    covariance_of,
+    inspect,
+    thin_scan,
+)
 
 GROUND = landscape(8)
 PLANE = replace(GROUND, bumps=np.empty((0, 4)))
-SPREAD = Spread(inflation=10.0, floor_m=0.005, floor_deg=0.02)
+MODEL = CovarianceModel(inflation=10.0, floor_m=0.005, floor_deg=0.02)
 
 
-def surfaces(ground=GROUND) -> tuple[Surface, Surface, Array]:
+def surfaces(ground=GROUND) -> tuple[PreparedScan, PreparedScan, Array]:
     a, b = pose_at(ground, -15, 0, 0), pose_at(ground, -14, 1, 7, 2)
-    return Surface(take(ground, a, 1).points), Surface(take(ground, b, 2).points), relative(a, b)
+    return PreparedScan(take(ground, a, 1).points), PreparedScan(take(ground, b, 2).points), relative(a, b)
 
 
 def nudged(pose: Array, metres: float, degrees: float) -> Array:
@@ -28,7 +36,7 @@ def nudged(pose: Array, metres: float, degrees: float) -> Array:
 
 def test_alignment_is_exact_to_centimetres() -> None:
     match, query, true = surfaces()
-    gap = relative(true, align(match, query, nudged(true, 0.4, 4)))
+    gap = relative(true, align_scans(match, query, nudged(true, 0.4, 4)).pose)
     assert np.linalg.norm(gap[:3, 3]) < 0.04
     assert np.degrees(rotation_angle(gap)) < 0.3
 
@@ -54,11 +62,11 @@ def test_far_apart_scans_share_nothing() -> None:
     away[0, 3] += 300
     found = inspect(match, query, away)
     assert len(found.residuals) == 0 and found.overlap == 0.0
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance_of(information(found), SPREAD))[:3]), SEARCH_M, rtol=0.01)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance_of(found.information, MODEL))[:3]), SEARCH_M, rtol=0.01)
 
 
 def test_surfaces_of_a_few_points_are_not_used() -> None:
-    assert not Surface(np.zeros((99, 3), np.float32)).usable
+    assert not PreparedScan(np.zeros((99, 3), np.float32)).usable
     assert surfaces()[0].usable
 
 
@@ -80,8 +88,8 @@ def test_a_plane_leaves_two_shifts_and_the_heading_open() -> None:
     """A camera sees texture on it, the geometry does not: the covariance must say so."""
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(3, 25, 4000), rng.uniform(-10, 10, 4000), np.zeros(4000)])
-    sheet = Surface(points.astype(np.float32))
-    covariance = covariance_of(information(inspect(sheet, sheet, np.eye(4))), SPREAD)
+    sheet = PreparedScan(points.astype(np.float32))
+    covariance = covariance_of(inspect(sheet, sheet, np.eye(4)).information, MODEL)
     deviation = np.sqrt(np.diag(covariance))
     assert deviation[0] > 1.0 and deviation[1] > 1.0 and np.degrees(deviation[5]) > 3.0
     assert deviation[2] < 0.05 and np.degrees(deviation[3:5]).max() < 0.3
@@ -89,7 +97,7 @@ def test_a_plane_leaves_two_shifts_and_the_heading_open() -> None:
 
 def test_rough_ground_fixes_all_six_axes() -> None:
     match, query, true = surfaces()
-    covariance = covariance_of(information(inspect(match, query, true)), SPREAD)
+    covariance = covariance_of(inspect(match, query, true).information, MODEL)
     assert np.linalg.eigvalsh(covariance)[0] > 0
     assert np.sqrt(np.diag(covariance)[:3]).max() < 0.15
     np.testing.assert_allclose(covariance, covariance.T)
@@ -98,8 +106,8 @@ def test_rough_ground_fixes_all_six_axes() -> None:
 def test_noisier_scans_are_less_certain() -> None:
     match, query, true = surfaces()
     rough_match, rough_query, rough_true = surfaces(replace(GROUND, roughness_m=0.04))
-    sure = covariance_of(information(inspect(match, query, true)), SPREAD)
-    unsure = covariance_of(information(inspect(rough_match, rough_query, rough_true)), SPREAD)
+    sure = covariance_of(inspect(match, query, true).information, MODEL)
+    unsure = covariance_of(inspect(rough_match, rough_query, rough_true).information, MODEL)
     assert np.trace(unsure[:3, :3]) > 3 * np.trace(sure[:3, :3])
 
 
@@ -112,8 +120,8 @@ def test_a_ridge_leaves_the_shift_along_it_open(heading_deg: float) -> None:
     ridge = np.column_stack([x, y, -0.5 * np.abs(x - 14)])[sides]
     turn = make_pose(Rotation.from_euler("z", heading_deg, degrees=True).as_matrix(), [0.0, 0.0, 0.0])
     turned = transform(invert(turn), ridge).astype(np.float32)
-    found = information(inspect(Surface(ridge.astype(np.float32)), Surface(turned), turn))
-    along, across = np.sqrt(np.diag(covariance_of(found, SPREAD)))[[1, 0]]
+    found = inspect(PreparedScan(ridge.astype(np.float32)), PreparedScan(turned), turn).information
+    along, across = np.sqrt(np.diag(covariance_of(found, MODEL)))[[1, 0]]
     assert along > 1.0 and across < 0.1
 
 
@@ -122,7 +130,7 @@ def test_covariance_names_the_axes_of_the_match_and_turns_about_the_query() -> N
     jacobian = np.zeros((300, 6))
     jacobian[:100, 0] = jacobian[100:200, 5] = 1.0
     residuals = np.random.default_rng(0).normal(0, 0.02, 300)
-    covariance = covariance_of(information(Alignment(np.eye(4), residuals, jacobian, 1.0)), SPREAD)
+    covariance = covariance_of(Alignment(np.eye(4), residuals, jacobian, 1.0, np.empty((0, 3))).information, MODEL)
     deviation = np.sqrt(np.diag(covariance))
     assert deviation[0] < 0.02 and deviation[5] < 0.02
     np.testing.assert_allclose(deviation[1:3], SEARCH_M, rtol=0.01)
@@ -133,6 +141,18 @@ def test_a_few_outliers_do_not_make_a_fit_surer_or_much_less_sure() -> None:
     found = inspect(match, query, true)
     spoiled = found.residuals.copy()
     spoiled[::20] = 0.35
-    clean = np.trace(covariance_of(information(found), SPREAD)[:3, :3])
-    dirty = np.trace(covariance_of(information(replace(found, residuals=spoiled)), SPREAD)[:3, :3])
+    clean = np.trace(covariance_of(found.information, MODEL)[:3, :3])
+    dirty = np.trace(covariance_of(replace(found, residuals=spoiled).information, MODEL)[:3, :3])
     assert clean < dirty < 2.0 * clean
+
+
+def test_thinning_keeps_one_mean_per_cube() -> None:
+    pair = np.array([[5.0, 0.1, 0.1], [5.1, 0.12, 0.12], [9.0, 0, 0], [60.0, 0, 0]], np.float32)
+    thinned = thin_scan(pair, 0.5)
+    assert len(thinned) == 2
+    np.testing.assert_allclose(np.sort(thinned[:, 0]), [5.05, 9.0], atol=1e-5)
+
+
+def test_thinning_nothing_gives_nothing() -> None:
+    for empty in (None, np.empty((0, 3), np.float32), np.full((3, 3), 90, np.float32)):
+        assert thin_scan(empty).shape == (0, 3)
