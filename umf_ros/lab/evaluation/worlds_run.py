@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.config import Embedding, Verification
+from umf_ros.config import EmbeddingSettings, Verification
 from umf_ros.embedding import METHODS, make_embedder
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.umf_embedder import UmfEmbedder
@@ -60,7 +60,7 @@ class WorldsRun:
         self._worlds, self._repeats, self._report = worlds, repeats, report
         self._embedder = UmfEmbedder(self._weights, super_features=True)
         names = [name for name in METHODS if name != "umf"] if others else []
-        self._others = {name: make_embedder(Embedding(method=name)) for name in names}
+        self._others = {name: make_embedder(EmbeddingSettings(method=name)) for name in names}
 
     def run(self) -> WorldsSummary:
         """Drive through all worlds, then take times."""

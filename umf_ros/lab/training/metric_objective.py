@@ -19,7 +19,7 @@ from umf_ros.lab.datasets.views import Augmentation, ViewMaker
 from umf_ros.lab.evaluation.protocol import ROBOTCAR_RULE, RULES
 from umf_ros.lab.training.batches import BatchMaker, TrainingBatch
 from umf_ros.lab.training.metric_loss import Bank, MetricLoss
-from umf_ros.lab.training.objective import Objective, Verdict, generator
+from umf_ros.lab.training.objective import Judgement, Objective, generator
 from umf_ros.lab.training.sampler import PairSampler
 from umf_ros.lab.training.settings import MetricSettings
 from umf_ros.lab.training.validation import MODES, Results, answerable, figures, mean_of, validate
@@ -110,7 +110,7 @@ class MetricObjective(Objective):
         if settings.loss == "triplet" and losses["active"] < settings.active_share:
             self.batch_size = min(int(self.batch_size * settings.batch_growth) // 2 * 2, settings.batch_limit)
 
-    def judge(self, step: int, folder: Path) -> Verdict:
+    def judge(self, step: int, folder: Path) -> Judgement:
         """Recall on the validation sequences, where a validation is due."""
         settings = self._settings
         due = step >= settings.steps or math.ceil(step / settings.epoch_steps) % settings.validate_epochs == 0
@@ -123,7 +123,7 @@ class MetricObjective(Objective):
         recalls["recall1_5m"] = mean_of(self._results, "fused", "recall1_within_5m")
         recalls["recall_at_precision1"] = mean_of(self._results, "fused", "recall_at_precision1")
         stop = bool(settings.patience) and self.stale >= settings.patience
-        return Verdict(keep, stop, recalls | {"batch": self.batch_size})
+        return Judgement(keep, stop, recalls | {"batch": self.batch_size})
 
     def _is_best(self) -> bool:
         if not answerable(self._results):

@@ -41,7 +41,7 @@ class Batch(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Judgement:
     """How the network stands after an epoch.
 
     Attributes:
@@ -89,14 +89,14 @@ class Objective(nn.Module, ABC):
     def finish_epoch(self, losses: Mapping[str, float]) -> None:
         """Adapt to the mean losses of an epoch, in every process."""
 
-    def judge(self, step: int, folder: Path) -> Verdict:
+    def judge(self, step: int, folder: Path) -> Judgement:
         """How the network stands after `step` steps; asked after every epoch, in the leading process alone.
 
         Args:
             step: steps done.
             folder: the run's, for pictures.
         """
-        return Verdict()
+        return Judgement()
 
     def card(self) -> dict[str, Any]:
         """What the card of the weights says beyond what every card does."""

@@ -23,7 +23,7 @@ from umf_ros.errors import ConfigError, OutputError
 from umf_ros.geometry import Array
 from umf_ros.lab.datasets.sample import Sample, SampleSequence
 from umf_ros.lab.datasets.views import Augmentation, View, ViewMaker
-from umf_ros.lab.training.objective import Objective, Verdict, generator
+from umf_ros.lab.training.objective import Judgement, Objective, generator
 from umf_ros.lab.training.settings import RunSettings
 from umf_ros.networks.umf import UMF
 
@@ -91,7 +91,7 @@ class Pretraining(Objective):
         self._sequences = sequences
         return lambda step: self._batch(self._settings.batch, generator(self._settings.seed, step, rank))
 
-    def judge(self, step: int, folder: Path) -> Verdict:
+    def judge(self, step: int, folder: Path) -> Judgement:
         """Draw the same examples under the same masks every time, so that progress can be seen.
 
         Raises:
@@ -102,7 +102,7 @@ class Pretraining(Objective):
         self.eval()
         with torch.inference_mode():
             _save(folder / f"reconstructions_{step:06d}.png", self.draw(batch.to(device)))
-        return Verdict()
+        return Judgement()
 
     def _batch(self, count: int, rng: np.random.Generator) -> MaskedBatch:
         ends = np.cumsum([len(sequence) for sequence in self._sequences])

@@ -16,7 +16,7 @@ from torch import nn
 from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.training.distributed import Team
 from umf_ros.lab.training.loading import made_ahead
-from umf_ros.lab.training.objective import Batch, Objective, Verdict
+from umf_ros.lab.training.objective import Batch, Judgement, Objective
 from umf_ros.lab.training.progress import Progress, append_row, learning_rate, resuming, save_checkpoint
 from umf_ros.lab.training.settings import RunSettings
 
@@ -59,14 +59,14 @@ class Trainer:
         """
         while self.progress.step < self._settings.steps and not self.progress.stopped:
             self._epoch(report)
-            verdict = self._objective.judge(self.progress.step, self._folder) if self._team.leads else Verdict()
-            measured = {name: value for name, value in verdict.figures.items() if math.isfinite(value)}
+            judgement = self._objective.judge(self.progress.step, self._folder) if self._team.leads else Judgement()
+            measured = {name: value for name, value in judgement.figures.items() if math.isfinite(value)}
             self.progress.figures |= measured
-            if self._team.leads and verdict.keep:
+            if self._team.leads and judgement.keep:
                 keep()
-            self.progress.stopped = self._shared(verdict.stop)
+            self.progress.stopped = self._shared(judgement.stop)
             if self._team.leads:
-                self._log(verdict.figures)
+                self._log(judgement.figures)
                 save_checkpoint(self._folder / "checkpoint.pt", self._state())
 
     def resume(self) -> None:
