@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from umf_ros.embedding import CHOICES
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -22,7 +24,7 @@ def command(
     out: Annotated[Path, Optional(help="Picture to write.")] = Path("explanation.png"),
     config: Annotated[Path | None, Optional(help="Parameter file (YAML).")] = None,
     dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
-    embedder: Annotated[str | None, Optional(help="umf, or a baseline.")] = None,
+    embedder: Annotated[str | None, Optional(help=f"How places are embedded: {CHOICES}.")] = None,
     weights: Annotated[Path | None, Optional(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
 ) -> None:
     """Show both images with their matching features, both scans aligned, and the decision's numbers."""

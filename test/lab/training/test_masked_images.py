@@ -5,14 +5,28 @@ import pytest
 import torch
 from tiny_worlds import TINY
 
-from umf_ros.lab.training.pretraining.cloud import OccupancyReconstruction, occupancy
-from umf_ros.lab.training.pretraining.image import ImageReconstruction, normalised, patches, repainted, unpatch
-from umf_ros.lab.training.pretraining.masks import visible_patches
-from umf_ros.lab.training.pretraining.sparse import hide, sparse, spread
+from umf_ros.lab.training.masked_images_objective import (
+    MaskedImagesObjective,
+    hide,
+    normalised,
+    patches,
+    repainted,
+    sparse,
+    spread,
+    unpatch,
+    visible_patches,
+)
+from umf_ros.lab.training.pretraining import MaskedBatch
+from umf_ros.lab.training.run import load_run
 from umf_ros.networks.image_encoder import Backbone
-from umf_ros.networks.voxel_encoder import VoxelEncoder
+from umf_ros.networks.umf import UMF
 
-SIZE = (64, 96)
+SIZE = TINY.image_size
+
+
+def objective() -> MaskedImagesObjective:
+    settings = load_run(None, method="masked_images", train="", decoder_width=32)
+    return MaskedImagesObjective(UMF(TINY), settings)
 
 
 @pytest.fixture(params=["resnet18", "resnet50", "mobile"])
@@ -78,9 +92,10 @@ def test_patches_are_cut_and_put_back() -> None:
 
 def test_only_hidden_patches_count_and_are_painted(visible: torch.Tensor) -> None:
     torch.manual_seed(1)
-    model = ImageReconstruction(Backbone("resnet18", 8), 32).eval()
+    model = objective().eval()
     image = torch.rand(4, 1, *SIZE)
-    loss, painting = model(image, visible)
+    batch = MaskedBatch(image, visible)
+    loss, painting = model(batch)["total"], model.paint(batch)
     error = (patches(painting) - normalised(patches(image))).square().mean(2)
     assert loss.item() == pytest.approx(error[~visible.flatten(1)].mean().item(), rel=1e-5)
     result = repainted(image, painting, visible)
@@ -91,32 +106,18 @@ def test_only_hidden_patches_count_and_are_painted(visible: torch.Tensor) -> Non
 
 
 def test_every_parameter_learns(visible: torch.Tensor) -> None:
-    model = ImageReconstruction(Backbone("resnet18", 8), 32)
-    model(torch.rand(4, 1, *SIZE), visible)[0].backward()
-    assert [name for name, parameter in model.named_parameters() if parameter.grad is None] == []
+    model = objective()
+    model(MaskedBatch(torch.rand(4, 1, *SIZE), visible))["total"].backward()
+    learned = [*model.network.image_encoder.backbone.parameters(), *model.decoder.parameters()]
+    assert [value for value in learned if value.grad is None] == []
 
 
-def grid_of(rng: np.random.Generator) -> torch.Tensor:
-    full = torch.from_numpy(rng.random((2, 20, 20, 20, 6, 8)) < 0.05).float()
-    return (full * full[..., :1, :]).flatten(-2)
+def test_exactly_the_wanted_share_of_every_image_is_hidden(rng: np.random.Generator) -> None:
+    visible = visible_patches(50, (128, 160), 0.6, rng)
+    assert visible.shape == (50, 1, 4, 5)
+    assert (visible.flatten(1).sum(1) == 8).all()
+    assert visible.float().mean(0).min() > 0.2 and visible.float().mean(0).max() < 0.65  # no place is preferred
 
 
-def test_the_encoder_never_sees_a_hidden_voxel(rng: np.random.Generator) -> None:
-    model = OccupancyReconstruction(VoxelEncoder(TINY), TINY.voxel_channels, 16).eval()
-    grid = grid_of(rng)
-    hidden = occupancy(grid) & torch.from_numpy(rng.random((2, 20, 20, 20, 8)) < 0.6)
-    without = (grid.unflatten(-1, (6, 8)) * ~hidden[..., None, :]).flatten(-2)
-    loss, logits = model(grid, hidden)
-    _, same = model(without, torch.zeros_like(hidden))
-    assert torch.equal(logits, same) and logits.shape == (2, 20, 20, 20, 8)
-    wanted = torch.nn.functional.binary_cross_entropy(logits.sigmoid(), occupancy(grid).float())
-    assert loss.item() == pytest.approx(wanted.item(), rel=1e-3)  # hidden voxels are asked for
-
-
-def test_stem_down_and_bottom_learn(rng: np.random.Generator) -> None:
-    model = OccupancyReconstruction(VoxelEncoder(TINY), TINY.voxel_channels, 16)
-    grid = grid_of(rng)
-    model(grid, torch.zeros_like(occupancy(grid)))[0].backward()
-    encoder = model.encoder
-    for part in (encoder.stem, encoder.down, encoder.bottom, model.mix_fine, model.head):
-        assert all(parameter.grad is not None for parameter in part.parameters())
+def test_a_patch_at_least_stays_visible(rng: np.random.Generator) -> None:
+    assert visible_patches(3, (64, 64), 0.99, rng).flatten(1).sum(1).tolist() == [1, 1, 1]

@@ -1,27 +1,17 @@
-"""Embedders without training, to compare with."""
+"""Scan Context: an embedder of scans without training, to compare with."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from umf_ros.frames import Embedding, Frame, Image, Points
-from umf_ros.geometry import Array
-
-
-class ThumbnailEmbedder:
-    """The image at 24 x 32 pixels, blurred and standardised; similarity is correlation."""
-
-    name = "thumbnail"
-    dimension = 24 * 32
-
-    def embed(self, frame: Frame) -> Embedding:
-        """Descriptor of the image; the same for every frame without one."""
-        return Embedding(_unit(_thumbnail(frame.left) if frame.left is not None else np.zeros(self.dimension)))
+from umf_ros.config import EmbeddingSettings
+from umf_ros.embedding.embedder import unit_descriptor
+from umf_ros.frames import Embedding, Frame, Points
 
 
 class ScanContextEmbedder:
-    """Highest return per ring and sector of the field of view, after Scan Context (Kim and Kim 2018).
+    """Highest return per ring and sector of the field of view, after Scan Context [Kim 2018].
 
     The LiDAR looks ahead only, so the original's search over turns is not needed: a neighbouring view
     is a shift by a fraction of a sector, which blurring takes up.
@@ -33,7 +23,9 @@ class ScanContextEmbedder:
 
     def embed(self, frame: Frame) -> Embedding:
         """Descriptor of the scan; the same for every frame without one."""
-        return Embedding(_unit(self._context(frame.points) if frame.points is not None else np.zeros(self.dimension)))
+        return Embedding(
+            unit_descriptor(self._context(frame.points) if frame.points is not None else np.zeros(self.dimension))
+        )
 
     def _context(self, points: Points, reach_m: float = 60.0, half_width: float = 0.61) -> Points:
         ring = (np.hypot(points[:, 0], points[:, 1]) / reach_m * self.rings).astype(int)
@@ -48,15 +40,6 @@ class ScanContextEmbedder:
         return np.concatenate([layer.ravel() for layer in maps])
 
 
-def _thumbnail(image: Image) -> Points:
-    small = cv2.resize(cv2.GaussianBlur(image, (0, 0), 5), (32, 24), interpolation=cv2.INTER_AREA)
-    values = small.astype(np.float32).ravel()
-    return values - values.mean()
-
-
-def _unit(values: Array) -> Points:
-    """Unit length; what has none becomes the first axis, so that similarities stay cosines."""
-    norm = float(np.linalg.norm(values))
-    if norm < 1e-6:
-        return np.eye(1, len(values), dtype=np.float32)[0]
-    return (values / norm).astype(np.float32)
+def make(settings: EmbeddingSettings, super_features: bool) -> ScanContextEmbedder:
+    """It has no settings."""
+    return ScanContextEmbedder()

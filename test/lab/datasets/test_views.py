@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from tiny_worlds import CAMERA, TINY, pose_at
-from training.conftest import flat_sample
+from tiny_worlds import CAMERA, TINY, flat_sample, pose_at
 
 from umf_ros.geometry import rotation_angle, transform
-from umf_ros.lab.training.views import Augmentation, View, ViewMaker, relative_pose, view_points
+from umf_ros.lab.datasets.views import Augmentation, View, ViewMaker, relative_pose, view_points
 
 HEIGHT, WIDTH = TINY.image_size
 CALM = Augmentation(erase=0.0)

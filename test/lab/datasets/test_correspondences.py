@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tiny_worlds import CAMERA, TINY, pose_at
-from training.conftest import flat_sample, plain_view
+from tiny_worlds import CAMERA, TINY, flat_sample, plain_view, pose_at
 
 from umf_ros.geometry import transform
-from umf_ros.lab.training.correspondences import cell_points, match_cells, match_voxels
-from umf_ros.lab.training.views import Augmentation, ViewMaker, view_points
+from umf_ros.lab.datasets.correspondences import cell_points, match_cells, match_voxels
+from umf_ros.lab.datasets.views import Augmentation, ViewMaker, view_points
 
 COLUMNS = TINY.image_size[1] // 4
 

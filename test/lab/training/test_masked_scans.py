@@ -3,23 +3,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from tiny_worlds import TINY
 
 from umf_ros.embedding.voxels import voxelise
-from umf_ros.lab.training.pretraining.cloud import occupancy
-from umf_ros.lab.training.pretraining.masks import hidden_voxels, unfold, visible_patches, voxel_ranges
+from umf_ros.lab.training.masked_scans_objective import (
+    MaskedScansObjective,
+    hidden_voxels,
+    occupancy,
+    unfold,
+    voxel_ranges,
+)
+from umf_ros.lab.training.pretraining import MaskedBatch
+from umf_ros.lab.training.run import load_run
+from umf_ros.networks.umf import UMF
 
 RATIOS = (0.8, 0.5, 0.25)
-
-
-def test_exactly_the_wanted_share_of_every_image_is_hidden(rng: np.random.Generator) -> None:
-    visible = visible_patches(50, (128, 160), 0.6, rng)
-    assert visible.shape == (50, 1, 4, 5)
-    assert (visible.flatten(1).sum(1) == 8).all()
-    assert visible.float().mean(0).min() > 0.2 and visible.float().mean(0).max() < 0.65  # no place is preferred
-
-
-def test_a_patch_at_least_stays_visible(rng: np.random.Generator) -> None:
-    assert visible_patches(3, (64, 64), 0.99, rng).flatten(1).sum(1).tolist() == [1, 1, 1]
 
 
 def test_unfolding_puts_every_voxel_where_its_points_are() -> None:
@@ -56,3 +54,33 @@ def test_masks_follow_from_the_generator() -> None:
     occupied = torch.ones(1, 20, 20, 20, 8, dtype=torch.bool)
     one, same, other = (hidden_voxels(occupied, RATIOS, np.random.default_rng(seed)) for seed in (1, 1, 2))
     assert torch.equal(one, same) and not torch.equal(one, other)
+
+
+def objective() -> MaskedScansObjective:
+    return MaskedScansObjective(UMF(TINY), load_run(None, method="masked_scans", train="", decoder_width=16))
+
+
+def grid_of(rng: np.random.Generator) -> torch.Tensor:
+    full = torch.from_numpy(rng.random((2, 20, 20, 20, 6, 8)) < 0.05).float()
+    return (full * full[..., :1, :]).flatten(-2)
+
+
+def test_the_encoder_never_sees_a_hidden_voxel(rng: np.random.Generator) -> None:
+    model = objective().eval()
+    grid = grid_of(rng)
+    hidden = occupancy(grid) & torch.from_numpy(rng.random((2, 20, 20, 20, 8)) < 0.6)
+    without = (grid.unflatten(-1, (6, 8)) * ~hidden[..., None, :]).flatten(-2)
+    loss, logits = model(MaskedBatch(grid, hidden))["total"], model.predict(MaskedBatch(grid, hidden))
+    same = model.predict(MaskedBatch(without, torch.zeros_like(hidden)))
+    assert torch.equal(logits, same) and logits.shape == (2, 20, 20, 20, 8)
+    wanted = torch.nn.functional.binary_cross_entropy(logits.sigmoid(), occupancy(grid).float())
+    assert loss.item() == pytest.approx(wanted.item(), rel=1e-3)  # hidden voxels are asked for
+
+
+def test_stem_down_and_bottom_learn(rng: np.random.Generator) -> None:
+    model = objective()
+    grid = grid_of(rng)
+    model(MaskedBatch(grid, torch.zeros_like(occupancy(grid))))["total"].backward()
+    encoder = model.network.voxel_encoder
+    for part in (encoder.stem, encoder.down, encoder.bottom, model.decoder):
+        assert all(parameter.grad is not None for parameter in part.parameters())

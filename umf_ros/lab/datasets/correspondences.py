@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from umf_ros.frames import Points
 from umf_ros.geometry import Array, invert, transform
-from umf_ros.lab.training.views import View, relative_pose, view_points
+from umf_ros.lab.datasets.views import View, relative_pose, view_points
 
 CELL = 4
 # depth is sampled at pixel 4 i + 2 of the shard's image: five eighths into its cell
