@@ -70,13 +70,16 @@ class BagEvaluation:
     Args:
         settings: of keyframes, of the gaps and of reranking.
         embedder: the same as the node's.
+
+    Attributes:
+        keyframes: what the detector would remember.
     """
 
     def __init__(self, settings: Settings, embedder: Embedder) -> None:
         self._settings = settings
         # places of earlier runs are not asked for
         self._detector = LoopDetector(settings.model_copy(update={"database": Database()}), embedder)
-        self._keyframes: list[Keyframe] = []
+        self.keyframes: list[Keyframe] = []
 
     def remember(self, frames: Iterable[Frame], report: Callable[[Frame, int], None]) -> None:
         """Embed the keyframes among the frames of the recording's first session."""
@@ -84,8 +87,8 @@ class BagEvaluation:
             if frame.session:
                 break
             if self._detector.select(frame):
-                self._keyframes.append(self._detector.embed(frame))
-            report(frame, len(self._keyframes))
+                self.keyframes.append(self._detector.embed(frame))
+            report(frame, len(self.keyframes))
 
     def judge(self, truth: Trajectory, report: Callable[[], None] = lambda: None) -> BagResult:
         """Score against the truth.
@@ -93,7 +96,7 @@ class BagEvaluation:
         Raises:
             UmfError: the truth covers none of the keyframes.
         """
-        keyframes = self._keyframes
+        keyframes = self.keyframes
         stamps = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
         poses, known = truth.at(stamps)
         if not known.any():
@@ -104,7 +107,7 @@ class BagEvaluation:
         return BagResult(len(rows), self._scores(task, rows, report))
 
     def _scores(self, task: Task, rows: np.ndarray, report: Callable[[], None]) -> dict[str, Scores]:
-        kept = [self._keyframes[row] for row in rows]
+        kept = [self.keyframes[row] for row in rows]
         descriptors = np.stack([keyframe.embedding.descriptor for keyframe in kept])
         similarity = descriptors @ descriptors.T
         ranking = rank(similarity, task.admissible)
