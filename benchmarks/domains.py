@@ -22,8 +22,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from umf_ros.config import Embedding as EmbeddingSettings
-from umf_ros.config import Verification
+from umf_ros.config import EmbeddingSettings, Verification
 from umf_ros.embedding import make_embedder
 from umf_ros.frames import Candidate, LoopClosure
 from umf_ros.geometry import Array, relative, rotation_angle
