@@ -66,7 +66,7 @@ def offline(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPath
     folder = tmp_path_factory.mktemp("offline")
     settings = load_settings(mini_config)
     replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
-    for _ in replay.run(FrameReader(open_bag(mini_bag), settings)):
+    for _ in replay.run(FrameReader(open_bag(mini_bag), settings).stream()):
         pass
     replay.finish({})
     return folder

@@ -60,7 +60,7 @@ def command(
     folder = create_run_folder(out)
     replay = Replay(folder, settings, detector)
     with stop_on_interrupt() as interrupted, FrameProgress(console) as progress:
-        for detection in replay.run(reader):
+        for detection in replay.run(reader.stream()):
             progress.show(reader.progress, detection)
             if interrupted():
                 break

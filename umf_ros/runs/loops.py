@@ -21,7 +21,7 @@ Stamps = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class JudgedClosure:
     """A published closure held against the truth.
 
     Attributes:
@@ -39,7 +39,9 @@ class Judgement:
     is_true: bool
 
 
-def judge(closure: LoopClosure, world_T_query: Array, world_T_match: Array, has_orientation: bool = True) -> Judgement:
+def judge(
+    closure: LoopClosure, world_T_query: Array, world_T_match: Array, has_orientation: bool = True
+) -> JudgedClosure:
     """Hold one closure against the truth.
 
     True means: both keyframes within 12 m and 30 deg of heading of each other (thesis 5.1.2), and the
@@ -56,7 +58,7 @@ def judge(closure: LoopClosure, world_T_query: Array, world_T_match: Array, has_
         translation_m = abs(float(np.linalg.norm(closure.match_T_query[:3, 3])) - distance_m)
         rotation_deg, heading_ok = float("nan"), True
     pose_ok = translation_m <= POSE_TOLERANCE_M and not rotation_deg > POSE_TOLERANCE_DEG
-    return Judgement(
+    return JudgedClosure(
         closure, distance_m, translation_m, rotation_deg, distance_m <= PLACE_RADIUS_M and heading_ok and pose_ok
     )
 
