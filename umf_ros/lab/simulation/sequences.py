@@ -9,7 +9,7 @@ import numpy as np
 
 from umf_ros.geometry import Array
 from umf_ros.lab.simulation.lighting import Sun
-from umf_ros.lab.simulation.passes import SETTINGS, Pass, metres_along, plan_passes
+from umf_ros.lab.simulation.passes import SETTINGS, Pass, plan_passes
 from umf_ros.lab.simulation.presets import ETNA, Preset
 from umf_ros.lab.simulation.route import Route
 from umf_ros.lab.simulation.survey import Survey
@@ -73,7 +73,7 @@ SEQUENCES = {"etna": etna_surveys, "thesis": thesis_surveys}
 
 def trail_length(trail: Array) -> float:
     """Length of a closed (N, 2) curve, m."""
-    return float(metres_along(np.vstack([trail, trail[:1]]))[-1])
+    return float(np.linalg.norm(np.diff(np.vstack([trail, trail[:1]]), axis=0), axis=1).sum())
 
 
 def first_samples(passes: list[Pass], count: int) -> list[Pass]:
