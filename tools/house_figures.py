@@ -34,8 +34,8 @@ class House:
 
     def rooms(self, *names: str) -> str:
         """Files of rooms wherever they stand, without the empty `__init__`s; a room may have changed its name."""
-        kept = [path for path in self.files if path.name != "__init__.py" and set(path.relative_to(self.root).parts[:-1]) & set(names)]
-        return str(len(kept))
+        kept = [path.relative_to(self.root) for path in self.files if path.name != "__init__.py"]
+        return str(sum(bool(set(path.parts) & set(names)) for path in kept))
 
     def arrows(self) -> set[tuple[str, str]]:
         """Which room imports from which."""

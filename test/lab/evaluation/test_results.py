@@ -11,7 +11,6 @@ from umf_ros.lab.evaluation.markdown import print_table, to_markdown
 TABLE = (["", "R@1", "R@5"], [["fused", "70.0", "75.0"], ["ransac both", "7.1", "-"]])
 
 
-
 def test_a_report_in_markdown() -> None:
     text = to_markdown("Title", ["first note", "second note"], {"Recall": TABLE}, {"A curve": "curve.png"})
     assert text == (
