@@ -52,11 +52,11 @@ class Outcome:
         self.pairs[pair.kind] += 1
         if closure is None:
             return
-        if pair.kind == ELSEWHERE or _is_wrong(closure.match_T_query, pair.match_T_query):
+        if pair.kind == ELSEWHERE or is_wrong(closure.match_T_query, pair.match_T_query):
             self.wrong[pair.kind] += 1
             return
         self.right[pair.kind] += 1
-        self.errors.append(_error_vector(closure.match_T_query, pair.match_T_query))
+        self.errors.append(error_vector(closure.match_T_query, pair.match_T_query))
         self.covariances.append(closure.covariance)
 
     def share(self, kind: str) -> float:
@@ -144,12 +144,13 @@ def _closure(verifier: Verifier, pair: Pair) -> LoopClosure | None:
     return verifier.verify(pair.query.keyframe, [(candidate, pair.match.keyframe)])[0].closure
 
 
-def _is_wrong(estimated: Array, true: Array) -> bool:
+def is_wrong(estimated: Array, true: Array) -> bool:
+    """Whether a pose is more than 1 m or 5 deg from the truth."""
     gap = relative(true, estimated)
     return bool(np.linalg.norm(gap[:3, 3]) > WRONG_M or np.degrees(rotation_angle(gap)) > WRONG_DEG)
 
 
-def _error_vector(estimated: Array, true: Array) -> Array:
+def error_vector(estimated: Array, true: Array) -> Array:
     """Error (6,) in ROS order, axes of the match."""
     turn = Rotation.from_matrix(estimated[:3, :3] @ true[:3, :3].T).as_rotvec()
     return np.concatenate([estimated[:3, 3] - true[:3, 3], turn])
