@@ -1,6 +1,6 @@
 """Verification on real scans in a plain folder, LiDAR alone: how many true and how many false pairs are accepted.
 
-python benchmarks/recordings.py FOLDER [--sample N] [--apart N] [--json FILE]
+python benchmarks/recordings.py FOLDER [--sample N] [--apart N] [--crop DEG] [--json FILE]
 
 The folder holds scans, .npy or .bin, (N, 3) or (N, 4) float32 (x y z in metres and, fourth, intensity; .bin always
 has four), and `pairs.csv` with the columns match_scan, query_scan (paths relative to the folder) and same_place
@@ -61,6 +61,7 @@ def main(
     folder: Annotated[Path, typer.Argument(help="scans and pairs.csv")],
     sample: Annotated[int, typer.Option(help="pairs drawn where there is no pairs.csv")] = 200,
     apart: Annotated[int, typer.Option(help="scans between the two of such a pair, at least")] = 20,
+    crop: Annotated[float, typer.Option(help="keep what lies at most this far to either side, deg")] = 180.0,
     json_file: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
 ) -> None:
     """Verify the pairs of a folder and compare with what is known."""
@@ -69,7 +70,7 @@ def main(
 
     @lru_cache(KEPT)
     def keyframe(path: str) -> Keyframe:
-        points = read_scan(folder / path)
+        points = cropped(read_scan(folder / path), crop)
         # the stamp is a key: whatever the path, the same again
         stamp_ns = zlib.crc32(path.encode())
         return keyframe_of(points[:, :3], points[:, 3] if points.shape[1] > 3 else None, embedder, stamp_ns)
@@ -93,6 +94,12 @@ def read_scan(path: Path) -> Array:
     points: Array = np.load(path) if path.suffix == ".npy" else np.fromfile(path, np.float32).reshape(-1, 4)
     finite: Array = points[np.isfinite(points).all(axis=1)].astype(np.float32)
     return finite
+
+
+def cropped(points: Array, half_width_deg: float) -> Array:
+    """What a LiDAR that looks forward and no further than this to either side would have seen."""
+    ahead: Array = points[np.abs(np.degrees(np.arctan2(points[:, 1], points[:, 0]))) <= half_width_deg]
+    return ahead
 
 
 def read_pairs(path: Path) -> Iterator[RealPair]:
