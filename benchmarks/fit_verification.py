@@ -23,8 +23,7 @@ from rich.progress import track
 from traps import TRAPS
 from verification import replay
 
-from umf_ros.config import Database, Loop, Verification
-from umf_ros.config import Embedding as EmbeddingSettings
+from umf_ros.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.embedding import make_embedder
 from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array

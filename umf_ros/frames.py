@@ -63,7 +63,7 @@ class Frame:
         intensity: (N,) float32, the sensor's unit.
         odom_T_body: odometry at `stamp_ns`, or None.
         image_stamp_ns: exposure of the left image, or None.
-        session: counts the restarts of the recording's clock.
+        session: counts the resets of the clock or the odometry.
     """
 
     stamp_ns: int
@@ -177,11 +177,11 @@ class LoopClosure:
         match_stamp_ns: key of the matched keyframe.
         match_T_query: pose of the query body in the match body frame.
         covariance: (6, 6) in ROS order (x y z rx ry rz, axes of the match body), m^2 and rad^2.
-        probability: calibrated probability that the closure is right.
+        probability: calibrated probability that the closure is right, NaN where it is unknown.
     """
 
     query_stamp_ns: int
     match_stamp_ns: int
     match_T_query: Array
     covariance: Array
-    probability: float = 1.0
+    probability: float = float("nan")
