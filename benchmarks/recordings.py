@@ -28,13 +28,12 @@ from domains import error_vector, is_wrong
 from rich.console import Console
 from rich.progress import track
 
-from umf_ros.config import Embedding as EmbeddingSettings
-from umf_ros.config import Verification
+from umf_ros.config import EmbeddingSettings, Verification
 from umf_ros.embedding import make_embedder
-from umf_ros.frames import Candidate, Keyframe, Verdict
+from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array, from_quaternion
 from umf_ros.lab.training.acceptance_fit import inside_ellipsoid
-from umf_ros.verification import Verifier
+from umf_ros.verification import Verdict, Verifier
 
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 KEPT = 1000  # keyframes in memory

@@ -28,6 +28,7 @@ REPORT = EvaluationReport(
     "Title", ["first note", "second note"], {"recall": 0.7, "none": None}, {"Recall": TABLE}, {"A curve": "curve.png"}
 )
 
+
 def test_a_report_in_markdown() -> None:
     assert REPORT.markdown() == (
         "# Title\n\n"
