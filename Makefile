@@ -1,6 +1,6 @@
 # make demo   simulate a traverse, run the real graph over DDS on it, write results/latest
 # make test   the whole test suite
-# make lint   ruff and mypy
+# make lint   ruff, mypy, and the contracts on who may import whom
 .PHONY: demo test lint install clean
 SHELL := /bin/bash
 
@@ -20,11 +20,12 @@ lint: install
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
+	@$(BIN)/lint-imports --no-logo
 
 install: $(VENV)/.installed
 
 # requirements first: they change rarely and take the time
-$(VENV)/.installed: requirements.txt requirements-dev.txt setup.py setup.cfg pyproject.toml
+$(VENV)/.installed: $(wildcard requirements*.txt) package.xml setup.py setup.cfg pyproject.toml
 	@test -n "$(PYTHON)" || { echo "make: Python 3.11 or 3.12 is needed (set PYTHON=...)" >&2; exit 1; }
 	@./tools/system_packages.sh
 	@test -x $(BIN)/python || { echo "Making $(VENV) with $$($(PYTHON) --version)"; $(PYTHON) -m venv $(VENV); }

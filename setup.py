@@ -2,6 +2,7 @@
 
 from glob import glob
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -15,10 +16,19 @@ def shared(folder: str) -> list[tuple[str, list[str]]]:
     return [(f"share/{PACKAGE}/{path}", names) for path, names in files.items() if names]
 
 
+def required(name: str) -> list[str]:
+    """Distributions that a requirements file lists, less its pins: those are what was tested, not what is needed."""
+    lines = [line for line in Path(name).read_text(encoding="utf-8").splitlines() if line and line[0] != "#"]
+    included = [line.removeprefix("-r ") for line in lines if line.startswith("-r ")]
+    own = [line.split("==")[0] for line in lines if not line.startswith("-r ")]
+    return [*own, *(package for other in included for package in required(other))]
+
+
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    package_data={PACKAGE: [f"**/*.{suffix}" for suffix in ("j2", "html", "css", "js")]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -27,6 +37,8 @@ setup(
         *shared("models"),
     ],
     python_requires=">=3.11",
+    install_requires=required("requirements.txt"),
+    extras_require={extra: required(f"requirements-{extra}.txt") for extra in ("ros", "lab", "dev")},
     zip_safe=True,
     description="Multimodal place recognition and loop closure for rovers with a camera and a LiDAR",
     license="Apache-2.0",

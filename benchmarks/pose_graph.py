@@ -4,7 +4,8 @@
 
 Generated graphs and, if given, g2o files (their closures count as right) get 0 to 50 % wrong
 closures: far at random, in groups that agree with each other, and as such groups to similar places
-close by. Times are CPU time of this process, which is wall time on a quiet core and does not depend
+close by. Some have odometry that is wrong in one direction all the time, or but one closure at the end of a long
+way (figures named hard). Times are CPU time of this process, which is wall time on a quiet core and does not depend
 on what else the machine does.
 """
 
@@ -24,7 +25,16 @@ import numpy as np
 
 from umf_ros.config import PoseGraph as Settings
 from umf_ros.geometry import Array
-from umf_ros.lab.simulation.pose_graphs import WORLDS, Kind, World, WorldClosure, rover_loops, with_wrong_closures
+from umf_ros.lab.simulation.pose_graphs import (
+    WORLDS,
+    Kind,
+    World,
+    WorldClosure,
+    rover_loops,
+    with_bias,
+    with_lone_end,
+    with_wrong_closures,
+)
 from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.condensed import Edge, between
@@ -37,6 +47,8 @@ MOST_CLOSURES_OF_A_FILE = 1500
 MOST_SOLUTIONS_OF_A_FILE = 150
 SETTINGS = Settings(keyframe_spacing_m=1e-6, max_gap_s=1.5, max_closure_m=1e7)
 KINDS: tuple[Kind, ...] = ("random", "groups", "near")
+# per metre; a tenth of it is what the stated noise makes of a hundred metres
+BIAS = np.array([0, 0, np.deg2rad(0.1), 0.01, 0, 0])
 
 
 @dataclass(frozen=True)
@@ -119,15 +131,53 @@ def optimum_near_truth(world: World) -> Array:
     return poses
 
 
-def generated(first_seed: int, quick: bool) -> dict[str, World]:
-    """Worlds by name, the large ones last."""
+class Cell(NamedTuple):
+    """What a world is tried with: share and kind of wrong closures, and the factor on the stated odometry noise."""
+
+    share: float
+    kind: Kind
+    stated: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A world with the cells it is driven through; closures come in batches; whether its figures are the hard ones."""
+
+    name: str
+    world: World
+    cells: list[Cell]
+    batch: int = 1
+    hard: bool = False
+
+
+def generated(first_seed: int, quick: bool) -> list[Trial]:
+    """Generated worlds with their cells."""
     full = [("rover", 400), ("garage", 1000), ("sphere", 1000), ("rover", 5000)]
     chosen = [("rover", 400), ("garage", 500), ("sphere", 400)] if quick else full
     seeds = range(first_seed, first_seed + (1 if quick else 5))
-    return {f"{name} {size} seed {seed}": WORLDS[name](size, seed) for name, size in chosen for seed in seeds}
+    trials = [
+        Trial(f"{name} {size} seed {seed}", WORLDS[name](size, seed), cells(quick, misscaled=True))
+        for name, size in chosen
+        for seed in seeds
+    ]
+    if quick:
+        trials.append(Trial(f"rover 5000 seed {first_seed}", rover_loops(5000, first_seed), cells(True, False)))
+    return trials + [
+        trial for seed in range(first_seed, first_seed + 5) for trial in hard(rover_loops(400, seed), seed)
+    ]
 
 
-def from_file(path: Path) -> World:
+def hard(world: World, seed: int) -> list[Trial]:
+    """The world with what its stated noise does not tell, and with a last closure that no other supports."""
+    chosen = [Cell(0.0, "random", 1.0), *(Cell(0.5, kind, 1.0) for kind in KINDS)]
+    return [
+        Trial(f"biased seed {seed}", with_bias(world, BIAS), chosen, hard=True),
+        Trial(f"biased back seed {seed}", with_bias(world, -BIAS), chosen, hard=True),
+        Trial(f"lone end seed {seed}", with_lone_end(world), chosen, hard=True),
+    ]
+
+
+def from_file(path: Path, quick: bool) -> Trial:
     """A g2o file as a world whose truth is its own optimum."""
     recording = as_recording(read_g2o(path))
     chosen = np.unique(np.linspace(0, len(recording.closures) - 1, MOST_CLOSURES_OF_A_FILE).astype(int))
@@ -141,15 +191,8 @@ def from_file(path: Path) -> World:
     stamps, poses = graph.trajectory()
     truth = recording.odometry.copy()
     truth[stamps // PERIOD_NS] = poses
-    return replace(world, truth=truth)
-
-
-class Cell(NamedTuple):
-    """What a world is tried with: share and kind of wrong closures, and the factor on the stated odometry noise."""
-
-    share: float
-    kind: Kind
-    stated: float
+    batch = max(1, len(closures) // MOST_SOLUTIONS_OF_A_FILE)
+    return Trial(f"file {path.name}", replace(world, truth=truth), cells(quick, misscaled=False), batch)
 
 
 def cells(quick: bool, misscaled: bool) -> list[Cell]:
@@ -159,30 +202,31 @@ def cells(quick: bool, misscaled: bool) -> list[Cell]:
     return chosen + [Cell(shares[-1], kind, stated) for kind in KINDS for stated in (1 / 3, 3.0) if misscaled]
 
 
-def try_world(name: str, world: World, chosen: list[Cell]) -> list[tuple[str, Cell, Outcome]]:
+def try_world(trial: Trial) -> list[tuple[Cell, Outcome]]:
     """Drive a world through its cells."""
-    reference = optimum_near_truth(world)
-    batch = max(1, len(world.closures) // MOST_SOLUTIONS_OF_A_FILE) if name.startswith("file") else 1
+    reference = optimum_near_truth(trial.world)
     outcomes = []
-    for cell in chosen:
-        trial = with_wrong_closures(world, cell.share, cell.kind, 1) if cell.share else world
-        outcomes.append((name, cell, drive(trial, reference, cell.stated, batch=batch)))
+    for cell in trial.cells:
+        world = with_wrong_closures(trial.world, cell.share, cell.kind, 1) if cell.share else trial.world
+        outcomes.append((cell, drive(world, reference, cell.stated, batch=trial.batch)))
     return outcomes
 
 
-def resist(worlds: dict[str, World], quick: bool, jobs: int) -> dict[str, float]:
-    """Every cell of wrong closures, rightly stated and mis-stated odometry; prints them as they are done."""
+def resist(trials: list[Trial], jobs: int) -> dict[str, float]:
+    """Every cell of every trial; prints them as they are done."""
     columns = f"{'graph':26s} {'wrong':>10s} {'stated':>7s} {'precision':>9s} {'recall':>7s} {'error m':>8s}"
     print(f"{columns} {'transient':>9s}")
     plain: list[Outcome] = []
     misscaled: list[Outcome] = []
+    hardest: list[Outcome] = []
     with ProcessPoolExecutor(jobs) as pool:
-        tried = [pool.submit(try_world, n, w, cells(quick, not n.startswith("file"))) for n, w in worlds.items()]
+        tried = {pool.submit(try_world, trial): trial for trial in trials}
         for done in as_completed(tried):
-            for name, cell, outcome in done.result():
-                (plain if cell.stated == 1 else misscaled).append(outcome)
+            trial = tried[done]
+            for cell, outcome in done.result():
+                (hardest if trial.hard else plain if cell.stated == 1 else misscaled).append(outcome)
                 label = f"{cell.share:.0%} {cell.kind}" if cell.share else "none"
-                head = f"{name:26s} {label:>10s} {f'x {cell.stated:.2f}':>7s}"
+                head = f"{trial.name:26s} {label:>10s} {f'x {cell.stated:.2f}':>7s}"
                 numbers = f"{outcome.precision:9.3f} {outcome.recall:7.3f} {outcome.error_m:8.4f}"
                 print(f"{head} {numbers} {outcome.transient_wrong:9.3f}", flush=True)
     return {
@@ -190,8 +234,11 @@ def resist(worlds: dict[str, World], quick: bool, jobs: int) -> dict[str, float]
         "recall_worst": min(outcome.recall for outcome in plain),
         "error_worst_m": max(outcome.error_m for outcome in plain),
         "transient_wrong_share_worst": max(outcome.transient_wrong for outcome in plain),
-        "misscaled_error_worst_m": max((outcome.error_m for outcome in misscaled), default=0.0),
-        "misscaled_precision_worst": min((outcome.precision for outcome in misscaled), default=1.0),
+        "misscaled_error_worst_m": max(outcome.error_m for outcome in misscaled),
+        "misscaled_precision_worst": min(outcome.precision for outcome in misscaled),
+        "hard_precision_worst": min(outcome.precision for outcome in hardest),
+        "hard_recall_worst": min(outcome.recall for outcome in hardest),
+        "hard_error_worst_m": max(outcome.error_m for outcome in hardest),
     }
 
 
@@ -230,11 +277,11 @@ def main() -> None:
     arguments = parser.parse_args()
     # the cost first, while nothing else of ours runs
     costs = cost(arguments.seed)
-    worlds = generated(arguments.seed, arguments.quick)
-    files = {f"file {path.name}": from_file(path) for path in arguments.files}
+    trials = generated(arguments.seed, arguments.quick)
+    files = [from_file(path, arguments.quick) for path in arguments.files]
     print()
-    figures = resist(worlds | files, arguments.quick, arguments.jobs) | costs
-    figures |= equality([world for name, world in worlds.items() if name.endswith(f"seed {arguments.seed}")])
+    figures = resist(trials + files, arguments.jobs) | costs
+    figures |= equality([trial.world for trial in trials if trial.name.endswith(f"seed {arguments.seed}")])
     print()
     for name, value in figures.items():
         print(f"{name:32s} {value:.4g}")

@@ -11,9 +11,11 @@ from xml.etree import ElementTree
 
 import pytest
 from processes import Process
+from sources import PACKAGE, ROOT, distributions, imports, required
 
-ROOT = Path(__file__).parents[1]
 PARTS = ["package.xml", "setup.py", "setup.cfg", "umf_ros", "resource", "config", "launch", "models"]
+PARTS += [path.name for path in ROOT.glob("requirements*.txt")]
+TEMPLATE = Path("runs", "templates", "planted.html.j2")
 
 
 @pytest.fixture(scope="module")
@@ -24,6 +26,9 @@ def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for part in PARTS:
         copy = shutil.copytree if (ROOT / part).is_dir() else shutil.copy
         copy(ROOT / part, source / part)
+    template = source / "umf_ros" / TEMPLATE
+    template.parent.mkdir(exist_ok=True)
+    template.write_text("")
     tools = Path(sys.executable).parent
     path = f"{tools}{os.pathsep}{os.environ['PATH']}"
     environment = {**os.environ, "PATH": path, "AMENT_PREFIX_PATH": str(Path(sys.prefix))}
@@ -71,18 +76,61 @@ def test_package_xml_names_what_is_imported() -> None:
     depends = {element.text for element in package.iter("exec_depend")}
     imported = {
         line.split()[1].split(".")[0]
-        for path in (ROOT / "umf_ros" / "nodes").glob("*.py")
+        for path in (PACKAGE / "nodes").glob("*.py")
         for line in path.read_text().splitlines()
         if line.startswith("from ") and (".msg import" in line or ".srv import" in line)
     }
     assert imported <= depends, imported - depends
 
 
-def test_versions_agree() -> None:
-    from umf_ros import __version__
+def installed_package(install: Path) -> Path:
+    return next(install.glob("lib/python*/site-packages/umf_ros"))
 
-    assert ElementTree.parse(ROOT / "package.xml").getroot().findtext("version") == __version__
-    assert f'version="{__version__}"' in (ROOT / "setup.py").read_text()
+
+def test_the_version_is_that_of_package_xml(install: Path) -> None:
+    written = ElementTree.parse(ROOT / "package.xml").getroot().findtext("version")
+    show = "import umf_ros; print(umf_ros.__version__, umf_ros.__file__)"
+    for place in (ROOT, installed_package(install).parent):
+        done = subprocess.run(
+            [sys.executable, "-c", show], cwd=place, env={}, capture_output=True, text=True, check=True, timeout=60
+        )
+        assert done.stdout.split() == [written, str(place / "umf_ros" / "__init__.py")]
+
+
+def test_what_is_not_python_is_installed_with_the_package(install: Path) -> None:
+    files = [path for path in PACKAGE.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")]
+    for path in [TEMPLATE, *(path.relative_to(PACKAGE) for path in files)]:
+        assert (installed_package(install) / path).is_file(), path
+
+
+@pytest.mark.parametrize(
+    ("wing", "lists"),
+    [("runtime", ["requirements.txt"]), ("lab", ["requirements.txt", "requirements-lab.txt"])],
+)
+def test_what_is_imported_is_required(wing: str, lists: list[str]) -> None:
+    """Every distribution by its own name: what another one happens to bring along may be gone tomorrow."""
+    lab = PACKAGE / "lab"
+    paths = [path for path in PACKAGE.rglob("*.py") if (lab in path.parents) == (wing == "lab")]
+    imported = {name.split(".")[0] for path in paths for name in imports(path)}
+    ros = {element.text for element in ElementTree.parse(ROOT / "package.xml").iter("exec_depend")}
+    for module in imported - {"umf_ros", *sys.stdlib_module_names} - ros:
+        assert distributions().get(module, {module}) & required(*lists), (
+            f"{module} is imported but not in {' or '.join(lists)}"
+        )
+
+
+def test_a_package_that_only_the_lab_has_is_asked_for_in_one_line(tmp_path: Path) -> None:
+    missing = "import sys; sys.modules['open3d'] = None; from umf_ros import cli; cli.main()"
+    done = subprocess.run(
+        [sys.executable, "-c", missing, "simulate", str(tmp_path / "a.mcap")],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 1
+    assert done.stderr == "umf: open3d is not installed; the lab needs it: pip install 'umf_ros[lab]'\n"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_parameter_documentation_is_up_to_date() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from recordings import small_settings, traverse, write_mcap
 
-from umf_ros.bags.frames import read_frames
+from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.config import Settings, load_settings
@@ -21,16 +21,28 @@ from umf_ros.frames import Frame
 from umf_ros.loop_detector import LoopDetector
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.replay import Replay
+from umf_ros.sensors.messages import OdometrySample
 
 TABLES = ["candidates.csv", "closures.csv", "config.yaml", "inliers.csv", "keyframes.csv", "summary.json"]
 GRAPH = ["graph.g2o", "graph_verdicts.csv", "trajectory_odometry.tum", "trajectory_optimized.tum"]
 
 
+Stream = list[Frame | OdometrySample]
+
+
 @pytest.fixture(scope="module")
-def frames(tmp_path_factory: pytest.TempPathFactory) -> list[Frame]:
+def stream(tmp_path_factory: pytest.TempPathFactory) -> Stream:
     """Scans, images and odometry of four seconds."""
     folder = tmp_path_factory.mktemp("bag")
-    return list(read_frames(open_bag(write_mcap(folder / "a.mcap", traverse(4.0))), small_settings(folder)))
+    return list(FrameReader(open_bag(write_mcap(folder / "a.mcap", traverse(4.0))), small_settings(folder)).stream())
+
+
+def frames_of(stream: Stream) -> list[Frame]:
+    return [item for item in stream if isinstance(item, Frame)]
+
+
+def later_by(seconds: int, stream: Stream) -> Stream:
+    return [replace(item, stamp_ns=item.stamp_ns + seconds * 10**9) for item in stream]
 
 
 @pytest.fixture
@@ -60,11 +72,9 @@ def keyframes_in(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_a_whole_run_leaves_tables_trajectories_and_graph(
-    folder: Path, settings: Settings, frames: list[Frame]
-) -> None:
+def test_a_whole_run_leaves_tables_trajectories_and_graph(folder: Path, settings: Settings, stream: Stream) -> None:
     replay = replay_of(folder, settings)
-    detections = list(replay.run(frames))
+    detections, frames = list(replay.run(stream)), frames_of(stream)
     assert [detection.frame_stamp_ns for detection in detections] == [frame.stamp_ns for frame in frames]
     assert replay.finish({"image": 0}) is True
     assert set(TABLES + GRAPH) <= set(names_in(folder))
@@ -82,53 +92,54 @@ def test_a_whole_run_leaves_tables_trajectories_and_graph(
 
 
 def test_a_run_that_is_stopped_is_as_complete_as_far_as_it_went(
-    folder: Path, settings: Settings, frames: list[Frame]
+    folder: Path, settings: Settings, stream: Stream
 ) -> None:
     replay = replay_of(folder, settings)
-    for count, _ in enumerate(replay.run(frames), 1):
+    for count, _ in enumerate(replay.run(stream), 1):
         if count == 7:
             break
     assert replay.finish({}) is True
     assert set(TABLES + GRAPH) <= set(names_in(folder))
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["frames"] == 7 and summary["keyframes"] == len(keyframes_in(folder))
-    assert read_tum(folder / "trajectory_odometry.tum").stamps_ns[-1] <= frames[6].stamp_ns
+    assert read_tum(folder / "trajectory_odometry.tum").stamps_ns[-1] <= frames_of(stream)[7].stamp_ns
 
 
-def test_rows_are_on_disk_while_the_run_goes_on(folder: Path, settings: Settings, frames: list[Frame]) -> None:
+def test_rows_are_on_disk_while_the_run_goes_on(folder: Path, settings: Settings, stream: Stream) -> None:
     found = 0
-    for detection in replay_of(folder, settings).run(frames):
+    for detection in replay_of(folder, settings).run(stream):
         found += detection.keyframe is not None
         assert len(keyframes_in(folder)) == found
 
 
-def test_without_odometry_there_is_no_graph_and_it_says_so(
-    folder: Path, settings: Settings, frames: list[Frame]
-) -> None:
+def test_without_odometry_there_is_no_graph_and_it_says_so(folder: Path, settings: Settings, stream: Stream) -> None:
     replay = replay_of(folder, settings)
-    list(replay.run(replace(frame, odom_T_body=None) for frame in frames))
+    list(replay.run(replace(frame, odom_T_body=None) for frame in frames_of(stream)))
     assert replay.finish({}) is False
     assert names_in(folder) == TABLES
     assert {row["travelled_m"] for row in keyframes_in(folder)} == {"nan"}
 
 
 def test_odometry_that_jumps_begins_a_chain_of_its_own_as_it_does_live(
-    folder: Path, settings: Settings, frames: list[Frame]
+    folder: Path, settings: Settings, stream: Stream
 ) -> None:
-    half, moved = len(frames) // 2, np.eye(4)
+    half, moved = len(stream) // 2, np.eye(4)
     moved[0, 3] = 500.0
-    later = [replace(f, odom_T_body=None if f.odom_T_body is None else moved @ f.odom_T_body) for f in frames[half:]]
+    later = [
+        item if item.odom_T_body is None else replace(item, odom_T_body=moved @ item.odom_T_body) for item in stream
+    ]
     replay = replay_of(folder, settings)
-    list(replay.run([*frames[:half], *later]))
+    list(replay.run([*stream[:half], *later[half:]]))
     replay.finish({})
     vertices = [line for line in (folder / "graph.g2o").read_text().splitlines() if line.startswith("VERTEX")]
     edges = [line for line in (folder / "graph.g2o").read_text().splitlines() if line.startswith("EDGE")]
     assert len(vertices) - len(edges) == 2
 
 
-def test_a_recording_that_starts_over_is_another_session(folder: Path, settings: Settings, frames: list[Frame]) -> None:
+def test_a_recording_that_starts_over_is_another_session(folder: Path, settings: Settings, stream: Stream) -> None:
     replay = replay_of(folder, settings)
-    list(replay.run([*frames, *(replace(frame, session=1) for frame in frames)]))
+    again = [replace(item, session=1) if isinstance(item, Frame) else item for item in stream]
+    list(replay.run([*stream, *again]))
     assert replay.finish({}) is True
     rows = keyframes_in(folder)
     first, second = ([row["stamp_ns"] for row in rows if row["session"] == session] for session in ("0", "1"))
@@ -142,11 +153,11 @@ def test_a_run_of_no_frames_is_a_run(folder: Path, settings: Settings) -> None:
     assert summary["frames"] == summary["keyframes"] == 0 and summary["latency_ms"]["total"]["p50"] is None
 
 
-def test_the_same_frames_give_the_same_tables(tmp_path: Path, settings: Settings, frames: list[Frame]) -> None:
+def test_the_same_frames_give_the_same_tables(tmp_path: Path, settings: Settings, stream: Stream) -> None:
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         replay = replay_of(tmp_path / name, settings)
-        list(replay.run(frames))
+        list(replay.run(stream))
         replay.finish({})
     for table in [name for name in TABLES + GRAPH if name != "summary.json"]:
         assert (tmp_path / "one" / table).read_bytes() == (tmp_path / "two" / table).read_bytes(), table
@@ -157,12 +168,11 @@ def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path: Path, settings: 
         replay_of(tmp_path / "nowhere", settings)
 
 
-def test_places_are_kept_from_run_to_run_when_a_file_is_named(tmp_path: Path, frames: list[Frame]) -> None:
+def test_places_are_kept_from_run_to_run_when_a_file_is_named(tmp_path: Path, stream: Stream) -> None:
     database = {"path": str(tmp_path / "places.sqlite")}
     settings = small_settings(tmp_path, database=database, loop__min_time_gap_s=1.0)
-    later = [replace(frame, stamp_ns=frame.stamp_ns + 60 * 10**9) for frame in frames]
     counts = []
-    for name, driven in (("first", frames), ("second", later)):
+    for name, driven in (("first", stream), ("second", later_by(60, stream))):
         (tmp_path / name).mkdir()
         replay = replay_of(tmp_path / name, settings)
         detections = list(replay.run(driven))
@@ -175,20 +185,20 @@ def test_places_are_kept_from_run_to_run_when_a_file_is_named(tmp_path: Path, fr
     assert np.isfinite(float(keyframes_in(tmp_path / "second")[-1]["travelled_m"]))
 
 
-def test_a_recording_played_twice_finds_no_keyframe_again_in_itself(tmp_path: Path, frames: list[Frame]) -> None:
+def test_a_recording_played_twice_finds_no_keyframe_again_in_itself(tmp_path: Path, stream: Stream) -> None:
     database = {"path": str(tmp_path / "places.sqlite")}
     settings = small_settings(tmp_path, database=database, loop__min_time_gap_s=1.0)
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
         replay = replay_of(tmp_path / name, settings)
-        verdicts = [(d.frame_stamp_ns, v.candidate.stamp_ns) for d in replay.run(frames) for v in d.verdicts]
+        verdicts = [(d.frame_stamp_ns, v.candidate.stamp_ns) for d in replay.run(stream) for v in d.verdicts]
         replay.finish({})
         assert all(query - match >= 10**9 for query, match in verdicts)
     assert verdicts
 
 
 def test_a_full_disk_ends_the_replay_after_what_was_found_is_kept(
-    tmp_path: Path, settings: Settings, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, settings: Settings, stream: Stream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> int:
         raise OutputError("no space left on device")
@@ -197,6 +207,6 @@ def test_a_full_disk_ends_the_replay_after_what_was_found_is_kept(
     (tmp_path / "run").mkdir()
     replay = replay_of(tmp_path / "run", settings)
     with pytest.raises(OutputError, match="no space"):
-        list(replay.run(frames))
+        list(replay.run(stream))
     replay.finish({})
     assert len(keyframes_in(tmp_path / "run")) == 1

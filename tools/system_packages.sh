@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Install the system libraries the wheels need but do not bring along: open3d loads libusb-1.0 and libGL.
+# Install the system libraries that the lab's wheels need but do not bring along: open3d loads libusb-1.0 and libGL.
+# A rover, which does without open3d, needs none of them.
 set -eu
 missing=()
 known=$(ldconfig -p 2>/dev/null || /sbin/ldconfig -p)

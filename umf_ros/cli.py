@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import traceback
+from functools import cache
 from importlib import import_module
 from typing import Annotated, NoReturn
 
@@ -29,29 +31,6 @@ COMMANDS = {
 }
 """The module of every subcommand, by name: those of the lab are known here by their names alone."""
 
-app = typer.Typer(
-    name="umf",
-    help="Multimodal place recognition and loop closure for rovers with a camera and a LiDAR.",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode="rich",
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-
-
-def _register() -> None:
-    """Add every subcommand: a module offers either `command` or, for a group of them, `app`."""
-    for name, module_name in COMMANDS.items():
-        module = import_module(module_name)
-        if hasattr(module, "app"):
-            app.add_typer(module.app, name=name)
-        else:
-            app.command(name)(module.command)
-
-
-_register()
-
 
 def _print_version(wanted: bool) -> None:
     if wanted:
@@ -62,9 +41,39 @@ def _print_version(wanted: bool) -> None:
 Version = Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")]
 
 
-@app.callback()
-def options(version: Version = False) -> None:
+@cache
+def umf() -> typer.Typer:
+    """The command with its subcommands: a module offers either `command` or, for a group of them, `app`."""
+    app = typer.Typer(
+        name="umf",
+        help="Multimodal place recognition and loop closure for rovers with a camera and a LiDAR.",
+        no_args_is_help=True,
+        add_completion=False,
+        rich_markup_mode="rich",
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    for name, module_name in COMMANDS.items():
+        module = import_module(module_name)
+        if hasattr(module, "app"):
+            app.add_typer(module.app, name=name)
+        else:
+            app.command(name)(module.command)
+    app.callback()(_options)
+    return app
+
+
+def _options(version: Version = False) -> None:
     """Options of `umf` itself."""
+
+
+def _what_helps(error: ModuleNotFoundError) -> str:
+    """Where a missing package comes from: the lab has its own, and the innermost module of ours tells who asked."""
+    names = [frame.f_globals["__name__"] for frame, _ in traceback.walk_tb(error.__traceback__)]
+    ours = [name for name in names if name.startswith("umf_ros.")]
+    if ours and ours[-1].startswith("umf_ros.lab."):
+        return "the lab needs it: pip install 'umf_ros[lab]'"
+    return "umf doctor says what helps"
 
 
 def main() -> NoReturn:
@@ -74,9 +83,12 @@ def main() -> NoReturn:
     """
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
-        sys.exit(app(prog_name="umf"))  # also when it is run as a module
+        sys.exit(umf()(prog_name="umf"))  # also when it is run as a module
     except UmfError as error:
         typer.echo(f"umf: {error}", err=True)
+        sys.exit(1)
+    except ModuleNotFoundError as error:
+        typer.echo(f"umf: {error.name} is not installed; {_what_helps(error)}", err=True)
         sys.exit(1)
     except BrokenPipeError:
         # the reader of our output went away, as with `umf ... | head`

@@ -6,12 +6,12 @@ z up), the camera frame is optical (x right, y down, z forward). Poses follow `g
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array
+from umf_ros.geometry import Array, invert, transform
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float32]
@@ -32,6 +32,20 @@ class StereoCamera:
     cy: float
     baseline: float
 
+    def project(self, points: Array, body_T_camera: Array) -> tuple[Array, Array]:
+        """Left pixels (N, 2) and depths (N,) of points (N, 3) of the body frame; a depth <= 0 lies behind the camera.
+
+        Args:
+            points: (N, 3) metres, body frame.
+            body_T_camera: pose of the left camera in the body frame.
+        """
+        optical = transform(invert(body_T_camera), points)
+        depth = optical[:, 2]
+        safe = np.where(depth > 0, depth, 1.0)
+        u = self.fx * optical[:, 0] / safe + self.cx
+        v = self.fy * optical[:, 1] / safe + self.cy
+        return np.column_stack([u, v]), depth
+
 
 @dataclass(frozen=True, slots=True)
 class Frame:
@@ -49,7 +63,7 @@ class Frame:
         intensity: (N,) float32, the sensor's unit.
         odom_T_body: odometry at `stamp_ns`, or None.
         image_stamp_ns: exposure of the left image, or None.
-        session: counts the restarts of the recording's clock.
+        session: counts the resets of the clock or the odometry.
     """
 
     stamp_ns: int
@@ -163,30 +177,11 @@ class LoopClosure:
         match_stamp_ns: key of the matched keyframe.
         match_T_query: pose of the query body in the match body frame.
         covariance: (6, 6) in ROS order (x y z rx ry rz, axes of the match body), m^2 and rad^2.
-        probability: calibrated probability that the closure is right.
+        probability: calibrated probability that the closure is right, NaN where it is unknown.
     """
 
     query_stamp_ns: int
     match_stamp_ns: int
     match_T_query: Array
     covariance: Array
-    probability: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What verification found for one candidate.
-
-    Attributes:
-        candidate: the candidate that was tested.
-        reason: one word or a short phrase; "accepted" when there is a closure.
-        numbers: what was measured, by name (inliers_image, inliers_cloud, residual_m, overlap, ...).
-        closure: the loop closure, or None when rejected.
-        inlier_pixels: (K, 4) float32: u, v in the query image and u, v in the match image.
-    """
-
-    candidate: Candidate
-    reason: str
-    numbers: dict[str, float] = field(default_factory=dict)
-    closure: LoopClosure | None = None
-    inlier_pixels: Points = field(default_factory=lambda: np.empty((0, 4), np.float32))
+    probability: float = float("nan")

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from umf_ros.config import Settings
 from umf_ros.embedding import make_embedder
+from umf_ros.embedding.depth import lift
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.errors import OutputError
-from umf_ros.frames import Frame, Keyframe, LoopClosure, Verdict
+from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure
 from umf_ros.keyframes import KeyframeSelector
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.verification import Verifier, lift, thin_scan
+from umf_ros.verification import Verdict, Verifier, thin_scan
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +46,9 @@ class Detection:
 
 
 class LoopDetector:
-    """Finds loop closures in a stream of frames; the live node and the offline replay run this same class.
+    """Finds loop closures in a stream of frames; the live node, the replay and the evaluation run this same class.
+
+    `process` takes a frame through all stages: `select`, `embed`, `query`, `verify`, `remember`.
 
     Args:
         settings: all settings.
@@ -71,24 +74,47 @@ class LoopDetector:
 
     def process(self, frame: Frame) -> Detection:
         """Take one frame, in order of stamps within a session."""
-        if frame.session != self._session:
-            self._start_session(frame)
-        if not self._selector.select(frame):
+        if not self.select(frame):
             return Detection(frame.stamp_ns)
         latency = Stopwatch()
         with latency.measure("embed"):
-            travelled_m = self._selector.travelled_m(frame)
-            keyframe = make_keyframe(frame, self._embedder, travelled_m, self._first_session)
+            keyframe = self.embed(frame)
         with latency.measure("query"):
-            candidates = self.database.query(keyframe, self._rules)
+            candidates = self.query(keyframe)
         with latency.measure("verify"):
-            verdicts = self._verifier.verify(keyframe, [(found, self.database[found.index]) for found in candidates])
+            verdicts = self.verify(keyframe, candidates)
         fault = None
         try:
-            self.database.add(keyframe)
+            self.remember(keyframe)
         except OutputError as error:
             fault = error
         return Detection(frame.stamp_ns, keyframe, verdicts, latency.milliseconds, fault)
+
+    def select(self, frame: Frame) -> bool:
+        """Whether the frame becomes a keyframe; call once per frame, in order of stamps within a session."""
+        if frame.session != self._session:
+            self._start_session(frame)
+        return self._selector.select(frame)
+
+    def embed(self, frame: Frame) -> Keyframe:
+        """The keyframe that the frame selected last becomes."""
+        return make_keyframe(frame, self._embedder, self._selector.travelled_m(frame), self._first_session)
+
+    def query(self, keyframe: Keyframe) -> list[Candidate]:
+        """Remembered places that look like a keyframe, best first."""
+        return self.database.query(keyframe, self._rules)
+
+    def verify(self, keyframe: Keyframe, candidates: Sequence[Candidate]) -> list[Verdict]:
+        """Test the candidates geometrically."""
+        return self._verifier.verify(keyframe, [(found, self.database[found.index]) for found in candidates])
+
+    def remember(self, keyframe: Keyframe) -> None:
+        """Make a keyframe a place that later ones may find.
+
+        Raises:
+            OutputError: the disk is full.
+        """
+        self.database.add(keyframe)
 
     def reset(self) -> None:
         """Forget all places."""
@@ -97,10 +123,10 @@ class LoopDetector:
         self._verifier.reset()
 
     def _start_session(self, frame: Frame) -> None:
-        """The clock jumped back (a looped bag): what was recorded from here on lies in the future now."""
+        """A new way begins; where the clock was set back, what was recorded from here on lies in the future now."""
         self._session = frame.session
         forgotten = self.database.forget_from(frame.stamp_ns, self._first_session)
-        logger.warning("the clock went back: a new session begins, %d places are forgotten", forgotten)
+        logger.warning("a new session begins, %d places are forgotten", forgotten)
         self._selector.reset()
         self._verifier.reset()
 

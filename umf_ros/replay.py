@@ -9,13 +9,16 @@ from umf_ros.config import Settings
 from umf_ros.frames import Frame
 from umf_ros.loop_detector import Detection, LoopDetector
 from umf_ros.pose_graph.graph import PoseGraph
-from umf_ros.pose_graph.restarts import RestartGuard
 from umf_ros.pose_graph.results import write_results
 from umf_ros.runs.recorder import RunRecorder
+from umf_ros.sensors.messages import OdometrySample
+from umf_ros.sensors.odometry_feed import OdometryFeed
 
 
 class Replay:
-    """Feeds frames to the detector and the pose graph and fills a run folder.
+    """Feeds frames to the detector, odometry and closures to the pose graph, and fills a run folder.
+
+    The graph gets what the live back-end gets: every message of the odometry, and one closure after the other.
 
     Args:
         folder: run folder.
@@ -28,20 +31,24 @@ class Replay:
         self._detector = detector
         self._graph = PoseGraph(settings.pose_graph)
         self._recorder = RunRecorder(folder, settings, detector.embedder_name)
-        self._guard = RestartGuard()
-        self._session = 0
+        self._feed = OdometryFeed(self._graph)
         self._has_odometry = False
 
-    def run(self, frames: Iterable[Frame]) -> Iterator[Detection]:
-        """Process frame by frame, yielding what became of each; stop iterating to stop the run.
+    def run(self, stream: Iterable[Frame | OdometrySample]) -> Iterator[Detection]:
+        """Process a recording's stream, yielding what became of each frame; stop iterating to stop the run.
 
         Raises:
             OutputError: the disk is full.
         """
-        for frame in frames:
-            detection = self._detector.process(frame)
-            self._recorder.record(frame, detection)
-            self._extend_graph(frame, detection)
+        for item in stream:
+            if isinstance(item, OdometrySample):
+                self._has_odometry = True
+                self._feed.take(item.stamp_ns, item.odom_T_body)
+                continue
+            detection = self._detector.process(item)
+            self._recorder.record(item, detection)
+            for closure in detection.closures:
+                self._graph.add_closure(closure)
             yield detection
             if detection.fault is not None:
                 raise detection.fault
@@ -54,18 +61,3 @@ class Replay:
         if self._has_odometry:
             write_results(self._graph, self._folder)
         return self._has_odometry
-
-    def _extend_graph(self, frame: Frame, detection: Detection) -> None:
-        if frame.odom_T_body is None:
-            return
-        self._has_odometry = True
-        if frame.session != self._session:
-            self._session, self._guard = frame.session, RestartGuard()
-            self._graph.begin_session()
-        starts_anew, samples = self._guard.take(frame.stamp_ns, frame.odom_T_body)
-        if starts_anew:
-            self._graph.begin_session()
-        for stamp_ns, odom_T_body in samples:
-            self._graph.add_odometry(stamp_ns, odom_T_body)
-        if detection.closures:
-            self._graph.add_closures(detection.closures)

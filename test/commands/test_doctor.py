@@ -155,3 +155,12 @@ def test_a_program_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.Mo
     name = broken_package(tmp_path, monkeypatch, "import time; time.sleep(60)")
     finding = checks.check_package(name, name, "1")
     assert not finding.fine and finding.found == "no answer within 0.5 s"
+
+
+def test_a_rover_does_without_the_lab_but_a_broken_lab_is_a_problem(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missing = checks.check_lab_package("no_such_package", "no-such-package", "1")
+    assert missing.fine and "umf_ros[lab]" in missing.found
+    name = broken_package(tmp_path, monkeypatch, "raise OSError('libusb-1.0.so.0: cannot open shared object file')")
+    assert not checks.check_lab_package(name, name, "1").fine

@@ -7,12 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from umf_ros.config import Loop
 from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, make_pose, relative
+from umf_ros.geometry import Array, invert, make_pose, relative, transform
 from umf_ros.runs.tables import KEYFRAMES, Table
-from umf_ros.runs.truth import Judged, judge_run, trajectory_error
+from umf_ros.runs.truth import (
+    JudgedRun,
+    absolute_trajectory_error,
+    align_rigidly,
+    endpoints,
+    judge_run,
+    positions_in_truth,
+    trajectory_error,
+)
 from umf_ros.trajectory import Trajectory
 
 START_NS = 1_600_000_000 * 10**9
@@ -48,7 +57,7 @@ def closure(query_s: float, match_s: float, error_m: float = 0.0) -> LoopClosure
     return LoopClosure(stamp(query_s), stamp(match_s), pose, np.eye(6))
 
 
-def judged(folder: Path, known: Trajectory, closures: list[LoopClosure]) -> Judged:
+def judged(folder: Path, known: Trajectory, closures: list[LoopClosure]) -> JudgedRun:
     return judge_run(folder, known, closures, RULES, None, None)
 
 
@@ -56,20 +65,20 @@ def test_true_and_false_closures_are_counted(folder: Path) -> None:
     closures = [closure(42, 2), closure(44, 5, 0.4), closure(46, 6, 0.6), closure(30, 2)]
     found = judged(folder, truth(), closures)
     # half a metre is the limit; (30, 2) has the right pose and is 28 m away
-    assert [one.is_true for one in found.judgements] == [True, True, False, False]
-    assert [one.closure for one in found.judgements] == closures
-    assert [one.distance_m for one in found.judgements] == pytest.approx([0, 1, 0, 28])
+    assert [one.is_true for one in found.closures] == [True, True, False, False]
+    assert [one.closure for one in found.closures] == closures
+    assert [one.distance_m for one in found.closures] == pytest.approx([0, 1, 0, 28])
     assert (found.summary()["closures_true"], found.summary()["closures_false"]) == (2, 2)
 
 
 def test_poses_between_those_of_the_truth_are_interpolated(folder: Path) -> None:
-    (found,) = judged(folder, truth(), [closure(42.25, 2.75)]).judgements
+    (found,) = judged(folder, truth(), [closure(42.25, 2.75)]).closures
     assert found.is_true and found.distance_m == pytest.approx(0.5, abs=1e-6)
 
 
 @pytest.mark.parametrize("ends", [(78, 30), (60, 5)])
 def test_a_closure_with_an_end_outside_of_the_truth_is_not_judged(folder: Path, ends: tuple[int, int]) -> None:
-    assert judged(folder, truth(10, 70), [closure(*ends)]).judgements == []
+    assert judged(folder, truth(10, 70), [closure(*ends)]).closures == []
 
 
 def test_revisits_are_those_that_the_truth_covers(folder: Path) -> None:
@@ -112,12 +121,12 @@ def test_an_estimate_that_the_truth_hardly_covers_has_no_error() -> None:
 
 def test_a_truth_without_headings_judges_distances(folder: Path) -> None:
     found = judged(folder, truth(has_orientation=False), [closure(42, 5), closure(46, 6, 3.0)])
-    assert [one.is_true for one in found.judgements] == [True, False]
-    assert all(math.isnan(one.rotation_error_deg) for one in found.judgements)
+    assert [one.is_true for one in found.closures] == [True, False]
+    assert all(math.isnan(one.rotation_error_deg) for one in found.closures)
 
 
 def test_the_summary_has_its_keys_and_plain_numbers() -> None:
-    assert Judged([], 7, 1.23456789, None).summary() == {
+    assert JudgedRun([], 7, 1.23456789, None).summary() == {
         "closures_true": 0,
         "closures_false": 0,
         "revisits": 7,
@@ -129,3 +138,76 @@ def test_the_summary_has_its_keys_and_plain_numbers() -> None:
 def test_a_run_without_keyframes(tmp_path: Path) -> None:
     Table(tmp_path / "keyframes.csv", KEYFRAMES).close()
     assert judged(tmp_path, truth(), []).revisits == 0
+
+
+def random_pose(rng: np.random.Generator) -> np.ndarray:
+    return make_pose(Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 50, 3))
+
+
+def test_alignment_recovers_any_rigid_motion(rng: np.random.Generator) -> None:
+    truth = rng.normal(0, 20, (40, 3))
+    for _ in range(20):
+        pose = random_pose(rng)
+        np.testing.assert_allclose(align_rigidly(transform(invert(pose), truth), truth), pose, atol=1e-9)
+
+
+def test_alignment_never_mirrors(rng: np.random.Generator) -> None:
+    flat = np.c_[rng.normal(0, 5, (30, 2)), np.zeros(30)]
+    found = align_rigidly(flat * [1, -1, 1], flat)
+    assert np.linalg.det(found[:3, :3]) == pytest.approx(1)
+
+
+def test_error_is_the_residual_after_alignment(rng: np.random.Generator) -> None:
+    truth = rng.normal(0, 20, (500, 3))
+    noise = rng.normal(0, 0.3, (500, 3))
+    moved = transform(random_pose(rng), truth + noise)
+    assert absolute_trajectory_error(moved, truth) == pytest.approx(0.3 * np.sqrt(3), rel=0.05)
+    assert absolute_trajectory_error(transform(random_pose(rng), truth), truth) < 1e-9
+
+
+def test_scale_is_not_aligned_away() -> None:
+    truth = np.c_[np.linspace(0, 10, 11), np.zeros(11), np.sin(np.arange(11))]
+    assert absolute_trajectory_error(1.1 * truth, truth) > 0.3
+
+
+def test_too_few_positions_are_refused() -> None:
+    with pytest.raises(ValueError, match="cannot align 2 positions with 2"):
+        align_rigidly(np.zeros((2, 3)), np.zeros((2, 3)))
+
+
+def test_closures_are_found_by_their_endpoints(folder: Path) -> None:
+    closures = [closure(42, 2), closure(42, 3, 0.6)]
+    found = judged(folder, truth(), closures).by_endpoints()
+    assert [found[endpoints(one)].closure for one in closures] == closures
+    assert (stamp(2), stamp(42)) not in found  # query first
+
+
+def positions(trajectory: Trajectory) -> Array:
+    return trajectory.poses[:, :3, 3]
+
+
+def test_a_trajectory_is_drawn_from_where_the_truth_begins() -> None:
+    known = truth(10, 40)
+    turned = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [5, 6, 7])
+    whole = truth(0, 40)
+    longer = whole.poses.copy()
+    longer[:, 0, 3] = 10 + 1.5 * (longer[:, 0, 3] - 10)
+    drawn = positions_in_truth(Trajectory(whole.stamps_ns, turned @ longer), known)
+    # joined at the first pose that the truth covers, not fitted: the error grows from there
+    np.testing.assert_allclose(drawn, longer[:, :3, 3], atol=1e-9)
+
+
+def test_over_a_truth_without_headings_it_is_laid_best() -> None:
+    known = truth(0, 40, has_orientation=False)
+    # to both sides alike: joined at the start, all of it would lie a metre aside
+    aside = [1.0 if int(abs(second - 19.5)) % 2 else -1.0 for second in range(40)]
+    bent = np.stack([make_pose(np.eye(3), [second, aside[second], 0]) for second in range(40)])
+    turned = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [5, 6, 7])
+    drawn = positions_in_truth(Trajectory(known.stamps_ns, turned @ bent), known)
+    np.testing.assert_allclose(drawn, bent[:, :3, 3], atol=1e-9)
+
+
+@pytest.mark.parametrize("other", [None, truth(200, 240), truth(0, 2)])
+def test_without_a_truth_to_speak_of_it_stays_where_it_is(other: Trajectory | None) -> None:
+    own = truth()
+    np.testing.assert_array_equal(positions_in_truth(own, other), positions(own))

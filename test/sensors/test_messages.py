@@ -170,11 +170,10 @@ def test_unknown_data_type_is_refused() -> None:
     assert kind_of(decode_cloud, message) == "datatype"
 
 
-def test_odometry_keeps_pose_and_covariance() -> None:
+def test_odometry_is_a_stamped_pose() -> None:
     sample = decode_odometry(odometry(START_NS, drive(1.3)))
     assert sample.stamp_ns == START_NS
     assert np.allclose(sample.odom_T_body, drive(1.3))
-    assert (sample.covariance == np.arange(36).reshape(6, 6)).all()
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from recordings import drive
 from scipy.spatial.transform import Rotation
 
 from umf_ros.geometry import Array, invert, make_pose, transform
 from umf_ros.sensors.buffers import OdometryBuffer
-from umf_ros.sensors.clock import StreamClock
 from umf_ros.sensors.motion import deskew
 
 START_NS = 1_625_680_800_000_000_000
@@ -106,33 +104,3 @@ def test_the_key_may_lie_anywhere_on_the_path() -> None:
     for key in (0.0, 0.1, 0.2):
         freed = deskew(point, stamp, path, drive(key))
         np.testing.assert_allclose(transform(drive(key), freed), world, atol=1e-4)
-
-
-def heard(*messages: tuple[str, float]) -> StreamClock:
-    clock = StreamClock()
-    for name, second in messages:
-        clock.advance(name, ns(second))
-    return clock
-
-
-@pytest.mark.parametrize(
-    ("second", "fault", "restarts"),
-    [(5.1, None, False), (5.0, "duplicate", False), (4.5, "out of order", False), (4.0, None, True), (0.0, None, True)],
-)
-def test_a_stamp_is_judged_by_its_own_input(second: float, fault: str | None, restarts: bool) -> None:
-    clock = heard(("left", 5.0), ("cloud", 9.0))
-    assert clock.restarts("left", ns(second)) is restarts
-    if not restarts:
-        assert clock.fault("left", ns(second)) == fault
-    assert clock.fault("odometry", ns(0)) is None  # the first of its input
-
-
-def test_after_a_restart_the_clock_runs_anew() -> None:
-    clock = heard(("left", 5.0), ("cloud", 9.0))
-    assert (clock.session, clock.elapsed_ns, clock.has_heard("cloud")) == (0, 4 * S, True)
-    clock.restart()
-    assert (clock.session, clock.now_ns, clock.elapsed_ns, clock.has_heard("cloud")) == (1, None, 0, False)
-    clock.advance("left", ns(0.5))
-    # what comes late from before the restart is nearer to its end than to the new beginning
-    assert clock.fault("cloud", ns(8.9)) == "stale"
-    assert clock.fault("cloud", ns(0.6)) is None

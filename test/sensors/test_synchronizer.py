@@ -303,6 +303,25 @@ def test_one_stamp_that_jumps_back_is_no_restart(calibration: Calibration, name:
     assert len(frames) == len(plain) and all(same(a, b) for a, b in zip(frames, plain, strict=True))
 
 
+def test_odometry_that_is_reset_is_a_new_session_and_costs_nothing_else(calibration: Calibration) -> None:
+    streams = rover(6.0)
+    away = np.array([[0, -1, 0, 80], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    plain = feed(Synchronizer(Sync(), calibration), in_order(streams))
+    streams["odometry"] = [
+        (n, stamp, away @ pose if stamp > T0 + 3 * S else pose) for n, stamp, pose in rover(6.0)["odometry"]
+    ]
+    synchronizer = Synchronizer(Sync(), calibration)
+    frames = feed(synchronizer, in_order(streams))
+    assert [frame.stamp_ns for frame in frames] == [frame.stamp_ns for frame in plain]
+    assert synchronizer.session == 1 and synchronizer.counters["odometry"].dropped.total() == 0
+    around = [f for f in frames if f.odom_T_body is None]
+    assert len(around) <= 2 and all(abs(frame.stamp_ns - T0 - 3 * S) < 0.5 * S for frame in around)
+    for frame, before in zip(frames, plain, strict=True):
+        if frame.odom_T_body is not None:
+            expected = before.odom_T_body if frame.session == 0 else away @ before.odom_T_body
+            assert np.allclose(frame.odom_T_body, expected) and frame.left is before.left
+
+
 def test_odometry_of_a_computer_whose_clock_runs_ahead_costs_no_image(calibration: Calibration) -> None:
     streams = rover(6.0)
     streams["odometry"] = [(name, stamp + 3 * S, pose) for name, stamp, pose in streams["odometry"]]

@@ -6,16 +6,17 @@ import logging
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from umf_ros.bags.presets import topics_of
-from umf_ros.bags.reader import Bag, RawMessage, decode
+from umf_ros.bags.presets import calibration_of, topics_of
+from umf_ros.bags.reader import Bag, decode
+from umf_ros.bags.records import RawMessage
 from umf_ros.config import Settings, Topics
 from umf_ros.errors import BagError, MessageError
 from umf_ros.frames import Frame
-from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.counters import InputCounter
 from umf_ros.sensors.intake import Intake, wanted_inputs
-from umf_ros.sensors.messages import stamp_ns
-from umf_ros.sensors.synchronizer import Input, Synchronizer
+from umf_ros.sensors.messages import OdometrySample, stamp_ns
+from umf_ros.sensors.sessions import Input
+from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
@@ -63,12 +64,13 @@ class FrameReader:
             _check_overlap(odometry, bag)
             topics = topics.model_copy(update={"odometry": ""})
             inputs.add("odometry")
-        calibration = load_calibration(settings.calibration or settings.dataset)
+        calibration = calibration_of(settings)
         self.progress = 0.0
         self._bag = bag
         self._odometry = odometry
         self._synchronizer = Synchronizer(settings.sync, calibration, inputs)
-        self._intake = Intake(self._synchronizer, topics, warn)
+        self._samples: list[OdometrySample] = []
+        self._intake = Intake(self._synchronizer, topics, warn, self._samples.append)
         if bag.warning:
             warn(bag.warning)
 
@@ -79,10 +81,16 @@ class FrameReader:
 
     def __iter__(self) -> Iterator[Frame]:
         """Frames in the order of their stamps."""
+        return (item for item in self.stream() if isinstance(item, Frame))
+
+    def stream(self) -> Iterator[Frame | OdometrySample]:
+        """Every message of the odometry as it comes, and the frames as they are complete."""
         odometry = _Cursor(self._odometry) if self._odometry is not None else None
         for raw in self._bag.raw_messages(self._intake.topics):
             self._take(raw, odometry)
             self.progress = (raw.log_ns - self._bag.start_ns) / max(1, self._bag.end_ns - self._bag.start_ns)
+            yield from self._samples
+            self._samples.clear()
             yield from self._synchronizer.pop()
         yield from self._synchronizer.flush()
 
@@ -93,7 +101,7 @@ class FrameReader:
             self._intake.refuse(raw.topic, error)
             return
         if odometry is not None:
-            odometry.feed(self._synchronizer, message)
+            odometry.feed(self._intake, message)
         self._intake.take(raw.topic, message)
 
 
@@ -104,7 +112,7 @@ class _Cursor:
         self._trajectory = trajectory
         self._next = 0
 
-    def feed(self, synchronizer: Synchronizer, message: Any) -> None:
+    def feed(self, intake: Intake, message: Any) -> None:
         """Add the poses up to the message's stamp that were not added before."""
         try:
             end_ns = stamp_ns(message)
@@ -112,7 +120,7 @@ class _Cursor:
             return  # the intake says what is wrong with it
         stamps = self._trajectory.stamps_ns
         while self._next < len(stamps) and stamps[self._next] <= end_ns:
-            synchronizer.add_odometry(int(stamps[self._next]), self._trajectory.poses[self._next])
+            intake.take_odometry(OdometrySample(int(stamps[self._next]), self._trajectory.poses[self._next]))
             self._next += 1
 
 

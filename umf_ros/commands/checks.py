@@ -25,14 +25,15 @@ _PACKAGES = (
     ("torch", "torch", "2.4"),
     ("safetensors", "safetensors", "0.4"),
     ("openvino", "openvino", "2025"),
-    ("open3d", "open3d", "0.19"),
     ("small_gicp", "small_gicp", "1"),
     ("gtsam", "gtsam", "4.3"),
     ("mcap", "mcap", "1.2"),
     ("rosbags", "rosbags", "0.10"),
     ("pydantic", "pydantic", "2"),
     ("matplotlib", "matplotlib", "3.8"),
+    ("jinja2", "Jinja2", "3.1"),
 )
+_LAB_PACKAGES = (("open3d", "open3d", "0.19"), ("sklearn", "scikit-learn", "1.4"))
 _MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "visualization_msgs", "std_srvs")
 
 
@@ -58,6 +59,8 @@ def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
     yield "Python", check_python
     for module, distribution, minimum in _PACKAGES:
         yield distribution, partial(check_package, module, distribution, minimum)
+    for module, distribution, minimum in _LAB_PACKAGES:
+        yield distribution, partial(check_lab_package, module, distribution, minimum)
     yield "ROS 2 Python", check_rclpy
     yield "ROS 2 messages", check_messages
     yield "DDS", check_dds
@@ -84,6 +87,13 @@ def check_package(module: str, distribution: str, minimum: str) -> Finding:
         return Finding(distribution, False, _last_line(output) or f"import ends with status {status}", advice)
     found = _version(distribution) or _last_line(output)
     return Finding(distribution, _at_least(found, minimum), found, f"{minimum} or newer is needed: {advice}")
+
+
+def check_lab_package(module: str, distribution: str, minimum: str) -> Finding:
+    """A rover does without the lab's packages; one that is there has to work."""
+    if importlib.util.find_spec(module) is None:
+        return Finding(distribution, True, "not installed; only the lab needs it: pip install 'umf_ros[lab]'")
+    return check_package(module, distribution, minimum)
 
 
 def check_rclpy() -> Finding:

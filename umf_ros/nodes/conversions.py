@@ -12,7 +12,8 @@ from std_msgs.msg import ColorRGBA
 
 from umf_ros.errors import MessageError
 from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, from_quaternion, to_quaternion
+from umf_ros.geometry import Array, to_quaternion
+from umf_ros.sensors.messages import decode_pose
 
 GREEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.5)
@@ -39,21 +40,6 @@ def to_pose(pose: Array) -> Pose:
     """(4, 4) pose as a message."""
     x, y, z, w = (float(number) for number in to_quaternion(pose))
     return Pose(position=to_point(pose[:3, 3]), orientation=Quaternion(x=x, y=y, z=z, w=w))
-
-
-def from_pose(message: Pose) -> Array:
-    """(4, 4) pose of a message.
-
-    Raises:
-        MessageError: not finite, or no unit quaternion.
-    """
-    p, q = message.position, message.orientation
-    if not np.isfinite([p.x, p.y, p.z]).all():
-        raise MessageError("pose_not_finite", "pose with a position that is not finite")
-    try:
-        return from_quaternion([p.x, p.y, p.z], [q.x, q.y, q.z, q.w])
-    except ValueError as error:
-        raise MessageError("pose_not_a_rotation", f"pose with {error}") from None
 
 
 def to_pose_stamped(stamp_ns: int, frame: str, pose: Array) -> PoseStamped:
@@ -85,7 +71,7 @@ def closure_to_message(closure: LoopClosure) -> Odometry:
 
 
 def closure_from_message(message: Odometry) -> LoopClosure:
-    """The loop closure in a message of `/loop_closures`.
+    """The loop closure in a message of `/loop_closures`; its probability does not travel there and is unknown.
 
     Raises:
         MessageError: the frames name no keyframes, or the pose is no pose.
@@ -93,7 +79,7 @@ def closure_from_message(message: Odometry) -> LoopClosure:
     return LoopClosure(
         query_stamp_ns=_keyframe_stamp(message.child_frame_id),
         match_stamp_ns=_keyframe_stamp(message.header.frame_id),
-        match_T_query=from_pose(message.pose.pose),
+        match_T_query=decode_pose(message.pose.pose),
         covariance=np.asarray(message.pose.covariance, dtype=float).reshape(6, 6),
     )
 

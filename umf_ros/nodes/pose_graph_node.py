@@ -25,7 +25,7 @@ from umf_ros.bags.presets import topics_of
 from umf_ros.errors import MessageError, UmfError
 from umf_ros.geometry import Array
 from umf_ros.nodes import pose_graph_messages as messages
-from umf_ros.nodes.conversions import closure_from_message, from_pose, from_time
+from umf_ros.nodes.conversions import closure_from_message, from_time
 from umf_ros.nodes.diagnostics import OK, WARN, InputWatch, status
 from umf_ros.nodes.parameters import declare
 from umf_ros.nodes.process import run
@@ -33,10 +33,10 @@ from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
 from umf_ros.nodes.worker import Worker
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.graph import PoseGraph
-from umf_ros.pose_graph.restarts import RestartGuard
 from umf_ros.pose_graph.results import write_results
 from umf_ros.runs.folder import check_writable
-from umf_ros.sensors.messages import stamp_ns
+from umf_ros.sensors.messages import OdometrySample, decode_odometry
+from umf_ros.sensors.odometry_feed import OdometryFeed
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works
@@ -77,24 +77,23 @@ class PoseGraphNode(Node):
         if self._results:
             write_results(self._graph, self._results)
 
-    def _subscribe(self, name: str, topic: str, take: Callable[[Odometry, int], None], qos: QoSProfile) -> None:
+    def _subscribe(self, name: str, topic: str, take: Callable[[Odometry], None], qos: QoSProfile) -> None:
         watch = InputWatch(self, name, topic)
         self._watches.append(watch)
 
         def receive(message: Odometry) -> None:
             watch.saw(from_time(message.header.stamp))
             try:
-                take(message, stamp_ns(message))
+                take(message)
             except MessageError as error:
                 self._refuse(error)
 
         self.create_subscription(Odometry, topic, receive, qos)
 
     def _begin(self) -> None:
-        self._guard = RestartGuard()
         self._graph = PoseGraph(self._settings.pose_graph)
+        self._feed = OdometryFeed(self._graph)
         self._refused: Counter[str] = Counter()
-        self._newest_ns = -1
         self._map_T_odom: Array = np.eye(4)
         self._covariance: Array = np.zeros((6, 6))
         self._drawn = -1
@@ -108,19 +107,19 @@ class PoseGraphNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._broadcast = _broadcaster(self) if self._frames.publish_tf else None
 
-    def _on_odometry(self, message: Odometry, stamp_ns: int) -> None:
-        odom_T_body = from_pose(message.pose.pose)
-        self._worker.submit(lambda: self._add_odometry(stamp_ns, odom_T_body))
+    def _on_odometry(self, message: Odometry) -> None:
+        sample = decode_odometry(message)
+        self._worker.submit(lambda: self._add_odometry(sample))
         # the newest correction, not the next: the pose never waits for the optimiser
         map_T_odom = self._map_T_odom
-        pose = messages.pose(stamp_ns, map_T_odom @ odom_T_body, self._covariance, self._frames)
+        pose = messages.pose(sample.stamp_ns, map_T_odom @ sample.odom_T_body, self._covariance, self._frames)
         self._pose_publisher.publish(pose)
-        transform = messages.transform(stamp_ns, map_T_odom, self._frames)
+        transform = messages.transform(sample.stamp_ns, map_T_odom, self._frames)
         self._transform_publisher.publish(transform)
         if self._broadcast is not None:
             self._broadcast(transform)
 
-    def _on_closure(self, message: Odometry, _: int) -> None:
+    def _on_closure(self, message: Odometry) -> None:
         closure = closure_from_message(message)
         self._worker.submit(lambda: self._announce(self._graph.add_closure(closure)))
 
@@ -136,15 +135,10 @@ class PoseGraphNode(Node):
         with self._lock:
             step()
 
-    def _add_odometry(self, stamp_ns: int, odom_T_body: Any) -> None:
-        restarted, samples = self._guard.take(stamp_ns, odom_T_body)
-        if restarted:
-            self.get_logger().warning(f"{restarted}: a new session begins")
-            self._graph.begin_session()
-            self._newest_ns = -1
-        for stamp_ns, odom_T_body in samples:
-            self._newest_ns = max(self._newest_ns, stamp_ns)
-            self._graph.add_odometry(stamp_ns, odom_T_body)
+    def _add_odometry(self, sample: OdometrySample) -> None:
+        reset = self._feed.take(sample.stamp_ns, sample.odom_T_body)
+        if reset is not None:
+            self.get_logger().warning(f"{reset.reason}: a new session begins")
 
     def _announce(self, verdicts: list[ClosureVerdict]) -> None:
         if not verdicts:
@@ -169,7 +163,7 @@ class PoseGraphNode(Node):
         self._drawn = len(stamps)
         self._path_publisher.publish(messages.path(stamps, poses, self._frames))
         verdicts, lines = self._graph.closure_lines()
-        self._marker_publisher.publish(messages.markers(verdicts, lines, max(self._newest_ns, 0), self._frames))
+        self._marker_publisher.publish(messages.markers(verdicts, lines, max(self._feed.newest_ns, 0), self._frames))
 
     def _tick(self) -> None:
         self._worker.submit(self._keep_up)
@@ -188,7 +182,7 @@ class PoseGraphNode(Node):
 
     def _own_status(self) -> DiagnosticStatus:
         values: dict[str, object] = {**self._graph.counts, **self._refused, "queue_dropped": self._worker.dropped}
-        values["odometry_out_of_line"] = self._guard.slips
+        values["odometry_out_of_line"] = self._feed.dropped
         values |= {state.value: count for state, count in self._graph.verdict_counts().items()}
         trouble = self._worker.dropped or any(name.startswith("optimiser") for name in self._graph.counts)
         level = WARN if trouble or self._refused else OK
@@ -238,12 +232,7 @@ def describe(verdict: ClosureVerdict) -> str:
 
 def _as_status(verdict: ClosureVerdict) -> DiagnosticStatus:
     level = OK if verdict.state is State.ACCEPTED else WARN
-    values = {
-        "verdict": verdict.state.value,
-        "mahalanobis": verdict.residual,
-        "misfit_m": verdict.residual_m,
-        "probability": verdict.closure.probability,
-    }
+    values = {"verdict": verdict.state.value, "mahalanobis": verdict.residual, "misfit_m": verdict.residual_m}
     return status(level, _name(verdict.closure), verdict.reason, values)
 
 

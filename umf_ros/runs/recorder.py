@@ -20,7 +20,7 @@ from umf_ros.loop_detector import Detection
 from umf_ros.runs import tables
 from umf_ros.runs.folder import write_atomically
 from umf_ros.sensors.counters import InputCounter
-from umf_ros.sensors.synchronizer import Input
+from umf_ros.sensors.sessions import Input
 
 STAGES = ("embed", "query", "verify", "total")
 

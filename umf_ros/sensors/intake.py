@@ -7,8 +7,16 @@ from typing import Any
 
 from umf_ros.config import Topics
 from umf_ros.errors import MessageError
-from umf_ros.sensors.messages import decode_camera_info, decode_cloud, decode_image, decode_odometry, stamp_ns
-from umf_ros.sensors.synchronizer import SILENCE_NS, Input, Synchronizer
+from umf_ros.sensors.messages import (
+    OdometrySample,
+    decode_camera_info,
+    decode_cloud,
+    decode_image,
+    decode_odometry,
+    stamp_ns,
+)
+from umf_ros.sensors.sessions import Input
+from umf_ros.sensors.synchronizer import SILENCE_NS, Synchronizer
 
 
 def wanted_inputs(topics: Topics) -> set[Input]:
@@ -29,9 +37,16 @@ class Intake:
     A message that cannot be used is counted by kind and skipped; the first of each kind is told.
     """
 
-    def __init__(self, synchronizer: Synchronizer, topics: Topics, warn: Callable[[str], None]) -> None:
-        """Warn with one line per kind of fault and topic."""
+    def __init__(
+        self,
+        synchronizer: Synchronizer,
+        topics: Topics,
+        warn: Callable[[str], None],
+        hear_odometry: Callable[[OdometrySample], None] = lambda _: None,
+    ) -> None:
+        """Warn with one line per kind of fault and topic; `hear_odometry` gets every sample at its full rate."""
         self._synchronizer = synchronizer
+        self._hear_odometry = hear_odometry
         self._warn = warn
         self._warned: set[tuple[str, str]] = set()
         self._stereo_info = bool(topics.right_info and topics.right_image)
@@ -59,6 +74,11 @@ class Intake:
         except MessageError as error:
             self.refuse(topic, error)
 
+    def take_odometry(self, sample: OdometrySample) -> None:
+        """Add one pose of the odometry."""
+        self._hear_odometry(sample)
+        self._synchronizer.add_odometry(sample.stamp_ns, sample.odom_T_body)
+
     def refuse(self, topic: str, error: MessageError) -> None:
         """Count a message that cannot be used."""
         self._synchronizer.reject(self._handlers[topic][0], error.kind)
@@ -76,8 +96,7 @@ class Intake:
         self._synchronizer.add_cloud(stamp_ns(message), decode_cloud(message))
 
     def _odometry(self, message: Any) -> None:
-        sample = decode_odometry(message)
-        self._synchronizer.add_odometry(sample.stamp_ns, sample.odom_T_body)
+        self.take_odometry(decode_odometry(message))
 
     def _left_info(self, message: Any) -> None:
         self._use_info("left", message)

@@ -62,12 +62,10 @@ class OdometrySample:
     Attributes:
         stamp_ns: when.
         odom_T_body: (4, 4) pose.
-        covariance: (6, 6) of the pose in ROS order.
     """
 
     stamp_ns: int
     odom_T_body: Array
-    covariance: Array
 
 
 def stamp_ns(message: Any) -> int:
@@ -191,8 +189,7 @@ def decode_odometry(message: Any) -> OdometrySample:
     Raises:
         MessageError: of kind "pose" when it is not finite or its quaternion is not of unit length.
     """
-    covariance = np.array(message.pose.covariance, dtype=float).reshape(6, 6)
-    return OdometrySample(stamp_ns(message), decode_pose(message.pose.pose), covariance)
+    return OdometrySample(stamp_ns(message), decode_pose(message.pose.pose))
 
 
 def decode_pose(pose: Any) -> Array:

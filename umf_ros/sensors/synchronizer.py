@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
-from typing import Literal
+from typing import Any
 
 from umf_ros.config import Sync
 from umf_ros.errors import MessageError
@@ -14,28 +13,17 @@ from umf_ros.geometry import Array
 from umf_ros.sensors.assembly import Anchor, assemble, filter_cloud
 from umf_ros.sensors.buffers import ImageBuffer, OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
-from umf_ros.sensors.clock import StreamClock
 from umf_ros.sensors.counters import InputCounter
 from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.sessions import Arrival, Input, Reset, SessionClock
 
-Input = Literal["left", "right", "cloud", "odometry", "camera_info"]
 INPUTS: tuple[Input, ...] = ("left", "right", "cloud", "odometry")
 
 STEREO_SLOP_NS = 17_000_000
 """Exposures of a pair carry the same stamp; half a period at 30 Hz tells a pair from the neighbouring one."""
 
-
 SILENCE_NS = 5_000_000_000
 """An input of which nothing has come in this much stream time is taken to be absent."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Doubted:
-    """A message whose stamp jumped back, until another one tells a restart from a slip of its clock."""
-
-    name: Input
-    stamp_ns: int
-    add: Callable[[], None]
 
 
 class Synchronizer:
@@ -47,14 +35,15 @@ class Synchronizer:
     give the same frames however their arrivals interleave. A frame that has waited longer is completed
     with what is there; an input that has been silent for long is not waited for until it speaks.
 
-    When stamps jump back (the recording starts again), the waiting frames are completed with what is
-    there, the buffers are emptied and a new session begins. One message does not make a restart: it is held
-    back until a second one agrees, and dropped when its input goes on as before.
+    When a new session begins (`SessionClock` says so: stamps went back because the recording starts again, or the
+    odometry was reset), the waiting frames are completed with what is there and what cannot be compared with the
+    measurements to come is forgotten: everything, or after a reset of the odometry its poses.
 
     Not for several threads at once.
 
     Attributes:
         counters: what became of the messages of each input.
+        session: number of resets of the clock or the odometry so far.
     """
 
     def __init__(self, settings: Sync, calibration: Calibration, inputs: Collection[Input] = INPUTS) -> None:
@@ -66,7 +55,8 @@ class Synchronizer:
         self._absent: set[Input] = set()
         self._slop_ns = round(settings.slop_s * 1e9)
         self._max_wait_ns = round(settings.max_wait_s * 1e9)
-        self._clock = StreamClock()
+        self._clock = SessionClock()
+        self.session = 0
         self._left = ImageBuffer(settings.queue_size, self.counters["left"])
         self._right = ImageBuffer(settings.queue_size, self.counters["right"])
         self._odometry = OdometryBuffer(
@@ -75,12 +65,12 @@ class Synchronizer:
         self._anchors: deque[Anchor] = deque()
         self._frames: list[Frame] = []
         self._given_up_ns = -1  # images up to here come too late
-        self._doubted: _Doubted | None = None
-
-    @property
-    def session(self) -> int:
-        """How often the recording has started again."""
-        return self._clock.session
+        self._adders: dict[Input, Callable[[int, Any], None]] = {
+            "left": self._use_left,
+            "right": self._use_right,
+            "cloud": self._use_cloud,
+            "odometry": self._use_odometry,
+        }
 
     @property
     def waiting(self) -> int:
@@ -99,11 +89,7 @@ class Synchronizer:
             MessageError: of kind "size" when the calibration is for other images.
         """
         self._check_size(image)
-        if self._accept("left", stamp_ns, lambda: self.add_left(stamp_ns, image)):
-            self._left.add(stamp_ns, image, late=stamp_ns <= self._given_up_ns)
-            if "cloud" not in self._inputs:
-                self._anchors.append(Anchor(stamp_ns, stamp_ns))
-            self._build()
+        self._take(Arrival("left", stamp_ns, image))
 
     def add_right(self, stamp_ns: int, image: Image) -> None:
         """Add a right image, (H, W) uint8, as the camera sends it.
@@ -112,23 +98,15 @@ class Synchronizer:
             MessageError: of kind "size" when the calibration is for other images.
         """
         self._check_size(image)
-        if self._accept("right", stamp_ns, lambda: self.add_right(stamp_ns, image)):
-            self._right.add(stamp_ns, image, late=stamp_ns <= self._given_up_ns)
-            self._build()
+        self._take(Arrival("right", stamp_ns, image))
 
     def add_cloud(self, stamp_ns: int, cloud: Cloud) -> None:
         """Add a scan by the stamp of its message, the start of the scan."""
-        if self._accept("cloud", stamp_ns, lambda: self.add_cloud(stamp_ns, cloud)):
-            key = stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
-            self._anchors.append(Anchor(key, stamp_ns, filter_cloud(cloud, self._calibration)))
-            self._build()
+        self._take(Arrival("cloud", stamp_ns, cloud))
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
         """Add a (4, 4) pose of the odometry."""
-        if self._accept("odometry", stamp_ns, lambda: self.add_odometry(stamp_ns, odom_T_body)):
-            self._odometry.add(stamp_ns, odom_T_body)
-            self.counters["odometry"].used += 1
-            self._build()
+        self._take(Arrival("odometry", stamp_ns, odom_T_body))
 
     def reject(self, name: Input, reason: str) -> None:
         """Count a message that could not be used at all; a camera_info like that is not waited for again."""
@@ -145,37 +123,52 @@ class Synchronizer:
 
     def flush(self) -> list[Frame]:
         """Complete the waiting frames with what is there, at the end of the stream, and pop them."""
-        self._drop_doubted()
+        self._count_dropped(self._clock.give_up())
         self._clear()
         return self.pop()
 
-    def _accept(self, name: Input, stamp_ns: int, add: Callable[[], None]) -> bool:
-        doubted = self._doubted
-        if self._clock.restarts(name, stamp_ns):
-            if doubted is None or abs(stamp_ns - doubted.stamp_ns) > SILENCE_NS:
-                self._drop_doubted()
-                self._doubted = _Doubted(name, stamp_ns, add)
-                return False
-            self._doubted = None
-            self._clear()
-            self._clock.restart()
-            doubted.add()
-        elif doubted and doubted.name == name:
-            self._drop_doubted()
-        counter = self.counters[name]
-        counter.received += 1
-        fault = self._clock.fault(name, stamp_ns)
-        if fault:
-            counter.dropped[fault] += 1
-            return False
-        self._clock.advance(name, stamp_ns)
-        self._absent.discard(name)
-        return True
+    def _take(self, arrival: Arrival) -> None:
+        ruling = self._clock.take(arrival)
+        self._count_dropped(ruling.dropped)
+        if ruling.reset is not None:
+            self._begin_session(ruling.reset)
+        for one in ruling.usable:
+            counter = self.counters[one.name]
+            counter.received += 1
+            if one.fault:
+                counter.dropped[one.fault] += 1
+                continue
+            self._absent.discard(one.name)
+            self._adders[one.name](one.stamp_ns, one.value)
+            self._build()
 
-    def _drop_doubted(self) -> None:
-        if self._doubted is not None:
-            self.reject(self._doubted.name, "clock jump")
-            self._doubted = None
+    def _count_dropped(self, wrong: list[Arrival]) -> None:
+        for one in wrong:
+            self.reject(one.name, one.fault)
+
+    def _begin_session(self, reset: Reset) -> None:
+        if reset.of_clock:
+            self._clear()
+        else:
+            self._complete_all()
+            self._odometry.clear()
+        self.session = self._clock.session
+
+    def _use_left(self, stamp_ns: int, image: Image) -> None:
+        self._left.add(stamp_ns, image, late=stamp_ns <= self._given_up_ns)
+        if "cloud" not in self._inputs:
+            self._anchors.append(Anchor(stamp_ns, stamp_ns))
+
+    def _use_right(self, stamp_ns: int, image: Image) -> None:
+        self._right.add(stamp_ns, image, late=stamp_ns <= self._given_up_ns)
+
+    def _use_cloud(self, stamp_ns: int, cloud: Cloud) -> None:
+        key = stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
+        self._anchors.append(Anchor(key, stamp_ns, filter_cloud(cloud, self._calibration)))
+
+    def _use_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
+        self._odometry.add(stamp_ns, odom_T_body)
+        self.counters["odometry"].used += 1
 
     def _check_size(self, image: Image) -> None:
         height, width = image.shape
@@ -185,9 +178,12 @@ class Synchronizer:
                 "size", f"image of {width} x {height} pixels, the calibration is for {expected[0]} x {expected[1]}"
             )
 
-    def _clear(self) -> None:
+    def _complete_all(self) -> None:
         while self._anchors:
             self._complete(self._anchors.popleft())
+
+    def _clear(self) -> None:
+        self._complete_all()
         self._left.clear()
         self._right.clear()
         self._odometry.clear()

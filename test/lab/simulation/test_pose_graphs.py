@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from umf_ros.lab.simulation.pose_graphs import WORLDS, Kind, World, rover_loops, with_wrong_closures
+from umf_ros.lab.simulation.pose_graphs import (
+    WORLDS,
+    Kind,
+    World,
+    rover_loops,
+    with_bias,
+    with_lone_end,
+    with_wrong_closures,
+)
 from umf_ros.pose_graph import lie
 
 
@@ -66,3 +74,20 @@ def test_messages_carry_the_stamps_and_the_stated_noise() -> None:
     np.testing.assert_array_equal(message.match_T_query, closure.pose)
     assert np.trace(message.covariance) == pytest.approx(np.trace(closure.covariance), rel=1e-6)
     assert world.step_covariance(0) is None and world.step_covariance(1) is not None
+
+
+def test_a_bias_is_the_same_in_every_metre_and_not_stated() -> None:
+    world, twist = rover_loops(300, 7), np.array([0, 0, 0.002, 0.01, 0, 0])
+    biased = with_bias(world, twist)
+    np.testing.assert_array_equal(biased.odometry[0], world.odometry[0])
+    np.testing.assert_array_equal(biased.step_covariances, world.step_covariances)
+    steps, wrong = (lie.invert(w.odometry[:-1]) @ w.odometry[1:] for w in (world, biased))
+    lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
+    np.testing.assert_allclose(lie.log(lie.invert(steps) @ wrong), lengths[:, None] * twist, atol=1e-9)
+
+
+def test_a_lone_end_leaves_one_closure_in_the_second_half() -> None:
+    world = rover_loops(400, 7)
+    lone = with_lone_end(world)
+    assert [closure.second for closure in lone.closures if closure.second >= 200] == [world.closures[-1].second]
+    assert len(lone.closures) == 1 + sum(closure.second < 200 for closure in world.closures) > 1

@@ -24,7 +24,7 @@ from umf_ros.geometry import Array, transform
 from umf_ros.lab.datasets.pickles import load_data_frame
 from umf_ros.lab.datasets.recorded import RecordedSequence, course, detours, poses_of, travelled
 from umf_ros.lab.datasets.sample import Sample
-from umf_ros.runs.trajectory_error import align_rigidly
+from umf_ros.runs.truth import align_rigidly
 from umf_ros.sensors.calibration import Calibration, load_calibration
 from umf_ros.trajectory import Trajectory
 

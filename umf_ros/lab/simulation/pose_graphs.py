@@ -121,6 +121,22 @@ def with_wrong_closures(world: World, share: float, kind: Kind, seed: int) -> Wo
     return replace(world, closures=order)
 
 
+def with_bias(world: World, twist: Array) -> World:
+    """The world with every metre of its odometry wrong by the same (6,) twist, which its covariances do not state."""
+    steps = lie.invert(world.odometry[:-1]) @ world.odometry[1:]
+    lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
+    odometry = [world.odometry[0]]
+    for step in steps @ lie.exp(lengths[:, None] * twist):
+        odometry.append(odometry[-1] @ step)
+    return replace(world, odometry=np.array(odometry))
+
+
+def with_lone_end(world: World) -> World:
+    """The world with the closures of its first half and, after a long way without any, its last one alone."""
+    early = [closure for closure in world.closures if closure.second < len(world.truth) // 2]
+    return replace(world, closures=[*early, world.closures[-1]])
+
+
 def _alias(world: World, i: int, j: int, length: int, rng: np.random.Generator) -> list[WorldClosure]:
     """Closures that all say place j is place i: one wrong shift of the world for the whole group."""
     claimed = lie.exp(rng.normal(0, [0, 0, 0.05, 0.7, 0.7, 0.1])[None])[0]

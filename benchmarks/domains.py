@@ -1,0 +1,172 @@
+"""Verification in other domains: other LiDARs, other places, other mounts, LiDAR alone.
+
+python benchmarks/domains.py [--quick] [--seed N] [--jobs N] [--folder FOLDER] [--json FILE]
+
+With `--folder` the simulated scans are kept and used again. Descriptors and local features are those of the shipped
+network; there is no odometry, and every pair is verified on its own, so that no other pair supports it.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from domain_pairs import ELSEWHERE, FULL, QUICK, SAME, TURNED, Extent, Pair, pairs_of, places_of
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from umf_ros.config import EmbeddingSettings, Verification
+from umf_ros.embedding import make_embedder
+from umf_ros.frames import Candidate, LoopClosure
+from umf_ros.geometry import Array, relative, rotation_angle
+from umf_ros.lab.simulation.domains import DOMAINS, Domain
+from umf_ros.lab.simulation.seeds import TEST
+from umf_ros.lab.training.acceptance_fit import inside_ellipsoid
+from umf_ros.verification import Verifier
+
+WRONG_M, WRONG_DEG = 1.0, 5.0
+
+
+@dataclass
+class Outcome:
+    """What the verifier made of one domain's pairs."""
+
+    name: str
+    pairs: dict[str, int] = field(default_factory=lambda: dict.fromkeys((SAME, TURNED, ELSEWHERE), 0))
+    right: dict[str, int] = field(default_factory=lambda: dict.fromkeys((SAME, TURNED, ELSEWHERE), 0))
+    wrong: dict[str, int] = field(default_factory=lambda: dict.fromkeys((SAME, TURNED, ELSEWHERE), 0))
+    errors: list[Array] = field(default_factory=list)
+    covariances: list[Array] = field(default_factory=list)
+    refine_ms: list[float] = field(default_factory=list)
+
+    def judge(self, pair: Pair, closure: LoopClosure | None) -> None:
+        """Count one verdict."""
+        self.pairs[pair.kind] += 1
+        if closure is None:
+            return
+        if pair.kind == ELSEWHERE or is_wrong(closure.match_T_query, pair.match_T_query):
+            self.wrong[pair.kind] += 1
+            return
+        self.right[pair.kind] += 1
+        self.errors.append(error_vector(closure.match_T_query, pair.match_T_query))
+        self.covariances.append(closure.covariance)
+
+    def share(self, kind: str) -> float:
+        """Share of the pairs of a kind that were rightly accepted."""
+        return self.right[kind] / self.pairs[kind] if self.pairs[kind] else float("nan")
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """The domain's own figures."""
+        inside = inside_ellipsoid(np.array(self.errors), np.array(self.covariances)) if self.errors else float("nan")
+        return {
+            "pairs": sum(self.pairs.values()),
+            "accepted": sum(self.right.values()) + sum(self.wrong.values()),
+            "wrong": sum(self.wrong.values()),
+            "wrong_elsewhere": self.wrong[ELSEWHERE],
+            "recall": self.share(SAME),
+            "turned_recall": self.share(TURNED),
+            "inside_95": inside,
+        }
+
+
+def main(
+    quick: Annotated[bool, typer.Option(help="fewer scans of fewer worlds")] = False,
+    seed: Annotated[int, typer.Option(help="other worlds")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
+    jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1,
+    folder: Annotated[Path | None, typer.Option(help="keeps the simulated scans for the next time")] = None,
+    only: Annotated[str, typer.Option(help="domains whose name contains this")] = "",
+) -> None:
+    """Verify true and false pairs of every domain and compare with the truth."""
+    console = Console()
+    extent = QUICK if quick else FULL
+    chosen = [domain for domain in DOMAINS if only in domain.name]
+    outcomes: dict[str, Outcome] = {}
+    # a thread pool of Open3D or torch does not survive a fork
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        waiting = [pool.submit(run, domain, seed, extent, folder) for domain in chosen]
+        for done in as_completed(waiting):
+            outcome = done.result()
+            outcomes[outcome.name] = outcome
+            console.print(f"{outcome.name}: {outcome.figures['accepted']} accepted, {outcome.figures['wrong']} wrong")
+    ordered = [outcomes[domain.name] for domain in chosen]
+    figures = summary(ordered)
+    console.print(_table(ordered))
+    for name, value in figures.items():
+        console.print(f"{name:20} {value:.4g}")
+    if json_file:
+        details = {"domains": {outcome.name: outcome.figures for outcome in ordered}}
+        json_file.write_text(json.dumps(figures | details, indent=2) + "\n", encoding="utf-8")
+
+
+def run(domain: Domain, seed: int, extent: Extent, folder: Path | None) -> Outcome:
+    """Survey one domain and verify its pairs."""
+    embedder = make_embedder(EmbeddingSettings(threads=1))
+    start = TEST[100 * seed % len(TEST)]
+    places = places_of(domain, range(start, start + extent.worlds), extent, folder, embedder)
+    verifier, outcome = Verifier(Verification()), Outcome(domain.name)
+    for pair in pairs_of(places, domain, np.random.default_rng(seed)):
+        outcome.judge(pair, _closure(verifier, pair))
+        outcome.refine_ms.append(verifier.latency_ms["refine"])
+    return outcome
+
+
+def summary(outcomes: list[Outcome]) -> dict[str, float]:
+    """The figures over all domains; means and worst are of the domains, whatever their size."""
+    recall = [outcome.share(SAME) for outcome in outcomes]
+    inside = [outcome.figures["inside_95"] for outcome in outcomes]
+    turned = [sum(outcome.right[TURNED] for outcome in outcomes), sum(outcome.pairs[TURNED] for outcome in outcomes)]
+    known = [value for value in inside if np.isfinite(value)]
+    return {
+        "accepted": sum(outcome.figures["accepted"] for outcome in outcomes),
+        "wrong": sum(outcome.figures["wrong"] for outcome in outcomes),
+        "recall_mean": float(np.mean(recall)),
+        "recall_worst": float(np.min(recall)),
+        "inside_95_mean": float(np.mean(known)) if known else float("nan"),
+        "inside_95_worst": float(np.min(known)) if known else float("nan"),
+        "turned_recall": turned[0] / max(turned[1], 1),
+        "refine_ms": float(np.median(np.concatenate([outcome.refine_ms for outcome in outcomes]))),
+    }
+
+
+def _closure(verifier: Verifier, pair: Pair) -> LoopClosure | None:
+    verifier.reset()
+    candidate = Candidate(0, pair.match.keyframe.stamp_ns, pair.similarity)
+    return verifier.verify(pair.query.keyframe, [(candidate, pair.match.keyframe)])[0].closure
+
+
+def is_wrong(estimated: Array, true: Array) -> bool:
+    """Whether a pose is more than 1 m or 5 deg from the truth."""
+    gap = relative(true, estimated)
+    return bool(np.linalg.norm(gap[:3, 3]) > WRONG_M or np.degrees(rotation_angle(gap)) > WRONG_DEG)
+
+
+def error_vector(estimated: Array, true: Array) -> Array:
+    """Error (6,) in ROS order, axes of the match."""
+    turn = Rotation.from_matrix(estimated[:3, :3] @ true[:3, :3].T).as_rotvec()
+    return np.concatenate([estimated[:3, 3] - true[:3, 3], turn])
+
+
+def _table(outcomes: list[Outcome]) -> Table:
+    table = Table(title="pairs (same way, other way, elsewhere) and verdicts", box=None)
+    for name in ("sensor-place-mount", "same", "other", "else", "acc.", "wrong", "recall", "turned", "in 95 %"):
+        first = name == "sensor-place-mount"
+        table.add_column(name, justify="left" if first else "right", no_wrap=True)
+    for outcome in outcomes:
+        figures = outcome.figures
+        counts = (*outcome.pairs.values(), figures["accepted"], figures["wrong"])
+        shares = (f"{figures[key]:.3f}" for key in ("recall", "turned_recall", "inside_95"))
+        table.add_row(outcome.name, *map(str, counts), *shares)
+    return table
+
+
+if __name__ == "__main__":
+    typer.run(main)

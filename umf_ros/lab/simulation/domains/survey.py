@@ -1,0 +1,174 @@
+"""Domains: a sensor in a kind of place on a mount, and the scans that it takes there with their true poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from umf_ros.geometry import Array, interpolate, transform
+from umf_ros.lab.simulation.domains.mounts import MOUNTS, Mount
+from umf_ros.lab.simulation.domains.places import PLACES, Place
+from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner
+from umf_ros.lab.simulation.domains.sweeps import Sweep, stamp_moment, sweep
+from umf_ros.lab.simulation.passes import Setting, plan_passes
+from umf_ros.lab.simulation.relief import Relief
+from umf_ros.lab.simulation.rover import stand
+from umf_ros.lab.simulation.seeds import check_seed
+
+SWING_DEG = 8.0  # how far a revisit's heading swings to either side
+TILT_DEG = 1.0  # of the ground under single wheels
+FIRST, SAME_WAY, OTHER_WAY = "first", "offset", "opposite"
+
+
+@dataclass(frozen=True, slots=True)
+class Domain:
+    """One combination, each by its name in `SCANNERS`, `PLACES` and `MOUNTS`.
+
+    Attributes:
+        sensor: LiDAR.
+        place: kind of place.
+        mount: how the LiDAR is carried.
+    """
+
+    sensor: str
+    place: str
+    mount: str
+
+    @property
+    def name(self) -> str:
+        """Sensor, place and mount."""
+        return f"{self.sensor}-{self.place}-{self.mount}"
+
+    @property
+    def scale(self) -> float:
+        """Of distances in this kind of place, 1 in the open."""
+        return PLACES[self.place].scale
+
+    @property
+    def scanner(self) -> Scanner:
+        """The LiDAR."""
+        return SCANNERS[self.sensor]
+
+
+@dataclass(frozen=True, slots=True)
+class DomainScan:
+    """One scan of a survey.
+
+    Attributes:
+        sweep: points, intensity and times; points in the body frame of a calibrated mount, else in the LiDAR's own.
+        world_T_body: (4, 4) true pose of that frame at the scan's stamp.
+        world_T_lidar: (4, 4) true pose of the LiDAR then.
+        label: first, offset (again, the same way) or opposite.
+    """
+
+    sweep: Sweep
+    world_T_body: Array
+    world_T_lidar: Array
+    label: str
+
+
+DOMAINS: tuple[Domain, ...] = (
+    Domain("cube1", "etna", "rover"),
+    Domain("cube1", "quarry", "tilted"),
+    Domain("cube1", "street", "rover"),
+    Domain("spin16", "corridor", "rolling"),
+    Domain("spin16", "orchard", "rover"),
+    Domain("spin16", "dunes", "mast"),
+    Domain("spin64", "street", "car"),
+    Domain("spin64", "woods", "mast"),
+    Domain("spin64", "canyon", "rover"),
+    Domain("spin128", "quarry", "rolling"),
+    Domain("spin128", "rooms", "rolling"),
+    Domain("spin128", "moon", "tilted"),
+    Domain("solid360", "street", "tilted"),
+    Domain("solid360", "corridor", "low"),
+    Domain("solid360", "rooms", "tilted"),
+    Domain("rosette70", "street", "car"),
+    Domain("rosette70", "orchard", "rolling"),
+    Domain("rosette70", "corridor", "low"),
+)
+"""The combinations that the benchmarks run; any other can be surveyed too."""
+
+
+def survey(domain: Domain, seed: int, step_m: float, longest_m: float, place: Place | None = None) -> list[DomainScan]:
+    """Drive a stretch of the place's trail, again the same way and, with a LiDAR that sees all around, back.
+
+    Args:
+        domain: what to take along and where.
+        seed: the place's number; see `seeds` for which are whose.
+        step_m: between scans in the open, m; multiplied by the domain's scale.
+        longest_m: length of the stretch, m; likewise.
+        place: the place of this seed where it is at hand already.
+
+    Raises:
+        ConfigError: negative seed.
+    """
+    place = place or PLACES[domain.place].build(check_seed(seed))
+    mount, scanner = MOUNTS[domain.mount], domain.scanner
+    carrier = np.random.default_rng([seed, 51])
+    body_T_lidar = mount.body_T_lidar(carrier)
+    scans = []
+    for visit, label in enumerate((FIRST, SAME_WAY, OTHER_WAY) if scanner.all_round else (FIRST, SAME_WAY)):
+        rng = np.random.default_rng([seed, 52, visit])
+        scene = place.scene(visit)
+        for world_T_body in _drive(place, label, (step_m * domain.scale, longest_m * domain.scale), rng):
+            phase, start_s = rng.random(), rng.random()
+            motion = _Motion(world_T_body, mount, scanner, (phase, start_s, float(rng.normal(0, 0.15))), body_T_lidar)
+            found = sweep(scanner, scene, motion.world_T_lidar, rng)
+            stamp = stamp_moment(scanner)
+            lidar = motion.world_T_lidar(stamp)
+            if mount.calibrated:
+                points = transform(body_T_lidar, found.points)
+                found = Sweep(points, found.intensity, found.offset_s)
+                scans.append(DomainScan(found, motion.world_T_body(stamp), lidar, label))
+            else:
+                scans.append(DomainScan(found, lidar, lidar, label))
+    return scans
+
+
+class _Motion:
+    """The carrier drives, turns and sways during a scan."""
+
+    def __init__(
+        self,
+        world_T_start: Array,
+        mount: Mount,
+        scanner: Scanner,
+        chance: tuple[float, float, float],
+        body_T_lidar: Array,
+    ) -> None:
+        self._start, self._mount, self._period_s = world_T_start, mount, scanner.period_s
+        self._phase, self._start_s, turn_rad_s = chance
+        self._body_T_lidar = body_T_lidar
+        angle, way = turn_rad_s * scanner.period_s, mount.speed_m_s * scanner.period_s
+        step = np.eye(4)
+        step[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        step[0, 3] = way
+        self._end = world_T_start @ step
+
+    def world_T_body(self, moment: float) -> Array:
+        """Pose of the body at a moment of the scan, 0 to 1."""
+        sway = self._mount.sway(self._start_s + moment * self._period_s, self._phase)
+        return interpolate(self._start, self._end, moment) @ sway
+
+    def world_T_lidar(self, moment: float) -> Array:
+        """Pose of the LiDAR then."""
+        return self.world_T_body(moment) @ self._body_T_lidar
+
+
+def _drive(place: Place, label: str, stretch: tuple[float, float], rng: np.random.Generator) -> Iterator[Array]:
+    """Poses of the body along the trail, for a revisit with offsets and swings of its own."""
+    step_m, longest_m = stretch
+    lateral = 0.0 if label == FIRST else place.lateral_m
+    setting = Setting(lateral, SWING_DEG, 0.0, TILT_DEG, 0.0)
+    trail = np.roll(place.trail, -int(rng.integers(max(int(step_m / 0.1), 1))), axis=0)
+    drive = plan_passes(trail, (label,), setting, step_m, int(rng.integers(2**31)))[0]
+    count = int(longest_m / step_m)
+    chosen = slice(-count, None) if label == OTHER_WAY and count < len(drive.path) else slice(0, count)
+    # anything with a height will do as ground
+    ground = cast(Relief, place)
+    x, y = drive.path[chosen].T
+    yield from stand(ground, x, y, drive.yaw[chosen], drive.tilt[chosen])

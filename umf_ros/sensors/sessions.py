@@ -1,0 +1,177 @@
+"""The one authority on time and sessions: where a recording, or its odometry, begins anew.
+
+Front-end, back-end and replay ask the same class. A process that sees the odometry alone comes to the same
+sessions of it as one that sees every input.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+Input = Literal["left", "right", "cloud", "odometry", "camera_info"]
+ODOMETRY: Input = "odometry"
+"""The input whose values are poses, (4, 4) `odom_T_body`: they tell a reset even when its clock runs on."""
+
+CLOCK_STEP_NS = 1_000_000_000
+"""A stamp this much older than the newest of its input is not late: the clock was set back."""
+AGREEMENT_NS = 5_000_000_000
+"""Two messages out of line tell of the same new session when their stamps lie this close together."""
+FASTEST_M_PER_S = 20.0
+LEAST_JUMP_M = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """A message as it arrives.
+
+    Attributes:
+        name: its input.
+        stamp_ns: its stamp.
+        value: what it says; of the odometry (4, 4) `odom_T_body`.
+        fault: why it does not go on from its input's newest message ("duplicate", "out of order", "stale"), or why
+            it was dropped ("clock jump", "position jump"); empty for an ordinary one.
+    """
+
+    name: Input
+    stamp_ns: int
+    value: Any = None
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """Why a new session begins.
+
+    Attributes:
+        reason: for a person.
+        of_clock: the stamps went back; otherwise the odometry alone jumped and time goes on.
+    """
+
+    reason: str
+    of_clock: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Ruling:
+    """What is to be done when a message has arrived.
+
+    Attributes:
+        reset: a new session begins before the messages to use, or None.
+        usable: messages to use, in the order of their arrival; none while the message is held.
+        dropped: messages that were held and turned out to be wrong.
+    """
+
+    reset: Reset | None = None
+    usable: list[Arrival] = field(default_factory=list)
+    dropped: list[Arrival] = field(default_factory=list)
+
+
+class SessionClock:
+    """Keeps the time of some inputs and tells a new session from a single message that is wrong.
+
+    A message out of line with the newest of its input (its stamp went back, or the odometry jumped) is held until
+    another agrees with it: of its own input one that goes on from it or, where the stamps went back, one of any
+    input. Then a new session begins. When its input goes on as before, the message is dropped.
+
+    Attributes:
+        session: number of resets.
+    """
+
+    def __init__(self) -> None:
+        self.session = 0
+        self._now_ns: int | None = None
+        self._start_ns = 0
+        self._previous_end_ns: int | None = None
+        self._newest: dict[Input, Arrival] = {}
+        self._held: dict[Input, tuple[Arrival, Reset]] = {}
+
+    @property
+    def elapsed_ns(self) -> int:
+        """Time since the first stamp on this clock."""
+        return 0 if self._now_ns is None else self._now_ns - self._start_ns
+
+    def newest_ns(self, *names: Input) -> int | None:
+        """Latest stamp of some inputs on this clock, or None before their first."""
+        return max((self._newest[name].stamp_ns for name in names if name in self._newest), default=None)
+
+    def has_heard(self, name: Input) -> bool:
+        """Whether a message of input `name` has come on this clock."""
+        return name in self._newest
+
+    def take(self, arrival: Arrival) -> Ruling:
+        """Take one message."""
+        newest = self._newest.get(arrival.name)
+        reset = None if newest is None else _reset(newest, arrival)
+        if reset is None:
+            return Ruling(usable=[self._advance(arrival)], dropped=self._drop({arrival.name}))
+        agreeing = {name for name, held in self._held.items() if _agree(*held, arrival, reset)}
+        if not agreeing:
+            dropped = self._drop({arrival.name})
+            self._held[arrival.name] = arrival, reset
+            return Ruling(dropped=dropped)
+        return self._begin(agreeing, arrival)
+
+    def give_up(self) -> list[Arrival]:
+        """Drop what is still held, at the end of the stream."""
+        return self._drop(set(self._held))
+
+    def _begin(self, agreeing: set[Input], arrival: Arrival) -> Ruling:
+        held = [self._held.pop(name) for name in list(self._held) if name in agreeing]
+        reset = held[0][1]
+        self.session += 1
+        if reset.of_clock:
+            self._previous_end_ns, self._now_ns = self._now_ns, None
+            self._newest.clear()
+        else:
+            del self._newest[arrival.name]
+        dropped = self._drop(set(self._held) if reset.of_clock else {arrival.name})
+        return Ruling(reset, [self._advance(one) for one in (*(one for one, _ in held), arrival)], dropped)
+
+    def _drop(self, names: set[Input]) -> list[Arrival]:
+        pairs = [self._held.pop(name) for name in list(self._held) if name in names]
+        return [replace(one, fault="clock jump" if reset.of_clock else "position jump") for one, reset in pairs]
+
+    def _advance(self, arrival: Arrival) -> Arrival:
+        """Take note of a message that is in line, and tell its fault."""
+        newest = self._newest.get(arrival.name)
+        if newest is None and self._is_stale(arrival.stamp_ns):
+            return replace(arrival, fault="stale")
+        if newest is not None and arrival.stamp_ns <= newest.stamp_ns:
+            return replace(arrival, fault="duplicate" if arrival.stamp_ns == newest.stamp_ns else "out of order")
+        # an image is not kept alive for its stamp
+        self._newest[arrival.name] = arrival if arrival.name == ODOMETRY else Arrival(arrival.name, arrival.stamp_ns)
+        if self._now_ns is None:
+            self._now_ns = self._start_ns = arrival.stamp_ns
+        self._now_ns = max(self._now_ns, arrival.stamp_ns)
+        return arrival
+
+    def _is_stale(self, stamp_ns: int) -> bool:
+        """Whether the first message of an input on a new clock lies closer to the end of the one before."""
+        if self._previous_end_ns is None or self._now_ns is None or stamp_ns <= self._now_ns:
+            return False
+        return abs(self._previous_end_ns - stamp_ns) < stamp_ns - self._now_ns
+
+
+def _reset(before: Arrival, after: Arrival) -> Reset | None:
+    """Why the second message of an input cannot go on from the first; None when it can."""
+    elapsed_ns = after.stamp_ns - before.stamp_ns
+    if elapsed_ns <= -CLOCK_STEP_NS:
+        return Reset(f"the clock of the {after.name} went back", of_clock=True)
+    if after.name != ODOMETRY:
+        return None
+    jump_m = float(np.linalg.norm(after.value[:3, 3] - before.value[:3, 3]))
+    if jump_m > max(LEAST_JUMP_M, FASTEST_M_PER_S * abs(elapsed_ns) * 1e-9):
+        return Reset(f"the odometry jumped by {jump_m:.0f} m", of_clock=False)
+    return None
+
+
+def _agree(held: Arrival, why: Reset, arrival: Arrival, reset: Reset) -> bool:
+    """Whether two messages out of line tell of the same new session."""
+    if abs(arrival.stamp_ns - held.stamp_ns) > AGREEMENT_NS:
+        return False
+    if held.name == arrival.name:
+        return _reset(held, arrival) is None
+    return why.of_clock and reset.of_clock
