@@ -12,7 +12,7 @@ from pathlib import Path
 from sources import PACKAGE, ROOT, distributions, imports, required
 
 STILL_SHARED = {
-    *("Bag", "Calibration", "Embedding", "Entry", "Evidence", "Hits", "Picture", "PoseGraph", "Progress"),
+    *("Bag", "Calibration", "Embedding", "Entry", "Evidence", "PoseGraph", "Progress"),
     *("Scan", "Task", "Worker", "World"),
 }
 """Names of classes that mean two things."""
