@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+from typing import get_type_hints
 
 import pytest
 from processes import wait_until
@@ -36,10 +37,8 @@ def test_impossible_drives(tmp_path, options, line):
 
 def test_the_help_names_every_preset_and_family():
     """They are written out there: what knows them is too heavy for `umf --help`."""
-    told = {
-        name: parameter.annotation.__metadata__[0].help for name, parameter in signature(command).parameters.items()
-    }
-    names = {key: re.findall(r"\w+", told[key].split(";")[0]) for key in ("preset", "family")}
+    hints = get_type_hints(command, include_extras=True)
+    names = {key: re.findall(r"\w+", hints[key].__metadata__[0].help.split(";")[0]) for key in ("preset", "family")}
     assert set(names["preset"]) - {"or"} == set(PRESETS)
     assert set(names["family"]) - {"or", "random"} == set(FAMILIES) - {"random"}
 
