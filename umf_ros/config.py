@@ -22,6 +22,10 @@ class Group(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
 
+Dataset = Literal["simulated", "s3li-etna", "s3li-vulcano"]
+"""Data sets known by name: their topics stand in `bags.presets`, their rig in `config/calibration/<name>.yaml`."""
+
+
 class Topics(Group):
     """Names of the input topics; the defaults are S3LI Etna's."""
 
@@ -65,7 +69,7 @@ class KeyframePolicy(Group):
     untracked_period_s: float = Field(1.0, gt=0, description="without odometry: a keyframe every so often, s")
 
 
-class Embedding(Group):
+class EmbeddingSettings(Group):
     """The network that turns a frame into a descriptor and local features."""
 
     method: str = Field("umf", description="embedder by name: umf, or a baseline")
@@ -166,7 +170,7 @@ class Database(Group):
     cached_keyframes: int = Field(400, ge=20, description="keyframes whose local features stay in memory")
 
 
-class Worker(Group):
+class WorkerSettings(Group):
     """The thread that does the work of the live node."""
 
     queue_size: int = Field(10, ge=1, le=1000, description="frames that may wait; the oldest is dropped and counted")
@@ -175,21 +179,19 @@ class Worker(Group):
 class Settings(Group):
     """All settings."""
 
-    dataset: Literal["simulated", "s3li-etna", "s3li-vulcano"] = Field(
-        "simulated", description="preset of calibration and topics"
-    )
+    dataset: Dataset = Field("simulated", description="preset of calibration and topics")
     calibration: str = Field("", description="calibration file (YAML); empty: the data set's")
     topics: Topics = Topics()
     qos: Qos = Qos()
     sync: Sync = Sync()
     keyframe: KeyframePolicy = KeyframePolicy()
-    embedding: Embedding = Embedding()
+    embedding: EmbeddingSettings = EmbeddingSettings()
     loop: Loop = Loop()
     verification: Verification = Verification()
     pose_graph: PoseGraph = PoseGraph()
     frames: Frames = Frames()
     database: Database = Database()
-    worker: Worker = Worker()
+    worker: WorkerSettings = WorkerSettings()
 
 
 def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:

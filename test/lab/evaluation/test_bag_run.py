@@ -9,11 +9,12 @@ import pytest
 from landmarks import PLACES, LandmarkEmbedder, frame_of
 
 from umf_ros.config import Settings, load_settings
-from umf_ros.embedding.baselines import ThumbnailEmbedder
+from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.errors import UmfError
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array, make_pose
-from umf_ros.lab.evaluation.bag_run import BagEvaluation, BagResult, write_bag_result
+from umf_ros.lab.evaluation.bag_run import BagEvaluation, BagResult
+from umf_ros.loop_detector import LoopDetector
 from umf_ros.trajectory import Trajectory
 
 LAPS = 2
@@ -82,12 +83,27 @@ def test_the_second_lap_is_recognised(settings: Settings) -> None:
     assert result.scores["ransac both"].recall1 == 1.0
 
 
+def test_keyframes_are_those_of_the_live_detector(settings: Settings) -> None:
+    often = [  # ten frames a place: most are passed over
+        dataclasses.replace(frame, stamp_ns=frame.stamp_ns + tick * 10**8, odom_T_body=on_the_circle(step + tick / 99))
+        for step, frame in enumerate(frames())
+        for tick in range(10)
+    ]
+    evaluation, detector = BagEvaluation(settings, Sharp()), LoopDetector(settings, Sharp())
+    evaluation.remember(often, lambda frame, count: None)
+    live = [found.keyframe for found in map(detector.process, often) if found.keyframe is not None]
+    assert len(often) > 2 * len(live) > 0
+    for ours, theirs in zip(evaluation.keyframes, live, strict=True):
+        assert (ours.stamp_ns, ours.travelled_m, ours.session) == (theirs.stamp_ns, theirs.travelled_m, theirs.session)
+        np.testing.assert_array_equal(ours.embedding.descriptor, theirs.embedding.descriptor)
+
+
 def test_confused_places_are_missed_and_won_back(settings: Settings) -> None:
     result = evaluate(settings, Confused(), truth())
     assert result.scores["fused"].recall1 < 1.0 and result.scores["ransac both"].recall1 == 1.0
-    flat = result.flat()
-    assert flat["recall1"] == round(result.scores["fused"].recall1, 4) and flat["recall1_ransac"] == 1.0
-    assert flat["queries"] == PLACES
+    figures = result.figures()
+    assert figures["recall1"] == round(result.scores["fused"].recall1, 4) and figures["recall1_ransac"] == 1.0
+    assert figures["queries"] == PLACES
 
 
 def test_a_truth_of_positions_alone(settings: Settings) -> None:
@@ -112,7 +128,7 @@ def test_a_truth_of_another_time_is_an_error(settings: Settings) -> None:
 
 def test_results_are_written(settings: Settings, tmp_path: Path) -> None:
     result = evaluate(settings, Confused(), truth())
-    write_bag_result(tmp_path, result, ["a note"])
-    assert json.loads((tmp_path / "evaluation.json").read_text()) == result.flat()
+    report = result.write(tmp_path, ["a note"])
+    assert json.loads((tmp_path / "evaluation.json").read_text()) == result.figures() == report.figures
     text = (tmp_path / "evaluation.md").read_text()
     assert "superfeatures lidar" in text and "a note" in text and (tmp_path / "recall.png").stat().st_size > 5000

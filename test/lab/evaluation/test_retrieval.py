@@ -1,9 +1,27 @@
+"""Places embedded, ranked by hand and by brute force, and reranked by local features that belong to them."""
+
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from landmarks import PLACES, LandmarkEmbedder, at, frame_of
 
-from umf_ros.lab.evaluation.retrieval import NOTHING, Ranking, rank, recall_curve, recall_top_percent, rerank
+from umf_ros.config import Verification
+from umf_ros.frames import Keyframe
+from umf_ros.lab.evaluation.retrieval import (
+    METHODS,
+    MODES,
+    NOTHING,
+    TOP_K,
+    PlaceCollection,
+    Ranking,
+    Reranking,
+    as_keyframe,
+    rank,
+    rerank_all,
+)
 
 SIMILARITY = np.array([[0.9, 0.5, 0.7], [0.2, 0.2, 0.1]])
 
@@ -25,41 +43,130 @@ def test_inadmissible_references_are_never_retrieved() -> None:
 
 def test_reranking_reorders_the_head_alone_and_keeps_the_order_of_equals() -> None:
     ranking = Ranking(np.array([[4, 3, 2, 1, 0], [0, 1, NOTHING, NOTHING, NOTHING]]), np.ones(2), np.array([5, 2]))
-    better = rerank(ranking, np.array([[1.0, 1.0, 7.0], [0.0, 3.0, 99.0]]))
+    better = ranking.reordered(np.array([[1.0, 1.0, 7.0], [0.0, 3.0, 99.0]]))
     assert better.order.tolist() == [[2, 4, 3, 1, 0], [1, 0, NOTHING, NOTHING, NOTHING]]
     assert better.score.tolist() == [7.0, 3.0]  # the score of nothing does not count
 
 
-def test_recall_curve_by_hand() -> None:
-    hits = np.array([[1, 0, 0], [0, 0, 1], [0, 0, 0], [0, 1, 1]], bool)
-    assert recall_curve(hits, 5).tolist() == [0.25, 0.5, 0.75, 0.75, 0.75]
-    assert recall_curve(hits, 2).tolist() == [0.25, 0.5]
-    assert np.isnan(recall_curve(hits[:0], 3)).all()
+ASKED = [0, 3, 6]  # the places of the queries; to their descriptors 3 looks like 9, and 6 like 11
 
 
-@pytest.mark.parametrize(("references", "wanted"), [(3, 1), (149, 1), (151, 2), (858, 9)])
-def test_the_best_percent_is_rounded_and_at_least_one(references: int, wanted: int) -> None:
-    hits = np.zeros((1, references), bool)
-    hits[0, wanted - 1] = True
-    assert recall_top_percent(hits, np.array([references])) == 1.0
-    if wanted < references:
-        assert recall_top_percent(np.roll(hits, 1, axis=1), np.array([references])) == 0.0
+def keyframes(first_stamp: int, places: list[int]) -> list[Keyframe]:
+    collection = PlaceCollection(LandmarkEmbedder())
+    for number, place in enumerate(places):
+        collection.add(frame_of(first_stamp + number, place))
+    return collection.keyframes
 
 
-def test_each_query_has_its_own_percent() -> None:
-    hits = np.zeros((2, 300), bool)
-    hits[:, 2] = True
-    assert recall_top_percent(hits, np.array([300, 40])) == 0.5
+@pytest.fixture(scope="module")
+def gathered() -> tuple[np.ndarray, Reranking, list[int]]:
+    queries, references = keyframes(1000, ASKED), keyframes(0, list(range(PLACES)))
+    similarity = np.array([[q.embedding.descriptor @ r.embedding.descriptor for r in references] for q in queries])
+    reports: list[int] = []
+    ranking = rank(similarity)
+    reranking = rerank_all(queries, references, ranking, similarity, Verification(), lambda: reports.append(1))
+    return similarity, reranking, reports
 
 
-def test_recall_equals_brute_force(rng: np.random.Generator) -> None:
-    similarity = rng.integers(0, 6, (40, 23)) / 5.0  # many ties
-    positive, admissible = rng.random((40, 23)) < 0.1, rng.random((40, 23)) < 0.8
-    hits = rank(similarity, admissible).hits(positive)
-    curve = recall_curve(hits, 25)
-    for n in (1, 5, 25):
-        found = 0
-        for query in range(40):
-            allowed = [(-similarity[query, r], r) for r in range(23) if admissible[query, r]]
-            found += any(positive[query, r] for _, r in sorted(allowed)[:n])
-        assert curve[n - 1] == pytest.approx(found / 40)
+def test_every_method_scores_every_candidate_and_every_query_is_reported(gathered) -> None:
+    _, reranking, reports = gathered
+    assert set(reranking.scores) == set(METHODS) and len(METHODS) == 6
+    assert {scores.shape for scores in reranking.scores.values()} == {(3, min(TOP_K, PLACES))}
+    assert len(reports) == 3 == len(reranking.before.order)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_local_features_know_the_place(gathered, method: str) -> None:
+    _, reranking, _ = gathered
+    ranking = reranking.before
+    assert [int(row) for row in ranking.order[:, 0]] == [0, 9, 11]
+    assert [int(row) for row in reranking.after(method).order[:, 0]] == ASKED
+
+
+def test_counts_of_both_modalities_stand_beside_the_similarity(gathered) -> None:
+    similarity, reranking, _ = gathered
+    ranking = reranking.before
+    before = np.take_along_axis(similarity, ranking.order, axis=1)
+    gained = {method: (scores - before) / Verification().rerank_weight for method, scores in reranking.scores.items()}
+    for name in ("superfeatures", "ransac"):
+        both, image, cloud = (gained[f"{name} {part}"] for part in ("both", "image", "lidar"))
+        np.testing.assert_allclose(both, image + cloud, atol=1e-9)
+        for counts in (np.expm1(image), np.expm1(cloud)):
+            np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
+    # all twelve super-features of a place are its own
+    right = [list(row).index(place) for row, place in zip(ranking.order, ASKED, strict=True)]
+    np.testing.assert_allclose(np.expm1(gained["superfeatures image"][[0, 1, 2], right]), 12)
+
+
+def test_only_the_first_candidates_are_reordered(gathered) -> None:
+    _, reranking, _ = gathered
+    ranking = reranking.before
+    for count in (1, 2, 5):
+        after = reranking.after("ransac both", count)
+        assert np.array_equal(after.order[:, count:], ranking.order[:, count:])
+        assert np.array_equal(np.sort(after.order[:, :count]), np.sort(ranking.order[:, :count]))
+    assert np.array_equal(reranking.after("ransac both", 1).order, ranking.order)
+
+
+def test_recall_grows_when_the_right_place_comes_among_the_candidates(gathered) -> None:
+    _, reranking, _ = gathered
+    ranking = reranking.before
+    positive = np.arange(PLACES)[None] == np.array(ASKED)[:, None]
+    where = [list(row).index(place) + 1 for row, place in zip(ranking.order, ASKED, strict=True)]
+    curve = reranking.recall1_by_candidates("ransac both", positive)
+    expected = [sum(place <= count for place in where) / 3 for count in range(1, TOP_K + 1)]
+    np.testing.assert_allclose(curve, expected)
+    assert curve[0] == pytest.approx(1 / 3) and curve[-1] == 1.0
+
+
+def test_queries_without_a_true_match_do_not_count_for_the_curve(gathered) -> None:
+    _, reranking, _ = gathered
+    positive = np.zeros((3, PLACES), bool)
+    positive[0, 0] = True
+    assert reranking.recall1_by_candidates("ransac both", positive).tolist() == [1.0] * TOP_K
+
+
+def test_a_query_with_fewer_candidates_is_reranked_among_them() -> None:
+    queries, references = keyframes(1000, [3, 5]), keyframes(0, list(range(PLACES)))
+    similarity = np.array([[q.embedding.descriptor @ r.embedding.descriptor for r in references] for q in queries])
+    admissible = np.zeros((2, PLACES), bool)
+    admissible[0, [3, 9, 10]] = True
+    ranking = rank(similarity, admissible)
+    reranking = rerank_all(queries, references, ranking, similarity, Verification())
+    after = reranking.after("ransac both")
+    assert after.order[0, 0] == 3 and set(after.order[0, :3]) == {3, 9, 10}
+    assert set(after.order[0, 3:]) == {NOTHING} == set(after.order[1])
+    assert after.score[1] == -np.inf
+    assert not reranking.scores["ransac both"][1].any()
+
+
+def test_modes_take_one_sensor_away_and_nothing_else() -> None:
+    frame = frame_of(5, 2)
+    seen = {mode: change(frame) for mode, change in MODES.items()}
+    assert seen["fused"] is frame
+    assert seen["image"].points is None and seen["image"].intensity is None and seen["image"].left is frame.left
+    assert seen["lidar"].left is None and seen["lidar"].points is frame.points
+    black, empty = seen["image black"].left, seen["cloud empty"].points
+    assert black is not None and not black.any() and black.shape == frame.left.shape
+    assert seen["image black"].points is frame.points
+    assert empty is not None and empty.shape == (0, 3) and seen["cloud empty"].left is frame.left
+    assert {changed.stamp_ns for changed in seen.values()} == {5}
+
+
+def test_a_keyframe_of_the_evaluation_keeps_what_retrieval_needs() -> None:
+
+    frame = replace(frame_of(5, 2), odom_T_body=at(2), session=3)
+    embedding = LandmarkEmbedder().embed(frame)
+    keyframe = as_keyframe(frame, embedding, 12.5)
+    assert (keyframe.stamp_ns, keyframe.travelled_m, keyframe.session) == (5, 12.5, 3)
+    assert keyframe.embedding is embedding and keyframe.odom_T_body is frame.odom_T_body
+    assert keyframe.points.shape == (0, 3)
+
+
+def test_modes_that_were_not_asked_for_hold_no_number() -> None:
+    places = PlaceCollection(LandmarkEmbedder())
+    places.add(frame_of(0, 1), ("image",))
+    places.add(frame_of(1, 2))
+    assert np.isnan(places.descriptors("image")).all(axis=1).tolist() == [False, True]
+    assert np.isnan(places.descriptors("lidar")).all() and np.isfinite(places.descriptors("fused")).all()
+    assert [keyframe.stamp_ns for keyframe in places.keyframes] == [0, 1]

@@ -1,22 +1,43 @@
-"""The figures and tables of an evaluation on worlds, against values computed by hand."""
+"""The figures and tables of an evaluation on worlds, against values computed by hand; what networks cost."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from landmarks import LandmarkEmbedder, frame_of
+from tiny_worlds import TINY
 
-from umf_ros.lab.evaluation.curves import precision_recall
-from umf_ros.lab.evaluation.latency import Cost
-from umf_ros.lab.evaluation.protocol import YawBin
-from umf_ros.lab.evaluation.reranking import METHODS
-from umf_ros.lab.evaluation.scores import Scores
-from umf_ros.lab.evaluation.summary import WorldsSummary, percent
-from umf_ros.lab.evaluation.world_evaluation import ASKED, WorldResult
+from umf_ros.frames import Embedding, Frame
+from umf_ros.lab.evaluation import summary as summary_module
+from umf_ros.lab.evaluation.retrieval import METHODS
+from umf_ros.lab.evaluation.scores import Scores, YawBin, precision_recall
+from umf_ros.lab.evaluation.summary import (
+    WARM_UP,
+    Cost,
+    WorldResult,
+    WorldsSummary,
+    at_full_size,
+    cost_of_weights,
+    measure,
+)
+from umf_ros.lab.evaluation.worlds_run import ASKED
+from umf_ros.networks.umf import UMF, count_parameters
+from umf_ros.networks.weights import save_weights
 
 CURVE = precision_recall(np.array([0.9, 0.5]), np.array([True, False]), np.ones(2, bool))
 NAMES = (*ASKED, "same light", *METHODS)
+KEYS = (
+    "recall1_fused_mean recall1_fused_worst recall1_image_mean recall1_lidar_mean recall1_superfeatures_mean "
+    "recall1_ransac_mean recall1_image_black_mean recall1_cloud_empty_mean recall1_within5m_mean auc_pr_mean "
+    "recall_at_precision1_mean embed_ms_default embed_ms_resnet50 embed_ratio_default embed_ratio_resnet50 "
+    "parameters_default parameters_resnet50"
+).split()
 SMALL, LARGE = Cost("small", 2**20, 40.0, 10.0), Cost("large", 4 * 2**20, 200.0, 50.0)
 
 
@@ -65,14 +86,14 @@ def rows_of(summary: WorldsSummary, title: str) -> dict[str, list[str]]:
 
 
 def test_figures_are_means_over_the_worlds(summary: WorldsSummary) -> None:
-    flat = summary.flat()
-    assert flat["recall1_fused_mean"] == pytest.approx(0.7) and flat["recall1_fused_worst"] == pytest.approx(0.6)
-    assert flat["recall1_ransac_mean"] == pytest.approx(0.75)
-    assert flat["recall1_within5m_mean"] == pytest.approx(0.6)
-    assert flat["auc_pr_mean"] == pytest.approx(0.5) and flat["recall_at_precision1_mean"] == pytest.approx(0.4)
-    assert (flat["embed_ms_default"], flat["embed_ms_resnet50"]) == (10.0, 50.0)
-    assert (flat["embed_ratio_default"], flat["embed_ratio_resnet50"]) == (0.25, 0.25)
-    assert (flat["parameters_default"], flat["parameters_resnet50"]) == (2**20, 4 * 2**20)
+    figures = summary.figures()
+    assert figures["recall1_fused_mean"] == pytest.approx(0.7) and figures["recall1_fused_worst"] == pytest.approx(0.6)
+    assert figures["recall1_ransac_mean"] == pytest.approx(0.75)
+    assert figures["recall1_within5m_mean"] == pytest.approx(0.6)
+    assert figures["auc_pr_mean"] == pytest.approx(0.5) and figures["recall_at_precision1_mean"] == pytest.approx(0.4)
+    assert (figures["embed_ms_default"], figures["embed_ms_resnet50"]) == (10.0, 50.0)
+    assert (figures["embed_ratio_default"], figures["embed_ratio_resnet50"]) == (0.25, 0.25)
+    assert (figures["parameters_default"], figures["parameters_resnet50"]) == (2**20, 4 * 2**20)
 
 
 def test_tables_show_per_cent_in_the_order_of_their_headings(summary: WorldsSummary) -> None:
@@ -116,18 +137,87 @@ def test_costs_are_sizes_times_and_ratios(summary: WorldsSummary) -> None:
 def test_a_world_without_revisits_is_left_out_wherever_it_stands(order: tuple[int, int]) -> None:
     worlds = [world("etna 1", 0.6, []), world("empty", math.nan, [])]
     summary = WorldsSummary([worlds[i] for i in order], {}, SMALL, LARGE)
-    flat = summary.flat()
-    assert flat["recall1_fused_mean"] == flat["recall1_fused_worst"] == pytest.approx(0.6)
+    figures = summary.figures()
+    assert figures["recall1_fused_mean"] == figures["recall1_fused_worst"] == pytest.approx(0.6)
     assert rows_of(summary, "Modalities")["fused"][:2] == ["60.0", "60.0"]
     assert rows_of(summary, "Worlds")["empty"][2:] == ["-"] * 5
 
 
 def test_without_any_revisit_there_is_no_figure() -> None:
-    flat = WorldsSummary([world("empty", math.nan, [])], {}, SMALL, LARGE).flat()
-    assert flat["recall1_fused_mean"] is None and flat["recall1_fused_worst"] is None
-    assert flat["parameters_default"] == 2**20
+    figures = WorldsSummary([world("empty", math.nan, [])], {}, SMALL, LARGE).figures()
+    assert figures["recall1_fused_mean"] is None and figures["recall1_fused_worst"] is None
+    assert figures["parameters_default"] == 2**20
 
 
-@pytest.mark.parametrize(("share", "text"), [(0.0, "0.0"), (1.0, "100.0"), (0.12345, "12.3"), (math.nan, "-")])
-def test_shares_in_per_cent(share: float, text: str) -> None:
-    assert percent(share) == text
+def test_what_could_not_be_measured_is_null(summary: WorldsSummary) -> None:
+    lost = replace(summary, default=Cost("net", 1, math.nan, math.nan))
+    assert lost.figures()["embed_ms_default"] is None and lost.figures()["embed_ratio_default"] is None
+
+
+def test_the_published_keys(summary: WorldsSummary) -> None:
+    assert list(summary.figures()) == KEYS
+
+
+def test_every_table_has_rows_as_wide_as_its_headings(summary: WorldsSummary) -> None:
+    for head, rows in summary.tables().values():
+        assert rows and all(len(row) == len(head) for row in rows)
+
+
+FRAMES = [frame_of(stamp, 1) for stamp in range(5)]
+
+
+class Timed(LandmarkEmbedder):
+    """Takes as many seconds as it is told, by a clock of its own."""
+
+    def __init__(self, seconds: Iterator[float]) -> None:
+        self.now_s = 0.0
+        self.stamps: list[int] = []
+        self._seconds = seconds
+
+    def perf_counter(self) -> float:
+        return self.now_s
+
+    def embed(self, frame: Frame) -> Embedding:
+        self.stamps.append(frame.stamp_ns)
+        self.now_s += next(self._seconds)
+        return super().embed(frame)
+
+
+def test_the_median_counts_and_warming_up_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow_start = [9.0] * WARM_UP
+    embedder = Timed(iter([*slow_start, 0.010, 0.030, 0.020, 5.0, 0.015, 0.010, 0.030, 0.020, 0.040, 0.015]))
+    monkeypatch.setattr(summary_module, "time", SimpleNamespace(perf_counter=embedder.perf_counter))
+    # 10 10 15 15 20 20 30 30 40 5000 ms: between the fifth and the sixth
+    assert measure(embedder, FRAMES, repeats=2) == pytest.approx(20.0)
+    assert embedder.stamps == [0, 1, 2, 0, 1, 2, 3, 4, 0, 1, 2, 3, 4]
+
+
+def test_size_and_ratio() -> None:
+    cost = Cost("net", 3 * 2**18, eager_ms=80.0, fast_ms=20.0)
+    assert cost.megabytes == 3.0 and cost.ratio == 0.25
+
+
+def test_frames_are_timed_at_the_size_of_the_real_camera() -> None:
+    frame = frame_of(7, 3)
+    large = at_full_size(frame)
+    assert large.left is not None and large.left.shape == (512, 688) and large.left.dtype == np.uint8
+    assert (large.camera.width, large.camera.height) == (688, 512)
+    assert large.points is frame.points and large.stamp_ns == 7
+    blind = replace(frame, left=None)
+    assert at_full_size(blind) is blind
+
+
+def textured(stamp: int) -> Frame:
+    rng = np.random.default_rng(stamp)
+    points = rng.uniform([2, -15, -1], [35, 15, 1], (2000, 3)).astype(np.float32)
+    image = rng.integers(0, 255, (48, 64)).astype(np.uint8)
+    return replace(frame_of(stamp, 1), left=image, points=points, intensity=np.zeros(2000, np.float32))
+
+
+def test_a_network_is_timed_in_both_runtimes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    weights = tmp_path / "tiny.safetensors"
+    save_weights(UMF(TINY), weights, {})
+    found = cost_of_weights(weights, [textured(stamp) for stamp in range(2)], repeats=1)
+    assert found.name == weights.stem and found.parameters == count_parameters(UMF(TINY))
+    assert found.eager_ms > 0 and found.fast_ms > 0

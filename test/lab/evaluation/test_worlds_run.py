@@ -1,22 +1,65 @@
-"""An evaluation on worlds from the weights to the report, and what a preset costs."""
+"""An evaluation on worlds from the weights to the report."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-from landmarks import LineWorld, frame_of
+from landmarks import CONFUSED, PLACES, LandmarkEmbedder, LineWorld
 from tiny_worlds import TINY
 
-from umf_ros.frames import Frame
+from umf_ros.config import Verification
 from umf_ros.lab.evaluation import worlds_run
-from umf_ros.lab.evaluation.latency import cost_of_weights
-from umf_ros.lab.evaluation.worlds_run import PICTURES, WorldsRun
+from umf_ros.lab.evaluation.summary import WorldResult, cost_of_weights
+from umf_ros.lab.evaluation.worlds_run import PICTURES, WorldEvaluation, WorldsRun
 from umf_ros.networks.umf import UMF, count_parameters
 from umf_ros.networks.weights import save_weights
+
+
+@pytest.fixture(scope="module")
+def result() -> WorldResult:
+    return WorldEvaluation(LineWorld(), LandmarkEmbedder(), Verification()).run()  # type: ignore[arg-type]
+
+
+def test_confused_places_cost_recall_and_reranking_wins_them_back(result: WorldResult) -> None:
+    fused = result.scores["fused"]
+    assert fused.queries == PLACES and fused.recall1 == pytest.approx(1 - len(CONFUSED) / PLACES)
+    assert fused.recall5 == 1.0
+    for method in ("superfeatures image", "superfeatures lidar", "superfeatures both", "ransac image", "ransac both"):
+        assert result.scores[method].recall1 == 1.0, method
+    assert result.scores["ransac both"].recall_at_precision1 == 1.0
+
+
+def test_candidates_beyond_the_first_are_needed(result: WorldResult) -> None:
+    for curve in result.by_candidates.values():
+        assert curve[0] == pytest.approx(1 - len(CONFUSED) / PLACES) and curve[-1] == 1.0
+    assert set(result.milliseconds) == {"superfeatures", "ransac"}
+
+
+def test_a_lost_modality_is_asked_against_whole_references(result: WorldResult) -> None:
+    # without the image the embedder answers with the next place, 8 m on: still within 12 m, but not within 5
+    assert result.scores["image black"].recall1_within_5m < 0.1 < result.scores["image black"].recall1
+    assert result.scores["cloud empty"].recall1 == result.scores["fused"].recall1
+    assert result.scores["lidar"].recall1_within_5m < 0.1
+    assert result.scores["image"].recall1 == result.scores["fused"].recall1
+
+
+def test_the_opposite_direction_is_reported_apart(result: WorldResult) -> None:
+    bins = {item.name: item for item in result.yaw}
+    assert bins["10-20 deg"].queries == PLACES and bins["opposite direction"].queries == PLACES
+    assert bins["opposite direction"].recall1 == pytest.approx(1 - len(CONFUSED) / PLACES)
+
+
+def test_examples_are_true_matches(result: WorldResult) -> None:
+    assert len(result.examples) == 3
+    assert all(query.left[0, 0] == match.left[0, 0] for query, match in result.examples)
+
+
+def test_another_method_is_compared_on_the_same_frames() -> None:
+    evaluation = WorldEvaluation(LineWorld(), LandmarkEmbedder(), Verification())  # type: ignore[arg-type]
+    run = evaluation.run()
+    assert evaluation.compare(LandmarkEmbedder()).recall1 == run.scores["fused"].recall1
 
 
 @pytest.fixture
@@ -32,13 +75,6 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def textured(stamp: int) -> Frame:
-    rng = np.random.default_rng(stamp)
-    points = rng.uniform([2, -15, -1], [35, 15, 1], (2000, 3)).astype(np.float32)
-    image = rng.integers(0, 255, (48, 64)).astype(np.uint8)
-    return replace(frame_of(stamp, 1), left=image, points=points, intensity=np.zeros(2000, np.float32))
-
-
 def test_tables_figures_and_pictures_of_a_small_network(
     weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -50,8 +86,8 @@ def test_tables_figures_and_pictures_of_a_small_network(
     folder = tmp_path / "results"
     folder.mkdir()
     run.write(summary, folder, ["a note"])
-    assert json.loads((folder / "evaluation.json").read_text()) == summary.flat()
-    assert summary.flat()["parameters_default"] == count_parameters(UMF(TINY))
+    assert json.loads((folder / "evaluation.json").read_text()) == summary.figures()
+    assert summary.figures()["parameters_default"] == count_parameters(UMF(TINY))
     text = (folder / "evaluation.md").read_text()
     assert "a note" in text and "scan_context" in text
     for picture in PICTURES.values():
@@ -59,9 +95,3 @@ def test_tables_figures_and_pictures_of_a_small_network(
     line = LineWorld()
     assert sum(done for what, done in told if what == line.name) == len(line) + line.revisits
     assert [what for what, _ in told[-2:]] == ["taking times", "drawing"]
-
-
-def test_a_network_is_timed_in_both_runtimes(weights: Path) -> None:
-    found = cost_of_weights(weights, [textured(stamp) for stamp in range(2)], repeats=1)
-    assert found.name == weights.stem and found.parameters == count_parameters(UMF(TINY))
-    assert found.eager_ms > 0 and found.fast_ms > 0

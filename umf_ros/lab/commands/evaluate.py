@@ -8,11 +8,24 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from umf_ros.commands.recordings import (
+    DatasetName,
+    OdometryFrame,
+    OdometryPath,
+    RunsFolder,
+    TruthPath,
+    WeightsPath,
+    open_frames,
+    open_recording,
+)
+from umf_ros.embedding import CHOICES
 from umf_ros.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
+
+    from umf_ros.lab.evaluation.results import Figures
 
 Optional = typer.Option
 
@@ -28,17 +41,15 @@ def command(
     seed: Annotated[int | None, Optional(min=0, help="First of the four worlds' seeds.")] = None,
     quick: Annotated[bool, Optional("--quick", help="A smaller sample of every world.")] = False,
     methods: Annotated[str, Optional(help="umf, or all: methods that need no training too.")] = "umf",
-    weights: Annotated[Path | None, Optional(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
+    weights: WeightsPath = None,
     json_file: Annotated[Path | None, Optional("--json", help="Write the figures here too.")] = None,
-    out: Annotated[Path, Optional(help="Where results/<timestamp> goes.")] = Path("results"),
+    out: RunsFolder = Path("results"),
     config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording.")] = None,
-    dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
-    embedder: Annotated[str | None, Optional(help="umf, or a baseline, for a recording.")] = None,
-    odometry: Annotated[Path | None, Optional(help="Odometry as a TUM file, where the recording has none.")] = None,
-    odometry_frame: Annotated[
-        str, Optional(help="Whose poses --odometry holds: body, imu, camera or lidar (S3LI's Eval/BASALT: imu).")
-    ] = "body",
-    ground_truth: Annotated[Path | None, Optional(help="Truth as RTKLIB .pos or TUM file.")] = None,
+    dataset: DatasetName = "auto",
+    embedder: Annotated[str | None, Optional(help=f"How the places of a recording are embedded: {CHOICES}.")] = None,
+    odometry: OdometryPath = None,
+    odometry_frame: OdometryFrame = "body",
+    ground_truth: TruthPath = None,
     rule: Annotated[str, Optional(help="What is the same place in listed sequences: s3li or robotcar.")] = "s3li",
 ) -> None:
     """Recall, precision, rerankers, lost modalities and cost.
@@ -82,15 +93,11 @@ def _refuse(data: str, options: Mapping[str, object]) -> None:
         raise ConfigError(f"{data} {'has' if data.startswith('a ') else 'have'} no use for {', '.join(given)}")
 
 
-def _on_worlds(
-    name: str, seed: int | None, quick: bool, others: bool, weights: Path | None, out: Path
-) -> dict[str, float | int | None]:
+def _on_worlds(name: str, seed: int | None, quick: bool, others: bool, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
-    from umf_ros.lab.evaluation.markdown import print_table
-    from umf_ros.lab.evaluation.world_evaluation import work
     from umf_ros.lab.evaluation.worlds import FIRST_SEEDS, FULL, QUICK, test_worlds
-    from umf_ros.lab.evaluation.worlds_run import WorldsRun
+    from umf_ros.lab.evaluation.worlds_run import WorldsRun, work
     from umf_ros.runs.folder import create_run_folder
 
     if name not in FIRST_SEEDS:
@@ -100,10 +107,10 @@ def _on_worlds(
     with _bar(console) as bar:
         task = bar.add_task("", total=sum(work(world) for world in chosen))
 
-        def report(what: str, done: int) -> None:
+        def progress(what: str, done: int) -> None:
             bar.update(task, description=what, advance=done)
 
-        run = WorldsRun(weights, chosen, 3 if quick else 10, others, report)
+        run = WorldsRun(weights, chosen, 3 if quick else 10, others, progress)
         folder = create_run_folder(out)
         summary = run.run()
         names = ", ".join(world.name for world in chosen)
@@ -112,11 +119,9 @@ def _on_worlds(
             f"{', quick' if quick else ''}. A match is true within 12 m and 30 deg (thesis 5.1.2). Times are "
             "medians on this machine, as busy as it was."
         ]
-        run.write(summary, folder, notes)
-    for title, table in summary.tables().items():
-        print_table(console, title, table)
-    console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
-    return {**summary.flat()}
+        report = run.write(summary, folder, notes)
+    report.show(console, folder)
+    return report.figures
 
 
 def _on_recording(
@@ -129,34 +134,21 @@ def _on_recording(
     odometry_frame: str,
     ground_truth: Path | None,
     out: Path,
-) -> dict[str, float | int | None]:
+) -> Figures:
     from rich.console import Console
 
-    from umf_ros.bags.frames import FrameReader
-    from umf_ros.bags.presets import settings_for
-    from umf_ros.bags.reader import open_bag
-    from umf_ros.bags.trajectories import read_ground_truth, read_odometry
-    from umf_ros.commands.progress import WARNING
+    from umf_ros.bags.trajectories import read_ground_truth
     from umf_ros.embedding import make_embedder
     from umf_ros.frames import Frame
-    from umf_ros.lab.evaluation.bag_run import BagEvaluation, write_bag_result
-    from umf_ros.lab.evaluation.markdown import print_table
+    from umf_ros.lab.evaluation.bag_run import BagEvaluation
     from umf_ros.runs.folder import create_run_folder
 
     console = Console()
-    recording = open_bag(bag)
-    settings = settings_for(
-        recording,
-        config,
-        dataset,
-        embedding__method=embedder,
-        embedding__weights=str(weights) if weights else None,
-    )
+    recording, settings = open_recording(bag, config, dataset, embedder, weights)
     truth = read_ground_truth(recording, ground_truth)
     if truth is None:
         raise ConfigError(f"{bag} holds no ground truth; name a file with --ground-truth")
-    path = read_odometry(odometry, odometry_frame, settings) if odometry else None
-    frames = FrameReader(recording, settings, path, warn=lambda text: console.print(text, **WARNING))
+    frames = open_frames(recording, settings, console, odometry, odometry_frame)
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, super_features=True))
     folder = create_run_folder(out)
     with _bar(console) as bar:
@@ -178,23 +170,20 @@ def _on_recording(
     ]
     if not truth.has_orientation:
         notes.append("The truth has no headings: a match is true within 12 m, whatever its heading.")
-    write_bag_result(folder, result, notes)
-    print_table(console, "Loop-closure protocol", result.table())
-    for note in notes:
-        console.print(note, markup=False)
-    console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
-    return result.flat()
+    report = result.write(folder, notes)
+    report.show(console, folder)
+    return report.figures
 
 
-def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> dict[str, float | int | None]:
+def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
     from umf_ros.lab.datasets.listed import SequenceList
-    from umf_ros.lab.evaluation.markdown import print_table, to_markdown
     from umf_ros.lab.evaluation.protocol import RULES
+    from umf_ros.lab.evaluation.results import EvaluationReport
     from umf_ros.lab.training.validation import answerable, means, table, validate
     from umf_ros.networks.weights import load_weights, locate_weights
-    from umf_ros.runs.folder import create_run_folder, write_atomically
+    from umf_ros.runs.folder import create_run_folder
 
     if rule not in RULES:
         raise ConfigError(f"--rule: expected {' or '.join(RULES)}, not {rule!r}")
@@ -204,15 +193,14 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     if not answerable(results):
         raise ConfigError(f"{listing}: no place is visited twice")
     folder = create_run_folder(out)
-    shown = table(results)
-    title = "Place recognition by the global descriptor"
     notes = [
         f"{listing}: samples with a true match in an earlier pass are asked for it; same place by the rule {rule}."
     ]
-    write_atomically(folder / "evaluation.md", to_markdown("Evaluation on sequences", notes, {title: shown}, {}))
-    print_table(console, title, shown)
-    console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
-    return means(results)
+    tables = {"Place recognition by the global descriptor": table(results)}
+    report = EvaluationReport("Evaluation on sequences", notes, means(results), tables)
+    report.write(folder)
+    report.show(console, folder)
+    return report.figures
 
 
 def _bar(console: Console) -> Progress:

@@ -1,4 +1,4 @@
-"""What is the same place, and what is not (thesis 4.5.2 and 5.1.2)."""
+"""What is the same place, and what is not [UMF 4.5.2, 5.1.2]."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array, wrap_angle
+from umf_ros.geometry import Array, heading, wrap_angle
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
     """Distances in metres, headings in degrees; what is neither positive nor negative is neutral.
 
-    The thesis takes every pair beyond 30 deg for different. Two views 40 deg apart still share half of
+    UMF takes every pair beyond 30 deg for different. Two views 40 deg apart still share half of
     their field, so in training the band up to `negative_deg` stays neutral. With `between_passes`, pairs
     of one pass are neutral too.
     """
@@ -45,10 +45,9 @@ class Places:
 
 def places_of(world: int, world_T_body: Array, passage: NDArray | None = None) -> Places:
     """Places of (N, 4, 4) poses in one world; without `passage` (N,) they are of one pass."""
-    heading = np.arctan2(world_T_body[:, 1, 0], world_T_body[:, 0, 0])
     count = len(world_T_body)
     passage = np.zeros(count) if passage is None else passage.astype(float)
-    return Places(np.full(count, world), world_T_body[:, :2, 3], heading, passage)
+    return Places(np.full(count, world), world_T_body[:, :2, 3], heading(world_T_body), passage)
 
 
 def distances(a: Places, b: Places) -> tuple[Array, Array]:

@@ -9,21 +9,18 @@ from numpy.typing import NDArray
 
 from umf_ros.config import Loop
 from umf_ros.geometry import Array
+from umf_ros.keyframes import is_past
 from umf_ros.lab.datasets.labels import Rule, distances, label, places_of
-from umf_ros.lab.evaluation.retrieval import Indices, Mask, Ranking
+from umf_ros.lab.evaluation.retrieval import Indices, Mask
 
 THESIS_RULE = Rule(positive_m=12.0, positive_deg=30.0, negative_m=60.0, negative_deg=30.0)
 ROBOTCAR_RULE = Rule(positive_m=10.0, positive_deg=180.0, negative_m=50.0, negative_deg=180.0)
 RULES = {"s3li": THESIS_RULE, "robotcar": ROBOTCAR_RULE}
 NEAR_M = 5.0
-OPPOSITE_DEG = 150.0
-
-YAW_BINS = ((0.0, 10.0), (10.0, 20.0), (20.0, 30.0), (OPPOSITE_DEG, 180.0))
-"""Degrees by which a query's heading differs from that of its place's references."""
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class RetrievalTask:
     """Queries against references.
 
     Attributes:
@@ -32,7 +29,6 @@ class Task:
         admissible: (Q, R) references a query may retrieve.
         positive: (Q, R) admissible true matches.
         near: (Q, R) those within 5 m.
-        neutral: (Q, R) admissible references that are neither true nor false.
         metres: (Q, R) distance.
         turn_deg: (Q, R) difference of heading, 0 to 180; zero where headings are unknown.
     """
@@ -42,7 +38,6 @@ class Task:
     admissible: Mask
     positive: Mask
     near: Mask
-    neutral: Mask
     metres: Array
     turn_deg: Array
 
@@ -51,12 +46,12 @@ class Task:
         """(Q,) whether a query has a true match."""
         return np.asarray(self.positive.any(axis=1))
 
-    def of_rows(self, rows: Indices) -> Task:
+    def of_rows(self, rows: Indices) -> RetrievalTask:
         """The same task, its samples being those `rows` of a larger set."""
         return replace(self, queries=rows[self.queries], references=rows[self.references])
 
 
-def place_recognition(world_T_body: Array, pass_index: Indices, rule: Rule = THESIS_RULE) -> Task:
+def place_recognition(world_T_body: Array, pass_index: Indices, rule: Rule = THESIS_RULE) -> RetrievalTask:
     """Later passes of a place against its first.
 
     Args:
@@ -70,7 +65,7 @@ def place_recognition(world_T_body: Array, pass_index: Indices, rule: Rule = THE
     return _task(world_T_body, queries, references, everything, rule)
 
 
-def revisits(world_T_body: Array, pass_index: NDArray, rule: Rule = THESIS_RULE) -> Task:
+def revisits(world_T_body: Array, pass_index: NDArray, rule: Rule = THESIS_RULE) -> RetrievalTask:
     """Each sample of a recording against all earlier passes.
 
     Args:
@@ -89,7 +84,7 @@ def loop_closure(
     gaps: Loop,
     has_orientation: bool = True,
     rule: Rule = THESIS_RULE,
-) -> Task:
+) -> RetrievalTask:
     """Each sample against its own past, as on a rover.
 
     Args:
@@ -101,9 +96,8 @@ def loop_closure(
         rule: what is a true match.
     """
     every = np.arange(len(stamps))
-    age_s = (stamps[:, None] - stamps[None]) * 1e-9
-    recent = travelled_m[:, None] - travelled_m[None] < gaps.min_travel_m  # False where unknown
-    admissible = (every[None] < every[:, None]) & (age_s >= gaps.min_time_gap_s) & ~recent
+    past = is_past(stamps[:, None] - stamps[None], travelled_m[:, None] - travelled_m[None], gaps)
+    admissible = (every[None] < every[:, None]) & past
     if not has_orientation:
         flat = np.tile(np.eye(4), (len(stamps), 1, 1))
         flat[:, :3, 3] = world_T_body[:, :3, 3]
@@ -111,43 +105,9 @@ def loop_closure(
     return _task(world_T_body, every, every, admissible, rule)
 
 
-def _task(world_T_body: Array, queries: Indices, references: Indices, admissible: Mask, rule: Rule) -> Task:
+def _task(world_T_body: Array, queries: Indices, references: Indices, admissible: Mask, rule: Rule) -> RetrievalTask:
     places = places_of(0, world_T_body[queries]), places_of(0, world_T_body[references])
     metres, turn = distances(*places)
-    positive, negative = (found & admissible for found in label(*places, rule))
+    positive = label(*places, rule)[0] & admissible
     near = positive & (metres < NEAR_M)
-    neutral = admissible & ~positive & ~negative
-    return Task(queries, references, admissible, positive, near, neutral, metres, np.degrees(turn))
-
-
-@dataclass(frozen=True, slots=True)
-class YawBin:
-    """Recall@1 of the queries that saw their place turned by so much.
-
-    Attributes:
-        name: for people.
-        queries: how many.
-        recall1: share whose best match lies within the radius and is turned no more than the bin (30 deg at least).
-    """
-
-    name: str
-    queries: int
-    recall1: float
-
-
-def recall_by_yaw(task: Task, ranking: Ranking, rule: Rule = THESIS_RULE) -> list[YawBin]:
-    """Recall@1 by difference of heading; revisits in the opposite direction are a bin of their own.
-
-    A query belongs to the bin of the least turned reference within the radius. In the opposite
-    direction the thesis knows no true match: there, any reference within the radius is one.
-    """
-    here = task.admissible & (task.metres < rule.positive_m)
-    least = np.where(here, task.turn_deg, np.inf).min(axis=1, initial=np.inf)
-    bins = []
-    for low, high in YAW_BINS:
-        chosen = (least >= low) & ((least < high) | (high == 180.0) & (least <= high))
-        true = here & (task.turn_deg <= max(high, rule.positive_deg))
-        hits = ranking.hits(true)[chosen, :1].any(axis=1)
-        name = "opposite direction" if low == OPPOSITE_DEG else f"{low:.0f}-{high:.0f} deg"
-        bins.append(YawBin(name, int(chosen.sum()), float(hits.mean()) if chosen.any() else float("nan")))
-    return bins
+    return RetrievalTask(queries, references, admissible, positive, near, metres, np.degrees(turn))

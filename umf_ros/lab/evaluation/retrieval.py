@@ -1,19 +1,85 @@
-"""How often the right place is among the best matches (thesis 5.2)."""
+"""Places embedded, retrieved by their descriptors and reranked by their local features (thesis 5.2 and 5.5.2)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from umf_ros.config import Verification
+from umf_ros.embedding.embedder import Embedder
+from umf_ros.frames import Candidate, Embedding, Frame, Keyframe
 from umf_ros.geometry import Array
+from umf_ros.verification.rerank import rerank
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Descriptors = NDArray[np.float32]
 
 NOTHING = -1
 """Stands in a ranking where there is no further reference."""
+
+TOP_K = 20
+"""Candidates that are reranked (thesis 5.5.2)."""
+
+RERANKERS = ("superfeatures", "ransac")
+PARTS = {"image": "image", "lidar": "cloud", "both": "both"}
+"""Which local features a reranker uses: what it is called here and in the settings."""
+
+METHODS = {f"{reranker} {part}": (reranker, modalities) for reranker in RERANKERS for part, modalities in PARTS.items()}
+"""What is compared: the settings `rerank` and `modalities` of every way to rerank."""
+
+NO_POINTS = np.empty((0, 3), np.float32)
+
+MODES: dict[str, Callable[[Frame], Frame]] = {
+    "fused": lambda frame: frame,
+    "image": lambda frame: replace(frame, points=None, intensity=None),
+    "lidar": lambda frame: replace(frame, left=None, right=None),
+    "image black": lambda frame: replace(frame, left=np.zeros_like(frame.left), right=None),
+    "cloud empty": lambda frame: replace(frame, points=NO_POINTS, intensity=np.empty(0, np.float32)),
+}
+"""What a frame looks like when a sensor is not used, or failed."""
+
+
+class PlaceCollection:
+    """Descriptors of frames in several modes, and the keyframes of the whole frames for reranking."""
+
+    def __init__(self, embedder: Embedder) -> None:
+        self._embedder = embedder
+        self._descriptors: dict[str, list[Descriptors]] = {mode: [] for mode in MODES}
+        self.keyframes: list[Keyframe] = []
+
+    def add(self, frame: Frame, modes: Collection[str] = ("fused",), travelled_m: float = float("nan")) -> None:
+        """Embed a frame whole ("fused") and in further modes; in the others it holds NaN."""
+        for mode, change in MODES.items():
+            row = np.full(self._embedder.dimension, np.nan, np.float32)
+            if mode == "fused" or mode in modes:
+                embedding = self._embedder.embed(change(frame))
+                row = embedding.descriptor
+                if mode == "fused":
+                    self.keyframes.append(as_keyframe(frame, embedding, travelled_m))
+            self._descriptors[mode].append(row)
+
+    def descriptors(self, mode: str) -> Descriptors:
+        """(N, D), NaN for the frames that were not embedded in this mode."""
+        return np.stack(self._descriptors[mode])
+
+
+def as_keyframe(frame: Frame, embedding: Embedding, travelled_m: float) -> Keyframe:
+    """A keyframe that can be retrieved and reranked; it keeps no points for registration."""
+    return Keyframe(
+        stamp_ns=frame.stamp_ns,
+        embedding=embedding,
+        camera=frame.camera,
+        body_T_camera=frame.body_T_camera,
+        points=NO_POINTS,
+        odom_T_body=frame.odom_T_body,
+        travelled_m=travelled_m,
+        session=frame.session,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +101,14 @@ class Ranking:
         found = np.take_along_axis(positive, np.maximum(self.order, 0), axis=1)
         return found & (self.order != NOTHING)
 
-    def of(self, queries: Mask | Indices) -> Ranking:
-        """The ranking of some of the queries."""
-        return Ranking(self.order[queries], self.score[queries], self.admissible[queries])
+    def reordered(self, scores: Array) -> Ranking:
+        """The ranking with its first K references ordered by other scores (Q, K); equals keep their order."""
+        wanted = scores.shape[1]
+        head = self.order[:, :wanted]
+        scores = np.where(head == NOTHING, -np.inf, scores)
+        better = np.argsort(-scores, axis=1, kind="stable")
+        order = np.concatenate([np.take_along_axis(head, better, 1), self.order[:, wanted:]], axis=1)
+        return Ranking(order, scores.max(axis=1, initial=-np.inf), self.admissible)
 
 
 def rank(similarity: Array, admissible: Mask | None = None) -> Ranking:
@@ -55,37 +126,65 @@ def rank(similarity: Array, admissible: Mask | None = None) -> Ranking:
     return Ranking(order, masked.max(axis=1, initial=-np.inf), count)
 
 
-def rerank(ranking: Ranking, scores: Array) -> Ranking:
-    """Reorder the best candidates of every query by other scores; equals keep their order.
+@dataclass(frozen=True, slots=True)
+class Reranking:
+    """What the local features make of a ranking.
+
+    Attributes:
+        before: the ranking by descriptors alone.
+        scores: (Q, K) of its first candidates, by method.
+        milliseconds: median per query of each reranker with both modalities.
+    """
+
+    before: Ranking
+    scores: dict[str, Array]
+    milliseconds: dict[str, float] = field(default_factory=dict)
+
+    def after(self, method: str, candidates: int = TOP_K) -> Ranking:
+        """The ranking after reranking the first `candidates`."""
+        return self.before.reordered(self.scores[method][:, :candidates])
+
+    def recall1_by_candidates(self, method: str, positive: Mask) -> Array:
+        """(K,) recall@1 of the answerable queries when the first 1, 2, ... K are reranked (figure 5.12)."""
+        answerable = positive.any(axis=1)
+        counts = range(1, TOP_K + 1)
+        return np.array([self.after(method, count).hits(positive)[answerable, 0].mean() for count in counts])
+
+
+def rerank_all(
+    queries: Sequence[Keyframe],
+    references: Sequence[Keyframe],
+    ranking: Ranking,
+    similarity: Array,
+    settings: Verification,
+    report: Callable[[], None] = lambda: None,
+) -> Reranking:
+    """Rerank the candidates of every query with the verifier's reranker, in each of the `METHODS`.
 
     Args:
-        ranking: by global descriptors.
-        scores: (Q, K) of the first K of each query.
+        queries: Q keyframes.
+        references: R keyframes.
+        ranking: of the references for every query.
+        similarity: (Q, R) of the global descriptors.
+        settings: of the reranker.
+        report: called after every query.
     """
-    wanted = scores.shape[1]
-    head = ranking.order[:, :wanted]
-    scores = np.where(head == NOTHING, -np.inf, scores)
-    better = np.argsort(-scores, axis=1, kind="stable")
-    order = np.concatenate([np.take_along_axis(head, better, 1), ranking.order[:, wanted:]], axis=1)
-    return Ranking(order, scores.max(axis=1, initial=-np.inf), ranking.admissible)
-
-
-def recall_curve(hits: Mask, most: int) -> Array:
-    """(most,) share of the queries with a true match among their first 1, 2, ... `most` references.
-
-    Args:
-        hits: (Q, N) whether each retrieved reference is a true match, best first.
-        most: length of the curve; beyond N it stays level.
-    """
-    if not len(hits):
-        return np.full(most, np.nan)
-    found = np.logical_or.accumulate(hits, axis=1).mean(axis=0)
-    return np.pad(found[:most], (0, max(most - len(found), 0)), mode="edge")
-
-
-def recall_top_percent(hits: Mask, admissible: Indices) -> float:
-    """Share of the queries with a true match among the best percent of their references, at least one."""
-    if not len(hits):
-        return float("nan")
-    wanted = np.maximum(np.round(admissible / 100), 1)
-    return float((hits & (np.arange(hits.shape[1])[None] < wanted[:, None])).any(axis=1).mean())
+    heads = ranking.order[:, :TOP_K]
+    ways = {name: settings.model_copy(update={"rerank": r, "modalities": m}) for name, (r, m) in METHODS.items()}
+    scores: dict[str, Array] = {method: np.zeros(heads.shape) for method in METHODS}
+    took: dict[str, list[float]] = {method: [] for method in METHODS}
+    for row, (query, head) in enumerate(zip(queries, heads, strict=True)):
+        candidates = [
+            (Candidate(column, references[index].stamp_ns, float(similarity[row, index])), references[index])
+            for column, index in enumerate(head)
+            if index != NOTHING
+        ]
+        for method, way in ways.items():
+            started = time.perf_counter()
+            ranked = rerank(query, candidates, way)
+            took[method].append(1e3 * (time.perf_counter() - started))
+            for item in ranked:
+                scores[method][row, item.candidate.index] = item.order
+        report()
+    medians = {reranker: float(np.median(took[f"{reranker} both"])) for reranker in RERANKERS if len(heads)}
+    return Reranking(ranking, scores, medians)

@@ -1,4 +1,4 @@
-"""Every figure of merit of one ranking."""
+"""Every figure of merit of a ranking (thesis 5.2)."""
 
 from __future__ import annotations
 
@@ -7,12 +7,42 @@ from dataclasses import dataclass
 import numpy as np
 
 from umf_ros.geometry import Array
-from umf_ros.lab.evaluation.curves import PrecisionRecall, precision_recall
-from umf_ros.lab.evaluation.protocol import Task
-from umf_ros.lab.evaluation.retrieval import Mask, Ranking, recall_curve, recall_top_percent
+from umf_ros.lab.evaluation.protocol import THESIS_RULE, RetrievalTask
+from umf_ros.lab.evaluation.retrieval import Indices, Mask, Ranking
 
 CURVE = 25
 """Candidates up to which recall is reported."""
+
+OPPOSITE_DEG = 150.0
+YAW_BINS = ((0.0, 10.0), (10.0, 20.0), (20.0, 30.0), (OPPOSITE_DEG, 180.0))
+"""Degrees by which a query's heading differs from that of its place's references."""
+
+
+@dataclass(frozen=True, slots=True)
+class PrecisionRecall:
+    """Precision against recall when only matches above a threshold are believed (thesis figure 5.13).
+
+    One row per distinct score, the highest first.
+
+    Attributes:
+        threshold: (T,) matches with at least this score are believed.
+        precision: (T,) share of the believed matches that are true.
+        recall: (T,) share of the queries with a true match whose best match is believed and true.
+    """
+
+    threshold: Array
+    precision: Array
+    recall: Array
+
+    @property
+    def area(self) -> float:
+        """Area under the curve, in steps: no precision is claimed between two thresholds."""
+        return float(np.sum(np.diff(self.recall, prepend=0.0) * self.precision))
+
+    @property
+    def recall_at_full_precision(self) -> float:
+        """The largest recall without a single false match."""
+        return float(self.recall[self.precision == 1.0].max(initial=0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +72,22 @@ class Scores:
     curve: PrecisionRecall
 
 
-def score(task: Task, ranking: Ranking, unanswerable_count: bool = False) -> Scores:
+@dataclass(frozen=True, slots=True)
+class YawBin:
+    """Recall@1 of the queries that saw their place turned by so much.
+
+    Attributes:
+        name: for people.
+        queries: how many.
+        recall1: share whose best match lies within the radius and is turned no more than the bin (30 deg at least).
+    """
+
+    name: str
+    queries: int
+    recall1: float
+
+
+def score(task: RetrievalTask, ranking: Ranking, unanswerable_count: bool = False) -> Scores:
     """Score a ranking of a task.
 
     Args:
@@ -73,3 +118,67 @@ def score(task: Task, ranking: Ranking, unanswerable_count: bool = False) -> Sco
         recalls=recalls,
         curve=curve,
     )
+
+
+def recall_curve(hits: Mask, most: int) -> Array:
+    """(most,) share of the queries with a true match among their first 1, 2, ... `most` references.
+
+    Args:
+        hits: (Q, N) whether each retrieved reference is a true match, best first.
+        most: length of the curve; beyond N it stays level.
+    """
+    if not len(hits):
+        return np.full(most, np.nan)
+    found = np.logical_or.accumulate(hits, axis=1).mean(axis=0)
+    return np.pad(found[:most], (0, max(most - len(found), 0)), mode="edge")
+
+
+def recall_top_percent(hits: Mask, admissible: Indices) -> float:
+    """Share of the queries with a true match among the best percent of their references, at least one."""
+    if not len(hits):
+        return float("nan")
+    wanted = np.maximum(np.round(admissible / 100), 1)
+    return float((hits & (np.arange(hits.shape[1])[None] < wanted[:, None])).any(axis=1).mean())
+
+
+def precision_recall(score: Array, correct: Mask, answerable: Mask) -> PrecisionRecall:
+    """The curve of the best match of every query.
+
+    Queries of one score are believed together, so that ties never look better than they are. A query
+    without a true match can only be wrong; one with -inf retrieved nothing and is never believed.
+    scikit-learn's curve is no substitute: its recall is a share of the best matches that are true, so a
+    query whose place was not found would not be missed.
+
+    Args:
+        score: (Q,) of the best match.
+        correct: (Q,) whether the best match is true.
+        answerable: (Q,) whether there is a true match.
+    """
+    total = int(answerable.sum())
+    order = np.argsort(-score, kind="stable")
+    order = order[np.isfinite(score[order])]
+    if not total or not len(order):
+        return PrecisionRecall(np.empty(0), np.empty(0), np.empty(0))
+    sorted_score, sorted_correct = score[order], correct[order]
+    last_of_tie = np.append(sorted_score[1:] != sorted_score[:-1], True)
+    true = np.cumsum(sorted_correct)[last_of_tie]
+    believed = np.arange(1, len(order) + 1)[last_of_tie]
+    return PrecisionRecall(sorted_score[last_of_tie], true / believed, true / total)
+
+
+def recall_by_yaw(task: RetrievalTask, ranking: Ranking) -> list[YawBin]:
+    """Recall@1 by difference of heading; revisits in the opposite direction are a bin of their own.
+
+    A query belongs to the bin of the least turned reference within the radius. In the opposite
+    direction the thesis knows no true match: there, any reference within the radius is one.
+    """
+    here = task.admissible & (task.metres < THESIS_RULE.positive_m)
+    least = np.where(here, task.turn_deg, np.inf).min(axis=1, initial=np.inf)
+    bins = []
+    for low, high in YAW_BINS:
+        chosen = (least >= low) & ((least < high) | (high == 180.0) & (least <= high))
+        true = here & (task.turn_deg <= max(high, THESIS_RULE.positive_deg))
+        hits = ranking.hits(true)[chosen, :1].any(axis=1)
+        name = "opposite direction" if low == OPPOSITE_DEG else f"{low:.0f}-{high:.0f} deg"
+        bins.append(YawBin(name, int(chosen.sum()), float(hits.mean()) if chosen.any() else float("nan")))
+    return bins

@@ -1,29 +1,95 @@
-"""The figures of an evaluation on worlds: flat for programs, tables for people."""
+"""What an evaluation on worlds found, and what the networks cost."""
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 
-from umf_ros.lab.evaluation.latency import Cost
-from umf_ros.lab.evaluation.markdown import Table
-from umf_ros.lab.evaluation.reranking import METHODS
-from umf_ros.lab.evaluation.scores import Scores
-from umf_ros.lab.evaluation.world_evaluation import WorldResult
+from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding.umf_embedder import UmfEmbedder
+from umf_ros.frames import Frame
+from umf_ros.geometry import Array
+from umf_ros.lab.evaluation.results import Figures, TextTable, mean, percent, rounded, scores_table
+from umf_ros.lab.evaluation.retrieval import METHODS, RERANKERS, TOP_K, Indices
+from umf_ros.lab.evaluation.scores import Scores, YawBin
+from umf_ros.networks.umf import count_parameters
+from umf_ros.networks.weights import load_weights, locate_weights
+from umf_ros.sensors.calibration import load_calibration
 
-REFERENCE = {
-    # thesis table 5.7, Mt Etna: what the method reached on the real data
-    "fused": (73.5, 82.9, 87.5),
-    "superfeatures image": (74.5, 84.3, 89.0),
-    "superfeatures lidar": (73.7, 83.4, 87.5),
-    "superfeatures both": (75.0, 85.1, 89.1),
-    "ransac image": (75.1, 84.9, 89.3),
-    "ransac lidar": (73.9, 83.8, 87.8),
-    "ransac both": (75.3, 85.3, 89.5),
+WARM_UP = 3
+
+ETNA_RECALL1 = {
+    # thesis table 5.7: what the method reached on the real data of Mt Etna, in per cent
+    "fused": 73.5,
+    "superfeatures image": 74.5,
+    "superfeatures lidar": 73.7,
+    "superfeatures both": 75.0,
+    "ransac image": 75.1,
+    "ransac lidar": 73.9,
+    "ransac both": 75.3,
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """What a network costs (thesis table 5.9).
+
+    Attributes:
+        name: for people.
+        parameters: trainable numbers.
+        eager_ms: median of preprocessing and network, batch of one, plain torch in single precision.
+        fast_ms: the same in the fastest runtime.
+    """
+
+    name: str
+    parameters: int
+    eager_ms: float
+    fast_ms: float
+
+    @property
+    def megabytes(self) -> float:
+        """Size of the weights in single precision."""
+        return self.parameters * 4 / 2**20
+
+    @property
+    def ratio(self) -> float:
+        """Time in the fastest runtime as a share of plain torch's."""
+        return self.fast_ms / self.eager_ms
+
+
+@dataclass(frozen=True, slots=True)
+class WorldResult:
+    """What was found in one world.
+
+    Attributes:
+        name: family and seed.
+        references: samples of the first pass.
+        scores: by what was asked: modes, rerankers, "same light".
+        yaw: recall@1 by difference of heading, opposite direction included.
+        by_candidates: (K,) recall@1 by number of reranked candidates, by reranker.
+        milliseconds: of the rerankers per query.
+        descriptors: (N, D) fused.
+        world_T_body: (N, 4, 4).
+        pass_index: (N,).
+        examples: frames of queries and of their best match after RANSAC.
+    """
+
+    name: str
+    references: int
+    scores: dict[str, Scores]
+    yaw: list[YawBin]
+    by_candidates: dict[str, Array]
+    milliseconds: dict[str, float]
+    descriptors: Array
+    world_T_body: Array
+    pass_index: Indices
+    examples: list[tuple[Frame, Frame]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +98,7 @@ class WorldsSummary:
 
     Attributes:
         results: one per world.
-        baselines: R@1, R@5, top-1 % scores of other methods, by name and world.
+        baselines: scores of other methods, by name and world.
         default, resnet50: costs of the evaluated weights, and of the thesis's network with random ones.
     """
 
@@ -41,60 +107,51 @@ class WorldsSummary:
     default: Cost
     resnet50: Cost
 
-    def mean(self, name: str, figure: str = "recall1") -> float:
-        """Mean over the worlds of one figure of merit."""
-        return _mean([getattr(result.scores[name], figure) for result in self.results])
+    def of(self, name: str, figure: str = "recall1") -> list[float]:
+        """One figure of merit in every world."""
+        return [getattr(result.scores[name], figure) for result in self.results]
 
-    def flat(self) -> dict[str, float | None]:
-        """The figures by their published names; None for what could not be measured."""
-        fused = [result.scores["fused"].recall1 for result in self.results]
-        figures = {
-            "recall1_fused_mean": _mean(fused),
+    def figures(self) -> Figures:
+        """The figures by their published names."""
+        fused = self.of("fused")
+        asked = ("image", "lidar", "superfeatures both", "ransac both", "image black", "cloud empty")
+        names = {name: name.removesuffix(" both").replace(" ", "_") for name in asked}
+        shares = {
+            "recall1_fused_mean": mean(fused),
             "recall1_fused_worst": _worst(fused),
-            "recall1_image_mean": self.mean("image"),
-            "recall1_lidar_mean": self.mean("lidar"),
-            "recall1_superfeatures_mean": self.mean("superfeatures both"),
-            "recall1_ransac_mean": self.mean("ransac both"),
-            "recall1_image_black_mean": self.mean("image black"),
-            "recall1_cloud_empty_mean": self.mean("cloud empty"),
-            "recall1_within5m_mean": self.mean("fused", "recall1_within_5m"),
-            "auc_pr_mean": self.mean("fused", "auc_pr"),
-            "recall_at_precision1_mean": self.mean("fused", "recall_at_precision1"),
-            "embed_ms_default": self.default.fast_ms,
-            "embed_ms_resnet50": self.resnet50.fast_ms,
-            "embed_ratio_default": self.default.ratio,
-            "embed_ratio_resnet50": self.resnet50.ratio,
+            **{f"recall1_{names[name]}_mean": mean(self.of(name)) for name in asked},
+            "recall1_within5m_mean": mean(self.of("fused", "recall1_within_5m")),
+            "auc_pr_mean": mean(self.of("fused", "auc_pr")),
+            "recall_at_precision1_mean": mean(self.of("fused", "recall_at_precision1")),
         }
-        rounded = {name: round(value, 4) if math.isfinite(value) else None for name, value in figures.items()}
-        counts = {"parameters_default": self.default.parameters, "parameters_resnet50": self.resnet50.parameters}
-        return rounded | counts
+        costs = {"default": self.default, "resnet50": self.resnet50}
+        times = {f"embed_ms_{name}": cost.fast_ms for name, cost in costs.items()}
+        ratios = {f"embed_ratio_{name}": cost.ratio for name, cost in costs.items()}
+        parameters = {f"parameters_{name}": cost.parameters for name, cost in costs.items()}
+        return rounded(shares | times | ratios) | parameters
 
-    def tables(self) -> dict[str, Table]:
+    def tables(self) -> dict[str, TextTable]:
         """The tables by their titles."""
-        names = ["fused", "image", "lidar"]
-        damaged = ["image black", "cloud empty", "same light"]
         return {
-            "Modalities": self._recalls(names),
-            "Reranking (as thesis table 5.7; its Etna recall@1 beside)": self._recalls(["fused", *METHODS], True),
-            "Lost modalities and unchanged light": self._recalls(["fused", *damaged]),
+            "Modalities": self._recalls(["fused", "image", "lidar"]),
+            "Reranking (as thesis table 5.7; its Etna recall@1 beside)": self._reranking(),
+            "Lost modalities and unchanged light": self._recalls(["fused", "image black", "cloud empty", "same light"]),
             "Recall@1 by difference of heading": self._yaw(),
             "Other methods": self._baselines(),
             "Worlds": self._worlds(),
             "Cost": self._costs(),
         }
 
-    def _recalls(self, names: Sequence[str], reference: bool = False) -> Table:
-        head = ["", "R@1", "worst", "R@5", "top 1 %", "within 5 m", "AUC-PR", "R@100 % P"]
-        rows = []
-        for name in names:
-            figures = ["recall1", "recall5", "recall_top_percent", "recall1_within_5m", "auc_pr"]
-            values = [self.mean(name, figure) for figure in [*figures, "recall_at_precision1"]]
-            worst = _worst([result.scores[name].recall1 for result in self.results])
-            row = [name, *map(percent, [values[0], worst, *values[1:]])]
-            rows.append([*row, f"{REFERENCE[name][0]:.1f}"] if reference else row)
-        return ([*head, "thesis, Etna"] if reference else head), rows
+    def _recalls(self, names: Sequence[str]) -> TextTable:
+        table = scores_table({name: [result.scores[name] for result in self.results] for name in names})
+        return _with_column(table, 2, "worst", [percent(_worst(self.of(name))) for name in names])
 
-    def _yaw(self) -> Table:
+    def _reranking(self) -> TextTable:
+        names = ["fused", *METHODS]
+        table = self._recalls(names)
+        return _with_column(table, len(table[0]), "thesis, Etna", [f"{ETNA_RECALL1[name]:.1f}" for name in names])
+
+    def _yaw(self) -> TextTable:
         rows = []
         for bins in zip(*(result.yaw for result in self.results), strict=True):
             queries = sum(item.queries for item in bins)
@@ -102,23 +159,11 @@ class WorldsSummary:
             rows.append([bins[0].name, str(queries), percent(found / queries if queries else math.nan)])
         return ["heading differs by", "queries", "recall@1"], rows
 
-    def _baselines(self) -> Table:
-        rows = []
-        for name, scores in self.baselines.items():
-            figures = [
-                "recall1",
-                "recall5",
-                "recall_top_percent",
-                "recall1_within_5m",
-                "auc_pr",
-                "recall_at_precision1",
-            ]
-            rows.append([name, *(percent(_mean([getattr(found, figure) for found in scores])) for figure in figures)])
-        chance = _mean([result.scores["fused"].chance for result in self.results])
-        rows.append(["chance", percent(chance), *[""] * 5])
-        return ["", "R@1", "R@5", "top 1 %", "within 5 m", "AUC-PR", "R@100 % P"], rows
+    def _baselines(self) -> TextTable:
+        head, rows = scores_table(self.baselines)
+        return head, [*rows, ["chance", percent(mean(self.of("fused", "chance"))), *[""] * (len(head) - 2)]]
 
-    def _worlds(self) -> Table:
+    def _worlds(self) -> TextTable:
         shown = ["fused", "image", "lidar", "superfeatures both", "ransac both"]
         rows = []
         for result in self.results:
@@ -126,27 +171,53 @@ class WorldsSummary:
             rows.append([result.name, str(result.references), str(result.scores["fused"].queries), *recalls])
         return ["recall@1 in", "references", "queries", *shown], rows
 
-    def _costs(self) -> Table:
+    def _costs(self) -> TextTable:
         head = ["", "parameters", "MB (fp32)", "embedding, eager torch [ms]", "fastest runtime [ms]", "ratio"]
         rows = []
         for cost in (self.default, self.resnet50):
             numbers = [f"{cost.megabytes:.1f}", f"{cost.eager_ms:.1f}", f"{cost.fast_ms:.1f}", f"{cost.ratio:.2f}"]
             rows.append([cost.name, f"{cost.parameters:,}", *numbers])
-        for name in ("superfeatures", "ransac"):
-            took = _mean([result.milliseconds.get(name, math.nan) for result in self.results])
-            rows.append([f"reranking by {name}, 20 candidates", "", "", "", f"{took:.1f}", ""])
+        for name in RERANKERS:
+            took = mean([result.milliseconds.get(name, math.nan) for result in self.results])
+            rows.append([f"reranking by {name}, {TOP_K} candidates", "", "", "", f"{took:.1f}", ""])
         return head, rows
 
 
-def percent(share: float) -> str:
-    """A share in per cent, or a dash."""
-    return f"{100 * share:.1f}" if math.isfinite(share) else "-"
+def measure(embedder: Embedder, frames: Sequence[Frame], repeats: int) -> float:
+    """Median milliseconds to embed one frame of full resolution."""
+    for frame in frames[:WARM_UP]:
+        embedder.embed(frame)
+    took = []
+    for _ in range(repeats):
+        for frame in frames:
+            started = time.perf_counter()
+            embedder.embed(frame)
+            took.append(time.perf_counter() - started)
+    return 1e3 * float(np.median(took))
+
+
+def cost_of_weights(weights: Path, frames: Sequence[Frame], repeats: int) -> Cost:
+    """Cost of a weights file, or of shipped weights by name."""
+    path = locate_weights(weights)
+    eager = measure(UmfEmbedder(path, runtime="torch"), frames, repeats)
+    fast = measure(UmfEmbedder(path), frames, repeats)
+    return Cost(path.stem, count_parameters(load_weights(path)), eager, fast)
+
+
+def at_full_size(frame: Frame) -> Frame:
+    """The frame with its image at the size the real camera delivers, so that preprocessing costs what it will."""
+    camera = load_calibration("simulated").camera
+    if frame.left is None:
+        return frame
+    left = cv2.resize(frame.left, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR).astype(np.uint8)
+    return replace(frame, left=left, camera=camera)
 
 
 def _worst(values: Sequence[float]) -> float:
     return min((value for value in values if math.isfinite(value)), default=math.nan)
 
 
-def _mean(values: Sequence[float]) -> float:
-    finite = [value for value in values if math.isfinite(value)]
-    return float(np.mean(finite)) if finite else math.nan
+def _with_column(table: TextTable, place: int, name: str, column: Sequence[str]) -> TextTable:
+    head, rows = table
+    wider = [[*row[:place], cell, *row[place:]] for row, cell in zip(rows, column, strict=True)]
+    return [*head[:place], name, *head[place:]], wider

@@ -1,29 +1,47 @@
-"""An evaluation on simulated worlds, from the weights to the report."""
+"""An evaluation on simulated worlds, in every way the thesis compares: from the weights to the report."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from umf_ros.config import Embedding, Verification
-from umf_ros.embedding import METHODS, make_embedder
+from umf_ros.config import EmbeddingSettings, Verification
+from umf_ros.embedding import METHODS as EMBEDDERS
+from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.umf_embedder import UmfEmbedder
 from umf_ros.frames import Frame
-from umf_ros.lab.evaluation.attention_plots import look, plot_keypoints, plot_superfeatures
-from umf_ros.lab.evaluation.curve_plots import plot_precision_recall, plot_recall
-from umf_ros.lab.evaluation.embedding_plots import plot_embeddings
-from umf_ros.lab.evaluation.latency import at_full_size, cost_of_weights
-from umf_ros.lab.evaluation.markdown import to_markdown
-from umf_ros.lab.evaluation.scores import Scores
-from umf_ros.lab.evaluation.summary import WorldsSummary
-from umf_ros.lab.evaluation.world_evaluation import WorldEvaluation, WorldResult
-from umf_ros.lab.evaluation.worlds import TestWorld
+from umf_ros.geometry import Array
+from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures
+from umf_ros.lab.evaluation.protocol import RetrievalTask, place_recognition
+from umf_ros.lab.evaluation.results import EvaluationReport, plot_precision_recall, plot_recall
+from umf_ros.lab.evaluation.retrieval import (
+    METHODS,
+    MODES,
+    RERANKERS,
+    Indices,
+    PlaceCollection,
+    Ranking,
+    rank,
+    rerank_all,
+)
+from umf_ros.lab.evaluation.scores import Scores, YawBin, recall_by_yaw, score
+from umf_ros.lab.evaluation.summary import WorldResult, WorldsSummary, at_full_size, cost_of_weights
+from umf_ros.lab.evaluation.worlds import FIRST, OPPOSITE, REVISIT, SAME_LIGHT, TestWorld, Visit
 from umf_ros.networks.weights import load_weights, locate_weights
-from umf_ros.runs.folder import write_atomically
+
+ASKED = {
+    # what the queries and the references are embedded with
+    "fused": ("fused", "fused"),
+    "image": ("image", "image"),
+    "lidar": ("lidar", "lidar"),
+    "image black": ("image black", "fused"),
+    "cloud empty": ("cloud empty", "fused"),
+}
+SHOWN = 3
+"""Queries whose frames are kept for pictures."""
 
 RERANKED = ("fused", "superfeatures both", "ransac both")
 TIMED_FRAMES = 8
@@ -35,6 +53,100 @@ PICTURES = {
     "Attention of super-features on images and voxels (figures 5.5 to 5.7)": "superfeatures.png",
     "Key-points and fusion (figure 5.8)": "keypoints.png",
 }
+
+
+class WorldEvaluation:
+    """Drives through a world and asks its questions.
+
+    Args:
+        world: to drive through.
+        embedder: what is evaluated; with super-features where their reranking is wanted.
+        settings: of the rerankers.
+        report: called after every frame and every reranked query.
+    """
+
+    def __init__(
+        self, world: TestWorld, embedder: Embedder, settings: Verification, report: Callable[[], None] = lambda: None
+    ) -> None:
+        self._world, self._settings, self._report = world, settings, report
+        self._places = PlaceCollection(embedder)
+        self._frames: list[Frame] = []
+        self._poses: list[Array] = []
+        self._passes: list[int] = []
+
+    def run(self) -> WorldResult:
+        """Embed, retrieve, rerank and score."""
+        for visit in self._world:
+            self._remember(visit)
+            self._report()
+        task, similarity = self._ask((REVISIT,))
+        ranking = rank(similarity)
+        queries, references = (
+            [self._places.keyframes[row] for row in rows] for rows in (task.queries, task.references)
+        )
+        reranking = rerank_all(queries, references, ranking, similarity, self._settings, self._report)
+        return WorldResult(
+            name=self._world.name,
+            references=len(task.references),
+            scores={
+                **{name: self._score((REVISIT,), *modes) for name, modes in ASKED.items()},
+                "same light": self._score((SAME_LIGHT,)),
+                **{method: score(task, reranking.after(method)) for method in METHODS},
+            },
+            yaw=self._recall_by_yaw(),
+            by_candidates={name: reranking.recall1_by_candidates(f"{name} both", task.positive) for name in RERANKERS},
+            milliseconds=reranking.milliseconds,
+            descriptors=self._places.descriptors("fused"),
+            world_T_body=np.stack(self._poses),
+            pass_index=np.array(self._passes),
+            examples=self._examples(task, reranking.after("ransac both")),
+        )
+
+    def compare(self, embedder: Embedder) -> Scores:
+        """Score another embedder on the same frames, after `run`."""
+        rows, places = self._rows((REVISIT,)), PlaceCollection(embedder)
+        for row in rows:
+            places.add(self._frames[row])
+        task, found = self._task(rows), places.descriptors("fused")
+        return score(task, rank(found[task.queries] @ found[task.references].T))
+
+    def _remember(self, visit: Visit) -> None:
+        modes = {FIRST: ("image", "lidar"), REVISIT: tuple(MODES)}.get(visit.pass_index, ())
+        self._places.add(visit.frame, modes)
+        self._frames.append(visit.frame)
+        self._poses.append(visit.world_T_body)
+        self._passes.append(visit.pass_index)
+
+    def _rows(self, passes: tuple[int, ...]) -> Indices:
+        """Samples of the first pass and of some others."""
+        return np.flatnonzero(np.isin(self._passes, (FIRST, *passes)))
+
+    def _task(self, rows: Indices) -> RetrievalTask:
+        return place_recognition(np.stack(self._poses)[rows], np.array(self._passes)[rows])
+
+    def _ask(
+        self, passes: tuple[int, ...], of_query: str = "fused", of_reference: str = "fused"
+    ) -> tuple[RetrievalTask, Array]:
+        """Some passes against the first: the task, and (Q, R) how alike they are."""
+        rows = self._rows(passes)
+        task = self._task(rows).of_rows(rows)
+        queries, references = self._places.descriptors(of_query), self._places.descriptors(of_reference)
+        return task, queries[task.queries] @ references[task.references].T
+
+    def _score(self, passes: tuple[int, ...], of_query: str = "fused", of_reference: str = "fused") -> Scores:
+        task, similarity = self._ask(passes, of_query, of_reference)
+        return score(task, rank(similarity))
+
+    def _recall_by_yaw(self) -> list[YawBin]:
+        task, similarity = self._ask((REVISIT, OPPOSITE))
+        return recall_by_yaw(task, rank(similarity))
+
+    def _examples(self, task: RetrievalTask, ranking: Ranking) -> list[tuple[Frame, Frame]]:
+        found = np.flatnonzero(ranking.hits(task.positive)[:, 0])
+        chosen = found[np.linspace(0, len(found) - 1, min(SHOWN, len(found))).astype(int)]
+        return [
+            (self._frames[task.queries[row]], self._frames[task.references[ranking.order[row, 0]]]) for row in chosen
+        ]
 
 
 class WorldsRun:
@@ -59,8 +171,8 @@ class WorldsRun:
         self._weights = locate_weights(weights)
         self._worlds, self._repeats, self._report = worlds, repeats, report
         self._embedder = UmfEmbedder(self._weights, super_features=True)
-        names = [name for name in METHODS if name != "umf"] if others else []
-        self._others = {name: make_embedder(Embedding(method=name)) for name in names}
+        names = [name for name in EMBEDDERS if name != "umf"] if others else []
+        self._others = {name: make_embedder(EmbeddingSettings(method=name)) for name in names}
 
     def run(self) -> WorldsSummary:
         """Drive through all worlds, then take times."""
@@ -77,7 +189,7 @@ class WorldsRun:
         default = cost_of_weights(self._weights, frames, self._repeats)
         return WorldsSummary(results, baselines, default, cost_of_weights(Path("umf_resnet50"), frames, self._repeats))
 
-    def write(self, summary: WorldsSummary, folder: Path, notes: list[str]) -> None:
+    def write(self, summary: WorldsSummary, folder: Path, notes: list[str]) -> EvaluationReport:
         """Write tables, figures and pictures.
 
         Raises:
@@ -85,9 +197,10 @@ class WorldsRun:
         """
         self._report("drawing", 0)
         self._draw(summary, folder)
-        write_atomically(folder / "evaluation.json", json.dumps(summary.flat(), indent=2) + "\n")
-        text = to_markdown("Evaluation on simulated worlds", notes, summary.tables(), PICTURES)
-        write_atomically(folder / "evaluation.md", text)
+        title = "Evaluation on simulated worlds"
+        report = EvaluationReport(title, notes, summary.figures(), summary.tables(), PICTURES)
+        report.write(folder)
+        return report
 
     def _draw(self, summary: WorldsSummary, folder: Path) -> None:
         results = summary.results
@@ -111,3 +224,8 @@ def _draw_attention(folder: Path, weights: Path, embedder: Embedder, pairs: list
     seen = [(look(network, embedder, query), look(network, embedder, match)) for query, match in pairs]
     plot_superfeatures(folder / "superfeatures.png", seen, network.config.image_size)
     plot_keypoints(folder / "keypoints.png", [query for query, _ in seen])
+
+
+def work(world: TestWorld) -> int:
+    """How often a `WorldEvaluation` of the world reports, nearly."""
+    return len(world) + world.revisits
