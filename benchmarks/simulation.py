@@ -18,7 +18,7 @@ from rich.table import Table
 
 from umf_ros.frames import Image, StereoCamera
 from umf_ros.geometry import Array, heading, invert, relative, transform, wrap_angle
-from umf_ros.lab.simulation.camera import Picture
+from umf_ros.lab.simulation.camera import Rendering
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.lidar import PERIOD_NS, Lidar
 from umf_ros.lab.simulation.passes import SETTINGS, plan_passes
@@ -89,7 +89,7 @@ def exactness(simulator: Simulator, count: int) -> dict[str, float]:
     }
 
 
-def reprojection(simulator: Simulator, number: int, picture: Picture) -> tuple[Array, Array]:
+def reprojection(simulator: Simulator, number: int, picture: Rendering) -> tuple[Array, Array]:
     """Errors of one scan in depth (m), and in the image: how far the nearest rendered surface lies (px)."""
     calibration, stamp = simulator.calibration, int(simulator.scan_stamps_ns[number])
     camera = calibration.camera
@@ -120,7 +120,7 @@ def _nearest_pixel(camera: StereoCamera, depth: Array, uv: Array, seen: Array) -
     return best
 
 
-def disparity_error(camera: StereoCamera, left: Picture, right: Picture) -> Array:
+def disparity_error(camera: StereoCamera, left: Rendering, right: Rendering) -> Array:
     """(N,) px between the tracked and the true disparity of corners."""
     sky = (left.depth > 0).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(left.image, 800, 0.01, 8, mask=sky)

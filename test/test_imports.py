@@ -11,10 +11,7 @@ from pathlib import Path
 
 from sources import PACKAGE, ROOT, distributions, imports, required
 
-STILL_SHARED = {
-    *("Bag", "Calibration", "Embedding", "Entry", "Evidence", "Hits", "Picture", "PoseGraph", "Progress"),
-    *("Scan", "Task", "Worker", "World"),
-}
+STILL_SHARED = {"PoseGraph", "World"}
 """Names of classes that mean two things."""
 
 

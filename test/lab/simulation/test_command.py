@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
+from typing import get_type_hints
 
 import pytest
 from processes import wait_until
 
 from umf_ros.errors import UmfError
 from umf_ros.lab.commands.simulate import command
+from umf_ros.lab.simulation.families import FAMILIES
+from umf_ros.lab.simulation.presets import PRESETS
 
 
 @pytest.mark.parametrize(
@@ -29,6 +33,14 @@ def test_impossible_drives(tmp_path, options, line):
         command(tmp_path / "drive.mcap", **options)
     assert "\n" not in str(raised.value)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_help_names_every_preset_and_family():
+    """They are written out there: what knows them is too heavy for `umf --help`."""
+    hints = get_type_hints(command, include_extras=True)
+    names = {key: re.findall(r"\w+", hints[key].__metadata__[0].help.split(";")[0]) for key in ("preset", "family")}
+    assert set(names["preset"]) - {"or"} == set(PRESETS)
+    assert set(names["family"]) - {"or", "random"} == set(FAMILIES) - {"random"}
 
 
 def test_places_that_cannot_be_written(tmp_path):

@@ -13,7 +13,7 @@ from umf_ros.frames import Image, StereoCamera
 from umf_ros.geometry import Array
 from umf_ros.lab.simulation.lighting import Sun
 from umf_ros.lab.simulation.noise import Field
-from umf_ros.lab.simulation.shading import Hits, Shader, cast
+from umf_ros.lab.simulation.shading import RayHits, Shader, cast
 from umf_ros.lab.simulation.world import ROCK, World
 
 SKY = 255
@@ -37,7 +37,7 @@ def resized(camera: StereoCamera, width: int, height: int) -> StereoCamera:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class Rendering:
     """One exposure and the truth behind it.
 
     Attributes:
@@ -72,7 +72,7 @@ class Camera:
         rng: np.random.Generator,
         exposure: float = 1.0,
         smear_px: Array | None = None,
-    ) -> Picture:
+    ) -> Rendering:
         """Expose once.
 
         Args:
@@ -97,7 +97,7 @@ class Camera:
             light = _smeared(light, smear_px)
         image = self._develop(light, rng, exposure)
         depth = np.where(np.isfinite(hits.distance), hits.distance, 0).reshape(self._shape) * self._axial
-        return Picture(image, depth, *self._labels(hits))
+        return Rendering(image, depth, *self._labels(hits))
 
     def _develop(self, light: Field, rng: np.random.Generator, exposure: float) -> Image:
         if self.intrinsics.width > 400:
@@ -111,7 +111,7 @@ class Camera:
         value += noise * np.sqrt(np.float32(0.008**2) + value * np.float32(0.010**2))
         return np.clip(value * 255, 0, 255).astype(np.uint8)
 
-    def _labels(self, hits: Hits) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    def _labels(self, hits: RayHits) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
         semantic = np.minimum(hits.geometry, SKY).astype(np.uint8)
         instance = np.zeros(len(semantic), np.int32)
         rocks = np.flatnonzero(hits.geometry == ROCK)

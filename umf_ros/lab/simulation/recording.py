@@ -15,7 +15,7 @@ import numpy as np
 from umf_ros.bags.writer import BagWriter
 from umf_ros.errors import OutputError
 from umf_ros.lab.simulation import gnss, imu
-from umf_ros.lab.simulation.camera import Picture
+from umf_ros.lab.simulation.camera import Rendering
 from umf_ros.lab.simulation.lidar import PERIOD_NS
 from umf_ros.lab.simulation.messages import (
     camera_info_message,
@@ -126,7 +126,7 @@ def _images(simulator: Simulator, pool: ThreadPoolExecutor, truth: bool) -> Iter
             yield from _maps(pair[0], stamp, log_ns)
 
 
-def _maps(picture: Picture, stamp: int, log_ns: int) -> Iterator[Event]:
+def _maps(picture: Rendering, stamp: int, log_ns: int) -> Iterator[Event]:
     for name, values, encoding in (
         ("depth", picture.depth, "32FC1"),
         ("semantic", picture.semantic, "mono8"),

@@ -14,7 +14,7 @@ from umf_ros.lab.simulation.presets import ETNA, Preset
 from umf_ros.lab.simulation.route import Route
 from umf_ros.lab.simulation.survey import Survey
 from umf_ros.lab.simulation.world import World, ground
-from umf_ros.sensors.calibration import Calibration, load_calibration
+from umf_ros.sensors.calibration import Calibration
 
 THESIS = {
     f"{family}_{number}": (family, number)
@@ -33,7 +33,7 @@ def etna_surveys(seed: int, calibration: Calibration | None = None) -> Iterator[
     world = World(seed, "etna", aliasing, next(iter(ETNA.values())).clearing(relief, seed), relief)
     for day, (name, preset) in enumerate(ETNA.items()):
         passes = sampled(preset, preset.route(relief, seed), seed, day)
-        yield name, Survey(world, passes, calibration or load_calibration("simulated"))
+        yield name, Survey(world, passes, calibration)
 
 
 def thesis_surveys(seed: int, calibration: Calibration | None = None) -> Iterator[tuple[str, Survey]]:
@@ -47,7 +47,7 @@ def thesis_surveys(seed: int, calibration: Calibration | None = None) -> Iterato
         passes = first_samples(passes, THESIS_SAMPLES)
         clear = np.concatenate([drive.path for drive in passes])
         world = World(world_seed, family, setting.aliasing, clear, relief)
-        yield name, Survey(world, passes, calibration or load_calibration("simulated"))
+        yield name, Survey(world, passes, calibration)
 
 
 def sampled(preset: Preset, route: Route, seed: int, day: int = 0) -> list[Pass]:

@@ -21,7 +21,7 @@ _LARGE_PX = 400
 
 
 @dataclass(slots=True)
-class Hits:
+class RayHits:
     """What the rays of one picture met; all arrays have one entry per ray.
 
     Attributes:
@@ -38,18 +38,18 @@ class Hits:
     uv: Field
     normal: Field
 
-    def part(self, rays: slice) -> Hits:
+    def part(self, rays: slice) -> RayHits:
         """The hits of some of the rays."""
-        return Hits(self.distance[rays], self.geometry[rays], self.primitive[rays], self.uv[rays], self.normal[rays])
+        return RayHits(self.distance[rays], self.geometry[rays], self.primitive[rays], self.uv[rays], self.normal[rays])
 
 
-def cast(world: World, origin: Array, directions: Field) -> Hits:
+def cast(world: World, origin: Array, directions: Field) -> RayHits:
     """Send rays from one point, or one point each, along (N, 3) unit directions."""
     rays = np.empty((len(directions), 6), np.float32)
     rays[:, :3] = origin
     rays[:, 3:] = directions
     answer = world.scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
-    return Hits(
+    return RayHits(
         answer["t_hit"].numpy(),
         answer["geometry_ids"].numpy(),
         answer["primitive_ids"].numpy(),
@@ -65,7 +65,9 @@ class Shader:
         self.world, self.sun = world, sun.direction
         self.traits = world.traits
 
-    def radiance(self, hits: Hits, origin: Array, directions: Field, shape: tuple[int, int], pixel_rad: float) -> Field:
+    def radiance(
+        self, hits: RayHits, origin: Array, directions: Field, shape: tuple[int, int], pixel_rad: float
+    ) -> Field:
         """Light along each ray of a picture.
 
         Args:
@@ -105,7 +107,7 @@ class Shader:
         light[sky] = self._sky(dz[sky], toward_sun[sky])
         return light.reshape(shape).astype(np.float32, copy=False)
 
-    def _surface(self, hits: Hits, x: Field, y: Field, shape: tuple[int, int]) -> tuple[Field, ...]:
+    def _surface(self, hits: RayHits, x: Field, y: Field, shape: tuple[int, int]) -> tuple[Field, ...]:
         """Unit normal, log brightness and softness before the fine detail."""
         column, row = ((value + SIZE_M / 2) / np.float32(CELL_M) for value in (x, y))
         maps = cv2.remap(
@@ -132,7 +134,7 @@ class Shader:
                 softness[where] = 0
         return nx, ny, nz, brightness, softness
 
-    def _interpolated(self, geometry: int, hits: Hits, where: NDArray[np.intp]) -> Field:
+    def _interpolated(self, geometry: int, hits: RayHits, where: NDArray[np.intp]) -> Field:
         mesh = self.world.solids[geometry]
         corners = mesh.normals[mesh.triangles[hits.primitive[where]]]
         u, v = hits.uv[where, :1], hits.uv[where, 1:]
@@ -167,7 +169,7 @@ class Shader:
         return brightness
 
     def _sunlit(
-        self, incidence: Field, hits: Hits, distance: Field, place: tuple[Field, ...], shape: tuple[int, int]
+        self, incidence: Field, hits: RayHits, distance: Field, place: tuple[Field, ...], shape: tuple[int, int]
     ) -> Field:
         """1 where the sun is seen, 0 in shadow.
 
@@ -191,7 +193,7 @@ class Shader:
         return lit
 
     def _test_sun(
-        self, lit: Field, where: NDArray[np.intp], hits: Hits, distance: Field, place: tuple[Field, ...]
+        self, lit: Field, where: NDArray[np.intp], hits: RayHits, distance: Field, place: tuple[Field, ...]
     ) -> None:
         """Send rays to the sun from some of the places and note whether they arrive."""
         rays = np.empty((len(where), 6), np.float32)

@@ -10,7 +10,7 @@ import numpy as np
 from umf_ros.errors import ConfigError
 from umf_ros.frames import Frame, Image
 from umf_ros.geometry import Array, relative, transform
-from umf_ros.lab.simulation.camera import Picture
+from umf_ros.lab.simulation.camera import Rendering
 from umf_ros.lab.simulation.lidar import PERIOD_NS, Lidar, Scan
 from umf_ros.lab.simulation.lighting import Sun
 from umf_ros.lab.simulation.motion import Motion
@@ -110,11 +110,11 @@ class Simulator:
         start, end = self._lidar_poses(number)
         return self._lidar.scan(start, np.random.default_rng([self.seed, 11, number]), end)
 
-    def stereo(self, exposure: Exposure) -> tuple[Picture, Picture | None]:
+    def stereo(self, exposure: Exposure) -> tuple[Rendering, Rendering | None]:
         """Left and right picture of an exposure; no right one where it is dropped."""
         return self.picture(exposure), self.picture(exposure, right=True) if exposure.right else None
 
-    def picture(self, exposure: Exposure, right: bool = False) -> Picture:
+    def picture(self, exposure: Exposure, right: bool = False) -> Rendering:
         """One picture of an exposure, with the truth behind it."""
         rng = np.random.default_rng([self.seed, 12, exposure.number, int(right)])
         eye = self._eyes[int(right)]
@@ -124,7 +124,7 @@ class Simulator:
         pose = self.pose(exposure.stamp_ns) @ eye.body_T_camera
         return eye.camera.take(pose, self.sun(exposure.stamp_ns), rng, 1.0, smear)
 
-    def published(self, picture: Picture) -> Image:
+    def published(self, picture: Rendering) -> Image:
         """The image as the camera's driver sends it."""
         return mosaic(picture.image) if self.preset.layout.encoding.startswith("bayer") else picture.image
 

@@ -38,9 +38,10 @@ class SurveyFrame:
 class Survey:
     """Drives a rover over the passes of one world and yields training samples."""
 
-    def __init__(self, world: World, passes: list[Pass], calibration: Calibration) -> None:
-        self.world, self.passes, self.calibration = world, passes, calibration
-        self._camera = Camera(world, resized(calibration.camera, *TRAINING_SIZE))
+    def __init__(self, world: World, passes: list[Pass], calibration: Calibration | None = None) -> None:
+        """Place the rover; its sensors are those of the simulated rig where none are given."""
+        self.world, self.passes, self.calibration = world, passes, calibration or load_calibration("simulated")
+        self._camera = Camera(world, resized(self.calibration.camera, *TRAINING_SIZE))
         self._lidar = Lidar(world)
 
     def __len__(self) -> int:
@@ -84,7 +85,7 @@ def survey_world(seed: int, family: str, setting: str, calibration: Calibration 
     relief = ground(seed, family, chosen.aliasing)
     passes = plan_passes(relief.trail, labels, chosen, step, seed)
     world = World(seed, family, chosen.aliasing, np.concatenate([drive.path for drive in passes]), relief)
-    return Survey(world, passes, calibration or load_calibration("simulated"))
+    return Survey(world, passes, calibration)
 
 
 def _itinerary(rng: np.random.Generator) -> tuple[tuple[str, ...], float]:
