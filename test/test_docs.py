@@ -74,3 +74,11 @@ def test_the_citation_is_a_citation() -> None:
     assert {"cff-version", "message", "title", "authors"} <= set(content)
     assert content["preferred-citation"]["authors"][0]["family-names"] == "García-Hernández"
     assert content["references"][0]["type"] == "thesis"
+
+
+def test_every_source_that_is_cited_is_listed() -> None:
+    text = "\n".join(path.read_text(encoding="utf-8") for path in [*PACKAGE.rglob("*.py"), *ROOT.glob("docs/*.md")])
+    listed = set(re.findall(r"^- \*\*\[(.+?)\]\*\*", text_of("docs/references.md"), re.MULTILINE))
+    cited = set(re.findall(r"\[([A-ZÀ-Ž][\w-]+ (?:19|20)\d\d)[\],]", text))
+    assert "UMF" in listed and cited <= listed
+    assert listed - {"UMF"} <= cited

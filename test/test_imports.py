@@ -23,13 +23,13 @@ def imported_after(statement: str, candidates: list[str]) -> list[str]:
     return done.stdout.splitlines()[-1].split()
 
 
-def modules(room: str = "") -> list[str]:
-    paths = sorted((PACKAGE / room).rglob("*.py"))
-    return [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths]
+def modules(paths: list[Path]) -> list[str]:
+    """Names of modules and packages by their files."""
+    return [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in paths]
 
 
-def runtime() -> list[str]:
-    return [name for name in modules() if not name.startswith("umf_ros.lab.")]
+def runtime() -> list[Path]:
+    return sorted(path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "lab")
 
 
 def lab_packages() -> list[str]:
@@ -55,8 +55,8 @@ def test_the_runtime_imports_without_the_lab() -> None:
         "            raise ModuleNotFoundError(name)\n"
         "sys.meta_path.insert(0, Missing())\n"
     )
-    nodes = [name for name in runtime() if name.startswith("umf_ros.nodes.")]
-    core = [name for name in runtime() if name not in nodes]
+    nodes = [name for name in modules(runtime()) if name.startswith("umf_ros.nodes.")]
+    core = [name for name in modules(runtime()) if name not in nodes]
     no_ros = "assert 'rclpy' not in sys.modules, 'only nodes need ROS'"
     statements = [block, *(f"import {name}" for name in core), no_ros, *(f"import {name}" for name in nodes)]
     assert imported_after("\n".join(statements), [*missing, nodes[-1]]) == [nodes[-1]]
@@ -64,14 +64,13 @@ def test_the_runtime_imports_without_the_lab() -> None:
 
 def test_the_runtime_asks_for_no_package_of_the_lab_later() -> None:
     unwanted = set(lab_packages())
-    for name in runtime():
-        path = ROOT / Path(*name.split(".")).with_suffix(".py")
+    for path in runtime():
         later = {module.split(".")[0] for module in imports(path)} & unwanted
         assert not later, f"{path} imports {later}"
 
 
 def test_the_evaluation_imports_no_ros() -> None:
-    statement = "\n".join(f"import {name}" for name in modules("lab/evaluation"))
+    statement = "\n".join(f"import {name}" for name in modules(sorted((PACKAGE / "lab" / "evaluation").glob("*.py"))))
     assert imported_after(statement, ["rclpy", "rclpy.node"]) == []
 
 

@@ -1,4 +1,4 @@
-"""The eight families of worlds (thesis 5.1.4): what is typical for each, as ranges to draw from."""
+"""The eight families of worlds [UMF 5.1.4]: what is typical for each, as ranges to draw from."""
 
 from __future__ import annotations
 

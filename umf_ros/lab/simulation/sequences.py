@@ -1,4 +1,4 @@
-"""S3LI Etna's seven sequences over one world, and the thesis's thirteen synthetic ones (tables 5.2 and 5.3)."""
+"""S3LI Etna's seven sequences over one world, and the thesis's thirteen synthetic ones [UMF tables 5.2, 5.3]."""
 
 from __future__ import annotations
 
