@@ -24,7 +24,6 @@ from umf_ros.lab.simulation.shards import Survey
 from umf_ros.lab.simulation.world import World, ground
 from umf_ros.loop_detector import make_keyframe
 from umf_ros.sensors.calibration import Calibration, load_calibration
-from umf_ros.verification.lifting import project
 
 SPEED_M_S = 1.0
 STEP_M = 2.4  # between frames
@@ -62,9 +61,7 @@ class Drive:
         seen, points = _unproject(self.depths[query], camera, body_T_camera)
         if not seen:
             return 0.0
-        pixels, depth = project(
-            transform(relative(self.truth[match], self.truth[query]), points), camera, body_T_camera
-        )
+        pixels, depth = camera.project(transform(relative(self.truth[match], self.truth[query]), points), body_T_camera)
         cells = np.floor(pixels / DEPTH_STRIDE).astype(int)
         inside = (depth > 0.5) & (cells >= 0).all(axis=1) & (cells < self.depths.shape[1]).all(axis=1)
         there = self.depths[match][cells[inside, 1], cells[inside, 0]].astype(float)

@@ -23,17 +23,23 @@ from rich.progress import track
 from traps import TRAPS
 from verification import replay
 
-from umf_ros.config import Database, Loop, Verification
-from umf_ros.config import Embedding as EmbeddingSettings
+from umf_ros.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.embedding import make_embedder
 from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array
 from umf_ros.lab.simulation.seeds import VALIDATION
-from umf_ros.lab.training.acceptance_fit import Example, fit_logistic, fit_spread, inside_ellipsoid, scale_spread
+from umf_ros.lab.training.acceptance_fit import (
+    Example,
+    fit_covariance,
+    fit_logistic,
+    inside_ellipsoid,
+    scale_covariance,
+)
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
-from umf_ros.verification.acceptance import MEASURES, Calibration, load_calibration, measure, save_calibration
-from umf_ros.verification.evidence import Evidence
+from umf_ros.verification.acceptance import KINDS, AcceptanceModel, load_acceptance, save_acceptance, scores
+from umf_ros.verification.measurement import IMAGE, SCAN
+from umf_ros.verification.verifier import JudgedHypothesis
 
 RIGHT_M, RIGHT_DEG = 0.4, 3.0
 EXAMINED = 5  # candidates per query: what retrieval offers first
@@ -46,13 +52,18 @@ DEFAULT_OUT = Path(__file__).parent.parent / "config" / "verification" / "calibr
 
 @dataclass(frozen=True)
 class Finding:
-    """One examined pose, and its error (6,), of the drive with this seed."""
+    """One examined hypothesis, and the error (6,) of its pose, of the drive with this seed."""
 
     drive: int
-    evidence: Evidence
+    examined: JudgedHypothesis
     error: Array
     right: bool
     pristine: bool
+
+    @property
+    def example(self) -> Example:
+        """What the acceptance model is fitted to."""
+        return Example(self.examined.measurement, self.right)
 
 
 def main(
@@ -76,59 +87,59 @@ def main(
         with console.status(f"simulating world {number} ({family}, aliasing {aliasing:g})"):
             drive = kept(drives, number, family, aliasing)
         surveyed.append((drive, embedded(drive, embedder)))
-    calibration, results = fit([finding for survey in surveyed for finding in examine(*survey)])
-    calibration, honest = scaled(calibration, surveyed)
+    model, results = fit([finding for survey in surveyed for finding in examine(*survey)])
+    model, honest = scaled(model, surveyed)
     for name, value in (results := results | honest).items():
         console.print(f"{name:32} {value:.4g}")
-    save_calibration(calibration, out, f"python benchmarks/fit_verification.py --worlds {count}", results)
+    save_acceptance(model, out, f"python benchmarks/fit_verification.py --worlds {count}", results)
     console.print(f"wrote {out}")
 
 
-def fit(findings: list[Finding]) -> tuple[Calibration, dict[str, float]]:
-    """The calibration that explains the findings best, and figures of how it does on worlds it was not fitted to.
+def fit(findings: list[Finding]) -> tuple[AcceptanceModel, dict[str, float]]:
+    """The model that explains the findings best, and figures of how it does on worlds it was not fitted to.
 
-    A kind of evidence with next to no right examples, as images are to an embedder without local features,
+    A kind of hypothesis with next to no right examples, as images are to an embedder without local features,
     keeps what is shipped.
     """
-    shipped = load_calibration()
-    models, spreads = dict(shipped.models), dict(shipped.spreads)
+    shipped = load_acceptance()
+    models, covariances = dict(shipped.models), dict(shipped.covariances)
     results: dict[str, float] = {}
     sprung = _sprung_traps()
-    for kind in MEASURES:
-        mine = [finding for finding in findings if finding.evidence.kind == kind]
+    for kind in KINDS:
+        mine = [finding for finding in findings if finding.examined.measurement.kind == kind]
         if sum(finding.right for finding in mine) < ENOUGH:
             continue
-        models[kind] = fit_logistic([_example(finding) for finding in mine] + sprung, kind)
+        models[kind] = fit_logistic([finding.example for finding in mine] + sprung, kind)
         odds = _held_out(mine, sprung, kind)
         results |= _judge(kind, mine, odds)
         # of untouched scans only, for the covariance describes the sensor
         chosen = [one for one, p in zip(mine, odds, strict=True) if one.right and one.pristine and p >= THRESHOLD]
         if len(chosen) >= ENOUGH:
-            informations = np.array([one.evidence.information for one in chosen])
-            spreads[kind] = fit_spread(np.array([one.error for one in chosen]), informations)
-    return Calibration(models, spreads), results
+            informations = np.array([one.examined.aligned.alignment.information for one in chosen])
+            covariances[kind] = fit_covariance(np.array([one.error for one in chosen]), informations)
+    return AcceptanceModel(models, covariances), results
 
 
-def scaled(calibration: Calibration, surveyed: list[Survey]) -> tuple[Calibration, dict[str, float]]:
+def scaled(model: AcceptanceModel, surveyed: list[Survey]) -> tuple[AcceptanceModel, dict[str, float]]:
     """The same with covariances that hold for what is published, the best poses, rather than for any right one."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "calibration.json"
-        save_calibration(calibration, path, "", {})
+        path = Path(folder) / "acceptance.json"
+        save_acceptance(model, path, "", {})
         settings = Verification(calibration=str(path))
         published = [replay(*survey, Verifier(settings))[0] for survey in surveyed]
     errors = np.array([error for world in published for error in world.vectors])
     covariances = np.array([covariance for world in published for covariance in world.covariances])
-    spread = scale_spread(calibration.spreads["scan"], errors, covariances)
+    covariance = scale_covariance(model.covariances[SCAN], errors, covariances)
     figures = {
         "published": float(len(errors)),
         "published_wrong": float(sum(world.wrong for world in published)),
         "published_inside_95_before": inside_ellipsoid(errors, covariances),
     }
-    return Calibration(calibration.models, calibration.spreads | {"scan": spread}), figures
+    return AcceptanceModel(model.models, model.covariances | {SCAN: covariance}), figures
 
 
 def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Finding]:
-    """Evidence of candidates along a drive, with whole keyframes and without scans, and how wrong each pose is."""
+    """Hypotheses about candidates along a drive, with whole keyframes and without scans, and how wrong each pose is."""
     rng = np.random.default_rng(drive.seed)
     rules = Loop()
     database = PlaceDatabase(Database(), "drive", len(keyframes[0].embedding.descriptor))
@@ -142,12 +153,12 @@ def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Finding]:
             pairs = [(one, _degraded(database[one.index], strength, rng)) for one in chosen]
             scanless = [(one, _without_scan(match)) for one, match in pairs]
             found = whole.examine(_degraded(keyframe, strength, rng), pairs)
-            for evidence in found + blind.examine(_without_scan(keyframe), scanless):
-                match = evidence.proposal.ranked.candidate.index
-                metres, degrees = drive.error(query, match, evidence.pose)
-                error = drive.error_vector(query, match, evidence.pose)
+            for one in found + blind.examine(_without_scan(keyframe), scanless):
+                match, pose = one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose
+                metres, degrees = drive.error(query, match, pose)
                 right = metres < RIGHT_M and degrees < RIGHT_DEG
-                yield Finding(drive.seed, evidence, error, right, strength == 0 or evidence.kind == "image")
+                pristine = strength == 0 or one.measurement.kind == IMAGE
+                yield Finding(drive.seed, one, drive.error_vector(query, match, pose), right, pristine)
         database.add(keyframe)
     database.close()
 
@@ -184,18 +195,14 @@ def _without_scan(keyframe: Keyframe) -> Keyframe:
 
 
 def _sprung_traps() -> list[Example]:
-    """Every trap a few times over, as wrong examples of its kind of evidence."""
+    """Every trap a few times over, as wrong examples of its kind."""
     found = []
     for trap in TRAPS.values():
         for seed in range(100, 110):
             query, match = trap(seed)
-            for evidence in Verifier(Verification()).examine(query, [(Candidate(0, match.stamp_ns, 0.9), match)]):
-                found.append(Example(evidence.numbers, evidence.kind, False))
+            examined = Verifier(Verification()).examine(query, [(Candidate(0, match.stamp_ns, 0.9), match)])
+            found += [Example(one.measurement, False) for one in examined]
     return found
-
-
-def _example(finding: Finding) -> Example:
-    return Example(finding.evidence.numbers, finding.evidence.kind, finding.right)
 
 
 def _held_out(findings: list[Finding], sprung: list[Example], kind: str) -> Array:
@@ -203,10 +210,10 @@ def _held_out(findings: list[Finding], sprung: list[Example], kind: str) -> Arra
     odds = np.zeros(len(findings))
     seeds = np.array([finding.drive for finding in findings])
     for seed in np.unique(seeds):
-        others = [_example(finding) for finding in findings if finding.drive != seed]
+        others = [finding.example for finding in findings if finding.drive != seed]
         model = fit_logistic(others + sprung, kind)
         for index in np.flatnonzero(seeds == seed):
-            odds[index] = model.probability(measure(findings[index].evidence.numbers, kind))
+            odds[index] = model.probability(scores(findings[index].examined.measurement))
     return odds
 
 

@@ -1,4 +1,4 @@
-"""Whether pretraining helps: random against pretrained encoders at equal fine-tuning (thesis table 5.6).
+"""Whether pretraining helps: random against pretrained encoders at equal fine-tuning [UMF 5.5.1, table 5.6].
 
 `python benchmarks/pretraining.py [--quick] [--seed N] [--json FILE] [--folder FOLDER]`
 
@@ -23,10 +23,7 @@ from umf_ros.lab.commands import simulate
 from umf_ros.lab.datasets.simulated import WorldFolder
 from umf_ros.lab.evaluation.results import print_table
 from umf_ros.lab.simulation.seeds import TRAINING, VALIDATION
-from umf_ros.lab.training.config import load_training
-from umf_ros.lab.training.pretraining.run import pretrain
-from umf_ros.lab.training.pretraining.settings import make_settings
-from umf_ros.lab.training.run import train
+from umf_ros.lab.training.run import load_run, train
 from umf_ros.lab.training.validation import MODES, Results, mean_of, validate
 from umf_ros.networks.weights import load_weights
 
@@ -74,7 +71,7 @@ def main(
         for number in range(repeats):
             for kind, weights in (("random", ""), ("pretrained", str(start))):
                 chosen = {"steps": steps, "seed": seed + number, "start": weights, "workers": workers}
-                settings = load_training(None, train=str(few), **chosen, **FINE_TUNING)
+                settings = load_run(None, train=str(few), **chosen, **FINE_TUNING)
                 tuned = train(settings, folder / f"{kind}_{number}", False, _advance(bars, bar, f"training, {kind}"))
                 found[kind].append(validate(load_weights(tuned), validation))
     rows = [_row(kind, mode, runs) for mode in MODES for kind, runs in found.items()]
@@ -90,9 +87,10 @@ def main(
 
 def _pretrained(data: Path, folder: Path, common: dict[str, int], report: Callable[[object], None]) -> Path:
     """Weights whose image encoder, then whose voxel encoder has been pretrained."""
-    image = pretrain(make_settings("image", data, **common), folder / "image", False, report)
-    settings = make_settings("lidar", data, **common, start=str(image))
-    return pretrain(settings, folder / "lidar", False, report)
+    chosen = common | {"train": str(data)}
+    image = train(load_run(None, method="masked_images", **chosen), folder / "image", False, report)
+    settings = load_run(None, method="masked_scans", start=str(image), **chosen)
+    return train(settings, folder / "lidar", False, report)
 
 
 def _advance(bars: Progress, bar: TaskID, text: str) -> Callable[[object], None]:

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from umf_ros.frames import Embedding, Keyframe, LocalFeatures, StereoCamera
 from umf_ros.geometry import Array, invert, make_pose, transform
 from umf_ros.verification import thin_scan
-from umf_ros.verification.lifting import project
 
 CAMERA = StereoCamera(688, 512, 579.488, 579.488, 342.133, 255.806, 0.2003)
 BODY_T_CAMERA = make_pose(Rotation.from_euler("ZYX", [-90, 0, -96], degrees=True).as_matrix(), [0.3, 0.1, 1.1])
@@ -102,7 +101,7 @@ def _on_ground(ground: Landscape, world_T_body: Array, planar: Array, rng: np.ra
 def _image_features(ground: Landscape, world_T_body: Array, rng: np.random.Generator) -> LocalFeatures:
     world = np.column_stack([ground.landmarks, ground.height(ground.landmarks)])
     points = transform(invert(world_T_body), world)
-    pixels, depth = project(points, CAMERA, BODY_T_CAMERA)
+    pixels, depth = CAMERA.project(points, BODY_T_CAMERA)
     seen = (depth > 1) & (depth < 30) & (pixels >= 0).all(axis=1) & (pixels < [CAMERA.width, CAMERA.height]).all(axis=1)
     return _features(pixels[seen] + rng.normal(0, 2, (seen.sum(), 2)), points[seen], ground.descriptors[seen], rng)
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from scenes import CAMERA, Landscape, landscape, pose_at, take
 
-from umf_ros.frames import Candidate, Keyframe, LocalFeatures, Verdict
+from umf_ros.frames import Candidate, Keyframe, LocalFeatures
 from umf_ros.geometry import Array
-from umf_ros.verification import Verifier
+from umf_ros.verification import Verdict, Verifier
 
 Pair = tuple[Keyframe, Keyframe]
 BARE = replace(landscape(1), bumps=np.empty((0, 4)))

@@ -27,8 +27,7 @@ from rich.progress import track
 from rich.table import Table
 from traps import TRAPS, spring
 
-from umf_ros.config import Database, Loop, Verification
-from umf_ros.config import Embedding as EmbeddingSettings
+from umf_ros.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.embedding import make_embedder
 from umf_ros.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.geometry import Array, heading, wrap_angle

@@ -15,7 +15,7 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.config import Settings, load_settings
-from umf_ros.embedding.baselines import ThumbnailEmbedder
+from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.errors import OutputError
 from umf_ros.frames import Frame
 from umf_ros.loop_detector import LoopDetector

@@ -65,7 +65,7 @@ class KeyframePolicy(Group):
     untracked_period_s: float = Field(1.0, gt=0, description="without odometry: a keyframe every so often, s")
 
 
-class Embedding(Group):
+class EmbeddingSettings(Group):
     """The network that turns a frame into a descriptor and local features."""
 
     method: str = Field("umf", description="embedder by name: umf, or a baseline")
@@ -183,7 +183,7 @@ class Settings(Group):
     qos: Qos = Qos()
     sync: Sync = Sync()
     keyframe: KeyframePolicy = KeyframePolicy()
-    embedding: Embedding = Embedding()
+    embedding: EmbeddingSettings = EmbeddingSettings()
     loop: Loop = Loop()
     verification: Verification = Verification()
     pose_graph: PoseGraph = PoseGraph()

@@ -6,12 +6,12 @@ z up), the camera frame is optical (x right, y down, z forward). Poses follow `g
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array
+from umf_ros.geometry import Array, invert, transform
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float32]
@@ -31,6 +31,20 @@ class StereoCamera:
     cx: float
     cy: float
     baseline: float
+
+    def project(self, points: Array, body_T_camera: Array) -> tuple[Array, Array]:
+        """Left pixels (N, 2) and depths (N,) of points (N, 3) of the body frame; a depth <= 0 lies behind the camera.
+
+        Args:
+            points: (N, 3) metres, body frame.
+            body_T_camera: pose of the left camera in the body frame.
+        """
+        optical = transform(invert(body_T_camera), points)
+        depth = optical[:, 2]
+        safe = np.where(depth > 0, depth, 1.0)
+        u = self.fx * optical[:, 0] / safe + self.cx
+        v = self.fy * optical[:, 1] / safe + self.cy
+        return np.column_stack([u, v]), depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,22 +185,3 @@ class LoopClosure:
     match_T_query: Array
     covariance: Array
     probability: float = float("nan")
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What verification found for one candidate.
-
-    Attributes:
-        candidate: the candidate that was tested.
-        reason: one word or a short phrase; "accepted" when there is a closure.
-        numbers: what was measured, by name (inliers_image, inliers_cloud, residual_m, overlap, ...).
-        closure: the loop closure, or None when rejected.
-        inlier_pixels: (K, 4) float32: u, v in the query image and u, v in the match image.
-    """
-
-    candidate: Candidate
-    reason: str
-    numbers: dict[str, float] = field(default_factory=dict)
-    closure: LoopClosure | None = None
-    inlier_pixels: Points = field(default_factory=lambda: np.empty((0, 4), np.float32))

@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 
 from umf_ros.config import Settings
 from umf_ros.embedding import make_embedder
+from umf_ros.embedding.depth import lift
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.errors import OutputError
-from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure, Verdict
+from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure
 from umf_ros.keyframes import KeyframeSelector
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.verification import Verifier, lift, thin_scan
+from umf_ros.verification import Verdict, Verifier, thin_scan
 
 logger = logging.getLogger(__name__)
 

@@ -14,8 +14,9 @@ from conftest import make_keyframe
 from rich.console import Console
 
 from umf_ros.commands.progress import WARNING, FrameProgress, stop_on_interrupt, undisturbed
-from umf_ros.frames import Candidate, LoopClosure, Verdict
+from umf_ros.frames import Candidate, LoopClosure
 from umf_ros.loop_detector import Detection
+from umf_ros.verification import Measurement, Verdict
 
 SIGNALS = signal.SIGINT, signal.SIGTERM
 
@@ -95,7 +96,10 @@ def test_an_error_while_writing_gives_ctrl_c_back() -> None:
 def found(stamp_s: float, closures: int) -> Detection:
     stamp = round(stamp_s * 1e9)
     made = [LoopClosure(stamp, i, np.eye(4), np.eye(6)) for i in range(closures)]
-    verdicts = [Verdict(Candidate(i, i, 0.9), "accepted", closure=closure) for i, closure in enumerate(made)]
+    verdicts = [
+        Verdict(Candidate(i, i, 0.9), "accepted", Measurement(similarity=0.9), closure)
+        for i, closure in enumerate(made)
+    ]
     return Detection(stamp, make_keyframe(stamp_s), verdicts)
 
 

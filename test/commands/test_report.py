@@ -19,11 +19,12 @@ from recordings import CLOUD, LEFT, START_NS, TRUTH, drive, small_settings, trav
 
 from umf_ros.bags.frames import read_frames
 from umf_ros.bags.reader import open_bag
-from umf_ros.frames import Candidate, Frame, LoopClosure, Verdict
+from umf_ros.frames import Candidate, Frame, LoopClosure
 from umf_ros.geometry import Array, make_pose, relative
 from umf_ros.loop_detector import Detection
 from umf_ros.runs.recorder import RunRecorder
 from umf_ros.trajectory import Trajectory, write_tum
+from umf_ros.verification import Measurement, Verdict
 
 LATENCY = {"embed": 30.0, "query": 1.0, "verify": 9.0, "total": 40.0}
 PIXELS = np.array([[10, 12, 50, 30], [40, 20, 20, 41]], np.float32)
@@ -34,7 +35,7 @@ def verdict(query: Frame, match: Frame, error_m: float, probability: float) -> V
     poses = [drive((frame.stamp_ns - START_NS) * 1e-9) for frame in (match, query)]
     pose = relative(*poses) @ make_pose(np.eye(3), [0, error_m, 0])
     closure = LoopClosure(query.stamp_ns, match.stamp_ns, pose, np.eye(6) * 0.01, probability)
-    return Verdict(Candidate(0, match.stamp_ns, 0.8), "accepted", {"inliers_image": 2.0}, closure, PIXELS)
+    return Verdict(Candidate(0, match.stamp_ns, 0.8), "accepted", Measurement(similarity=0.8), closure, PIXELS)
 
 
 def record_run(folder: Path, bag: Path, settings_folder: Path) -> list[Frame]:
@@ -47,7 +48,7 @@ def record_run(folder: Path, bag: Path, settings_folder: Path) -> list[Frame]:
     closures[12] = verdict(frames[12], frames[7], 0.8, 0.9123)
     for i, frame in enumerate(frames):
         keyframe = replace(make_keyframe(0, 0.2 * i), stamp_ns=frame.stamp_ns)
-        rejected = Verdict(Candidate(1, frames[0].stamp_ns, 0.1), "few inliers", {"inliers_image": 1.0})
+        rejected = Verdict(Candidate(1, frames[0].stamp_ns, 0.1), "few inliers", Measurement(similarity=0.1))
         found = [closures[i], rejected] if i in closures else []
         recorder.record(frame, Detection(frame.stamp_ns, keyframe, found, LATENCY))
     recorder.write_summary({"image": 1, "cloud": 0, "odometry": 0, "worker": 0})

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -8,10 +10,12 @@ import torch
 from conftest import CAMERA
 from tiny_worlds import TINY, some_scan
 
-from umf_ros.config import Embedding as EmbeddingSettings
+from umf_ros import embedding
+from umf_ros.config import EmbeddingSettings
 from umf_ros.embedding import make_embedder
-from umf_ros.embedding.baselines import ScanContextEmbedder, ThumbnailEmbedder
 from umf_ros.embedding.ground_truth import GroundTruthEmbedder
+from umf_ros.embedding.scan_context_embedder import ScanContextEmbedder
+from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.embedding.umf_embedder import UmfEmbedder
 from umf_ros.errors import ConfigError, UmfError, WeightsError
 from umf_ros.frames import Frame
@@ -154,6 +158,39 @@ def test_baselines_know_a_place_again(embedder):
 def test_baselines_by_name():
     for name in ("thumbnail", "scan_context"):
         assert make_embedder(EmbeddingSettings(method=name)).name == name
+    assert embedding.METHODS == ("umf", "scan_context", "thumbnail")
+
+
+NEW = """
+class Nowhere:
+    name, dimension = "nowhere", 3
+
+    def embed(self, frame):
+        raise NotImplementedError
+
+def make(settings, super_features):
+    return Nowhere()
+"""
+
+
+def test_a_new_method_is_one_file(tmp_path, monkeypatch):
+    (tmp_path / "nowhere_embedder.py").write_text(NEW)
+    monkeypatch.setattr(embedding, "__path__", [*embedding.__path__, str(tmp_path)])
+    assert embedding.find_methods() == ("umf", "nowhere", "scan_context", "thumbnail")
+    monkeypatch.setattr(embedding, "METHODS", embedding.find_methods())
+    assert make_embedder(EmbeddingSettings(method="nowhere")).dimension == 3
+    with pytest.raises(ConfigError, match="unknown method 'magic'; known: umf, nowhere, scan_context, thumbnail"):
+        make_embedder(EmbeddingSettings(method="magic"))
+
+
+def test_every_command_names_the_methods():
+    """And to list them loads none of them."""
+    show = "from umf_ros.cli import main; import sys; sys.argv = ['umf', sys.argv[1], '--help']; main()"
+    for command in ("replay", "explain", "evaluate"):
+        said = subprocess.run([sys.executable, "-c", show, command], capture_output=True, text=True, check=True)
+        assert "umf, scan_context or thumbnail" in " ".join(said.stdout.replace("\u2502", " ").split())
+    listed = "import sys, umf_ros.embedding; print([name for name in ('torch', 'cv2') if name in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", listed], capture_output=True, text=True).stdout.strip() == "[]"
 
 
 def ground_truth() -> GroundTruthEmbedder:

@@ -20,12 +20,13 @@ from scipy.spatial.transform import Rotation
 from visualization_msgs.msg import Marker, MarkerArray
 
 from umf_ros.config import Frames
-from umf_ros.frames import Candidate, Keyframe, LoopClosure, Verdict
+from umf_ros.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.geometry import Array, make_pose
 from umf_ros.loop_detector import Detection
 from umf_ros.nodes.announcer import MAX_LINES, Announcer
 from umf_ros.nodes.conversions import from_time
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS
+from umf_ros.verification import Measurement, Verdict
 
 TOPICS: dict[str, tuple[type, Any]] = {
     "/loop_closures": (Odometry, CLOSURES_QOS),
@@ -84,12 +85,12 @@ def at(stamp_ns: int, x: float, y: float, session: int = 0) -> Keyframe:
 
 def accepted(match_ns: int = MATCH_NS, pose: Array = POSE) -> Verdict:
     closure = LoopClosure(QUERY_NS, match_ns, pose, COVARIANCE, 0.97)
-    numbers = {"inliers_image": 41.0, "residual_m": 0.0123456789}
-    return Verdict(Candidate(0, match_ns, 0.8125), "accepted", numbers, closure)
+    measurement = Measurement(similarity=0.8125, inliers_image=41.0)
+    return Verdict(Candidate(0, match_ns, 0.8125), "accepted", measurement, closure, probability=0.9712345678)
 
 
 def rejected(match_ns: int, reason: str = "few inliers") -> Verdict:
-    return Verdict(Candidate(1, match_ns, 0.5), reason, {"inliers_image": 3.0})
+    return Verdict(Candidate(1, match_ns, 0.5), reason, Measurement(similarity=0.5, inliers_image=3.0))
 
 
 def detection(verdicts: list[Verdict], keyframe: Keyframe | None = None) -> Detection:
@@ -127,8 +128,10 @@ def test_every_candidate_is_reported_with_its_reason_and_numbers(talk: Talk) -> 
     assert first.name == f"keyframe/{MATCH_NS} -> {QUERY_NS}" and second.name == f"keyframe/7 -> {QUERY_NS}"
     assert (first.level, second.level) == (DiagnosticStatus.OK, DiagnosticStatus.WARN)
     values = {pair.key: pair.value for pair in first.values}
-    assert values == {"similarity": "0.8125", "inliers_image": "41", "residual_m": "0.0123457"}
-    assert {pair.key: pair.value for pair in second.values} == {"similarity": "0.5", "inliers_image": "3"}
+    nothing = {"inliers_cloud": "0", "superfeatures": "0"}
+    assert values == {"similarity": "0.8125", "inliers_image": "41", **nothing, "probability": "0.971235"}
+    values = {pair.key: pair.value for pair in second.values}
+    assert values == {"similarity": "0.5", "inliers_image": "3", **nothing}
 
 
 def test_a_keyframe_is_a_pose_in_the_odometry_frame(talk: Talk) -> None:

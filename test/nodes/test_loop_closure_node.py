@@ -18,7 +18,7 @@ from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_srvs.srv import SetBool, Trigger
 
 from umf_ros.config import Database
-from umf_ros.embedding.baselines import ThumbnailEmbedder
+from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.nodes.conversions import to_time
 from umf_ros.places.database import PlaceDatabase
 

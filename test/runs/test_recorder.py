@@ -14,7 +14,7 @@ from conftest import make_frame, make_keyframe
 
 from umf_ros.config import Settings, load_settings
 from umf_ros.errors import OutputError, UmfError
-from umf_ros.frames import Candidate, LoopClosure, Verdict
+from umf_ros.frames import Candidate, LoopClosure
 from umf_ros.geometry import make_pose
 from umf_ros.loop_detector import Detection
 from umf_ros.runs import recorder as recorder_module
@@ -22,7 +22,9 @@ from umf_ros.runs.recorder import RunRecorder, count_drops, read_summary
 from umf_ros.runs.tables import read_closures
 from umf_ros.sensors.counters import SURPLUS, InputCounter
 from umf_ros.sensors.synchronizer import INPUTS
+from umf_ros.verification import Measurement, Verdict
 
+MEASUREMENT = Measurement(similarity=0.4, inliers_image=3.0)
 COUNTS = ["frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected"]
 OTHERS = ["latency_ms", "drops", "realtime_factor", "peak_rss_mb", "seed", "version", "weights"]
 KEYS = [*COUNTS, "ground_truth", *OTHERS]
@@ -34,7 +36,7 @@ def accepted(query_ns: int, match_ns: int) -> Verdict:
         query_ns, match_ns, make_pose(turn, [1.5, -0.25, 0.125]), np.diag([4, 1, 1, 0.25, 1, 1]), 0.97
     )
     pixels = np.array([[1, 2, 3, 4], [5, 6, 7, 8]], np.float32)
-    return Verdict(Candidate(0, match_ns, 0.8), "accepted", {"inliers_image": 31}, closure, pixels)
+    return Verdict(Candidate(0, match_ns, 0.8), "accepted", MEASUREMENT, closure, pixels)
 
 
 def detection(stamp_s: float, verdicts: list[Verdict]) -> Detection:
@@ -44,7 +46,7 @@ def detection(stamp_s: float, verdicts: list[Verdict]) -> Detection:
 
 def record_a_little(folder: Path) -> RunRecorder:
     recorder = RunRecorder(folder, Settings(), "some_weights")
-    rejected = Verdict(Candidate(1, 5, 0.4), "few inliers", {"inliers_image": 3})
+    rejected = Verdict(Candidate(1, 5, 0.4), "few inliers", MEASUREMENT)
     recorder.record(make_frame(1), Detection(10**9))
     recorder.record(make_frame(2), detection(2, []))
     recorder.record(
@@ -78,7 +80,7 @@ def test_tables_are_complete_before_anything_is_closed(tmp_path: Path) -> None:
     with (tmp_path / "candidates.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["reason"] for row in rows] == ["accepted", "few inliers"]
-    assert json.loads(rows[1]["numbers"]) == {"inliers_image": 3}
+    assert json.loads(rows[1]["numbers"]) == MEASUREMENT.numbers
     with (tmp_path / "inliers.csv").open() as file:
         assert [float(row["match_v"]) for row in csv.DictReader(file)] == [4, 8]
     with (tmp_path / "keyframes.csv").open() as file:
@@ -131,7 +133,7 @@ def test_the_summary_can_be_written_again_as_the_run_goes_on(tmp_path: Path) -> 
 
 def test_a_keyframe_that_was_asked_and_found_nothing_is_no_query(tmp_path: Path) -> None:
     recorder = RunRecorder(tmp_path, Settings(), "w")
-    rejected = Verdict(Candidate(1, 5, 0.4), "few inliers", {})
+    rejected = Verdict(Candidate(1, 5, 0.4), "few inliers", MEASUREMENT)
     recorder.record(make_frame(1), detection(1, []))
     recorder.record(make_frame(2), detection(2, [rejected, rejected]))
     recorder.record(make_frame(60), detection(60, [accepted(60, 2), accepted(60, 3), rejected]))

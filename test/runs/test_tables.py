@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from umf_ros.errors import OutputError, UmfError
-from umf_ros.frames import Candidate, LoopClosure, Verdict
+from umf_ros.frames import Candidate, LoopClosure
 from umf_ros.geometry import make_pose
 from umf_ros.runs.tables import (
     CANDIDATES,
@@ -26,6 +26,7 @@ from umf_ros.runs.tables import (
     read_closures,
     read_table,
 )
+from umf_ros.verification import Measurement, Verdict
 
 QUERY_NS, MATCH_NS = 1_667_000_100_123_456_789, 1_667_000_000_000_000_001
 
@@ -77,16 +78,18 @@ def test_a_table_without_rows_holds_no_closure(tmp_path: Path) -> None:
 
 def test_a_reason_may_hold_anything(tmp_path: Path) -> None:
     reason = 'turned too far, "31 deg"\n; gave up'
-    verdict = Verdict(Candidate(3, MATCH_NS, 0.123456789), reason, {"overlap": 1 / 3, "residual_m": float("inf")})
+    measurement = Measurement(similarity=1 / 3, inliers_image=float("inf"))
+    verdict = Verdict(Candidate(3, MATCH_NS, 0.123456789), reason, measurement, probability=2 / 3)
     path = written(tmp_path / "candidates.csv", [candidate_row(QUERY_NS, verdict)], CANDIDATES)
     (row,) = read_table(path, dict)
     assert row["reason"] == reason and row["similarity"] == "0.123457"
-    assert json.loads(row["numbers"]) == {"overlap": 0.333333, "residual_m": float("inf")}
+    counts = {"inliers_image": float("inf"), "inliers_cloud": 0.0, "superfeatures": 0.0}
+    assert json.loads(row["numbers"]) == {"similarity": 0.333333, **counts, "probability": 0.666667}
 
 
 def test_inliers_are_pixels_to_a_tenth(tmp_path: Path) -> None:
     pixels = np.array([[1.26, 2, 3, 687.98], [0, 0, 0, 0]], np.float32)
-    verdict = Verdict(Candidate(0, MATCH_NS, 0.5), "accepted", closure=closure(), inlier_pixels=pixels)
+    verdict = Verdict(Candidate(0, MATCH_NS, 0.5), "accepted", Measurement(similarity=0.5), closure(), pixels)
     path = written(tmp_path / "inliers.csv", inlier_rows(QUERY_NS, verdict), INLIERS)
     rows = read_table(path, lambda row: (int(row["query_stamp_ns"]), *(float(row[name]) for name in INLIERS[2:])))
     assert rows == [(QUERY_NS, 1.3, 2, 3, 688.0), (QUERY_NS, 0, 0, 0, 0)]

@@ -11,10 +11,10 @@ from traps import TRAPS, spring
 from umf_ros.config import Verification
 from umf_ros.frames import Candidate
 from umf_ros.verification import Verifier
-from umf_ros.verification.matching import mutual_neighbours, similarities
+from umf_ros.verification.constants import MIN_MAP_SCORE
+from umf_ros.verification.elevation_map import ElevationMap, TurnedMap, search
 from umf_ros.verification.ransac import fit_homography
-from umf_ros.verification.terrain import Fan, TerrainMap, search
-from umf_ros.verification.verifier import MIN_TERRAIN_SCORE
+from umf_ros.verification.rerank import mutual_neighbours, similarities
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -28,11 +28,11 @@ def test_trap_is_not_accepted(verifier: Verifier, name: str, seed: int) -> None:
 def test_the_homography_trap_is_a_real_one(verifier: Verifier) -> None:
     """The local features alone would fall for it."""
     verdict = spring(verifier, TRAPS["same_plane_and_texture"], 0)
-    assert verdict.numbers["inliers_image"] >= 20
+    assert verdict.measurement.inliers_image >= 20
 
 
 def test_the_rock_trap_is_a_real_one(verifier: Verifier) -> None:
-    assert spring(verifier, TRAPS["same_rocks_elsewhere"], 0).numbers["inliers_image"] >= 40
+    assert spring(verifier, TRAPS["same_rocks_elsewhere"], 0).measurement.inliers_image >= 40
 
 
 def test_the_mirror_trap_is_a_real_one() -> None:
@@ -60,8 +60,8 @@ def test_the_crowded_trap_is_a_real_one() -> None:
 @pytest.mark.parametrize("name", ["empty_scans", "planar_scans"])
 def test_no_relief_no_pose_from_it(name: str) -> None:
     query, match = TRAPS[name](0)
-    fits = search(TerrainMap(match.points), Fan(TerrainMap(query.points)))
-    assert all(fit.score < MIN_TERRAIN_SCORE for fit in fits)
+    fits = search(ElevationMap(match.points), TurnedMap(ElevationMap(query.points)))
+    assert all(fit.score < MIN_MAP_SCORE for fit in fits)
 
 
 @pytest.mark.parametrize("name", list(TRAPS))

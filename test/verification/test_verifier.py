@@ -11,9 +11,9 @@ import pytest
 from scenes import landscape, pose_at, take, without_image, without_scan
 
 from umf_ros.config import Verification
-from umf_ros.frames import Candidate, Keyframe, Verdict
+from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array, make_pose, relative, rotation_angle
-from umf_ros.verification import Verifier
+from umf_ros.verification import Verdict, Verifier
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
@@ -51,7 +51,7 @@ def test_revisit_among_others_is_found_with_its_pose(verifier: Verifier) -> None
 
 def test_every_verdict_has_numbers_and_a_reason(verifier: Verifier) -> None:
     verdicts = verifier.verify(take(GROUND, HERE, 100.0), [*others(7), candidate(take(GROUND, THERE, 10.0))])
-    assert all(verdict.reason and "similarity" in verdict.numbers for verdict in verdicts)
+    assert all(verdict.reason and verdict.measurement.similarity > 0 for verdict in verdicts)
     assert {"residual_m", "overlap", "probability", "inliers_image", "support"} <= set(verdicts[0].numbers)
     pixels = verdicts[0].inlier_pixels
     assert pixels.shape[1] == 4 and len(pixels) > 10
@@ -61,7 +61,7 @@ def test_rejected_candidate_says_how_far_it_fell_short(verifier: Verifier) -> No
     verdicts = verifier.verify(take(GROUND, HERE, 100.0), others(3))
     assert all(verdict.closure is None for verdict in verdicts)
     for verdict in verdicts:
-        judged = "probability" in verdict.numbers
+        judged = verdict.probability is not None
         assert verdict.reason.startswith("probability 0." if judged else ("no pose", "less promising"))
 
 
@@ -103,16 +103,16 @@ def test_threshold_is_the_one_knob() -> None:
 def test_superfeatures_can_rerank_instead(verifier: Verifier) -> None:
     chosen = Verifier(Verification(rerank="superfeatures"))
     found = chosen.verify(take(GROUND, HERE, 100.0), [candidate(take(GROUND, THERE, 10.0))])[0]
-    assert found.numbers["superfeatures"] == 0 and found.numbers["inliers_image"] == 0
+    assert found.measurement.superfeatures == 0 and found.measurement.inliers_image == 0
     assert gap(found)[0] < 0.05
 
 
 @pytest.mark.parametrize("modalities", ["image", "cloud"])
 def test_one_modality_can_rerank_alone(modalities: str) -> None:
     chosen = Verifier(Verification(modalities=modalities))
-    numbers = chosen.verify(take(GROUND, HERE, 100.0), [candidate(take(GROUND, THERE, 10.0))])[0].numbers
-    assert (numbers["inliers_image"] > 0) == (modalities == "image")
-    assert (numbers["inliers_cloud"] > 0) == (modalities == "cloud")
+    found = chosen.verify(take(GROUND, HERE, 100.0), [candidate(take(GROUND, THERE, 10.0))])[0].measurement
+    assert (found.inliers_image > 0) == (modalities == "image")
+    assert (found.inliers_cloud > 0) == (modalities == "cloud")
 
 
 def drive(shift: Array) -> list[tuple[Keyframe, Keyframe]]:
@@ -129,11 +129,11 @@ def drive(shift: Array) -> list[tuple[Keyframe, Keyframe]]:
 def test_neighbouring_keyframes_support_each_other_until_reset(verifier: Verifier) -> None:
     support = []
     for query, match in drive(make_pose(np.eye(3), [2.0, 1.0, 0.0])):
-        support.append(verifier.verify(query, [candidate(match)])[0].numbers["support"])
+        support.append(verifier.verify(query, [candidate(match)])[0].measurement.support)
     assert support == [0, 1, 2]
     verifier.reset()
     query, match = drive(np.eye(4))[2]
-    assert verifier.verify(query, [candidate(match)])[0].numbers["support"] == 0
+    assert verifier.verify(query, [candidate(match)])[0].measurement.support == 0
 
 
 def test_expected_place_is_tested_before_better_looking_ones() -> None:
@@ -182,4 +182,4 @@ def test_right_pose_of_another_view_is_no_closure(limits: dict[str, float], word
         take(GROUND, HERE, 100.0), [candidate(take(GROUND, THERE, 10.0))]
     )[0]
     assert verdict.closure is None and word in verdict.reason
-    assert verdict.numbers["probability"] > 0.9
+    assert verdict.probability is not None and verdict.probability > 0.9

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 
-from umf_ros.config import Embedding
+from umf_ros.config import EmbeddingSettings
 from umf_ros.errors import UmfError
 
 TIMEOUT_S = 60
@@ -139,7 +139,7 @@ def check_weights() -> Finding:
     try:
         from umf_ros.embedding import make_embedder
 
-        embedder = make_embedder(Embedding())
+        embedder = make_embedder(EmbeddingSettings())
     except (UmfError, ImportError) as error:
         return Finding("weights", False, str(error), advice)
     return Finding("weights", True, embedder.name)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from umf_ros.embedding import CHOICES
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -22,7 +24,7 @@ def command(
     out: Annotated[Path, Optional(help="Picture to write.")] = Path("explanation.png"),
     config: Annotated[Path | None, Optional(help="Parameter file (YAML).")] = None,
     dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
-    embedder: Annotated[str | None, Optional(help="umf, or a baseline.")] = None,
+    embedder: Annotated[str | None, Optional(help=f"How places are embedded: {CHOICES}.")] = None,
     weights: Annotated[Path | None, Optional(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
 ) -> None:
     """Show both images with their matching features, both scans aligned, and the decision's numbers."""
@@ -31,8 +33,8 @@ def command(
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.presets import settings_for
     from umf_ros.bags.reader import open_bag
+    from umf_ros.commands.explanation import draw, explain
     from umf_ros.loop_detector import make_detector_embedder, make_keyframe
-    from umf_ros.verification.explanation import draw, explain
 
     console = Console()
     moments = [_moment(text) for text in (query, match)]
@@ -51,8 +53,8 @@ def command(
     explanation = explain(query_keyframe, match_keyframe, settings.verification)
     draw(explanation, frames[0].left, frames[1].left, out)
     console.print(explanation.verdict, highlight=False)
-    if explanation.evidence is not None:
-        for name, value in explanation.evidence.numbers.items():
+    if explanation.best is not None:
+        for name, value in explanation.best.measurement.numbers.items():
             console.print(f"  {name:22} {value:.4g}", highlight=False)
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from umf_ros.embedding import CHOICES
+
 Optional = typer.Option
 
 
@@ -15,7 +17,7 @@ def command(
     config: Annotated[Path | None, Optional(help="Parameter file (YAML).")] = None,
     out: Annotated[Path, Optional(help="Where results/<timestamp> goes.")] = Path("results"),
     dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
-    embedder: Annotated[str | None, Optional(help="umf, or a baseline.")] = None,
+    embedder: Annotated[str | None, Optional(help=f"How places are embedded: {CHOICES}.")] = None,
     weights: Annotated[Path | None, Optional(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
     odometry: Annotated[Path | None, Optional(help="Odometry as a TUM file, where the bag has none.")] = None,
     odometry_frame: Annotated[

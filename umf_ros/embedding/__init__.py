@@ -1,19 +1,37 @@
-"""From a frame to a descriptor and local features."""
+"""From a frame to a descriptor and local features.
+
+A new method is one file here, `NAME_embedder.py`, with a function `make` that gives an `Embedder`; it is then known
+to `embedding.method`, to `--embedder` and to the evaluation. Its imports wait until it is asked for.
+"""
 
 from __future__ import annotations
 
+import pkgutil
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from umf_ros.errors import ConfigError
 
 if TYPE_CHECKING:
-    from umf_ros.config import Embedding
+    from umf_ros.config import EmbeddingSettings
     from umf_ros.embedding.embedder import Embedder
 
-METHODS = ("umf", "thumbnail", "scan_context")
+SUFFIX = "_embedder"
+DEFAULT = "umf"
 
 
-def make_embedder(settings: Embedding, super_features: bool = False) -> Embedder:
+def find_methods() -> tuple[str, ...]:
+    """Names of the methods that have a file here, the default first."""
+    names = (module.name for module in pkgutil.iter_modules(__path__) if module.name.endswith(SUFFIX))
+    return tuple(sorted((name.removesuffix(SUFFIX) for name in names), key=lambda name: (name != DEFAULT, name)))
+
+
+METHODS = find_methods()
+CHOICES = f"{', '.join(METHODS[:-1])} or {METHODS[-1]}"
+"""For help texts."""
+
+
+def make_embedder(settings: EmbeddingSettings, super_features: bool = False) -> Embedder:
     """The embedder that the settings name.
 
     Args:
@@ -24,15 +42,7 @@ def make_embedder(settings: Embedding, super_features: bool = False) -> Embedder
         ConfigError: unknown method or device.
         WeightsError: the weights cannot be used.
     """
-    if settings.method == "umf":
-        from pathlib import Path
-
-        from umf_ros.embedding.umf_embedder import UmfEmbedder
-
-        weights = Path(settings.weights) if settings.weights else None
-        return UmfEmbedder(weights, settings.runtime, settings.device, settings.threads, super_features)
-    if settings.method in METHODS:
-        from umf_ros.embedding.baselines import ScanContextEmbedder, ThumbnailEmbedder
-
-        return ThumbnailEmbedder() if settings.method == "thumbnail" else ScanContextEmbedder()
-    raise ConfigError(f"embedding.method: unknown method {settings.method!r}; known: {', '.join(METHODS)}")
+    if settings.method not in METHODS:
+        raise ConfigError(f"embedding.method: unknown method {settings.method!r}; known: {', '.join(METHODS)}")
+    embedder: Embedder = import_module(f"{__name__}.{settings.method}{SUFFIX}").make(settings, super_features)
+    return embedder

@@ -1,10 +1,13 @@
-"""What an embedder is."""
+"""What an embedder is, and what several of them need."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
-from umf_ros.frames import Embedding, Frame
+import numpy as np
+
+from umf_ros.frames import Embedding, Frame, Points
+from umf_ros.geometry import Array
 
 
 class Embedder(Protocol):
@@ -16,3 +19,11 @@ class Embedder(Protocol):
     def embed(self, frame: Frame) -> Embedding:
         """Embed one frame; either modality may be missing. Deterministic for one thread count."""
         ...
+
+
+def unit_descriptor(values: Array) -> Points:
+    """The values at unit length; what has none becomes the first axis, so that similarities stay cosines."""
+    norm = float(np.linalg.norm(values))
+    if norm < 1e-6:
+        return np.eye(1, len(values), dtype=np.float32)[0]
+    return (values / norm).astype(np.float32)

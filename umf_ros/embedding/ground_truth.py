@@ -16,7 +16,7 @@ NEAREST_NS = 100_000_000
 class GroundTruthEmbedder:
     """Descriptors whose similarity falls with the distance of the poses and of their headings.
 
-    Random Fourier features (Rahimi and Recht 2007) of position and heading approximate a Gaussian
+    Random Fourier features [Rahimi 2007] of position and heading approximate a Gaussian
     kernel: similarity is about exp(-d^2 / 2 scale^2) for equal headings, near zero for opposite ones.
 
     Args:

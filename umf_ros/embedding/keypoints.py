@@ -1,4 +1,4 @@
-"""Which local features are worth keeping (thesis 4.4): the salient ones, capped and spread."""
+"""Which local features are worth keeping [UMF 4.4]: the salient ones, capped and spread."""
 
 from __future__ import annotations
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from umf_ros.config import EmbeddingSettings
 from umf_ros.embedding.images import is_blank
 from umf_ros.embedding.inputs import pack, prepare_image, prepare_scan
 from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_salient
@@ -89,6 +90,12 @@ class UmfEmbedder:
     def _supers(self, found: Outputs) -> tuple[SuperFeatures, SuperFeatures]:
         image = SuperFeatures(found["super_image"].astype(np.float16), found["super_image_strength"])
         return image, SuperFeatures(found["super_cloud"].astype(np.float16), found["super_cloud_strength"])
+
+
+def make(settings: EmbeddingSettings, super_features: bool) -> UmfEmbedder:
+    """With the weights that the settings name."""
+    weights = Path(settings.weights) if settings.weights else None
+    return UmfEmbedder(weights, settings.runtime, settings.device, settings.threads, super_features)
 
 
 def _features(

@@ -8,7 +8,7 @@ MASKED = -1e4
 
 
 class Attention(nn.Module):
-    """Multi-head attention (thesis 4.1) that can also say where it looked."""
+    """Multi-head attention [UMF 4.1] that can also say where it looked."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()

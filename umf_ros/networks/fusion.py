@@ -1,4 +1,4 @@
-"""Fusion of image and voxel tokens (thesis 4.1-4.2), and the pooling of the result."""
+"""Fusion of image and voxel tokens [UMF 4.1, 4.2], and the pooling of the result."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class FusionLayer(nn.Module):
 
 
 class GeneralisedMean(nn.Module):
-    """GeM pooling over the tokens that exist, with a learned exponent."""
+    """GeM pooling [Radenović 2019] over the tokens that exist, with a learned exponent."""
 
     def __init__(self, exponent: float = 3.0) -> None:
         super().__init__()
@@ -94,7 +94,7 @@ class Fusion(nn.Module):
     """Fusion transformer, GeM pooling and fully connected layer per modality, and their weighted union.
 
     Each modality fills its half of the descriptor. How much a half counts is decided frame by frame
-    (adaptive weights, thesis 3.9), and a missing modality counts nothing: similarity to a complete
+    (adaptive weights [UMF 3.9]), and a missing modality counts nothing: similarity to a complete
     frame then rests on what both have.
     """
 

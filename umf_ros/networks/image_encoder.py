@@ -1,4 +1,4 @@
-"""Image encoders and their feature pyramid (thesis 4, figure 4.1)."""
+"""Image encoders and their feature pyramid [UMF 4, figure 4.1]."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def conv_norm(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: i
 
 
 class ResidualBlock(nn.Module):
-    """Residual block of ResNet: basic (two 3x3), or a bottleneck (1x1, 3x3, 1x1 with four times the width)."""
+    """Residual block of ResNet [He 2016]: basic (two 3x3), or a bottleneck (1x1, 3x3, 1x1 with four times the width)."""
 
     def __init__(self, inputs: int, width: int, stride: int, bottleneck: bool) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""RANSAC local features (thesis 4.4): two transformer layers whose attention says what is salient."""
+"""RANSAC local features [UMF 4.4]: two transformer layers whose attention says what is salient."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sine encodings of position (DETR; thesis 4.2), which keep the 2-D and 3-D layout of the tokens."""
+"""Sine encodings of position [UMF 4.2] [Carion 2020], which keep the 2-D and 3-D layout of the tokens."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Super-features: an ordered set of learned templates that gather local features (thesis 4.3).
+"""Super-features: an ordered set of learned templates that gather local features [UMF 4.3].
 
-Written from the equations of Weinzaepfel et al., "Learning super-features for image retrieval" (2022).
+Written from the equations of [Weinzaepfel 2022].
 """
 
 from __future__ import annotations

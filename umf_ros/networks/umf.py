@@ -1,4 +1,4 @@
-"""UMF: unifying local and global multimodal features (thesis 4)."""
+"""UMF: unifying local and global multimodal features [UMF 4]."""
 
 from __future__ import annotations
 

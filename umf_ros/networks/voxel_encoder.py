@@ -1,4 +1,4 @@
-"""Hierarchical encoder of a voxelised scan, with a pyramid decoder (thesis 4), in plain torch.
+"""Hierarchical encoder of a voxelised scan, with a pyramid decoder [UMF 4], in plain torch.
 
 The grid comes folded two by two by two into its channels (space to depth), which makes dense 3-D
 convolutions cheap enough for a small CPU; the fine map is only evaluated at occupied voxels.

@@ -11,11 +11,12 @@ from rclpy.node import Node
 from visualization_msgs.msg import Marker, MarkerArray
 
 from umf_ros.config import Frames
-from umf_ros.frames import Keyframe, Verdict
+from umf_ros.frames import Keyframe
 from umf_ros.loop_detector import Detection
 from umf_ros.nodes import conversions
 from umf_ros.nodes.diagnostics import OK, WARN, status
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS
+from umf_ros.verification import Verdict
 
 # RViz redraws every line it is sent: a rover that runs for days shows its latest ones
 MAX_LINES = 500

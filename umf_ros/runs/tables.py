@@ -6,13 +6,16 @@ import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 import numpy as np
 
 from umf_ros.errors import OutputError, UmfError
-from umf_ros.frames import LoopClosure, Verdict
+from umf_ros.frames import LoopClosure
 from umf_ros.geometry import from_quaternion, to_quaternion
+
+if TYPE_CHECKING:
+    from umf_ros.verification import Verdict
 
 POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
 SIGMA = ["sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"]

@@ -1,6 +1,7 @@
 """From a retrieved candidate to a metric loop closure, or to the reason why not."""
 
-from umf_ros.verification.lifting import lift, thin_scan
-from umf_ros.verification.verifier import Verifier
+from umf_ros.verification.measurement import Measurement
+from umf_ros.verification.registration import thin_scan
+from umf_ros.verification.verifier import Verdict, Verifier
 
-__all__ = ["Verifier", "lift", "thin_scan"]
+__all__ = ["Measurement", "Verdict", "Verifier", "thin_scan"]

@@ -1,6 +1,6 @@
 """The calibrated decision: from what was measured to the probability that a closure is right.
 
-A logistic regression on a handful of clipped, monotone measures: each can only speak for a closure
+A logistic regression on a handful of clipped, monotone criteria: each can only speak for a closure
 the way a person would read it, and none can shout. The weights are fitted on validation worlds by
 `benchmarks/fit_verification.py` and shipped as JSON.
 """
@@ -16,120 +16,149 @@ from typing import Any
 
 from umf_ros.config import find
 from umf_ros.errors import ConfigError
-from umf_ros.verification.covariance import Spread
+from umf_ros.geometry import Array
+from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
+from umf_ros.verification.registration import CovarianceModel, covariance_of
 
 SHIPPED = "config/verification/calibration.json"
-Numbers = dict[str, float]
+KINDS = (SCAN, IMAGE)
 
 
 @dataclass(frozen=True, slots=True)
-class Measure:
-    """One argument for a closure: larger is better, `low` and below count 0, `high` and above count 1."""
+class Criterion:
+    """One thing that speaks for a closure: 0 at `worst` and beyond, 1 at `best` and beyond, linear in between.
 
-    read: Callable[[Numbers], float]
-    low: float
-    high: float
+    Attributes:
+        read: what is looked at; where larger is worse, `best` is less than `worst`.
+        worst: the value that says nothing for a closure.
+        best: the value that says all it can.
+        kinds: of hypotheses that it is applied to.
+        missing: what counts where the value is unknown.
+    """
+
+    read: Callable[[Measurement], float]
+    worst: float
+    best: float
+    kinds: tuple[str, ...] = (SCAN,)
     missing: float = 0.0
 
-    def __call__(self, numbers: Numbers) -> float:
-        """Value between 0 and 1; `missing` where the number is unknown."""
-        value = self.read(numbers)
+    def __call__(self, measurement: Measurement) -> float:
+        """Value between 0 and 1."""
+        value = self.read(measurement)
         if not math.isfinite(value):
             return self.missing
-        return min(max((value - self.low) / (self.high - self.low), 0.0), 1.0)
+        return min(max((value - self.worst) / (self.best - self.worst), 0.0), 1.0)
 
 
 def _log_ratio(above: float, below: float) -> float:
     return math.log(max(above, 1e-6) / max(below, 1e-6))
 
 
-SCAN_MEASURES: dict[str, Measure] = {
-    "residual_like_noise": Measure(lambda n: _log_ratio(n["noise_m"], n["residual_m"]), math.log(0.5), math.log(2.0)),
-    "tail_like_noise": Measure(lambda n: _log_ratio(n["noise_m"], n["residual_p90_m"]), math.log(0.15), math.log(0.6)),
-    "relief_explained": Measure(lambda n: _log_ratio(n["relief_m"], n["residual_m"]), math.log(1.5), math.log(12)),
-    "relief_present": Measure(lambda n: _log_ratio(n["relief_m"], n["noise_m"]), math.log(1.2), math.log(5.0)),
-    "terrain_correlation": Measure(lambda n: n["terrain_correlation"], 0.2, 0.9),
-    "terrain_score": Measure(lambda n: n["terrain_score"], 3.0, 15.0),
-    "overlap": Measure(lambda n: n["overlap"], 0.4, 0.95),
-    "points": Measure(lambda n: math.log(max(n["points"], 1.0)), math.log(100), math.log(1000)),
-    "position_known": Measure(lambda n: -math.log(n["position_std_m"]), -math.log(1.0), -math.log(0.05)),
-    "heading_known": Measure(lambda n: -math.log(n["heading_std_deg"]), -math.log(5.0), -math.log(0.2)),
-    "image_agreement": Measure(lambda n: n["agreement_image"], 0.0, 6.0, missing=0.5),
-    "cloud_agreement": Measure(lambda n: n["agreement_cloud"], 0.0, 6.0, missing=0.5),
-    "inliers": Measure(lambda n: math.log1p(n["inliers_image"] + n["inliers_cloud"]), math.log(10), math.log(100)),
-    "similarity": Measure(lambda n: n["similarity"], 0.3, 0.9),
-    "odometry_prior": Measure(lambda n: -n["prior_sigmas"], -4.0, -1.0, missing=0.7),
-    "support": Measure(lambda n: n["support"], 0.0, 3.0),
+# every range is by hand: wide enough for right poses, beyond the reach of most wrong ones
+CRITERIA: dict[str, Criterion] = {
+    "residual_like_noise": Criterion(lambda m: _log_ratio(m.noise_m, m.residual_m), math.log(0.5), math.log(2.0)),
+    "tail_like_noise": Criterion(lambda m: _log_ratio(m.noise_m, m.residual_p90_m), math.log(0.15), math.log(0.6)),
+    "relief_explained": Criterion(lambda m: _log_ratio(m.relief_m, m.residual_m), math.log(1.5), math.log(12)),
+    "relief_present": Criterion(lambda m: _log_ratio(m.relief_m, m.noise_m), math.log(1.2), math.log(5.0)),
+    "terrain_correlation": Criterion(lambda m: m.terrain_correlation, 0.2, 0.9),
+    "terrain_score": Criterion(lambda m: m.terrain_score, 3.0, 15.0),
+    "overlap": Criterion(lambda m: m.overlap, 0.4, 0.95),
+    "points": Criterion(lambda m: math.log(max(m.points, 1.0)), math.log(100), math.log(1000)),
+    "position_known": Criterion(lambda m: math.log(m.position_std_m), math.log(1.0), math.log(0.05), KINDS),
+    "heading_known": Criterion(lambda m: math.log(m.heading_std_deg), math.log(5.0), math.log(0.2), KINDS),
+    "image_agreement": Criterion(lambda m: m.agreement_image, 0.0, 6.0, KINDS, missing=0.5),
+    "cloud_agreement": Criterion(lambda m: m.agreement_cloud, 0.0, 6.0, missing=0.5),
+    "inliers": Criterion(lambda m: math.log1p(m.inliers_image + m.inliers_cloud), math.log(10), math.log(100), KINDS),
+    "similarity": Criterion(lambda m: m.similarity, 0.3, 0.9, KINDS),
+    "odometry_prior": Criterion(lambda m: m.prior_sigmas, 4.0, 1.0, KINDS, missing=0.7),
+    "support": Criterion(lambda m: m.support, 0.0, 3.0, KINDS),
+    "pose_inliers": Criterion(lambda m: math.log1p(m.pose_inliers), math.log(8), math.log(60), (IMAGE,)),
+    "spread": Criterion(lambda m: m.spread, 0.05, 0.3, (IMAGE,)),
 }
-_SHARED = ("image_agreement", "inliers", "position_known", "heading_known", "similarity", "odometry_prior", "support")
-IMAGE_MEASURES: dict[str, Measure] = {name: SCAN_MEASURES[name] for name in _SHARED} | {
-    "pose_inliers": Measure(lambda n: math.log1p(n["pose_inliers"]), math.log(8), math.log(60)),
-    "spread": Measure(lambda n: n["spread"], 0.05, 0.3),
-}
-MEASURES = {"scan": SCAN_MEASURES, "image": IMAGE_MEASURES}
+
+
+def criteria_of(kind: str) -> dict[str, Criterion]:
+    """The criteria that hypotheses of one kind are judged by, by name."""
+    return {name: criterion for name, criterion in CRITERIA.items() if kind in criterion.kinds}
+
+
+def scores(measurement: Measurement) -> dict[str, float]:
+    """How far the measurement meets every criterion of its kind, 0 to 1, by name."""
+    return {name: criterion(measurement) for name, criterion in criteria_of(measurement.kind).items()}
 
 
 @dataclass(frozen=True, slots=True)
 class Logistic:
-    """Weights of one kind of evidence; the log-odds are `bias + sum(weight * measure)`."""
+    """Weights of one kind of hypothesis; the log-odds are `bias + sum(weight * score)`."""
 
     bias: float
     weights: dict[str, float]
 
-    def probability(self, measures: dict[str, float]) -> float:
-        """Probability that a closure with these measures is right."""
-        odds = self.bias + sum(weight * measures[name] for name, weight in self.weights.items())
+    def contributions(self, scores: dict[str, float]) -> dict[str, float]:
+        """Log-odds that each criterion adds to the bias, by name."""
+        return {name: weight * scores[name] for name, weight in self.weights.items()}
+
+    def probability(self, scores: dict[str, float]) -> float:
+        """Probability that a closure with these scores is right."""
+        odds = self.bias + sum(self.contributions(scores).values())
         return 1.0 / (1.0 + math.exp(-min(max(odds, -60.0), 60.0)))
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class AcceptanceModel:
     """Everything that was fitted.
 
     Attributes:
-        models: one logistic model per kind of evidence, "scan" or "image" (without a scan).
-        spreads: likewise, what turns residuals into a covariance.
+        models: one logistic model per kind of hypothesis, "scan" or "image" (without a scan).
+        covariances: likewise, what turns residuals into a covariance.
     """
 
     models: dict[str, Logistic]
-    spreads: dict[str, Spread]
+    covariances: dict[str, CovarianceModel]
 
-    def probability(self, numbers: Numbers, kind: str) -> float:
-        """Probability that the closure with these numbers is right."""
-        return self.models[kind].probability(measure(numbers, kind))
+    def probability(self, measurement: Measurement) -> float:
+        """Probability that the closure with this measurement is right."""
+        return self.models[measurement.kind].probability(scores(measurement))
+
+    def contributions(self, measurement: Measurement) -> dict[str, float]:
+        """Log-odds of each criterion by name; "bias" is what has to be overcome."""
+        model = self.models[measurement.kind]
+        return model.contributions(scores(measurement)) | {"bias": model.bias}
+
+    def covariance(self, information: Array, kind: str) -> Array:
+        """Covariance (6, 6) of a pose with this information (6, 6), ROS order, m^2 and rad^2."""
+        return covariance_of(information, self.covariances[kind])
 
 
-def measure(numbers: Numbers, kind: str) -> dict[str, float]:
-    """Every measure of one kind of evidence, by name."""
-    return {name: rule(numbers) for name, rule in MEASURES[kind].items()}
-
-
-def load_calibration(path: str = "") -> Calibration:
+def load_acceptance(path: str = "") -> AcceptanceModel:
     """The fitted decision; an empty path means the shipped one.
 
+    A criterion that is younger than the file has no weight.
+
     Raises:
-        ConfigError: the file cannot be read or does not fit this version's measures.
+        ConfigError: the file cannot be read or does not fit this version's criteria.
     """
     file = Path(path) if path else find(SHIPPED)
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-        models = {kind: _logistic(content["models"][kind], kind) for kind in MEASURES}
-        spreads = {kind: Spread(**content["covariance"][kind]) for kind in MEASURES}
-        return Calibration(models, spreads)
+        models = {kind: _logistic(content["models"][kind], kind) for kind in KINDS}
+        covariances = {kind: CovarianceModel(**content["covariance"][kind]) for kind in KINDS}
+        return AcceptanceModel(models, covariances)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{file}: not an acceptance model of this version ({error!r})") from None
 
 
-def save_calibration(calibration: Calibration, path: Path, fitted_with: str, results: Numbers) -> None:
-    """Write a fitted decision for `load_calibration`, with the command that made it and what it reached."""
+def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: str, results: dict[str, float]) -> None:
+    """Write a fitted decision for `load_acceptance`, with the command that made it and what it reached."""
     content: dict[str, Any] = {"fitted_with": fitted_with, "results": results}
-    content["models"] = {kind: asdict(calibration.models[kind]) for kind in MEASURES}
-    content["covariance"] = {kind: asdict(calibration.spreads[kind]) for kind in MEASURES}
+    content["models"] = {kind: asdict(model.models[kind]) for kind in KINDS}
+    content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in KINDS}
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def _logistic(model: dict[str, Any], kind: str) -> Logistic:
     weights = {name: float(weight) for name, weight in model["weights"].items()}
-    if set(weights) != set(MEASURES[kind]):
-        raise KeyError(*sorted(set(weights) ^ set(MEASURES[kind])))
-    return Logistic(float(model["bias"]), weights)
+    names = criteria_of(kind)
+    if unknown := sorted(set(weights) - set(names)):
+        raise KeyError(*unknown)
+    return Logistic(float(model["bias"]), weights | {name: 0.0 for name in names if name not in weights})

@@ -1,7 +1,8 @@
-"""Fine alignment of two scans (generalised ICP) and what the geometry says about the result."""
+"""Fine alignment of two keyframes, by their scans or by their features, and what the geometry says about the result."""
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,27 +10,49 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
-from umf_ros.frames import Points
+from umf_ros.frames import Keyframe, Points
 from umf_ros.geometry import Array, transform
+from umf_ros.verification.constants import (
+    COARSE_REACH_M,
+    COARSE_STEPS,
+    FINE_REACH_M,
+    FINE_STEPS,
+    INLIER_M,
+    MAX_RANGE_M,
+    MIN_RESIDUAL_NOISE_M,
+    MIN_SCAN_POINTS,
+    NOISE_NEIGHBOURS,
+    NOMINAL_FLOOR_DEG,
+    NOMINAL_FLOOR_M,
+    NOMINAL_INFLATION,
+    NORMAL_NEIGHBOURS,
+    SAMPLE,
+    SCANS_KEPT,
+    SEARCH_M,
+    SEARCH_RAD,
+    THIN_CELL_M,
+)
+from umf_ros.verification.elevation_map import ElevationMap
+from umf_ros.verification.ransac import kabsch
 
-NORMAL_NEIGHBOURS = 10
-SAMPLE = 1500  # points of the query that are aligned: a third of the scan is as good in half the time
-COARSE_REACH_M = 1.0
-FINE_REACH_M = 0.4
-MIN_POINTS = 100
 
-
-class Surface:
-    """A scan made ready for registration: points with normals and a search tree."""
+class PreparedScan:
+    """A keyframe's scan made ready for comparison, each part when it is first asked for."""
 
     def __init__(self, points: Points) -> None:
         """Args: points (M, 3) m, body frame, thinned."""
+        self._thinned = points
         self.points: Array = points.astype(float)
 
     @property
     def usable(self) -> bool:
         """Whether there is anything to align."""
-        return len(self.points) >= MIN_POINTS
+        return len(self.points) >= MIN_SCAN_POINTS
+
+    @cached_property
+    def elevation(self) -> ElevationMap:
+        """Heights and relief, for the search."""
+        return ElevationMap(self._thinned)
 
     @cached_property
     def cloud(self) -> small_gicp.PointCloud:
@@ -64,7 +87,7 @@ class Surface:
     @cached_property
     def noise_m(self) -> float:
         """How far the points scatter about their neighbours' planes, m: sensor noise and roughness together."""
-        index, _ = self.tree.batch_knn_search(self.sample, 5, 1)
+        index, _ = self.tree.batch_knn_search(self.sample, NOISE_NEIGHBOURS, 1)
         neighbours = np.asarray(index, np.intp)
         offsets = self.points[neighbours[:, 1:]] - self.sample[:, None]
         away = np.abs(np.einsum("nki,ni->nk", offsets, self.normals[neighbours[:, 0]]))
@@ -76,27 +99,83 @@ class Surface:
         return np.asarray(index, np.intp), np.asarray(squared)
 
 
+class ScanCache:
+    """The most recently used scans; a cache, so it changes no result."""
+
+    def __init__(self) -> None:
+        self._scans: OrderedDict[tuple[int, int], PreparedScan] = OrderedDict()
+
+    def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
+        key = (keyframe.session, keyframe.stamp_ns)
+        scan = self._scans.pop(key, None) or PreparedScan(keyframe.points)
+        self._scans[key] = scan
+        if len(self._scans) > SCANS_KEPT:
+            self._scans.popitem(last=False)
+        return scan
+
+    def clear(self) -> None:
+        """Forget all scans, as when stamps start over."""
+        self._scans.clear()
+
+
+@dataclass(frozen=True, slots=True)
+class CovarianceModel:
+    """What residuals do not say about the error of a pose; fitted.
+
+    Attributes:
+        inflation: factor on the variance, for neighbouring residuals are not independent.
+        floor_m: standard deviation of every translation, m, from calibration and motion inside a scan.
+        floor_deg: of every rotation, deg.
+    """
+
+    inflation: float
+    floor_m: float
+    floor_deg: float
+
+    @property
+    def floor(self) -> Array:
+        """The floor as a covariance (6, 6), m^2 and rad^2."""
+        return np.diag([self.floor_m**2] * 3 + [np.radians(self.floor_deg) ** 2] * 3)
+
+
+# a fixed yardstick of what a pose is known to: refitting the covariance must not move the decision
+NOMINAL = CovarianceModel(NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG)
+
+
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """How a query scan lies on a match scan.
+    """How a query lies on a match.
 
     Attributes:
         pose: (4, 4) `match_T_query`.
-        residuals: (N,) point-to-plane distances, m, of the query points that have a counterpart.
+        residuals: (N,) m: point-to-plane distances of the query points that have a counterpart, or, without
+            scans, the three coordinates of the distances of the feature pairs that agree.
         jacobian: (N, 6) of the residuals by (x y z rx ry rz) about the match axes at the query's origin.
-        overlap: share of the query points seen by both that have a counterpart.
+        overlap: share of the query points seen by both, or of the feature pairs, that have a counterpart.
+        points: (P, 3) m: the query points that have one, in the match's body frame.
     """
 
     pose: Array
     residuals: Array
     jacobian: Array
     overlap: float
+    points: Array
+
+    @property
+    def information(self) -> Array:
+        """Information (6, 6) of the residuals as if they were independent, with outliers weighed down."""
+        if not len(self.residuals):
+            return np.zeros((6, 6))
+        noise = max(1.4826 * float(np.median(np.abs(self.residuals))), MIN_RESIDUAL_NOISE_M)
+        weight = 1.0 / (1.0 + (self.residuals / (2 * noise)) ** 2)
+        found: Array = (self.jacobian * weight[:, None]).T @ self.jacobian / noise**2
+        return found
 
 
-def align(match: Surface, query: Surface, guess: Array) -> Array:
-    """Generalised ICP (Segal, RSS 2009) from `guess`, first far-sighted, then near-sighted: `match_T_query`."""
+def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Alignment:
+    """Generalised ICP (Segal, RSS 2009) from the pose `guess`, first far-sighted, then near-sighted."""
     pose = guess
-    for reach, steps in ((COARSE_REACH_M, 10), (FINE_REACH_M, 8)):
+    for reach, steps in ((COARSE_REACH_M, COARSE_STEPS), (FINE_REACH_M, FINE_STEPS)):
         result = small_gicp.align(
             match.cloud,
             query.sample_cloud,
@@ -108,10 +187,10 @@ def align(match: Surface, query: Surface, guess: Array) -> Array:
             max_iterations=steps,
         )
         pose = np.asarray(result.T_target_source)
-    return pose
+    return inspect(match, query, pose)
 
 
-def inspect(match: Surface, query: Surface, pose: Array) -> Alignment:
+def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
     """Residuals, their Jacobian and the overlap of two scans at a pose."""
     moved = transform(pose, query.sample)
     index, squared = match.nearest(moved)
@@ -119,9 +198,53 @@ def inspect(match: Surface, query: Surface, pose: Array) -> Alignment:
     offset = moved - match.points[index]
     residual = np.einsum("ij,ij->i", offset, normals)
     solid = np.einsum("ij,ij->i", normals, normals) > 0.5
-    # a counterpart lies within reach along the surface: the spacing of far returns is wider than the noise
     close = solid & (squared < FINE_REACH_M**2)
     seen = solid & (squared < COARSE_REACH_M**2)
     arm = np.cross(moved[close] - pose[:3, 3], normals[close])
     overlap = float(close.sum()) / max(int(seen.sum()), 1)
-    return Alignment(pose, residual[close], np.hstack([normals[close], arm]), overlap)
+    return Alignment(pose, residual[close], np.hstack([normals[close], arm]), overlap, moved[close])
+
+
+def align_features(match_points: Array, query_points: Array, guess: Array) -> Alignment:
+    """Refine the pose `guess` on the pairs (N, 3) of lifted features that agree with it, each in its body frame, m."""
+    near = np.linalg.norm(transform(guess, query_points) - match_points, axis=1) < INLIER_M
+    pose = kabsch(query_points[near], match_points[near])
+    if pose is None:
+        pose = guess
+    moved = transform(pose, query_points[near])
+    arms = -_cross_matrices(moved - pose[:3, 3])
+    jacobian = np.concatenate([np.broadcast_to(np.eye(3), arms.shape), arms], axis=2).reshape(-1, 6)
+    residuals = (moved - match_points[near]).ravel()
+    return Alignment(pose, residuals, jacobian, float(near.mean()) if len(near) else 0.0, moved)
+
+
+def covariance_of(found: Array, model: CovarianceModel) -> Array:
+    """Covariance (..., 6, 6) of a pose in ROS order (x y z rx ry rz, match axes), m^2 and rad^2.
+
+    The information gives the shape: a plane leaves two shifts and a turn as wide as the search.
+    """
+    known = np.diag([SEARCH_M**-2] * 3 + [SEARCH_RAD**-2] * 3)
+    covariance = np.linalg.inv(known + found / model.inflation) + model.floor
+    return (covariance + covariance.swapaxes(-1, -2)) / 2
+
+
+def thin_scan(points: Points | None, cell_m: float = THIN_CELL_M) -> Points:
+    """One mean point per occupied cube of `cell_m`, nearer than 40 m: (M, 3) float32, body frame."""
+    if points is None or not len(points):
+        return np.empty((0, 3), np.float32)
+    near = points[np.einsum("ij,ij->i", points, points) < MAX_RANGE_M**2].astype(float)
+    if not len(near):
+        return np.empty((0, 3), np.float32)
+    cells = np.floor((near + MAX_RANGE_M) / cell_m).astype(np.int64)
+    side = int(2 * MAX_RANGE_M / cell_m) + 2
+    keys = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
+    _, owner, count = np.unique(keys, return_inverse=True, return_counts=True)
+    means = [np.bincount(owner, near[:, axis]) / count for axis in range(3)]
+    return np.column_stack(means).astype(np.float32)
+
+
+def _cross_matrices(vectors: Array) -> Array:
+    """Matrices (N, 3, 3) with `m @ x == cross(v, x)`."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

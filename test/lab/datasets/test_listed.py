@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from datasets.test_s3li import DATA, entries, write_pos
+from etna import entries, write_pos
 from recordings import START_NS, drive, small_settings, traverse, write_mcap, write_ros1
 from rosbags.typesys import Stores, get_typestore
 from tiny_worlds import world_arrays
@@ -74,7 +74,7 @@ def test_a_split_of_etna_as_it_is_published(tmp_path: Path, settings: Settings) 
 
 def test_pickles_are_found_beside_the_list(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
-    shutil.copy(DATA / "toolkit_pandas2.pkl", tmp_path / "data" / "loops.pkl")
+    shutil.copy(Path(__file__).parent / "data" / "toolkit_pandas2.pkl", tmp_path / "data" / "loops.pkl")
     listing = write_list(tmp_path / "data" / "a.yml", {"toolkit": ["loops.pkl"], "images": "elsewhere"})
     (sequence,) = SequenceList(listing).worlds
     assert len(sequence) == 5

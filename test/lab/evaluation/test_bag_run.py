@@ -9,7 +9,7 @@ import pytest
 from landmarks import PLACES, LandmarkEmbedder, frame_of
 
 from umf_ros.config import Settings, load_settings
-from umf_ros.embedding.baselines import ThumbnailEmbedder
+from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.errors import UmfError
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array, make_pose

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,15 +9,18 @@ import torch
 from tiny_worlds import pose_at
 
 from umf_ros.lab.datasets.labels import Rule, label, places_of
-from umf_ros.lab.training.local_losses import (
+from umf_ros.lab.training.losses import (
+    batch_hard_triplet,
     correspondence,
     decorrelation,
     eligible,
+    graded,
+    multi_similarity,
+    neighbourhood_components,
     neighbours,
     super_contrastive,
     wasted_saliency,
 )
-from umf_ros.lab.training.losses import batch_hard_triplet, graded, multi_similarity
 from umf_ros.networks.local_features import LocalMap
 from umf_ros.networks.superfeatures import SuperMap
 
@@ -169,3 +173,148 @@ def test_decorrelation_wants_different_places():
     together = torch.ones(1, 3, 5)
     assert decorrelation(super_map(torch.rand(1, 3, 4), apart)).item() == pytest.approx(0, abs=1e-6)
     assert decorrelation(super_map(torch.rand(1, 3, 4), together)).item() == pytest.approx(1)
+
+
+# against plain loops
+
+
+@pytest.fixture
+def relations() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Similarities, positives and negatives; one anchor without a positive, one without a negative."""
+    generator = torch.Generator().manual_seed(0)
+    similarity = torch.rand(6, 9, generator=generator) * 2 - 1
+    kind = torch.randint(0, 3, (6, 9), generator=generator)
+    positive, negative = kind == 1, kind == 2
+    positive[4], negative[5] = False, False
+    return similarity, positive, negative
+
+
+def test_multi_similarity_is_a_loop_over_anchors(relations):
+    similarity, positive, negative = relations
+    total = 0.0
+    for row in range(6):
+        pulls = sum(math.exp(-2.0 * (s - 0.5)) for s in similarity[row][positive[row]].tolist())
+        pushes = sum(math.exp(30.0 * (s - 0.5)) for s in similarity[row][negative[row]].tolist())
+        total += math.log1p(pulls) / 2.0 + math.log1p(pushes) / 30.0
+    assert multi_similarity(*relations).item() == pytest.approx(total / 6, rel=1e-5)
+
+
+def test_triplets_are_a_loop_over_anchors(relations):
+    similarity, positive, negative = relations
+    excesses = []
+    for row in range(6):
+        if positive[row].any() and negative[row].any():
+            far = max(math.sqrt(2 - 2 * s) for s in similarity[row][positive[row]].tolist())
+            near = min(math.sqrt(2 - 2 * s) for s in similarity[row][negative[row]].tolist())
+            excesses.append(far - near + 0.2)
+    active = [excess for excess in excesses if excess > 0]
+    loss, share = batch_hard_triplet(*relations)
+    assert len(excesses) == 4
+    assert loss.item() == pytest.approx(sum(active) / len(active), rel=1e-5)
+    assert share.item() == pytest.approx(len(active) / 4)
+
+
+def test_neighbourhood_components_are_a_loop_over_queries(relations):
+    similarity, wanted, unwanted = relations
+    penalties = []
+    for row in range(6):
+        right = sum(math.exp(20 * s) for s in similarity[row][wanted[row]].tolist())
+        wrong = sum(math.exp(20 * s) for s in similarity[row][unwanted[row]].tolist())
+        if right and wrong:
+            penalties.append(-math.log(right / (right + wrong)))
+    assert len(penalties) == 4
+    assert neighbourhood_components(*relations).item() == pytest.approx(np.mean(penalties), rel=1e-5)
+
+
+def test_queries_without_a_rival_teach_nothing():
+    similarity = torch.eye(3, requires_grad=True)
+    nothing, everything = torch.zeros(3, 3, dtype=torch.bool), torch.ones(3, 3, dtype=torch.bool)
+    loss = neighbourhood_components(similarity, nothing, everything)
+    loss.backward()
+    assert loss.item() == 0 and not similarity.grad.any()
+
+
+def test_a_batch_without_any_triplet_costs_nothing_and_stays_a_number():
+    similarity = torch.eye(3, requires_grad=True)
+    nothing = torch.zeros(3, 3, dtype=torch.bool)
+    loss, share = batch_hard_triplet(similarity, nothing, nothing)
+    loss.backward()
+    assert loss.item() == share.item() == 0 and torch.isfinite(similarity.grad).all()
+    assert multi_similarity(similarity, nothing, nothing).item() == 0
+
+
+def test_grading_is_a_loop_over_ordered_pairs():
+    generator = torch.Generator().manual_seed(1)
+    similarity, metres = torch.rand(4, 4, generator=generator), 40 * torch.rand(4, 4, generator=generator)
+    metres[2, 3] = math.inf
+    comparable = metres.isfinite() & ~torch.eye(4, dtype=torch.bool)
+    penalties = []
+    for row in range(4):
+        for near in range(4):
+            for far in range(4):
+                if comparable[row, near] and comparable[row, far] and metres[row, near] + 6 < metres[row, far]:
+                    wrong = float(similarity[row, far] - similarity[row, near])
+                    penalties.append(math.log1p(math.exp(20 * wrong + 1)) / 20)
+    assert len(penalties) > 5
+    assert graded(similarity, metres, comparable).item() == pytest.approx(np.mean(penalties), rel=1e-5)
+
+
+def random_map(seed: int = 0) -> LocalMap:
+    generator = torch.Generator().manual_seed(seed)
+    descriptors = torch.nn.functional.normalize(torch.randn(2, 5, 4, generator=generator), dim=-1)
+    mask = torch.tensor([[True] * 5, [True, True, True, True, False]])
+    return LocalMap(descriptors, descriptors, 2 * torch.rand(2, 5, generator=generator), mask)
+
+
+def test_correspondence_is_a_loop_over_matches():
+    local, matches = random_map(), [(0, 2), (3, 3), (4, 0)]
+    scores = local.descriptors[0] @ local.descriptors[1].T / 0.07
+
+    def likelihood(row: torch.Tensor, mask: torch.Tensor, target: int) -> float:
+        return float(row[target] - torch.logsumexp(row[mask], 0))
+
+    loss = weight = 0.0
+    for one, two in matches:
+        there = likelihood(scores[one], local.mask[1], two)
+        back = likelihood(scores[:, two], local.mask[0], one)
+        worth = [float(s / (1 + s) + 0.1) for s in (local.saliency[0, one], local.saliency[1, two])]
+        loss -= (there + back) / 2 * worth[0] * worth[1]
+        weight += worth[0] * worth[1]
+    table = torch.tensor([[*matches, (-1, -1)]])
+    found = correspondence(local, torch.tensor([0]), torch.tensor([1]), table, None)
+    assert found.item() == pytest.approx(loss / weight, rel=1e-5)
+
+
+def test_what_is_masked_is_never_the_wrong_answer():
+    local = random_map()
+    loud = replace(local, descriptors=local.descriptors.clone())
+    loud.descriptors[1, 4] = local.descriptors[0, 0]  # a perfect match that does not exist
+    table = torch.tensor([[[0, 2]]])
+    one, two = (correspondence(found, torch.tensor([0]), torch.tensor([1]), table, None) for found in (local, loud))
+    assert one.item() == pytest.approx(two.item(), rel=1e-5)
+
+
+def random_supers(seed: int) -> SuperMap:
+    generator = torch.Generator().manual_seed(seed)
+    descriptors = torch.nn.functional.normalize(torch.randn(4, 5, 3, generator=generator), dim=-1)
+    descriptors[1] = torch.nn.functional.normalize(descriptors[0] + 0.1, dim=-1)
+    return SuperMap(descriptors, torch.ones(4, 5), torch.rand(4, 5, 6, generator=generator))
+
+
+def test_super_features_are_compared_id_by_id():
+    supers, negative = random_supers(3), torch.zeros(4, 4, dtype=torch.bool)
+    negative[0, 2] = negative[0, 3] = True
+    ids = [row for row, chosen in enumerate(eligible(supers.descriptors[0], supers.descriptors[1]).tolist()) if chosen]
+    assert len(ids) >= 2
+    squared = lambda a, b, k: float((supers.descriptors[a, k] - supers.descriptors[b, k]).square().sum())  # noqa: E731
+    pulled = sum(squared(0, 1, k) for k in ids)
+    pushed = sum(max(1.1 - squared(0, other, k), 0) for other in (2, 3) for k in ids) / 2
+    found = super_contrastive(supers, torch.tensor([0]), torch.tensor([1]), negative)
+    assert found.item() == pytest.approx((pulled + pushed) / len(ids), rel=1e-4)
+
+
+def test_decorrelation_is_the_mean_over_pairs_of_maps():
+    supers = random_supers(4)
+    maps = torch.nn.functional.normalize(supers.attention, dim=-1)
+    pairs = [float(maps[row, a] @ maps[row, b]) for row in range(4) for a in range(5) for b in range(5) if a != b]
+    assert decorrelation(supers).item() == pytest.approx(np.mean(pairs), rel=1e-5)

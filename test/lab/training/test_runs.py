@@ -15,20 +15,18 @@ import pytest
 import torch
 import typer
 import yaml
-from tiny_worlds import TINY, pose_at, some_input
-from training.conftest import write_world
+from tiny_worlds import TINY, pose_at, some_input, write_world
 from typer.testing import CliRunner
 
 from umf_ros.errors import ConfigError, OutputError, UmfError, WeightsError
 from umf_ros.lab.commands import pretrain as pretrain_command
 from umf_ros.lab.commands import train as train_command
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
-from umf_ros.lab.training.checkpoint import resuming, save_checkpoint
-from umf_ros.lab.training.config import load_training
 from umf_ros.lab.training.distributed import Team, choose_device, join_team
-from umf_ros.lab.training.schedule import append_row, learning_rate
-from umf_ros.lab.training.setup import make_network
-from umf_ros.lab.training.trainer import Progress, Trainer
+from umf_ros.lab.training.metric_objective import MetricObjective
+from umf_ros.lab.training.progress import Progress, append_row, learning_rate, resuming, save_checkpoint
+from umf_ros.lab.training.run import load_run, make_network
+from umf_ros.lab.training.trainer import Trainer
 from umf_ros.lab.training.validation import describe, figures, mean_of, validate
 from umf_ros.networks.presets import PRESETS
 from umf_ros.networks.umf import UMF
@@ -51,13 +49,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def quick(folder: Path, **chosen: object):
     small = {"preset": "tiny", "steps": 2, "epoch_steps": 1, "batch": 4, "local_pairs": 0, "weight_super": 0}
-    return load_training(None, train=str(folder), **(small | {"half": False} | chosen))
+    return load_run(None, train=str(folder), **(small | {"half": False} | chosen))
 
 
 def trainer(folder: Path, out: Path, validation=list, **chosen: object) -> Trainer:
     out.mkdir(exist_ok=True)
     torch.manual_seed(0)
-    return Trainer(UMF(TINY), quick(folder, **chosen), WorldFolder(folder).refresh, validation, out, CPU)
+    settings = quick(folder, **chosen)
+    return Trainer(MetricObjective(UMF(TINY), settings, validation), WorldFolder(folder).refresh, settings, out, CPU)
 
 
 def ignore(*_: object) -> None:
@@ -70,7 +69,7 @@ def ignore(*_: object) -> None:
 def test_the_command_line_overrules_the_file(tmp_path):
     path = tmp_path / "run.yaml"
     path.write_text("train: a\nsteps: 10\nseed: 3\nimage_size: [64, 96]\n")
-    found = load_training(path, steps=20, seed=None)
+    found = load_run(path, steps=20, seed=None)
     assert (found.train, found.steps, found.seed, found.image_size) == ("a", 20, 3, (64, 96))
 
 
@@ -91,15 +90,15 @@ def test_wrong_settings_are_one_clear_line(tmp_path, content, word):
     path = tmp_path / "run.yaml"
     path.write_bytes(content)
     with pytest.raises(ConfigError, match=word) as raised:
-        load_training(path, train="worlds")
+        load_run(path, train="worlds")
     assert "\n" not in str(raised.value)
 
 
 def test_settings_that_are_not_there(tmp_path):
     with pytest.raises(ConfigError, match="No such file"):
-        load_training(tmp_path / "none.yaml", train="worlds")
+        load_run(tmp_path / "none.yaml", train="worlds")
     with pytest.raises(ConfigError, match="train: "):
-        load_training(None)
+        load_run(None)
 
 
 # schedule and log
@@ -156,7 +155,7 @@ def test_a_checkpoint_of_another_run_is_refused(folder, tmp_path):
     run = trainer(folder, tmp_path, steps=1)
     run.run(ignore, ignore)
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
-    for other in ({"network": {"weight": torch.zeros(2)}}, {"optimiser": {"model": 1}}, {"progress": {"moves": 3}}):
+    for other in ({"objective": {"weight": torch.zeros(2)}}, {"optimiser": {"model": 1}}, {"progress": {"moves": 3}}):
         save_checkpoint(tmp_path / "checkpoint.pt", state | other)
         with pytest.raises(WeightsError, match="of another run") as raised:
             run.resume()
@@ -186,8 +185,9 @@ import torch
 from tiny_worlds import TINY
 from umf_ros.lab.datasets.simulated import WorldFolder
 from umf_ros.networks.umf import UMF
-from umf_ros.lab.training.config import load_training
 from umf_ros.lab.training.distributed import join_team
+from umf_ros.lab.training.metric_objective import MetricObjective
+from umf_ros.lab.training.run import load_run
 from umf_ros.lab.training.trainer import Trainer
 torch.manual_seed(0)
 folder = Path(sys.argv[1])
@@ -196,9 +196,9 @@ with join_team("cpu") as team:
     network = UMF(TINY)
     out = folder / f"rank{team.rank}"
     out.mkdir()
-    settings = load_training(None, train=str(folder), **small)
-    trainer = Trainer(network, settings, WorldFolder(folder).refresh, list, out, team)
-    trainer.run(lambda progress: None, lambda best, summary: None)
+    settings = load_run(None, train=str(folder), **small)
+    trainer = Trainer(MetricObjective(network, settings), WorldFolder(folder).refresh, settings, out, team)
+    trainer.run(lambda progress: None, lambda: None)
     seen = sum(float(value.double().abs().sum()) for name, value in network.named_parameters())
     print(f"rank {team.rank}: {seen:.9f} {trainer.progress.losses['fused']:.9f}", flush=True)
 """
@@ -209,7 +209,7 @@ def test_two_processes_learn_the_same_from_different_batches(folder, tmp_path):
     (tmp_path / "two.py").write_text(TWO)
     port = str(20_000 + os.getpid() % 20_000)
     environment = os.environ | {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
-    command = [sys.executable, str(tmp_path / "two.py"), str(tmp_path), str(Path(__file__).parents[1])]
+    command = [sys.executable, str(tmp_path / "two.py"), str(tmp_path), str(Path(__file__).parents[2])]
     processes = [
         subprocess.Popen(command, env=environment | {"RANK": rank, "LOCAL_RANK": rank}, stdout=subprocess.PIPE)
         for rank in "01"
@@ -261,9 +261,9 @@ def test_a_match_beyond_five_metres_is_a_match_but_no_near_one(tmp_path):
 def test_the_best_weights_are_kept_and_not_the_last(folder, tmp_path):
     kept: list[int] = []
     run = trainer(folder, tmp_path, WorldFolder(folder).refresh, steps=3, validate_epochs=1, learning_rate=1e-9)
-    run.run(ignore, lambda network, summary: kept.append(summary["steps"]))
+    run.run(ignore, lambda: kept.append(run.progress.step))
     assert kept == [1]  # this world is perfect from the start: nothing later is better
-    assert run.progress.best == 2 and run.progress.stale == 2
+    assert run.progress.figures["recall1_fused"] == 1 and run.progress.figures["recall1_5m"] == 1
 
 
 def test_without_anything_to_compare_the_last_weights_are_kept(folder, tmp_path):
@@ -272,8 +272,8 @@ def test_without_anything_to_compare_the_last_weights_are_kept(folder, tmp_path)
     write_world(lone / "a.npz", 1, 12, pass_index=np.zeros(12, np.int32))
     kept: list[int] = []
     run = trainer(folder, tmp_path / "run", WorldFolder(lone).refresh, steps=3, validate_epochs=1)
-    run.run(ignore, lambda network, summary: kept.append(summary["steps"]))
-    assert kept == [1, 2, 3]
+    run.run(ignore, lambda: kept.append(run.progress.step))
+    assert kept == [1, 2, 3] and "recall1_fused" not in run.progress.figures
 
 
 def test_every_modality_is_lost_now_and_then_and_never_both(folder, tmp_path, monkeypatch):

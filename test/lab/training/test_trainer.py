@@ -12,21 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_worlds import TINY
-from training.conftest import write_world
+from tiny_worlds import TINY, write_world
 
 from umf_ros.errors import ConfigError, UmfError, WeightsError
 from umf_ros.lab.datasets.labels import Rule
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
+from umf_ros.lab.datasets.views import Augmentation, ViewMaker
 from umf_ros.lab.training.batches import BatchMaker
-from umf_ros.lab.training.config import load_training
 from umf_ros.lab.training.distributed import Team
-from umf_ros.lab.training.objective import Bank, Objective
-from umf_ros.lab.training.run import train
+from umf_ros.lab.training.metric_objective import MetricObjective, rule_of
+from umf_ros.lab.training.run import load_run, train
 from umf_ros.lab.training.sampler import PairSampler, places_drawn
-from umf_ros.lab.training.trainer import Trainer, _rule
+from umf_ros.lab.training.trainer import Trainer
 from umf_ros.lab.training.validation import validate
-from umf_ros.lab.training.views import Augmentation, ViewMaker
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights, read_card
 
@@ -43,11 +41,19 @@ def settings_for(folder, **changes):
         "bank_from_step": 2,
         "warmup_steps": 1,
     }
-    return load_training(None, train=str(folder), **(small | changes))
+    return load_run(None, train=str(folder), **(small | changes))
 
 
-def silent(_):
+def silent(*_):
     pass
+
+
+def run(network, settings, folder, out, report=silent):
+    """Train with no validation; the objective, and the trainer when it is done."""
+    objective = MetricObjective(network, settings, list)
+    trainer = Trainer(objective, WorldFolder(folder).refresh, settings, out, Team(0, 1, torch.device("cpu")))
+    trainer.run(report, silent)
+    return objective, trainer
 
 
 def weights_of(path):
@@ -83,7 +89,8 @@ def test_every_parameter_of_the_run_learns(world, folder, loss):
     batch = batch_of(world)
     image = torch.tensor([True] * 7 + [False])
     cloud = torch.tensor([False] + [True] * 7)
-    losses, _ = Objective(network, settings_for(folder, loss=loss), RULE)(batch, image, cloud, Bank(0, 16))
+    objective = MetricObjective(network, settings_for(folder, loss=loss), list)
+    losses = objective(replace(batch, image_kept=image, cloud_kept=cloud))
     losses["total"].backward()
     idle = [n for n, p in network.named_parameters() if p.grad is None or not p.grad.abs().any()]
     assert [name for name in idle if not name.endswith("key_value.bias")] == []
@@ -94,9 +101,7 @@ def test_what_only_local_features_teach_is_switched_off_without_them(folder, tmp
     torch.manual_seed(1)
     network = UMF(TINY)
     settings = settings_for(folder, local_pairs=0, modality_dropout=0.0, steps=1)
-    Trainer(network, settings, WorldFolder(folder).refresh, list, tmp_path, Team(0, 1, torch.device("cpu"))).run(
-        silent, lambda *_: None
-    )
+    run(network, settings, folder, tmp_path)
     idle = [n for n, p in network.named_parameters() if p.requires_grad and p.grad is None]
     assert idle == []
     assert not network.image_encoder.pyramid.fine.weight.requires_grad
@@ -107,8 +112,7 @@ def learned_by(folder, out, **changes):
     torch.manual_seed(3)
     network = UMF(TINY)
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    settings, team = settings_for(folder, steps=2, **changes), Team(0, 1, torch.device("cpu"))
-    Trainer(network, settings, WorldFolder(folder).refresh, list, out, team).run(silent, lambda *_: None)
+    run(network, settings_for(folder, steps=2, **changes), folder, out)
     return network, {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
 
 
@@ -139,8 +143,7 @@ def test_neighbours_are_drawn_from_whole_worlds(folder, tmp_path):
     """Every row finds its place in the other pass, and a nearer and a farther one."""
     settings = settings_for(folder, loss="neighbourhood", local_pairs=0, batch=24, steps=2, modality_dropout=0.0)
     losses = []
-    trainer = Trainer(UMF(TINY), settings, WorldFolder(folder).refresh, list, tmp_path, Team(0, 1, torch.device("cpu")))
-    trainer.run(lambda progress: losses.append(progress.losses), lambda *_: None)
+    run(UMF(TINY), settings, folder, tmp_path, lambda progress: losses.append(progress.losses))
     assert all(found[name] > 0.1 for found in losses for name in ("fused", "image", "cloud", "graded"))
 
 
@@ -155,7 +158,7 @@ def test_a_run_leaves_weights_card_log_and_settings(folder, tmp_path):
     rows = list(csv.DictReader((tmp_path / "run" / "log.csv").open()))
     assert [row["step"] for row in rows] == ["2", "4"]
     assert float(rows[0]["recall1_fused"]) >= 0
-    assert load_training(tmp_path / "run" / "training.yaml") == settings
+    assert load_run(tmp_path / "run" / "training.yaml") == settings
     json.dumps(card, allow_nan=False)
 
 
@@ -185,18 +188,18 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from tiny_worlds import TINY
 from umf_ros.networks.presets import PRESETS
-from umf_ros.lab.training.config import load_training
+from umf_ros.lab.training.run import load_run
 from umf_ros.lab.training.run import train
 PRESETS["tiny"] = TINY
 for workers in (0, 3):
     small = dict(preset="tiny", steps=4, epoch_steps=2, batch=8, local_pairs=2, bank_from_step=2, warmup_steps=1)
-    settings = load_training(None, train=sys.argv[2], workers=workers, **small)
+    settings = load_run(None, train=sys.argv[2], workers=workers, **small)
     train(settings, Path(sys.argv[3]) / str(workers), False, lambda progress: None)
 """
 
 
 def test_batches_made_by_other_processes_are_the_same(folder, tmp_path):
-    command = [sys.executable, "-c", AHEAD, str(Path(__file__).parents[1]), str(folder), str(tmp_path / "runs")]
+    command = [sys.executable, "-c", AHEAD, str(Path(__file__).parents[2]), str(folder), str(tmp_path / "runs")]
     said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
     here, ahead = (weights_of(tmp_path / "runs" / workers / "tiny.safetensors") for workers in "03")
     torch.testing.assert_close(here, ahead, rtol=0, atol=0)
@@ -208,28 +211,31 @@ def test_training_lowers_the_loss(world, folder, tmp_path):
     torch.manual_seed(0)
     network = UMF(TINY)
     settings = settings_for(folder, steps=40, weight_local=0, weight_super=0, local_pairs=0, bank=0)
-    objective, batch, every = Objective(network, settings, RULE), batch_of(world), torch.ones(8, dtype=torch.bool)
+    objective, batch = MetricObjective(network, settings, list), batch_of(world)
 
     def loss():
         with torch.no_grad():
-            return objective.train()(batch, every, every, Bank(0, 16))[0]["fused"].item()
+            return objective.train()(batch)["fused"].item()
 
     before = loss()
-    Trainer(network, settings, WorldFolder(folder).refresh, list, tmp_path, Team(0, 1, torch.device("cpu"))).run(
-        silent, lambda *_: None
-    )
+    run(network, settings, folder, tmp_path)
     assert loss() < 0.9 * before
 
 
 def test_batches_grow_while_triplets_sleep(folder, tmp_path):
     torch.manual_seed(0)
     settings = settings_for(folder, loss="triplet", active_share=1.0, batch_limit=10, steps=4)
-    trainer = Trainer(UMF(TINY), settings, WorldFolder(folder).refresh, list, tmp_path, Team(0, 1, torch.device("cpu")))
-    trainer.progress.losses["active"] = 0
+    objective = MetricObjective(UMF(TINY), settings, list)
     sizes = []
-    trainer.run(lambda progress: sizes.append(progress.batch), lambda *_: None)
-    assert sizes[0] == 8
-    assert trainer.progress.batch <= 10
+    for active in (1.0, 0.99, 0.0):
+        objective.finish_epoch({"active": active})
+        sizes.append(objective.batch_size)
+    assert sizes == [8, 10, 10]
+    batch = objective.batch_maker(WorldFolder(folder).refresh(), 0)(0)
+    assert len(batch.input.image) == 10
+    calm = MetricObjective(UMF(TINY), settings_for(folder), list)
+    calm.finish_epoch({"active": 0.0})
+    assert calm.batch_size == 8
 
 
 def test_early_stopping(folder, tmp_path):
@@ -282,11 +288,11 @@ def test_foreign_shards(tmp_path):
 
 def test_wrong_settings_and_missing_data(folder, tmp_path):
     with pytest.raises(ConfigError, match="learning_rate"):
-        load_training(None, train="x", learning_rate=-1)
+        load_run(None, train="x", learning_rate=-1)
     with pytest.raises(ConfigError, match="unknown parameter teh_steps"):
-        load_training(None, train="x", teh_steps=1)
+        load_run(None, train="x", teh_steps=1)
     with pytest.raises(ConfigError, match="local_pairs must be 0"):
-        load_training(None, train="x", branch="image", local_pairs=4)
+        load_run(None, train="x", branch="image", local_pairs=4)
     with pytest.raises(ConfigError, match="unknown network"):
         train(settings_for(folder, preset="umf_giant"), tmp_path / "run", False, silent)
     (tmp_path / "empty").mkdir()
@@ -297,7 +303,9 @@ def test_wrong_settings_and_missing_data(folder, tmp_path):
 
 
 def test_what_is_the_same_place_depends_on_the_data_set(folder):
-    kinds = [_rule(settings_for(folder, **chosen)) for chosen in ({}, {"rule": "robotcar"}, {"loss": "neighbourhood"})]
+    kinds = [
+        rule_of(settings_for(folder, **chosen)) for chosen in ({}, {"rule": "robotcar"}, {"loss": "neighbourhood"})
+    ]
     thesis, robotcar, whole = kinds
     assert (thesis.positive_m, thesis.positive_deg, thesis.between_passes) == (12, 30, False)
     assert (robotcar.positive_m, robotcar.positive_deg, robotcar.negative_m) == (10, 180, 50)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from umf_ros.embedding import CHOICES
 from umf_ros.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def command(
     out: Annotated[Path, Optional(help="Where results/<timestamp> goes.")] = Path("results"),
     config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording.")] = None,
     dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
-    embedder: Annotated[str | None, Optional(help="umf, or a baseline, for a recording.")] = None,
+    embedder: Annotated[str | None, Optional(help=f"How the places of a recording are embedded: {CHOICES}.")] = None,
     odometry: Annotated[Path | None, Optional(help="Odometry as a TUM file, where the recording has none.")] = None,
     odometry_frame: Annotated[
         str, Optional(help="Whose poses --odometry holds: body, imu, camera or lidar (S3LI's Eval/BASALT: imu).")

@@ -7,11 +7,12 @@ from typing import Annotated
 
 import typer
 
-from umf_ros.lab.commands.train import step_bar
+from umf_ros.lab.commands.train import train_with_bar
 
 app = typer.Typer(
     help="Pretrain an encoder without labels, by hiding a part of the data and predicting it.", no_args_is_help=True
 )
+METHODS = {"image": "masked_images", "lidar": "masked_scans"}
 _AFTERWARDS = "\n\n`umf train --start` begins with the weights that result."
 _IMAGE = f"Pretrain the image encoder: paint hidden patches (SparK).{_AFTERWARDS}"
 _LIDAR = f"Pretrain the voxel encoder: guess hidden voxels, most of them near the rover (Voxel-MAE).{_AFTERWARDS}"
@@ -29,6 +30,7 @@ def command(
         Path | None,
         typer.Option(help="Folder of the run: weights, card, log, pictures, checkpoint; default: runs/pretrain_NAME."),
     ] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML file of settings.")] = None,
     preset: Annotated[str | None, typer.Option(help="Network: umf_light, umf_mobile or umf_resnet50.")] = None,
     mask_ratio: Annotated[float | None, typer.Option(help="Share of an image's patches that is hidden.")] = None,
     start: Annotated[
@@ -43,18 +45,15 @@ def command(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
 ) -> None:
     """Pretrain the encoder that the subcommand names."""
-    from umf_ros.lab.training.pretraining.pretrainer import Progress
-    from umf_ros.lab.training.pretraining.run import pretrain
-    from umf_ros.lab.training.pretraining.settings import make_settings
+    from umf_ros.errors import ConfigError
+    from umf_ros.lab.training.run import load_run
 
-    modality = str(context.info_name)
-    out = out or Path(f"runs/pretrain_{modality}")
-    chosen = {"preset": preset, "mask_ratio": mask_ratio, "start": start, "steps": steps, "batch": batch}
-    settings = make_settings(modality, data, **chosen, seed=seed, threads=threads, workers=workers, device=device)
-    with step_bar("pretraining", settings.steps) as show:
-
-        def report(progress: Progress) -> None:
-            show(progress.step, f"loss {progress.loss:.4f}")
-
-        weights = pretrain(settings, out, resume, report)
-    typer.echo(f"weights: {weights}\npictures: {out}/reconstructions_*.png")
+    encoder = str(context.info_name)
+    if encoder == "lidar" and mask_ratio is not None:
+        raise ConfigError("mask_ratio is of images; ring_ratios say what is hidden of a scan")
+    out = out or Path(f"runs/pretrain_{encoder}")
+    chosen = {"method": METHODS[encoder], "train": str(data), "preset": preset, "mask_ratio": mask_ratio}
+    chosen |= {"start": start, "steps": steps, "batch": batch, "seed": seed}
+    chosen |= {"threads": threads, "workers": workers, "device": device}
+    train_with_bar(load_run(config, **chosen), out, resume)
+    typer.echo(f"pictures: {out}/reconstructions_*.png")

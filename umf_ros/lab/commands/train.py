@@ -1,13 +1,15 @@
-"""`umf train`: metric learning of the network on simulated worlds."""
+"""`umf train`: training of the network on simulated worlds or recordings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from umf_ros.lab.training.progress import Progress as RunProgress
+    from umf_ros.lab.training.settings import RunSettings
 
 
 def command(
@@ -26,28 +28,28 @@ def command(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
 ) -> None:
     """Train a network; under torchrun, on several processes or GPUs."""
-    from umf_ros.lab.training.config import load_training
-    from umf_ros.lab.training.run import train as run
-    from umf_ros.lab.training.trainer import Progress
+    from umf_ros.lab.training.run import load_run
 
     chosen = {"preset": preset, "steps": steps, "seed": seed, "loss": loss, "start": start}
     chosen |= {"threads": threads, "workers": workers, "device": device, "validation": validation, "train": train}
-    settings = load_training(config, **chosen)
-    with step_bar("training", settings.steps) as show:
-
-        def report(progress: Progress) -> None:
-            show(progress.step, f"loss {progress.losses['total']:.3f}  recall@1 {progress.recall:.3f}")
-
-        weights = run(settings, out, resume, report)
-    typer.echo(f"weights: {weights}")
+    train_with_bar(load_run(config, **chosen), out, resume)
 
 
-@contextmanager
-def step_bar(title: str, steps: int) -> Iterator[Callable[[int, str], None]]:
-    """A bar over the steps of a run; gives a function that shows how many are done, and a text before the bar."""
+def train_with_bar(settings: RunSettings, out: Path, resume: bool) -> None:
+    """Train, with a bar over the steps, and say where the weights are."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from umf_ros.lab.training.run import train
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns) as bars:
-        bar = bars.add_task(title, total=steps)
-        yield lambda done, text: bars.update(bar, completed=done, description=text)
+        bar = bars.add_task("training", total=settings.steps)
+
+        def report(run: RunProgress) -> None:
+            shown = {"loss": run.losses["total"]}
+            shown |= {name: value for name, value in run.figures.items() if name.startswith("recall1_")}
+            text = "  ".join(f"{name} {value:.3f}" for name, value in shown.items())
+            bars.update(bar, completed=run.step, description=text)
+
+        weights = train(settings, out, resume, report)
+    typer.echo(f"weights: {weights}")

@@ -1,4 +1,4 @@
-"""What is the same place, and what is not (thesis 4.5.2 and 5.1.2)."""
+"""What is the same place, and what is not [UMF 4.5.2, 5.1.2]."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from umf_ros.geometry import Array, wrap_angle
 class Rule:
     """Distances in metres, headings in degrees; what is neither positive nor negative is neutral.
 
-    The thesis takes every pair beyond 30 deg for different. Two views 40 deg apart still share half of
+    UMF takes every pair beyond 30 deg for different. Two views 40 deg apart still share half of
     their field, so in training the band up to `negative_deg` stays neutral. With `between_passes`, pairs
     of one pass are neutral too.
     """

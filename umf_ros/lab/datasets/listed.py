@@ -17,7 +17,7 @@ from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.datasets.simulated import WorldFolder
 
 
-class Entry(Group):
+class ListEntry(Group):
     """Some sequences of a list."""
 
     @abstractmethod
@@ -29,7 +29,7 @@ class Entry(Group):
         """
 
 
-class Worlds(Entry):
+class WorldsEntry(ListEntry):
     """Simulated worlds."""
 
     worlds: Path = Field(description="folder of shards")
@@ -39,7 +39,7 @@ class Worlds(Entry):
         return WorldFolder(base / self.worlds).refresh()
 
 
-class Bag(Entry):
+class BagEntry(ListEntry):
     """One recording."""
 
     bag: Path = Field(description="mcap file, db3 folder or ROS 1 bag")
@@ -55,18 +55,18 @@ class Bag(Entry):
         return [found]
 
 
-class S3li(Entry):
+class S3liEntry(ListEntry):
     """The recordings of Etna as they are published."""
 
     s3li: Path = Field(description="folder of the bags, GT and Eval")
-    split: Literal["training", "test"] = Field(description="part of the split of thesis 5.1.2")
+    split: Literal["training", "test"] = Field(description="part of the split of [UMF 5.1.2]")
     spacing_m: float = Field(1.0, gt=0, description="way between samples")
 
     def read(self, base: Path) -> Sequence[SampleSequence]:
         """Every recording of the split, with BASALT's headings."""
         found: list[SampleSequence] = []
         for name in ETNA_TRAINING if self.split == "training" else ETNA_TEST:
-            bag = Bag(
+            bag = BagEntry(
                 bag=self.s3li / f"{name}.bag",
                 ground_truth=self.s3li / "GT" / name / "global_lle.pos",
                 odometry=self.s3li / "Eval" / "BASALT" / name / "trajectory.txt",
@@ -77,7 +77,7 @@ class S3li(Entry):
         return found
 
 
-class Toolkit(Entry):
+class ToolkitEntry(ListEntry):
     """Pickles of the s3li-toolkit."""
 
     toolkit: list[Path] = Field(min_length=1, description="pickles; several are passes of one place")
@@ -90,7 +90,7 @@ class Toolkit(Entry):
         return [read_toolkit([base / path for path in self.toolkit], images, self.dataset)]
 
 
-class RobotCar(Entry):
+class RobotCarEntry(ListEntry):
     """Oxford RobotCar."""
 
     robotcar: Path = Field(description="folder of the pickles and submaps")
@@ -103,12 +103,12 @@ class RobotCar(Entry):
         return [read_training(root, images) if self.part == "training" else read_evaluation(root, images, self.part)]
 
 
-KINDS: dict[str, type[Entry]] = {
-    "worlds": Worlds,
-    "bag": Bag,
-    "s3li": S3li,
-    "toolkit": Toolkit,
-    "robotcar": RobotCar,
+KINDS: dict[str, type[ListEntry]] = {
+    "worlds": WorldsEntry,
+    "bag": BagEntry,
+    "s3li": S3liEntry,
+    "toolkit": ToolkitEntry,
+    "robotcar": RobotCarEntry,
 }
 
 
@@ -156,14 +156,14 @@ def open_source(path: Path) -> Source:
     return SequenceList(path) if is_list(path) else WorldFolder(path)
 
 
-def _entries(path: Path) -> list[Entry]:
+def _entries(path: Path) -> list[ListEntry]:
     content = read_yaml(path)
     if not isinstance(content, list) or not content:
         raise ConfigError(f"{path}: expected a list of sequences")
     return [_entry(path, number, values) for number, values in enumerate(content, 1)]
 
 
-def _entry(path: Path, number: int, values: Any) -> Entry:
+def _entry(path: Path, number: int, values: Any) -> ListEntry:
     kinds = [kind for kind in KINDS if isinstance(values, dict) and kind in values]
     if len(kinds) != 1:
         raise ConfigError(f"{path}: entry {number} must name one of {', '.join(KINDS)}")

@@ -1,11 +1,11 @@
-"""Oxford RobotCar in the layout of MinkLoc++: submaps of the laser scanner, and images by their stamps.
+"""Oxford RobotCar [Maddern 2017] in the layout of MinkLoc++ [Komorowski 2021]: submaps of the laser scanner, and images by their stamps.
 
     <root>/oxford/<traversal>/pointcloud_20m_10overlap/<stamp>.bin    4096 x 3 float64 in [-1, 1]
     <root>/training_queries_baseline.pickle, ...                      {number: TrainingTuple}
     <root>/oxford_evaluation_{database,query}.pickle                  [{number: {query, northing, easting, ...}}]
     <images>/<traversal>/<stamp>.png, lidar2image_ndx.pickle          {stamp of a submap: [stamps of images]}
 
-Same place means within 10 m, another beyond 50 m, whatever the heading (thesis 5.1.1).
+Same place means within 10 m, another beyond 50 m, whatever the heading [UMF 5.1.1].
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""S3LI (Giubilato et al. 2022): recordings with RTKLIB truth, and the s3li-toolkit's pickles."""
+"""S3LI [Giubilato 2022]: recordings with RTKLIB truth, and the s3li-toolkit's pickles."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from umf_ros.trajectory import Trajectory
 
 ETNA_TEST = ("s3li_loops", "s3li_traverse_1")
 ETNA_TRAINING = ("s3li_traverse_2", "s3li_crater", "s3li_crater_inout", "s3li_mapping", "s3li_landmarks")
-"""The split of thesis 5.1.2."""
+"""The split of [UMF 5.1.2]."""
 
 KEPT_SIZE = (256, 344)
 """Height and width at which images stay in memory: half of Etna's."""

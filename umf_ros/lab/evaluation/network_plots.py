@@ -26,7 +26,7 @@ from umf_ros.geometry import Array
 from umf_ros.lab.evaluation.retrieval import Indices
 from umf_ros.networks.attention import received
 from umf_ros.networks.umf import UMF, NetworkOutput
-from umf_ros.verification.matching import eligible_superfeatures
+from umf_ros.verification.rerank import eligible_superfeatures
 
 SHOWN = 3
 """Super-features drawn per pair."""

@@ -13,7 +13,7 @@ from umf_ros.config import Verification
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.frames import Candidate, Embedding, Frame, Keyframe
 from umf_ros.geometry import Array
-from umf_ros.verification.reranking import rerank
+from umf_ros.verification.rerank import rerank
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.config import Embedding, Verification
+from umf_ros.config import EmbeddingSettings, Verification
 from umf_ros.embedding import METHODS as EMBEDDERS
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
@@ -172,7 +172,7 @@ class WorldsRun:
         self._worlds, self._repeats, self._report = worlds, repeats, report
         self._embedder = UmfEmbedder(self._weights, super_features=True)
         names = [name for name in EMBEDDERS if name != "umf"] if others else []
-        self._others = {name: make_embedder(Embedding(method=name)) for name in names}
+        self._others = {name: make_embedder(EmbeddingSettings(method=name)) for name in names}
 
     def run(self) -> WorldsSummary:
         """Drive through all worlds, then take times."""

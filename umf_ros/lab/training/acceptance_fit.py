@@ -1,4 +1,4 @@
-"""Fitting the acceptance model and the covariance's size to closures whose truth is known."""
+"""Fitting the acceptance model and the covariance to closures whose truth is known."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from umf_ros.geometry import Array
-from umf_ros.verification.acceptance import MEASURES, Logistic, Numbers, measure
-from umf_ros.verification.covariance import Spread, covariance_of
+from umf_ros.verification.acceptance import Logistic, criteria_of, scores
+from umf_ros.verification.measurement import Measurement
+from umf_ros.verification.registration import CovarianceModel, covariance_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,20 +20,18 @@ class Example:
     """One refined pose and whether it was right.
 
     Attributes:
-        numbers: what verification measured.
-        kind: kind of evidence, "scan" or "image".
+        measurement: what verification measured.
         right: whether the pose was.
     """
 
-    numbers: Numbers
-    kind: str
+    measurement: Measurement
     right: bool
 
 
 def fit_logistic(examples: list[Example], kind: str, ridge: float = 0.003) -> Logistic:
-    """Weights >= 0 of one kind of evidence by penalised maximum likelihood.
+    """Weights >= 0 for one kind of hypothesis by penalised maximum likelihood.
 
-    A measure that would argue against itself gets the weight 0: a decision that punishes a better
+    A criterion that would argue against itself gets the weight 0: a decision that punishes a better
     overlap because of a quirk of the fitted worlds would not carry over to others.
 
     Args:
@@ -43,12 +42,12 @@ def fit_logistic(examples: list[Example], kind: str, ridge: float = 0.003) -> Lo
     Raises:
         ValueError: only right or only wrong examples.
     """
-    mine = [example for example in examples if example.kind == kind]
+    mine = [example for example in examples if example.measurement.kind == kind]
     right = np.array([example.right for example in mine], bool)
     if right.all() or not right.any():
         raise ValueError(f"need right and wrong examples of kind {kind}, got {int(right.sum())} right of {len(right)}")
-    rows = [measure(example.numbers, kind) for example in mine]
-    names = list(MEASURES[kind])
+    rows = [scores(example.measurement) for example in mine]
+    names = list(criteria_of(kind))
     design = np.array([[1.0, *(row[name] for name in names)] for row in rows])
     bounds = [(None, None)] + [(0.0, None)] * len(names)
     start = np.concatenate([[-1.0], np.ones(len(names))])
@@ -72,8 +71,8 @@ def _loss(parameters: Array, design: Array, right: NDArray[np.bool_], ridge: flo
     return float(loss), design.T @ slope / len(right) + ridge * penalty / len(parameters)
 
 
-def fit_spread(errors: Array, informations: Array) -> Spread:
-    """The spread under which the errors are most likely, scaled so that 95 % lie inside their 95 % ellipsoid.
+def fit_covariance(errors: Array, informations: Array) -> CovarianceModel:
+    """The model under which the errors are most likely, scaled so that 95 % lie inside their 95 % ellipsoid.
 
     Args:
         errors: (N, 6) of right closures, ROS order.
@@ -81,32 +80,32 @@ def fit_spread(errors: Array, informations: Array) -> Spread:
     """
 
     def surprise(logarithms: Array) -> float:
-        covariances = covariance_of(informations, _spread(logarithms))
+        covariances = covariance_of(informations, _model_of(logarithms))
         squared = _squared_distances(errors, covariances)
         # a heavy tail, so that a few bad fits do not widen all others
         return float(np.mean(np.linalg.slogdet(covariances)[1] + 16 * np.log1p(squared / 10)))
 
     found = minimize(surprise, np.log([10.0, 0.01, 0.05]), method="Nelder-Mead", options={"maxiter": 300}).x
-    spread = _spread(found)
-    return scale_spread(spread, errors, covariance_of(informations, spread))
+    model = _model_of(found)
+    return scale_covariance(model, errors, covariance_of(informations, model))
 
 
-def scale_spread(spread: Spread, errors: Array, covariances: Array) -> Spread:
-    """The spread that makes covariances (N, 6, 6) just so much larger or smaller that 95 % of their errors lie inside.
+def scale_covariance(model: CovarianceModel, errors: Array, covariances: Array) -> CovarianceModel:
+    """The model that makes covariances (N, 6, 6) just so much larger or smaller that 95 % of their errors lie inside.
 
     Args:
-        spread: with which the covariances were made.
+        model: with which the covariances were made.
         errors: (N, 6), ROS order.
         covariances: (N, 6, 6) of the same poses.
     """
     variance = float(np.quantile(_squared_distances(errors, covariances), 0.95)) / float(chi2.ppf(0.95, 6))
     deviation = variance**0.5
-    return Spread(spread.inflation * variance, spread.floor_m * deviation, spread.floor_deg * deviation)
+    return CovarianceModel(model.inflation * variance, model.floor_m * deviation, model.floor_deg * deviation)
 
 
-def _spread(logarithms: Array) -> Spread:
+def _model_of(logarithms: Array) -> CovarianceModel:
     inflation, floor_m, floor_deg = np.exp(np.clip(logarithms, np.log([0.1, 2e-3, 1e-2]), np.log([1e4, 0.5, 5.0])))
-    return Spread(float(inflation), float(floor_m), float(floor_deg))
+    return CovarianceModel(float(inflation), float(floor_m), float(floor_deg))
 
 
 def _squared_distances(errors: Array, covariances: Array) -> Array:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from umf_ros.embedding.inputs import pack
+from umf_ros.lab.datasets.correspondences import Matches, cell_points, match_cells, match_voxels
 from umf_ros.lab.datasets.labels import Places
 from umf_ros.lab.datasets.sample import SampleSequence
-from umf_ros.lab.training.correspondences import Matches, cell_points, match_cells, match_voxels
+from umf_ros.lab.datasets.views import View, ViewMaker
 from umf_ros.lab.training.sampler import Draw, places_drawn
-from umf_ros.lab.training.views import View, ViewMaker
 from umf_ros.networks.presets import NetworkConfig
-from umf_ros.networks.umf import NetworkInput
+from umf_ros.networks.umf import NetworkInput, to_device
 
 CHILDREN = 8
 """Voxels folded into one cell of the grid."""
@@ -28,18 +29,33 @@ class TrainingBatch:
 
     Attributes:
         input: the views; row i and row B/2 + i are a pair.
+        image_kept, cloud_kept: (B,) bool, images and scans that the fused descriptor may use.
         places: where they were taken.
+        with_bank: whether descriptors of past batches serve as references too.
         local_rows: (2L,) rows that train the local heads: L anchors, then their L partners.
         cells, voxels: (L, K, 2) corresponding features of each such pair, -1 for none.
         useful_cells: (2L, N) bool, image cells with a known depth.
     """
 
     input: NetworkInput
+    image_kept: Tensor
+    cloud_kept: Tensor
     places: Places
     local_rows: Tensor
     cells: Tensor
     voxels: Tensor
     useful_cells: Tensor
+    with_bank: bool = False
+
+    def thinned(self) -> Self:
+        """The batch with a sparse grid, a thirtieth of its size: what is sent between processes has to be copied."""
+        return replace(self, input=_thin(self.input))
+
+    def to(self, device: torch.device) -> Self:
+        """The batch on another device, its grid dense again."""
+        names = ("image_kept", "cloud_kept", "local_rows", "cells", "voxels", "useful_cells")
+        moved = {name: getattr(self, name).to(device) for name in names}
+        return replace(self, input=_thick(to_device(self.input, device)), **moved)
 
 
 def stack_views(views: Sequence[View], config: NetworkConfig) -> NetworkInput:
@@ -48,8 +64,7 @@ def stack_views(views: Sequence[View], config: NetworkConfig) -> NetworkInput:
     return pack(images, [view.scan for view in views], config, trim=True)
 
 
-def thin(batch: NetworkInput) -> NetworkInput:
-    """The batch with a sparse grid, a thirtieth of its size: what is sent between processes has to be copied."""
+def _thin(batch: NetworkInput) -> NetworkInput:
     cells = batch.grid.flatten(0, 3)
     occupied = torch.nonzero(cells[:, :CHILDREN].sum(1)).squeeze(1)  # the first feature is occupancy
     places = torch.stack(torch.unravel_index(occupied, batch.grid.shape[:4]))
@@ -57,8 +72,7 @@ def thin(batch: NetworkInput) -> NetworkInput:
     return replace(batch, grid=grid)
 
 
-def thick(batch: NetworkInput) -> NetworkInput:
-    """Undoes `thin`; a batch that is not thin stays as it is."""
+def _thick(batch: NetworkInput) -> NetworkInput:
     return replace(batch, grid=batch.grid.to_dense()) if batch.grid.is_sparse else batch
 
 
@@ -80,8 +94,11 @@ class BatchMaker:
         rows = np.concatenate([anchors, anchors + len(pairs)])
         couples = [(views[row], views[row + len(pairs)]) for row in anchors]
         useful = [np.isfinite(cell_points(views[row])[:, 2]) for row in rows]
+        stacked = stack_views(views, self._views.config)
         return TrainingBatch(
-            input=stack_views(views, self._views.config),
+            input=stacked,
+            image_kept=stacked.image_present,
+            cloud_kept=stacked.coarse_mask.any(1),
             places=places_drawn(draws, self._sequences),
             local_rows=torch.from_numpy(rows),
             cells=self._pick([match_cells(*couple) for couple in couples], rng),

@@ -1,219 +1,120 @@
-"""The sum of losses that metric learning minimises."""
+"""What a run learns: the one thing that differs between ways of training.
+
+A new way of training is one file here, `NAME_objective.py`, with a subclass of `Objective` as its `OBJECTIVE`
+and, where it has settings of its own, a subclass of `RunSettings`; `method: NAME` in a settings file chooses it.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import pkgutil
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from umf_ros.lab.datasets.labels import Places, Rule, distances, label
-from umf_ros.lab.evaluation.protocol import NEAR_M
-from umf_ros.lab.training.batches import TrainingBatch
-from umf_ros.lab.training.config import TrainingSettings
-from umf_ros.lab.training.local_losses import (
-    correspondence,
-    decorrelation,
-    neighbours,
-    super_contrastive,
-    wasted_saliency,
+from umf_ros.errors import ConfigError
+from umf_ros.lab.datasets.sample import SampleSequence
+from umf_ros.lab.training.settings import RunSettings
+from umf_ros.networks.umf import UMF
+
+SUFFIX = "_objective"
+METHODS = tuple(
+    module.name.removesuffix(SUFFIX)
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)])
+    if module.name.endswith(SUFFIX)
 )
-from umf_ros.lab.training.losses import batch_hard_triplet, graded, multi_similarity, neighbourhood_components
-from umf_ros.networks.umf import UMF, Features
+"""Names of the ways of training."""
 
 
-class Bank:
-    """Descriptors of past batches, as further references (cross-batch memory, Wang et al. 2020)."""
+class Batch(Protocol):
+    """What one step learns from."""
 
-    def __init__(self, size: int, dimension: int) -> None:
-        self._size = size
-        self.descriptors = torch.zeros(0, dimension)
-        self.places = Places(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-
-    def add(self, descriptors: Tensor, places: Places) -> None:
-        """Remember a batch, forgetting the oldest."""
-        kept = self._size
-        if kept == 0:
-            return
-        self.descriptors = torch.cat([self.descriptors, descriptors.detach().float().cpu()])[-kept:]
-        self.places = _join(self.places, places, kept)
-
-    def state(self) -> dict[str, Tensor]:
-        """For a checkpoint."""
-        arrays = {field.name: getattr(self.places, field.name) for field in fields(Places)}
-        return {"descriptors": self.descriptors} | {name: torch.from_numpy(array) for name, array in arrays.items()}
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Inverse of `state`."""
-        self.descriptors = state["descriptors"]
-        self.places = Places(*(state[field.name].numpy() for field in fields(Places)))
-
-
-def _join(a: Places, b: Places, kept: int) -> Places:
-    joined = (np.concatenate([getattr(a, field.name), getattr(b, field.name)]) for field in fields(Places))
-    return Places(*(values[-kept:] for values in joined))
+    def to(self, device: torch.device) -> Self:
+        """The batch on the device that computes."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
-class Relations:
-    """How the rows of a batch relate to its references (the batch, then the bank).
+class Judgement:
+    """How the network stands after an epoch.
 
     Attributes:
-        positive, negative: (B, M) bool.
-        comparable: (B, B) bool, pairs of one world with like headings.
-        metres: (B, B), infinite between worlds.
+        keep: whether its weights are the ones to keep.
+        stop: whether more steps would be wasted.
+        figures: what was measured, by name, for the log: always the same names, not a number where there is none.
     """
 
-    positive: Tensor
-    negative: Tensor
-    comparable: Tensor
-    metres: Tensor
+    keep: bool = True
+    stop: bool = False
+    figures: dict[str, float] = field(default_factory=dict)
 
 
-def relate(places: Places, bank: Places, rule: Rule, device: torch.device) -> Relations:
-    """Relations of a batch to itself and to the bank."""
-    count = len(places.world)
-    references = _join(places, bank, count + len(bank.world))
-    positive, negative = label(places, references, rule)
-    positive[:, :count] &= ~np.eye(count, dtype=bool)
-    metres, turn = distances(places, places)
-    comparable = np.isfinite(metres) & (turn < np.radians(rule.positive_deg)) & ~np.eye(count, dtype=bool)
-    tensors = [torch.from_numpy(array).to(device) for array in (positive, negative, comparable, metres)]
-    return Relations(*tensors)
+class Objective(nn.Module, ABC):
+    """Losses of a batch, and where the batches come from; a module, so that it can be distributed whole.
 
+    What is not to be learned has its gradient switched off. Everything random in a batch follows from the
+    seed, the step and the rank: a resumed run repeats an uninterrupted one, and so does one whose batches
+    are made by other processes.
 
-def attenuate(values: Tensor, share: float) -> Tensor:
-    """The same values, but only this share of the gradient goes back through them."""
-    return values * share + values.detach() * (1 - share)
+    Args:
+        network: trained in place.
+        settings: of the run, of the class `settings_type`.
+    """
 
+    settings_type: ClassVar[type[RunSettings]]
 
-class Objective(nn.Module):
-    """Losses of one batch; a module, so that it can be distributed whole."""
-
-    def __init__(self, network: UMF, settings: TrainingSettings, rule: Rule) -> None:
+    def __init__(self, network: UMF, settings: Any) -> None:
         super().__init__()
         self.network = network
-        self._settings = settings
-        self._rule = rule
-        self._near: Tensor
-        height, width = network.config.image_size
-        self.register_buffer("_near", neighbours(height // 4, width // 4), persistent=False)
 
-    def forward(
-        self, batch: TrainingBatch, image_present: Tensor, cloud_present: Tensor, bank: Bank
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        """Losses by name, "total" among them, and the fused descriptors.
+    @abstractmethod
+    def batch_maker(self, sequences: Sequence[SampleSequence], rank: int) -> Callable[[int], Batch]:
+        """What makes the batch of a step; it must depend on nothing but the step.
 
         Args:
-            batch: the batch, on the network's device.
-            image_present: (B,) bool, images the fused descriptor may use.
-            cloud_present: (B,) bool, scans it may use.
-            bank: past descriptors; none are used while it is empty.
+            sequences: the data there is now; asked again at every epoch.
+            rank: of this process among those that train.
         """
-        branch = self._settings.branch
-        features = self.network.encode(batch.input, branch)
-        if branch != "both":
-            nothing = torch.zeros_like(image_present)
-            image_present = batch.input.image_present if branch == "image" else nothing
-            cloud_present = batch.input.coarse_mask.any(1) if branch == "cloud" else nothing
-        fused = self.network.fuse(features, image_present, cloud_present).descriptor
-        relations = relate(batch.places, bank.places, self._rule, fused.device)
-        alone = self._alone(features, batch) if branch == "both" else {}
-        # similarities need all their digits: at first they differ in the third
-        with torch.autocast(fused.device.type, enabled=False):
-            losses, active = self._global(fused, (image_present, cloud_present), alone, bank, relations)
-        if len(batch.local_rows):
-            losses |= self._local(features, batch, relations.negative[:, : len(fused)])
-        weights = self._weights()
-        total = sum((weights[name] * value for name, value in losses.items()), start=fused.new_zeros(()))
-        return losses | {"total": total, "active": active}, fused
 
-    def _weights(self) -> dict[str, float]:
-        s = self._settings
-        return {
-            "fused": 1.0,
-            "image": s.weight_image,
-            "cloud": s.weight_cloud,
-            "graded": s.weight_graded,
-            "cells": s.weight_local,
-            "voxels": s.weight_local,
-            "wasted": s.weight_local,
-            "super": s.weight_super,
-        }
+    @abstractmethod
+    def forward(self, batch: Any) -> dict[str, Tensor]:
+        """Losses by name; "total" is what is minimised."""
 
-    def _alone(self, features: Features, batch: TrainingBatch) -> dict[str, tuple[Tensor, Tensor]]:
-        """Descriptors (B, D) of each modality without the other, and which frames (B,) have it.
+    def finish_epoch(self, losses: Mapping[str, float]) -> None:
+        """Adapt to the mean losses of an epoch, in every process."""
 
-        The other modality's tokens must not be there: what is learned with them at hand is not the image's own.
+    def judge(self, step: int, folder: Path) -> Judgement:
+        """How the network stands after `step` steps; asked after every epoch, in the leading process alone.
+
+        Args:
+            step: steps done.
+            folder: the run's, for pictures.
         """
-        images, clouds = batch.input.image_present, batch.input.coarse_mask.any(1)
-        nothing = torch.zeros_like(images)
-        return {
-            "image": (self.network.fuse(features, images, nothing).descriptor, images),
-            "cloud": (self.network.fuse(features, nothing, clouds).descriptor, clouds),
-        }
+        return Judgement()
 
-    def _global(
-        self,
-        fused: Tensor,
-        present: tuple[Tensor, Tensor],
-        alone: dict[str, tuple[Tensor, Tensor]],
-        bank: Bank,
-        relations: Relations,
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        count = len(fused)
-        similarity = fused @ torch.cat([fused, bank.descriptors.to(fused.device)]).T
-        # an image and a scan alone have nothing in common: no pair to learn from
-        shared = torch.ones_like(relations.positive)
-        images, clouds = (there[:, None] & there[None] for there in present)
-        shared[:, :count] = images | clouds
-        losses: dict[str, Tensor] = {}
-        losses["fused"], active = self._metric(similarity, relations.positive & shared, relations.negative & shared)
-        comparable = relations.comparable & shared[:, :count]
-        losses["graded"] = self._graded(similarity[:, :count], relations, comparable)
-        for name, (descriptor, there) in alone.items():
-            both = there[:, None] & there[None]
-            positive, negative = relations.positive[:, :count] & both, relations.negative[:, :count] & both
-            losses[name], share = self._metric(descriptor @ descriptor.T, positive, negative)
-            active = torch.maximum(active, share)
-        return losses, active
+    def card(self) -> dict[str, Any]:
+        """What the card of the weights says beyond what every card does."""
+        return {}
 
-    def _metric(self, similarity: Tensor, positive: Tensor, negative: Tensor) -> tuple[Tensor, Tensor]:
-        if self._settings.loss == "triplet":
-            return batch_hard_triplet(similarity, positive, negative)
-        if self._settings.loss == "neighbourhood":
-            return neighbourhood_components(similarity, positive, negative), similarity.new_ones(())
-        return multi_similarity(similarity, positive, negative), similarity.new_ones(())
 
-    def _graded(self, similarity: Tensor, relations: Relations, comparable: Tensor) -> Tensor:
-        if self._settings.loss != "neighbourhood":
-            return graded(similarity, relations.metres, comparable)
-        right = relations.positive[:, : len(similarity)] & comparable
-        near = right & (relations.metres < NEAR_M)
-        return neighbourhood_components(similarity, near, right & ~near)
+def find_objective(method: str) -> type[Objective]:
+    """The objective of a way of training.
 
-    def _local(self, features: Features, batch: TrainingBatch, negative: Tensor) -> dict[str, Tensor]:
-        rows, share = batch.local_rows, self._settings.local_gradient
-        fine_image = attenuate(features.fine_image[rows], share)
-        fine_cloud = attenuate(features.fine_cloud[rows], share)
-        image = self.network.image_local(fine_image)
-        index, mask = batch.input.fine_index[rows], batch.input.fine_mask[rows]
-        cloud = self.network.cloud_local(fine_cloud, self.network.voxels[index], mask)
-        count = len(rows) // 2
-        first = torch.arange(count, device=rows.device)
-        pairs = first, first + count
-        losses = {
-            "cells": correspondence(image, *pairs, batch.cells, self._near),
-            "voxels": correspondence(cloud, *pairs, batch.voxels, None),
-            "wasted": wasted_saliency(image.saliency, batch.useful_cells),
-        }
-        if self._settings.weight_super:
-            different = negative[rows][:, rows]
-            supers = [
-                self.network.super_image(image.tokens, image.mask),
-                self.network.super_cloud(cloud.tokens, cloud.mask),
-            ]
-            parts = [super_contrastive(found, *pairs, different) + decorrelation(found) for found in supers]
-            losses["super"] = parts[0] + parts[1]
-        return losses
+    Raises:
+        ConfigError: there is none of that name.
+    """
+    if method not in METHODS:
+        raise ConfigError(f"method: unknown method {method!r}; known: {', '.join(METHODS)}")
+    found: type[Objective] = import_module(f"{__package__}.{method}{SUFFIX}").OBJECTIVE
+    return found
+
+
+def generator(seed: int, step: int, rank: int = 0, purpose: int = 0) -> np.random.Generator:
+    """What draws everything random in a step of one process; another purpose is another stream."""
+    return np.random.default_rng([seed, step, rank, purpose])

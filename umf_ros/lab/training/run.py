@@ -1,84 +1,181 @@
-"""One training run: its folder, its weights and their card."""
+"""One run: its settings, its network, its folder, its weights and their card."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import platform
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import ValidationError
+from torch import nn
 
-from umf_ros.lab.datasets.listed import open_source
-from umf_ros.lab.datasets.sample import SampleSequence
-from umf_ros.lab.training.config import TrainingSettings
+from umf_ros.config import problems, read_values
+from umf_ros.errors import ConfigError
+from umf_ros.lab.datasets.listed import Source, open_source
 from umf_ros.lab.training.distributed import join_team
-from umf_ros.lab.training.setup import (
-    check_preset,
-    common_card,
-    earlier_runs,
-    make_network,
-    open_worlds,
-    write_settings,
-)
-from umf_ros.lab.training.trainer import Progress, Trainer
-from umf_ros.lab.training.validation import figures
-from umf_ros.networks.umf import UMF
-from umf_ros.networks.weights import save_weights
+from umf_ros.lab.training.objective import find_objective
+from umf_ros.lab.training.progress import Progress
+from umf_ros.lab.training.settings import RunSettings, write_settings
+from umf_ros.lab.training.trainer import Trainer
+from umf_ros.networks.image_encoder import ResidualBlock
+from umf_ros.networks.presets import PRESETS
+from umf_ros.networks.umf import UMF, channels_last, count_parameters
+from umf_ros.networks.voxel_encoder import ResidualBlock3d
+from umf_ros.networks.weights import load_weights, read_card, save_weights
 
 
-def train(settings: TrainingSettings, output: Path, resume: bool, report: Callable[[Progress], None]) -> Path:
+def load_run(path: Path | None, **overrides: object) -> Any:
+    """Settings of a run from a YAML file and overrides; None is skipped.
+
+    Returns:
+        The settings class of the run's `method`, which is metric learning unless named.
+
+    Raises:
+        ConfigError: unreadable file, unknown method or name, or wrong value; names every one.
+    """
+    values = read_values(path) if path else {}
+    values |= {name: value for name, value in overrides.items() if value is not None}
+    objective = find_objective(str(values.get("method", RunSettings.model_fields["method"].default)))
+    try:
+        return objective.settings_type.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(problems(error)) from None
+
+
+def train(settings: RunSettings, output: Path, resume: bool, report: Callable[[Progress], None]) -> Path:
     """Train a network and keep its best weights.
 
     Args:
         settings: of the run; written to `output`/training.yaml.
-        output: the run's folder: `<preset>.safetensors`, its card, `checkpoint.pt`, `log.csv`.
+        output: the run's folder: weights, their card, `checkpoint.pt`, `log.csv`.
         resume: go on from the checkpoint in `output`.
         report: called after every step.
 
     Returns:
-        Path of the weights.
+        Path of the weights, `<preset>.safetensors`, with the encoder's name where one was pretrained.
 
     Raises:
-        ConfigError: unknown preset, or worlds without revisits.
+        ConfigError: unknown preset, or no data that serves the objective.
         OutputError: the folder cannot be written.
         WeightsError: nothing to resume from, or weights to start from that do not fit.
     """
-    check_preset(settings.preset)
+    objective_type = find_objective(settings.method)
     torch.set_num_threads(settings.threads)
     torch.manual_seed(settings.seed)
-    training = open_worlds(settings.train, "train")
-    validation = open_source(Path(settings.validation)) if settings.validation else None
-    write_settings(settings, output / "training.yaml")
-    weights = output / f"{settings.preset}.safetensors"
+    data = _open_data(settings.train)
+    earlier = earlier_runs(settings.start)
+    weights = output / f"{settings.preset}{settings.weights_suffix}.safetensors"
     with join_team(settings.device) as team:
         network = make_network(settings.preset, settings.start, settings.image_size)
-        unseen = validation.refresh if validation else list
-        trainer = Trainer(network, settings, training.refresh, unseen, output, team)
+        objective = objective_type(network, settings)
+        write_settings(settings, output / "training.yaml")
+        trainer = Trainer(objective, data.refresh, settings, output, team)
         if resume:
             trainer.resume()
 
-        def keep(best: UMF, summary: dict[str, Any]) -> None:
-            card = summary | _card(settings, best, training.worlds, trainer)
-            save_weights(best, weights, card, settings.stored)
+        def keep() -> None:
+            card = _card(settings, weights.stem, network, data, trainer.progress)
+            save_weights(network, weights, card | {"earlier_runs": earlier} | objective.card(), settings.stored)
 
         trainer.run(report, keep)
     return weights
 
 
-def _card(
-    settings: TrainingSettings,
-    network: UMF,
-    training: Sequence[SampleSequence],
-    trainer: Trainer,
-) -> dict[str, Any]:
-    folders = {name: Path(getattr(settings, name)).name for name in ("train", "validation", "start")}
-    return common_card(settings.preset, network, training, trainer.progress.seconds) | {
-        "settings": settings.model_dump() | folders,
-        "final_losses": {name: round(value, 4) for name, value in trainer.progress.losses.items()},
-        "earlier_runs": earlier_runs(settings.start),
-        "training_samples": sum(len(world) for world in training),
-        "validation_stride": settings.validation_stride,
-        "validation": {
-            name: {mode: figures(found) for mode, found in by_mode.items()} for name, by_mode in trainer.results.items()
-        },
+def _open_data(where: str) -> Source:
+    """What to learn from, of which there is some."""
+    source = open_source(Path(where))
+    if not source.refresh():
+        raise ConfigError(f"train: there are no worlds in {where}")
+    return source
+
+
+def make_network(preset: str, start: str, image_size: tuple[int, int] | None = None) -> UMF:
+    """A fresh network to train, or one that starts from weights.
+
+    The weights may be those of another image size, and of fewer residual blocks: the further ones begin
+    by changing nothing.
+
+    Args:
+        preset: its name.
+        start: weights file; empty: none.
+        image_size: height and width of the input; None: the preset's.
+
+    Raises:
+        ConfigError: the preset is unknown, or the weights are those of another one.
+        WeightsError: they cannot be read.
+    """
+    if preset not in PRESETS:
+        raise ConfigError(f"preset: unknown network {preset}; known: {', '.join(PRESETS)}")
+    config = PRESETS[preset]
+    if image_size:
+        config = replace(config, image_size=image_size)
+    network = UMF(config)
+    if start:
+        trained = load_weights(Path(start))
+        grown = {name: getattr(config, name) for name in ("image_size", "backbone", "voxel_blocks")}
+        if replace(trained.config, **grown) != config or not _grow(network, trained):
+            raise ConfigError(f"start: {start} is not a {preset}")
+    channels_last(network)
+    return network.train()
+
+
+def _grow(network: UMF, trained: UMF) -> bool:
+    """Fill a network from one that may lack some of its residual blocks; False where more differs than that."""
+    known, wanted = trained.state_dict(), network.state_dict()
+    new = []
+    for name, module in network.named_modules():
+        if isinstance(module, ResidualBlock | ResidualBlock3d) and not any(key.startswith(f"{name}.") for key in known):
+            new.append(f"{name}.")
+            _silence(module)
+    old = {key for key in wanted if not key.startswith(tuple(new))}
+    if known.keys() != old or any(known[key].shape != wanted[key].shape for key in known):
+        return False
+    network.load_state_dict(known, strict=False)
+    return True
+
+
+def _silence(block: ResidualBlock | ResidualBlock3d) -> None:
+    """Make a residual block the identity: its last normalisation lets nothing through."""
+    norms = [layer for layer in block.layers.modules() if isinstance(layer, nn.BatchNorm2d | nn.BatchNorm3d)]
+    nn.init.zeros_(norms[-1].weight)
+
+
+def earlier_runs(start: str) -> list[dict[str, Any]]:
+    """The runs that the weights to start from went through, oldest first, as their cards have them.
+
+    Args:
+        start: weights file; empty: none.
+
+    Raises:
+        WeightsError: the weights have no card.
+    """
+    if not start:
+        return []
+    card = read_card(Path(start))
+    told = ("command", "settings", "steps", "training_hours", "training_worlds")
+    return [*card.get("earlier_runs", []), {name: card.get(name) for name in told}]
+
+
+def _card(settings: RunSettings, name: str, network: UMF, data: Source, progress: Progress) -> dict[str, Any]:
+    """What every card says; of folders and files only the names, in the command too."""
+    words = [re.sub(r"[^=]*/", "", word.rstrip("/")) for word in sys.argv[1:]]
+    said = settings.model_dump()
+    places = {place: Path(said[place]).name for place in ("train", "validation", "start") if place in said}
+    return {
+        "name": name,
+        "steps": progress.step,
+        "parameters": count_parameters(network),
+        "command": " ".join(["umf", *words]),
+        "training_hours": round(progress.seconds / 3600, 3),
+        "training_worlds": [world.name for world in data.worlds],
+        "training_samples": sum(len(world) for world in data.worlds),
+        "torch": torch.__version__,
+        "machine": platform.processor() or platform.machine(),
+        "settings": said | places,
+        "final_losses": {loss: round(value, 4) for loss, value in progress.losses.items()},
     }

@@ -1,0 +1,96 @@
+"""Fitting of the acceptance model and the covariance, to examples whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from measurements import BAD, GOOD
+
+from umf_ros.lab.training.acceptance_fit import (
+    Example,
+    fit_covariance,
+    fit_logistic,
+    inside_ellipsoid,
+    scale_covariance,
+)
+from umf_ros.verification import Measurement
+from umf_ros.verification.acceptance import scores
+from umf_ros.verification.measurement import IMAGE, SCAN
+from umf_ros.verification.registration import CovarianceModel, covariance_of
+
+
+def examples(count: int, rng: np.random.Generator) -> list[Example]:
+    """Right and wrong examples between GOOD and BAD, with some overlap."""
+    found = []
+    for number in range(count):
+        right = number % 2 == 0
+        share = np.clip(rng.normal(0.8 if right else 0.2, 0.15), 0, 1)
+        numbers = {name: float(share * good + (1 - share) * BAD.numbers[name]) for name, good in GOOD.numbers.items()}
+        found.append(Example(Measurement(**numbers | {"kind": SCAN, "similarity": float(rng.random())}), right))
+    return found
+
+
+def test_fit_separates_and_is_calibrated() -> None:
+    rng = np.random.default_rng(0)
+    model = fit_logistic(examples(400, rng), SCAN)
+    fresh = examples(400, rng)
+    odds = np.array([model.probability(scores(example.measurement)) for example in fresh])
+    right = np.array([example.right for example in fresh])
+    assert odds[right].mean() > 0.9 and odds[~right].mean() < 0.1
+    assert abs(odds.mean() - right.mean()) < 0.05
+    assert model.weights["similarity"] < max(model.weights.values()) / 5  # it was noise
+
+
+def test_fit_needs_both_classes() -> None:
+    with pytest.raises(ValueError, match="need right and wrong"):
+        fit_logistic([Example(GOOD, True)] * 3, SCAN)
+
+
+def test_covariance_is_recovered_and_honest() -> None:
+    """Errors drawn from a known covariance: 95 % of them lie inside the ellipsoids of the fitted one."""
+    rng = np.random.default_rng(1)
+    true = CovarianceModel(inflation=12.0, floor_m=0.01, floor_deg=0.05)
+    informations, errors = [], []
+    for _ in range(400):
+        axes = np.linalg.qr(rng.standard_normal((6, 6)))[0]
+        informations.append(axes @ np.diag(10 ** rng.uniform(2, 6, 6)) @ axes.T)
+        errors.append(rng.multivariate_normal(np.zeros(6), covariance_of(informations[-1], true)))
+    fitted = fit_covariance(np.array(errors), np.array(informations))
+    assert 0.5 < fitted.inflation / true.inflation < 2.0
+    covariances = covariance_of(np.array(informations), fitted)
+    assert 0.93 <= inside_ellipsoid(np.array(errors), covariances) <= 0.97
+    assert inside_ellipsoid(np.array(errors), covariances / 9) < 0.6
+
+
+@pytest.mark.parametrize("factor", [0.2, 1.0, 9.0])
+def test_covariances_of_the_wrong_size_are_scaled_until_95_percent_lie_inside(factor: float) -> None:
+    """Whether they were too timid or too bold."""
+    rng = np.random.default_rng(2)
+    true, stated = (
+        CovarianceModel(10.0, 0.01, 0.05),
+        CovarianceModel(10.0 * factor, 0.01 * factor**0.5, 0.05 * factor**0.5),
+    )
+    informations = np.array([np.diag(10 ** rng.uniform(3, 6, 6)) for _ in range(500)])
+    errors = np.array([rng.multivariate_normal(np.zeros(6), covariance_of(found, true)) for found in informations])
+    scaled = scale_covariance(stated, errors, covariance_of(informations, stated))
+    assert 0.93 <= inside_ellipsoid(errors, covariance_of(informations, scaled)) <= 0.97
+    assert scaled.inflation == pytest.approx(true.inflation, rel=0.2)
+
+
+def test_a_measure_that_argues_against_itself_is_given_no_weight() -> None:
+    rng = np.random.default_rng(3)
+    found = examples(200, rng)
+    perverse = [
+        Example(replace(one.measurement, overlap=GOOD.overlap * (0.3 if one.right else 1.0)), one.right)
+        for one in found
+    ]
+    assert fit_logistic(perverse, SCAN).weights["overlap"] == 0
+
+
+def test_examples_of_another_kind_are_left_aside() -> None:
+    rng = np.random.default_rng(4)
+    found = examples(100, rng)
+    others = [Example(replace(BAD, kind=IMAGE), True)] * 50
+    assert fit_logistic(found + others, SCAN) == fit_logistic(found, SCAN)

@@ -1,0 +1,179 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import landscape, pose_at, take, without_image, without_scan
+
+from umf_ros.config import Verification
+from umf_ros.frames import Candidate, Keyframe, SuperFeatures
+from umf_ros.verification.rerank import (
+    RankedCandidate,
+    eligible_superfeatures,
+    mutual_neighbours,
+    rerank,
+    similarities,
+)
+
+GROUND = landscape(20)
+QUERY = take(GROUND, pose_at(GROUND, -14.0, 1.2, 6.0), 100.0)
+SAME = take(GROUND, pose_at(GROUND, -15.0, 0.0, 0.0), 10.0)
+RANSAC = Verification()
+
+
+def elsewhere(number: int) -> Keyframe:
+    other = landscape(40 + number)
+    return take(other, pose_at(other, -15.0, number - 3.0, 0.0), 20.0 + number)
+
+
+def offered(*keyframes: Keyframe, similarity: float = 0.5) -> list[tuple[Candidate, Keyframe]]:
+    return [(Candidate(n, keyframe.stamp_ns, similarity), keyframe) for n, keyframe in enumerate(keyframes)]
+
+
+def stamps(ranked: list[RankedCandidate]) -> list[int]:
+    return [item.candidate.stamp_ns for item in ranked]
+
+
+def blind(keyframe: Keyframe) -> Keyframe:
+    return replace(keyframe, embedding=replace(keyframe.embedding, image=None, cloud=None))
+
+
+def test_the_same_place_comes_before_some_that_only_look_more_alike() -> None:
+    candidates = offered(*map(elsewhere, range(5)), similarity=0.64) + offered(SAME, similarity=0.6)
+    ranked = rerank(QUERY, candidates, RANSAC)
+    assert ranked[0].keyframe is SAME
+    assert ranked[0].score > 3 * ranked[1].score
+    assert sorted(stamps(ranked)) == sorted(candidate.stamp_ns for candidate, _ in candidates)
+
+
+def test_how_much_inliers_weigh_is_a_setting() -> None:
+    candidates = offered(*map(elsewhere, range(5)), similarity=0.9) + offered(SAME, similarity=0.1)
+    thesis, none = (rerank(QUERY, candidates, Verification(rerank_weight=weight)) for weight in (1000, 0))
+    assert thesis[0].keyframe is SAME and none[-1].keyframe is SAME
+
+
+def test_equals_are_ordered_by_similarity_then_by_age() -> None:
+    keyframes = [blind(elsewhere(number)) for number in range(4)]
+    similarity = (0.2, 0.7, 0.2, 0.9)
+    candidates = [(Candidate(n, k.stamp_ns, s), k) for n, (k, s) in enumerate(zip(keyframes, similarity, strict=True))]
+    ranked = rerank(QUERY, candidates[::-1], RANSAC)
+    assert stamps(ranked) == [keyframes[n].stamp_ns for n in (3, 1, 0, 2)]
+    assert all(item.score == 0 for item in ranked)
+
+
+def test_score_counts_the_inliers_of_both_modalities() -> None:
+    found = rerank(QUERY, offered(SAME), RANSAC)[0]
+    assert found.image is not None and found.cloud is not None
+    assert found.score == found.image.count + found.cloud.count
+    assert found.inliers_image == found.image.count > 30
+    assert found.inliers_cloud == found.cloud.count > 20
+
+
+@pytest.mark.parametrize("modalities", ["image", "cloud"])
+def test_one_modality_is_blind_for_the_other(modalities: str) -> None:
+    settings = Verification(modalities=modalities)
+    found = rerank(QUERY, offered(SAME), settings)[0]
+    stripped = without_scan(SAME) if modalities == "image" else without_image(SAME)
+    assert found.score == rerank(QUERY, offered(stripped), settings)[0].score > 0
+    assert (found.image is None) == (modalities == "cloud")
+    assert (found.cloud is None) == (modalities == "image")
+
+
+@pytest.mark.parametrize("absent", ["image", "cloud"])
+def test_a_missing_modality_on_one_side_counts_nothing(absent: str) -> None:
+    partial = without_image(SAME) if absent == "image" else without_scan(SAME)
+    ranked = rerank(QUERY, offered(partial), RANSAC)[0]
+    assert getattr(ranked, f"inliers_{absent}") == 0
+    assert ranked.score > 0
+
+
+def test_only_the_strongest_features_are_matched() -> None:
+    found = rerank(QUERY, offered(SAME), Verification(rerank_features=40))[0]
+    assert 0 < len(found.image_pairs) <= 40
+    assert found.image_pairs.max() < 40 and found.cloud_pairs.max() < 40
+
+
+def test_same_seed_same_ranking_and_another_seed_other_samples() -> None:
+    candidates = offered(SAME, *map(elsewhere, range(3)))
+    first, again = (rerank(QUERY, candidates, Verification(seed=3)) for _ in range(2))
+    assert stamps(first) == stamps(again)
+    for one, two in zip(first, again, strict=True):
+        assert one.image is not None and two.image is not None
+        assert one.image.model.tobytes() == two.image.model.tobytes()
+    other = rerank(QUERY, candidates, Verification(seed=4))
+    assert other[0].keyframe is SAME
+    counts = [[(item.inliers_image, item.inliers_cloud) for item in ranking[:2]] for ranking in (first, other)]
+    assert counts[0] != counts[1]
+
+
+def unit(rows: np.ndarray) -> np.ndarray:
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16)
+
+
+def supers(rows: np.ndarray) -> SuperFeatures:
+    return SuperFeatures(unit(rows), np.ones(len(rows), np.float32))
+
+
+def with_supers(keyframe: Keyframe, image: np.ndarray, cloud: np.ndarray) -> Keyframe:
+    embedding = replace(keyframe.embedding, super_image=supers(image), super_cloud=supers(cloud))
+    return replace(keyframe, embedding=embedding)
+
+
+@pytest.mark.parametrize(("modalities", "expected"), [("image", 8), ("cloud", 5), ("both", 13)])
+def test_superfeatures_are_counted_by_modality(modalities: str, expected: int) -> None:
+    rng = np.random.default_rng(0)
+    image, cloud = rng.standard_normal((8, 32)), rng.standard_normal((5, 32))
+    query, same = with_supers(QUERY, image, cloud), with_supers(SAME, image + 0.05, cloud - 0.05)
+    shuffled = with_supers(elsewhere(0), image[::-1], np.roll(cloud, 2, axis=0))
+    settings = Verification(rerank="superfeatures", modalities=modalities)
+    best, worst = rerank(query, offered(shuffled, same), settings)
+    assert best.keyframe is same
+    assert (best.superfeatures, worst.superfeatures) == (expected, 0)
+
+
+def test_no_candidates_no_ranking() -> None:
+    assert rerank(QUERY, [], RANSAC) == []
+
+
+def test_mutual_neighbours_need_both_directions() -> None:
+    # row 0 prefers column 0, but column 0 prefers row 1
+    similarity = np.array([[0.8, 0.1], [0.9, 0.2], [0.1, 0.7]])
+    assert mutual_neighbours(similarity).tolist() == [[1, 0], [2, 1]]
+
+
+def test_mutual_neighbours_of_nothing_are_none() -> None:
+    assert mutual_neighbours(np.empty((0, 5))).shape == (0, 2)
+    assert mutual_neighbours(np.empty((5, 0))).shape == (0, 2)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(10, 12), (700, 900), (0, 5), (5, 0)])
+def test_similarities_are_cosines_however_many_features_there_are(ours: int, theirs: int) -> None:
+    rng = np.random.default_rng(0)
+    query, match = unit(rng.standard_normal((ours, 64))), unit(rng.standard_normal((theirs, 64)))
+    found = similarities(query, match)
+    assert found.shape == (ours, theirs) and found.dtype == np.float32
+    np.testing.assert_allclose(found, query.astype(float) @ match.astype(float).T, atol=1e-5)
+
+
+def test_identical_superfeatures_all_match() -> None:
+    features = supers(np.eye(6) + 0.01)
+    assert eligible_superfeatures(features, features).tolist() == list(range(6))
+
+
+def test_superfeatures_of_different_ids_do_not_match() -> None:
+    features = np.eye(4)
+    assert len(eligible_superfeatures(supers(features), supers(features[[1, 0, 3, 2]]))) == 0
+
+
+def test_ratio_test_compares_distances_and_keeps_the_distinct() -> None:
+    query = np.eye(3)
+    # ID 0 stays distinct; for ID 1 a second feature is almost as near as the right one
+    match = np.array([[1, 0, 0], [0, 1, 0.9], [0, 0.85, 1]])
+    assert eligible_superfeatures(supers(query), supers(match), ratio=0.9).tolist() == [0, 1, 2]
+    assert eligible_superfeatures(supers(query), supers(match), ratio=0.5).tolist() == [0]
+
+
+def test_ratio_test_rejects_what_is_near_everything() -> None:
+    match = np.ones((3, 3)) + 0.01 * np.eye(3)
+    assert len(eligible_superfeatures(supers(np.eye(3)), supers(match))) == 0

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import BODY_T_CAMERA, CAMERA, landscape, pose_at
+
+from umf_ros.frames import Embedding, Keyframe
+from umf_ros.geometry import make_pose, relative
+from umf_ros.verification.constants import MEMORY_KEYFRAMES
+from umf_ros.verification.hypotheses import TemporalMemory, prior_sigmas
+
+GROUND = landscape(0, bumps=1)
+
+
+def keyframe(x: float, y: float, heading: float, stamp_s: float, session: int = 0, known: bool = True) -> Keyframe:
+    """A keyframe whose odometry is the truth shifted as a whole."""
+    drift = make_pose(np.eye(3), [3.0, -2.0, 0.5]) if stamp_s > 50 else np.eye(4)
+    odom = drift @ pose_at(GROUND, x, y, heading) if known else None
+    nothing = np.empty((0, 3), np.float32)
+    return Keyframe(
+        round(stamp_s * 1e9), Embedding(np.ones(4, np.float32)), CAMERA, BODY_T_CAMERA, nothing, odom, stamp_s, session
+    )
+
+
+def truth(query: tuple[float, float, float], match: tuple[float, float, float]) -> np.ndarray:
+    return relative(pose_at(GROUND, *match), pose_at(GROUND, *query))
+
+
+def pair(step: float) -> tuple[Keyframe, Keyframe, np.ndarray]:
+    """Query and match one step further along, with their true relative pose."""
+    query, match = (step, 1.0, 5.0), (step - 0.5, 0.0, 0.0)
+    return keyframe(*query, 100 + step), keyframe(*match, 10 + step), truth(query, match)
+
+
+def test_a_place_recognised_again_is_supported() -> None:
+    memory = TemporalMemory()
+    for step in (0.0, 1.0, 2.0):
+        query, match, pose = pair(step)
+        assert memory.support(query, match, pose) == step
+        memory.remember(query, [(match, pose, False)])
+
+
+def test_a_pose_that_does_not_follow_is_not_supported() -> None:
+    memory = TemporalMemory()
+    query, match, pose = pair(0.0)
+    memory.remember(query, [(match, pose, True)])
+    query, match, pose = pair(1.0)
+    assert memory.support(query, match, pose @ make_pose(np.eye(3), [0, 1.2, 0])) == 0
+
+
+def test_support_counts_keyframes_not_findings() -> None:
+    memory = TemporalMemory()
+    query, match, pose = pair(0.0)
+    memory.remember(query, [(match, pose, False), (replace(match, stamp_ns=match.stamp_ns + 1), pose, False)])
+    assert memory.support(*pair(1.0)) == 1
+
+
+def test_memory_is_short_and_can_be_cleared() -> None:
+    memory = TemporalMemory()
+    memory.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
+    assert memory.support(*pair(0.5)) == 1
+    for _ in range(MEMORY_KEYFRAMES):
+        memory.remember(pair(0.0)[0], [])
+    assert memory.support(*pair(0.5)) == 0
+    memory.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
+    memory.reset()
+    assert memory.support(*pair(0.5)) == 0
+
+
+@pytest.mark.parametrize("change", [{"odom_T_body": None}, {"session": 7}])
+def test_without_odometry_or_across_sessions_there_is_no_support(change: dict[str, object]) -> None:
+    memory = TemporalMemory()
+    memory.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
+    query, match, pose = pair(1.0)
+    assert memory.support(replace(query, **change), match, pose) == 0
+    assert memory.expected_distance(replace(query, **change), match) == math.inf
+
+
+def test_expected_place_needs_an_accepted_closure() -> None:
+    memory = TemporalMemory()
+    query, match, pose = pair(0.0)
+    memory.remember(query, [(match, pose, False)])
+    assert memory.expected_distance(*pair(1.0)[:2]) == math.inf
+    memory.remember(query, [(match, pose, True)])
+    query, match, pose = pair(1.0)
+    assert memory.expected_distance(query, match) == pytest.approx(np.linalg.norm(pose[:3, 3]), abs=1e-6)
+
+
+def test_prior_is_soft_after_a_long_way_and_unknown_without_odometry() -> None:
+    query, match, pose = pair(0.0)
+    near = prior_sigmas(query, match, pose, drift=0.05)
+    far = prior_sigmas(replace(query, travelled_m=1000.0), match, pose, drift=0.05)
+    assert 0 < far < near / 5
+    assert math.isnan(prior_sigmas(replace(query, odom_T_body=None), match, pose, drift=0.05))
+    assert math.isnan(prior_sigmas(replace(query, session=3), match, pose, drift=0.05))

@@ -1,0 +1,230 @@
+"""Masked image modelling of a convolutional encoder [UMF 4.5.1, figure 4.5] [Tian 2023].
+
+Dense convolutions behave like sparse ones: a convolution sees zeros where nothing is visible, and the batch
+normalisation behind it counts visible places only and puts the zeros back, as does pooling. So the statistics
+are those of whole images, and the mask does not dissolve from layer to layer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor, nn
+
+from umf_ros.lab.datasets.sample import Sample
+from umf_ros.lab.datasets.views import View
+from umf_ros.lab.training.pretraining import Column, MaskedBatch, Pretraining, PretrainingSettings
+from umf_ros.networks.umf import UMF
+
+PATCH = 32
+"""Pixels per side of a patch: one cell of the encoder's coarsest map."""
+NOISE = 0.01
+"""Variance, in images of unit variance, that is not worth painting: a black sky would be amplified to snow."""
+
+
+class MaskedImagesSettings(PretrainingSettings):
+    """Pretraining of the image encoder."""
+
+    weights_suffix = "_image"
+
+    method: Literal["masked_images"] = "masked_images"
+    mask_ratio: float = Field(0.6, gt=0, lt=1, description="share of the image's patches that is hidden")
+
+
+class MaskedImagesObjective(Pretraining):
+    """The image encoder under a decoder that paints the hidden patches; their squared error, each normalised."""
+
+    settings_type = MaskedImagesSettings
+
+    def __init__(self, network: UMF, settings: MaskedImagesSettings) -> None:
+        super().__init__(network, settings)
+        self._size, self._ratio = network.config.image_size, settings.mask_ratio
+        backbone = network.image_encoder.backbone.requires_grad_(True)
+        self.decoder = PaintingDecoder(backbone.channels, settings.decoder_width)
+
+    def part(self, sample: Sample) -> Sample | None:
+        """The image alone."""
+        return None if sample.image is None else replace(sample, points=None, intensity=None)
+
+    def masked(self, views: Sequence[View], rng: np.random.Generator) -> MaskedBatch:
+        """Images (B, 1, H, W), and which of their patches (B, 1, H/32, W/32) are visible."""
+        image = torch.from_numpy(np.stack([view.image for view in views]))[:, None]
+        return MaskedBatch(image, visible_patches(len(views), self._size, self._ratio, rng))
+
+    def forward(self, batch: MaskedBatch) -> dict[str, Tensor]:
+        """The loss of the hidden patches."""
+        predicted, wanted = patches(self.paint(batch)), normalised(patches(batch.values.float()))
+        error = (predicted - wanted).square().mean(dim=2)
+        hidden = ~batch.mask.flatten(1)
+        return {"total": (error * hidden).sum() / hidden.sum().clamp(min=1)}
+
+    def paint(self, batch: MaskedBatch) -> Tensor:
+        """The painting (B, 1, H, W), each patch with zero mean and unit variance."""
+        backbone = self.network.image_encoder.backbone
+        with sparse(backbone, batch.mask):
+            maps = backbone(hide(batch.values, batch.mask))
+        painting: Tensor = self.decoder(maps, batch.mask)
+        return painting.float()
+
+    def draw(self, batch: MaskedBatch) -> list[Column]:
+        """Image, visible patches, painted image, and the normalised patches wanted and painted."""
+        image, visible = batch.values, batch.mask
+        painting = self.paint(batch)
+        wanted = unpatch(normalised(patches(image)), self._size)
+        low = image.amin(dim=(2, 3), keepdim=True)
+        shown = {
+            "image": image,
+            "visible": hide(image - low, visible) + low,
+            "painted": repainted(image, painting, visible),
+            "patches, normalised": wanted,
+            "patches, painted": torch.where(hide(torch.ones_like(image), visible) > 0, wanted, painting),
+        }
+        columns = {name: values[:, 0].float().cpu().numpy() for name, values in shown.items()}
+        darkest, brightest = (
+            np.quantile(columns["image"], q, axis=(1, 2))[:, None, None] for q in (0.01, 0.99)
+        )  # every row has its own scale
+        span = np.maximum(brightest - darkest, 1e-6)
+        return [(name, (values - darkest) / span) for name, values in columns.items()]
+
+
+OBJECTIVE = MaskedImagesObjective
+
+
+class PaintingDecoder(nn.Module):
+    """U-shaped decoder from the maps of a backbone's stages to an image.
+
+    Args:
+        channels: of the four stages at strides 4, 8, 16 and 32.
+        width: channels of the decoder at stride 32, halved with every doubling of resolution, 16 at least.
+    """
+
+    def __init__(self, channels: Sequence[int], width: int) -> None:
+        super().__init__()
+        widths = [max(width >> level, 16) for level in range(6)]
+        deepest_first = list(reversed(channels))
+        # what stands in for a hidden place, for every scale
+        self.mask_tokens = nn.ParameterList(nn.Parameter(torch.randn(count) * 0.02) for count in deepest_first)
+        self.projections = nn.ModuleList(
+            nn.Conv2d(count, wide, 1 if level == 0 else 3, padding=0 if level == 0 else 1)
+            for level, (count, wide) in enumerate(zip(deepest_first, widths[:4], strict=True))
+        )
+        self.blocks = nn.ModuleList(_double(*widths[level : level + 2]) for level in range(5))
+        self.head = nn.Conv2d(widths[5], 1, 1)
+
+    def forward(self, maps: Sequence[Tensor], visible: Tensor) -> Tensor:
+        """Maps, finest first, and visible patches (B, 1, H/32, W/32) to an image (B, 1, H, W)."""
+        x = maps[0].new_zeros(())
+        for level, found in enumerate(reversed(maps)):
+            filled = torch.where(spread(visible, found.shape[2]), found, self.mask_tokens[level].view(1, -1, 1, 1))
+            x = self.blocks[level](x + self.projections[level](filled))
+        return self.head(self.blocks[4](x))
+
+
+def _double(inputs: int, outputs: int) -> nn.Sequential:
+    """Twice the resolution."""
+    return nn.Sequential(
+        nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False),
+        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(),
+    )
+
+
+def patches(image: Tensor) -> Tensor:
+    """(B, patches, pixels) of images (B, 1, H, W), row by row."""
+    return F.unfold(image, PATCH, stride=PATCH).transpose(1, 2)
+
+
+def unpatch(flat: Tensor, size: tuple[int, int]) -> Tensor:
+    """Inverse of `patches`."""
+    return F.fold(flat.transpose(1, 2), size, PATCH, stride=PATCH)
+
+
+def normalised(flat: Tensor) -> Tensor:
+    """Each patch with zero mean and unit variance, or less where there is nothing but noise."""
+    return (flat - flat.mean(dim=2, keepdim=True)) / _contrast(flat)
+
+
+def _contrast(flat: Tensor) -> Tensor:
+    return (flat.var(dim=2, keepdim=True) + NOISE).sqrt()
+
+
+def repainted(image: Tensor, painting: Tensor, visible: Tensor) -> Tensor:
+    """The image with its hidden patches painted, in the brightness and contrast they had."""
+    flat = patches(image.float())
+    painted = patches(painting) * _contrast(flat) + flat.mean(dim=2, keepdim=True)
+    size = (image.shape[2], image.shape[3])
+    return unpatch(torch.where(visible.flatten(1)[..., None], flat, painted), size)
+
+
+def visible_patches(batch: int, image_size: tuple[int, int], ratio: float, rng: np.random.Generator) -> Tensor:
+    """(B, 1, H/32, W/32) bool, False for the `ratio` of the patches of every image that is hidden."""
+    rows, columns = image_size[0] // PATCH, image_size[1] // PATCH
+    kept = max(round(rows * columns * (1 - ratio)), 1)
+    rank = rng.random((batch, rows * columns)).argsort(axis=1).argsort(axis=1)
+    return torch.from_numpy(rank < kept).view(batch, 1, rows, columns)
+
+
+@contextmanager
+def sparse(encoder: nn.Module, visible: Tensor) -> Iterator[None]:
+    """Let the encoder see only the visible patches inside the block.
+
+    Args:
+        encoder: every convolution of it is followed by a batch normalisation.
+        visible: (B, 1, H/32, W/32) bool.
+    """
+    emulated: list[nn.Module] = []
+    for layer in encoder.modules():
+        # an attribute of the instance hides the method of the class
+        if isinstance(layer, nn.BatchNorm2d):
+            layer.forward = partial(_normalise_visible, layer, visible)  # type: ignore[method-assign]
+        elif isinstance(layer, nn.MaxPool2d):
+            layer.forward = partial(_pool_visible, layer, visible)  # type: ignore[method-assign]
+        else:
+            continue
+        emulated.append(layer)
+    try:
+        yield
+    finally:
+        for layer in emulated:
+            del layer.forward
+
+
+def spread(visible: Tensor, height: int) -> Tensor:
+    """The patches' visibility at the resolution of a map with `height` rows."""
+    factor = height // visible.shape[2]
+    return visible.repeat_interleave(factor, 2).repeat_interleave(factor, 3)
+
+
+def hide(image: Tensor, visible: Tensor) -> Tensor:
+    """Images (B, 1, H, W) with zeros in the hidden patches."""
+    return image * F.interpolate(visible.to(image.dtype), scale_factor=float(PATCH))
+
+
+def _normalise_visible(layer: nn.BatchNorm2d, visible: Tensor, x: Tensor) -> Tensor:
+    where = spread(visible, x.shape[2])[:, 0]
+    rows = x.permute(0, 2, 3, 1)
+    seen = F.batch_norm(
+        rows[where],
+        layer.running_mean,
+        layer.running_var,
+        layer.weight,
+        layer.bias,
+        layer.training,
+        layer.momentum or 0.1,
+        layer.eps,
+    )
+    return rows.new_zeros(rows.shape, dtype=seen.dtype).masked_scatter(where[..., None], seen).permute(0, 3, 1, 2)
+
+
+def _pool_visible(layer: nn.MaxPool2d, visible: Tensor, x: Tensor) -> Tensor:
+    pooled = F.max_pool2d(x, layer.kernel_size, layer.stride, layer.padding)
+    return pooled * spread(visible, pooled.shape[2])

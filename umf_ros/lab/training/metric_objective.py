@@ -1,0 +1,200 @@
+"""Metric learning: descriptors of one place alike, of different places apart [UMF 4.5.2]."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from umf_ros.lab.datasets.labels import Rule
+from umf_ros.lab.datasets.listed import open_source
+from umf_ros.lab.datasets.sample import SampleSequence
+from umf_ros.lab.datasets.views import Augmentation, ViewMaker
+from umf_ros.lab.evaluation.protocol import ROBOTCAR_RULE, RULES
+from umf_ros.lab.training.batches import BatchMaker, TrainingBatch
+from umf_ros.lab.training.metric_loss import Bank, MetricLoss
+from umf_ros.lab.training.objective import Judgement, Objective, generator
+from umf_ros.lab.training.sampler import PairSampler
+from umf_ros.lab.training.settings import MetricSettings
+from umf_ros.lab.training.validation import MODES, Results, answerable, figures, mean_of, validate
+from umf_ros.networks.umf import UMF, NetworkInput
+
+MARGIN_M, MARGIN_DEG = 2.0, 5.0
+MOMENTUM = 0.02
+"""Share of a batch in the running statistics where each batch is of one world."""
+
+
+class MetricObjective(Objective):
+    """Trains descriptors and local features on places that are visited more than once.
+
+    Args:
+        network: trained in place.
+        settings: of the run.
+        validation: gives the sequences for recall, none at first if they are still being made; None: those
+            that the settings name.
+    """
+
+    settings_type = MetricSettings
+
+    def __init__(
+        self,
+        network: UMF,
+        settings: MetricSettings,
+        validation: Callable[[], Sequence[SampleSequence]] | None = None,
+    ) -> None:
+        super().__init__(network, settings)
+        self._settings = settings
+        if validation is None:
+            validation = open_source(Path(settings.validation)).refresh if settings.validation else list
+        self._validation = validation
+        self._rule = rule_of(settings)
+        self._loss = MetricLoss(network.config, settings, self._rule)
+        self._no_bank = Bank(0, network.config.descriptor)
+        self._sampler: tuple[int, PairSampler] | None = None
+        self._results: Results = {}
+        self.bank = Bank(settings.bank, network.config.descriptor)
+        self.batch_size = settings.batch
+        self.best, self.stale = -1.0, 0
+        _choose_parameters(network, settings)
+        if settings.loss == "neighbourhood":
+            _slow_statistics(network)
+
+    def batch_maker(self, sequences: Sequence[SampleSequence], rank: int) -> Callable[[int], TrainingBatch]:
+        """What makes the batch of a step: pairs of views, and which of their modalities get lost.
+
+        Raises:
+            ConfigError: no place of these sequences is visited twice.
+        """
+        settings, augmentation, pairs = self._settings, Augmentation(), self.batch_size // 2
+        if self._sampler is None or self._sampler[0] != len(sequences):  # to find all revisits takes its time
+            whole = settings.loss == "neighbourhood"
+            self._sampler = len(sequences), PairSampler(sequences, self._rule, augmentation.mirror, whole)
+        _, sampler = self._sampler
+        views = ViewMaker(self.network.config, augmentation)
+        maker = BatchMaker(sequences, views, settings.local_pairs, settings.local_matches)
+
+        def make(step: int) -> TrainingBatch:
+            rng = generator(settings.seed, step, rank)
+            batch = maker.make(sampler.draw(pairs, rng), rng)
+            rng = generator(settings.seed, step, rank, purpose=1)
+            image, cloud = dropped(batch.input, settings.modality_dropout, rng)
+            batch = replace(batch, image_kept=image, cloud_kept=cloud, with_bank=step >= settings.bank_from_step)
+            return batch.thinned() if settings.workers else batch
+
+        return make
+
+    def forward(self, batch: TrainingBatch) -> dict[str, Tensor]:
+        """Losses by name; the descriptors of the batch then serve as references of later ones."""
+        losses, fused = self._loss(self.network, batch, self.bank if batch.with_bank else self._no_bank)
+        if self.training:
+            self.bank.add(fused, batch.places)
+        return losses
+
+    def train(self, mode: bool = True) -> Self:
+        """Frozen encoders, and those of fixed statistics, normalise as in use."""
+        super().train(mode)
+        if self._settings.freeze_encoders or self._settings.fixed_statistics:
+            self.network.image_encoder.eval()
+            self.network.voxel_encoder.eval()
+        return self
+
+    def finish_epoch(self, losses: Mapping[str, float]) -> None:
+        """Let the batches of the triplet loss grow while too few triplets are active."""
+        settings = self._settings
+        if settings.loss == "triplet" and losses["active"] < settings.active_share:
+            self.batch_size = min(int(self.batch_size * settings.batch_growth) // 2 * 2, settings.batch_limit)
+
+    def judge(self, step: int, folder: Path) -> Judgement:
+        """Recall on the validation sequences, where a validation is due."""
+        settings = self._settings
+        due = step >= settings.steps or math.ceil(step / settings.epoch_steps) % settings.validate_epochs == 0
+        self._results, keep = {}, False
+        if due:
+            rule = RULES[settings.rule]
+            self._results = validate(self.network, self._validation(), settings.validation_stride, rule)
+            keep = self._is_best()
+        recalls = {f"recall1_{mode}": mean_of(self._results, mode, "recall1") for mode in MODES}
+        recalls["recall1_5m"] = mean_of(self._results, "fused", "recall1_within_5m")
+        recalls["recall_at_precision1"] = mean_of(self._results, "fused", "recall_at_precision1")
+        stop = bool(settings.patience) and self.stale >= settings.patience
+        return Judgement(keep, stop, recalls | {"batch": self.batch_size})
+
+    def _is_best(self) -> bool:
+        if not answerable(self._results):
+            return True  # nothing to compare by: the latest is the best
+        mode = "fused" if self._settings.branch == "both" else self._settings.branch
+        score = mean_of(self._results, mode, "recall1") + mean_of(self._results, mode, "recall1_within_5m")
+        better = score > self.best
+        self.stale = 0 if better else self.stale + 1
+        self.best = max(self.best, score)
+        return better
+
+    def card(self) -> dict[str, Any]:
+        """The figures of the last validation."""
+        validation = {
+            name: {mode: figures(found) for mode, found in by_mode.items()} for name, by_mode in self._results.items()
+        }
+        return {"validation_stride": self._settings.validation_stride, "validation": validation}
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """For a checkpoint: what is not a weight."""
+        return {"bank": self.bank.state(), "batch_size": self.batch_size, "best": self.best, "stale": self.stale}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Inverse of `get_extra_state`."""
+        self.bank.restore(state["bank"])
+        self.batch_size, self.best, self.stale = state["batch_size"], state["best"], state["stale"]
+
+
+OBJECTIVE = MetricObjective
+
+
+def dropped(batch: NetworkInput, chance: float, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Modality dropout: which rows (B,) keep their image and which their scan, never losing both."""
+    luck = torch.from_numpy(rng.random(len(batch.image_present)))
+    image, cloud = batch.image_present, batch.coarse_mask.any(1)
+    return image & ((luck >= chance) | ~cloud), cloud & ((luck < 1 - chance) | ~image)
+
+
+def rule_of(settings: MetricSettings) -> Rule:
+    """What is the same place, and what is not."""
+    rule = ROBOTCAR_RULE if settings.rule == "robotcar" else Rule()
+    if settings.loss != "neighbourhood":
+        return rule
+    # a later pass looks for itself in an earlier one, and all that is not the place may be taken for it
+    close = {"negative_m": rule.positive_m + MARGIN_M, "negative_deg": rule.positive_deg + MARGIN_DEG}
+    return replace(rule, between_passes=True, **close)
+
+
+def _slow_statistics(network: UMF) -> None:
+    """A batch of one world is no sample of all worlds: it takes the mean over many."""
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d | nn.BatchNorm3d):
+            module.momentum = MOMENTUM
+
+
+def _choose_parameters(network: UMF, settings: MetricSettings) -> None:
+    """Switch off what the losses do not reach, so that nothing is silently left at random."""
+    if settings.branch != "both":
+        network.requires_grad_(False)
+        for layer in network.branch_layers(settings.branch):
+            layer.requires_grad_(True)
+    if settings.freeze_encoders:
+        for encoder in (network.image_encoder, network.voxel_encoder):
+            encoder.requires_grad_(False)
+            for layer in encoder.fine_layers():  # they belong to the local features
+                layer.requires_grad_(True)
+    frozen: list[nn.Module] = []
+    if not settings.weight_super or not settings.local_pairs:
+        frozen += [network.super_image, network.super_cloud]
+    if not settings.local_pairs:
+        frozen += [network.image_local, network.cloud_local, *network.image_encoder.fine_layers()]
+        frozen += network.voxel_encoder.fine_layers()
+    for module in frozen:
+        module.requires_grad_(False)

@@ -1,0 +1,81 @@
+"""Every tuning constant of verification, and where its value comes from.
+
+Where values come from: *geometry* follows from the sensors the package was made for (S3LI's Cube-1 LiDAR, 70 deg wide,
+ten thousand returns up to 28 m; a camera of 688 x 512 pixels and 61 deg); *measured* was compared with its
+alternatives; *by hand* is an engineer's choice, held since by `benchmarks/verification.py`. What a user may want to
+change is a setting (`umf_ros.config.Verification`), what is fitted stands in `config/verification/calibration.json`,
+and the range of each criterion beside the criterion, in `acceptance`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+# rerank: do the local features of two keyframes belong together?
+IMAGE_THRESHOLD = 0.03  # of the image's width; geometry: a cell of the feature map is 1.8 %
+CLOUD_THRESHOLD_M = 0.75  # geometry: the cells of the voxel features are about a metre wide
+SERIAL_PRODUCTS = 2**18  # multiplications up to which OpenBLAS stays on one thread; its others would spin for nothing
+SUPERFEATURE_RATIO = 0.9  # thesis 4.3, equation 4.1
+SAME_PLACE_M = 3.0  # by hand: candidates nearer than this to a chosen one show the same place
+
+# ransac
+MIN_TRIANGLE = 1e-3  # by hand: of a sampled triangle, twice its area; the points fill the unit square
+MAX_TILT_RAD = 0.5  # by hand: a rover does not lie on its side
+
+# hypotheses: which poses are worth a closer look?
+POINT_THRESHOLD_M = 0.75  # geometry: as CLOUD_THRESHOLD_M
+PIXEL_THRESHOLD = 0.025  # of the image's width; geometry: as IMAGE_THRESHOLD, but for a pose and its parallax
+MIN_POINTS = 6  # by hand: that agree on a motion
+MIN_PIXELS = 10  # by hand: that agree on a view: with two coordinates each, more of them agree by chance
+DISTINCT_M, DISTINCT_RAD = 0.8, 0.1  # geometry: nearer hypotheses end in the same basin of the alignment
+MIN_MAP_SCORE = 5.0  # by hand, in standard deviations of chance: below, two elevation maps fit no better than noise
+MAX_REFINED = 3  # hypotheses per group of candidates that are aligned: bounds the time
+EXPECTED_M = 4.0  # by hand: a candidate this near to where odometry carries an accepted closure is tested first
+
+# elevation maps
+CELL_M = 0.5  # by hand: rocks and ripples are seen, and ten thousand returns leave few holes
+ROWS, COLUMNS = 72, 96  # geometry: 36 m along, 48 m across, the reach of the scan with its shifts
+BEHIND = 12  # cells kept free behind the body for rotated and shifted maps: as MAX_SHIFT
+RANGE_M = 28.0  # geometry: beyond, cells without a return outnumber the others
+MAX_SHIFT = 12  # cells, 6 m to every side; by hand
+HEADINGS = np.radians(np.arange(-36.0, 37.0, 6.0))  # geometry: half a step is within reach of the alignment
+PLANE_SIGMA_M = 1.2  # by hand: relief is what rises above a plane about this wide
+PLANE_RIDGE_M2 = 0.3  # keeps the slope of that plane finite where the neighbours lie on a line
+MAX_RELIEF_M = 0.2  # by hand: one boulder must not outvote a field
+MIN_CELLS = 50  # by hand: shared cells below which a fit means nothing
+MIN_NEIGHBOURHOOD = 0.25  # by hand: weight of the occupied cells around one, of all, below which it has no relief
+SETTLE_MEDIANS, SETTLE_M = 2.5, 0.05  # by hand: cells that a plane between two maps is fitted to lie so near to it
+MAX_SLOPE = 0.3  # by hand: of one map against the other, rad
+
+# registration
+THIN_CELL_M = 0.25  # by hand: a scan keeps some 4,500 of its returns
+MAX_RANGE_M = 40.0  # geometry: beyond, returns of a flat scan are metres apart
+NORMAL_NEIGHBOURS = 10  # small_gicp's own default
+NOISE_NEIGHBOURS = 5  # by hand: the point itself and four around it
+SAMPLE = 1500  # measured: points of the query that are aligned; a third of the scan is as good in half the time
+COARSE_REACH_M, COARSE_STEPS = 1.0, 10  # geometry: two cells of the elevation maps
+FINE_REACH_M, FINE_STEPS = 0.4, 8  # by hand: the spacing of far returns is wider than the noise
+MIN_SCAN_POINTS = 100  # by hand: below, there is nothing to align
+INLIER_M = 0.75  # geometry: as POINT_THRESHOLD_M; pairs of features a pose without scans is refined on
+SCANS_KEPT = 60  # prepared scans in memory: bounds it, changes no result
+
+# covariance
+SEARCH_M, SEARCH_RAD = 3.0, 0.35  # what the search itself knows, standard deviation: nothing is wider than this
+NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG = 20.0, 0.01, 0.05  # by hand: a yardstick of nobody's data
+MIN_RESIDUAL_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanner is better
+
+# measurement: every test of a hypothesis
+NO_FIT_M = 0.3  # stands for the residual where nothing overlaps
+MIN_SURFACE_NOISE_M = 0.003  # synthetic scans have none
+AGREEMENT_PIXELS = 0.04  # of the image's width, around the place where a feature should reappear; by hand
+AGREEMENT_ROWS = 0.1  # of the image's height: features are compared with their like: sky, horizon, foreground; by hand
+AGREEMENT_M = 1.0  # geometry: a voxel
+AGREEMENT_RANGE, AGREEMENT_RANGE_M = 0.25, 1.0  # by hand: likewise, share of the range and what is added to it
+AGREEMENT_PEERS = 8  # by hand: features a comparison needs
+AGREEMENT_COMPARED = 400  # strongest features of a side that are compared: bounds time and memory
+
+# temporal memory
+MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of keyframes
+ODOMETRY_REACH_M = 15.0  # by hand: odometry is trusted over this distance
+PRIOR_M = 1.0  # by hand: standard deviation of what odometry predicts before any way is driven
+AGREE_M, AGREE_RAD = 0.5, 0.05  # by hand: two findings this near are one

@@ -1,0 +1,229 @@
+"""Hypotheses about where the rover stood: from elevation maps, from local features, from earlier findings.
+
+A hypothesis is a pose worth a closer look; nothing is decided here.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from umf_ros.config import Verification
+from umf_ros.frames import Keyframe, Points
+from umf_ros.geometry import Array, make_pose, relative, rotation_angle, transform
+from umf_ros.verification.constants import (
+    AGREE_M,
+    AGREE_RAD,
+    DISTINCT_M,
+    DISTINCT_RAD,
+    EXPECTED_M,
+    MEMORY_KEYFRAMES,
+    MIN_MAP_SCORE,
+    MIN_PIXELS,
+    MIN_POINTS,
+    ODOMETRY_REACH_M,
+    PIXEL_THRESHOLD,
+    POINT_THRESHOLD_M,
+    PRIOR_M,
+)
+from umf_ros.verification.elevation_map import MapFit, TurnedMap, evaluate, search
+from umf_ros.verification.ransac import fit_rigid
+from umf_ros.verification.registration import PreparedScan
+from umf_ros.verification.rerank import RankedCandidate
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A pose to refine.
+
+    Attributes:
+        ranked: the candidate it belongs to.
+        pose: (4, 4) `match_T_query`.
+        score: of the elevation maps at that pose, or inliers without scans; larger is better.
+    """
+
+    ranked: RankedCandidate
+    pose: Array
+    score: float
+
+
+def find_hypotheses(
+    query: Keyframe,
+    ranked: RankedCandidate,
+    turned: TurnedMap | None,
+    match: PreparedScan,
+    settings: Verification,
+) -> list[Hypothesis]:
+    """Distinct poses for one candidate, best first; with scans only those at which the elevation maps fit.
+
+    Args:
+        query: the query keyframe.
+        ranked: the candidate.
+        turned: the query's elevation map at every heading; None without a usable scan.
+        match: the candidate's scan, usable or not.
+        settings: RANSAC iterations and seed.
+    """
+    poses = [
+        pose_from_points(query, ranked, settings.ransac_iterations, settings.seed),
+        pose_from_pixels(query, ranked, settings.ransac_iterations),
+    ]
+    # P3P on a degenerate view can succeed with numbers that are none
+    found = [pose for pose in poses if pose is not None and np.isfinite(pose).all()]
+    if turned is None or not match.usable:
+        return [Hypothesis(ranked, pose, ranked.score) for pose in found[:1]]
+    fits = [evaluate(match.elevation, turned.elevation, pose) for pose in found]
+    fits += search(match.elevation, turned)
+    fits.sort(key=lambda fit: -fit.score)
+    return [Hypothesis(ranked, fit.pose, fit.score) for fit in _distinct(fits) if fit.score >= MIN_MAP_SCORE]
+
+
+def pose_from_points(query: Keyframe, ranked: RankedCandidate, iterations: int, seed: int) -> Array | None:
+    """`match_T_query` from 3-D/3-D pairs of both modalities at once, or None."""
+    ours, theirs = paired_points(query, ranked)
+    consensus = fit_rigid(ours, theirs, POINT_THRESHOLD_M, iterations, seed)
+    return consensus.model if consensus is not None and consensus.count >= MIN_POINTS else None
+
+
+def pose_from_pixels(query: Keyframe, ranked: RankedCandidate, iterations: int) -> Array | None:
+    """`match_T_query` from the query's lifted features seen in the match's image (P3P in RANSAC), or None."""
+    ours, theirs = query.embedding.image, ranked.keyframe.embedding.image
+    if ours is None or theirs is None:
+        return None
+    points = ours.points[ranked.image_pairs[:, 0]].astype(float)
+    pixels = theirs.positions[ranked.image_pairs[:, 1]].astype(float)
+    known = np.isfinite(points).all(axis=1)
+    if known.sum() < MIN_PIXELS:
+        return None
+    camera = ranked.keyframe.camera
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
+        points[known],
+        pixels[known],
+        np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]]),
+        None,
+        iterationsCount=iterations,
+        reprojectionError=PIXEL_THRESHOLD * camera.width,
+        flags=cv2.SOLVEPNP_P3P,
+    )
+    if not found or inliers is None or len(inliers) < MIN_PIXELS:
+        return None
+    return ranked.keyframe.body_T_camera @ make_pose(cv2.Rodrigues(rotation)[0], translation.ravel())
+
+
+def paired_points(query: Keyframe, ranked: RankedCandidate) -> tuple[Array, Array]:
+    """Points (P, 3) of the query and of the match, each in its body frame, of all pairs with known depths."""
+    ours, theirs = [np.empty((0, 3))], [np.empty((0, 3))]
+    for mine, other, pairs in (
+        (query.embedding.image, ranked.keyframe.embedding.image, ranked.image_pairs),
+        (query.embedding.cloud, ranked.keyframe.embedding.cloud, ranked.cloud_pairs),
+    ):
+        if mine is not None and other is not None:
+            a, b = mine.points[pairs[:, 0]].astype(float), other.points[pairs[:, 1]].astype(float)
+            known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+            ours.append(a[known])
+            theirs.append(b[known])
+    return np.concatenate(ours), np.concatenate(theirs)
+
+
+def consistent_pixels(query: Keyframe, ranked: RankedCandidate, pose: Array) -> Points:
+    """Pixels (K, 4) of the image pairs that obey the pose: u, v of the query and u, v of the match."""
+    ours, theirs = query.embedding.image, ranked.keyframe.embedding.image
+    if ours is None or theirs is None or not len(ranked.image_pairs):
+        return np.empty((0, 4), np.float32)
+    here, there = ranked.image_pairs.T
+    camera = ranked.keyframe.camera
+    pixels, depth = camera.project(transform(pose, ours.points[here].astype(float)), ranked.keyframe.body_T_camera)
+    error = np.hypot(*(pixels - theirs.positions[there]).T)
+    obeys = (depth > 0) & (error < 2 * PIXEL_THRESHOLD * camera.width)
+    return np.hstack([ours.positions[here[obeys]], theirs.positions[there[obeys]]]).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class _Finding:
+    query: Keyframe
+    match: Keyframe
+    match_T_query: Array
+    accepted: bool
+
+
+class TemporalMemory:
+    """Poses found for the last few keyframes, accepted or not; the same live and offline."""
+
+    def __init__(self) -> None:
+        self._findings: deque[list[_Finding]] = deque(maxlen=MEMORY_KEYFRAMES)
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._findings.clear()
+
+    def remember(self, query: Keyframe, found: list[tuple[Keyframe, Array, bool]]) -> None:
+        """Add what one keyframe found: matched keyframes, `match_T_query` and whether it was accepted."""
+        self._findings.append([_Finding(query, *finding) for finding in found])
+
+    def expected_distance(self, query: Keyframe, match: Keyframe) -> float:
+        """Metres between a pair, as odometry carries it over from the latest accepted closure near it; or inf."""
+        for finding in (one for findings in reversed(self._findings) for one in findings if one.accepted):
+            carried = _carried(finding, query, match)
+            if carried is not None:
+                return float(np.linalg.norm(carried[:3, 3]))
+        return float("inf")
+
+    def expected(self, query: Keyframe, ranked: list[RankedCandidate]) -> list[RankedCandidate]:
+        """The candidate nearest to where earlier closures and odometry put the rover, if there is one within 4 m."""
+        distances = [self.expected_distance(query, item.keyframe) for item in ranked]
+        nearest = int(np.argmin(distances)) if distances else 0
+        return [ranked[nearest]] if distances and distances[nearest] < EXPECTED_M else []
+
+    def support(self, query: Keyframe, match: Keyframe, match_T_query: Array) -> float:
+        """How many of the remembered keyframes found a pose that odometry carries over to this one."""
+        return float(sum(any(_agrees(f, query, match, match_T_query) for f in findings) for findings in self._findings))
+
+
+def prior_sigmas(query: Keyframe, match: Keyframe, match_T_query: Array, drift: float) -> float:
+    """Distance from what odometry alone predicts, in standard deviations of its drift; NaN without odometry.
+
+    The test is soft by construction: after a long way round, odometry predicts next to nothing.
+    """
+    if query.odom_T_body is None or match.odom_T_body is None or query.session != match.session:
+        return float("nan")
+    predicted = relative(match.odom_T_body, query.odom_T_body)
+    driven = abs(query.travelled_m - match.travelled_m)
+    return float(np.linalg.norm(predicted[:3, 3] - match_T_query[:3, 3]) / (PRIOR_M + drift * driven))
+
+
+def _distinct(fits: list[MapFit]) -> list[MapFit]:
+    kept: list[MapFit] = []
+    for fit in fits:
+        if not any(_same(fit.pose, other.pose) for other in kept):
+            kept.append(fit)
+    return kept
+
+
+def _same(a: Array, b: Array) -> bool:
+    gap = relative(a, b)
+    return bool((gap[:3, 3] ** 2).sum() < DISTINCT_M**2 and rotation_angle(gap) < DISTINCT_RAD)
+
+
+def _agrees(found: _Finding, query: Keyframe, match: Keyframe, match_T_query: Array) -> bool:
+    carried = _carried(found, query, match)
+    if carried is None:
+        return False
+    gap = relative(carried, match_T_query)
+    return bool(np.linalg.norm(gap[:3, 3]) < AGREE_M and rotation_angle(gap) < AGREE_RAD)
+
+
+def _carried(found: _Finding, query: Keyframe, match: Keyframe) -> Array | None:
+    """`match_T_query` as odometry carries it over from an earlier finding; None where that is far or unknown."""
+    poses = (found.query.odom_T_body, query.odom_T_body, found.match.odom_T_body, match.odom_T_body)
+    query_before, query_now, match_before, match_now = poses
+    if query_before is None or query_now is None or match_before is None or match_now is None:
+        return None
+    if found.query.session != query.session or found.match.session != match.session:
+        return None
+    moved, shifted = relative(query_before, query_now), relative(match_before, match_now)
+    if float(np.linalg.norm(moved[:3, 3]) + np.linalg.norm(shifted[:3, 3])) > ODOMETRY_REACH_M:
+        return None
+    carried: Array = relative(shifted, found.match_T_query @ moved)
+    return carried

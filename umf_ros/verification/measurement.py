@@ -1,0 +1,250 @@
+"""Every test of a hypothesis, and the typed numbers that the tests give.
+
+A new test is three steps: a function of what an `AlignedHypothesis` holds, a field of `Measurement` that `measure`
+fills with it, and a `Criterion` in `acceptance` that says which values speak for a closure. Its weight is 0 until
+`benchmarks/fit_verification.py` has fitted one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from umf_ros.frames import Keyframe, LocalFeatures
+from umf_ros.geometry import Array, transform
+from umf_ros.verification.constants import (
+    AGREEMENT_COMPARED,
+    AGREEMENT_M,
+    AGREEMENT_PEERS,
+    AGREEMENT_PIXELS,
+    AGREEMENT_RANGE,
+    AGREEMENT_RANGE_M,
+    AGREEMENT_ROWS,
+    INLIER_M,
+    MIN_SURFACE_NOISE_M,
+    NO_FIT_M,
+)
+from umf_ros.verification.elevation_map import evaluate, shared_relief
+from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, prior_sigmas
+from umf_ros.verification.registration import NOMINAL, Alignment, PreparedScan, covariance_of
+from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
+
+SCAN, IMAGE = "scan", "image"
+
+
+def measured(*kinds: str) -> Any:
+    """A field for hypotheses of these kinds; NaN for others, and where nothing can be said."""
+    return field(default=math.nan, metadata={"kinds": kinds})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measurement:
+    """What was measured about one hypothesis, or, without a kind, about a candidate that got none.
+
+    The name of a field is its name in `candidates.csv` and on `~/candidates`.
+
+    Attributes:
+        kind: "scan" when two scans were aligned, "image" when only local features could be.
+        similarity: cosine similarity of the global descriptors.
+        inliers_image: pairs of image features that one homography explains.
+        inliers_cloud: pairs of the scan's features that one rigid motion explains.
+        superfeatures: eligible pairs of super-features, where the reranking goes by them.
+        residual_m: median point-to-plane distance of the scans; root mean square of the pairs without scans.
+        residual_p90_m: nine of ten points are nearer than this to their counterpart's plane.
+        noise_m: how far the match's points scatter about their own planes.
+        overlap: share of the points seen by both (of the feature pairs) that have a counterpart.
+        points: points that have one.
+        relief_m: standard deviation of the relief on the ground that both scans saw.
+        terrain_correlation: of both elevation maps' relief, -1 to 1.
+        terrain_score: the same in standard deviations of chance.
+        pose_inliers: feature pairs that agree with the pose.
+        spread: of those pairs across the view: smaller deviation of bearing (rad) and of log range.
+        position_std_m: standard deviation of the position along its least known direction, from the residuals.
+        heading_std_deg: of the heading.
+        agreement_image: whether image features reappear where the pose says, standard deviations of chance.
+        agreement_cloud: the same of the scan's features.
+        prior_sigmas: distance from what odometry predicts, in standard deviations of its drift.
+        support: earlier keyframes, of the last few, that found a pose which odometry carries over to this one.
+    """
+
+    kind: str = ""
+    similarity: float
+    inliers_image: float = 0.0
+    inliers_cloud: float = 0.0
+    superfeatures: float = 0.0
+    residual_m: float = measured(SCAN, IMAGE)
+    residual_p90_m: float = measured(SCAN)
+    noise_m: float = measured(SCAN)
+    overlap: float = measured(SCAN, IMAGE)
+    points: float = measured(SCAN)
+    relief_m: float = measured(SCAN)
+    terrain_correlation: float = measured(SCAN)
+    terrain_score: float = measured(SCAN)
+    pose_inliers: float = measured(IMAGE)
+    spread: float = measured(IMAGE)
+    position_std_m: float = measured(SCAN, IMAGE)
+    heading_std_deg: float = measured(SCAN, IMAGE)
+    agreement_image: float = measured(SCAN, IMAGE)
+    agreement_cloud: float = measured(SCAN, IMAGE)
+    prior_sigmas: float = measured(SCAN, IMAGE)
+    support: float = measured(SCAN, IMAGE)
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """What was measured for this kind, by name: for tables, messages and people."""
+        return {
+            one.name: getattr(self, one.name)
+            for one in fields(self)
+            if one.name != "kind" and self.kind in one.metadata.get("kinds", [self.kind])
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedHypothesis:
+    """A hypothesis after its alignment: everything that a test may look at.
+
+    Attributes:
+        query: the query keyframe.
+        hypothesis: as it was found, with its candidate.
+        alignment: the refined pose, its residuals and what they were measured on.
+        scans: of the match and of the query; None when only local features were aligned.
+    """
+
+    query: Keyframe
+    hypothesis: Hypothesis
+    alignment: Alignment
+    scans: tuple[PreparedScan, PreparedScan] | None
+
+    @property
+    def match(self) -> Keyframe:
+        """The matched keyframe."""
+        return self.hypothesis.ranked.keyframe
+
+    @property
+    def pose(self) -> Array:
+        """(4, 4) `match_T_query`."""
+        return self.alignment.pose
+
+
+def measure_candidate(ranked: RankedCandidate) -> Measurement:
+    """What is known of a candidate before any hypothesis about it."""
+    return Measurement(
+        similarity=ranked.candidate.similarity,
+        inliers_image=float(ranked.inliers_image),
+        inliers_cloud=float(ranked.inliers_cloud),
+        superfeatures=float(ranked.superfeatures),
+    )
+
+
+def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) -> Measurement:
+    """Every test of one hypothesis.
+
+    Args:
+        aligned: the hypothesis.
+        memory: what earlier keyframes found.
+        drift: odometry error per distance driven.
+    """
+    query, match, pose, alignment = aligned.query, aligned.match, aligned.pose, aligned.alignment
+    known = measure_candidate(aligned.hypothesis.ranked)
+    fit = _measure_scans(known, alignment, *aligned.scans) if aligned.scans else _measure_pairs(known, alignment)
+    nominal = covariance_of(alignment.information, NOMINAL)
+    return replace(
+        fit,
+        position_std_m=float(np.sqrt(np.linalg.eigvalsh(nominal[:3, :3])[-1])),
+        heading_std_deg=float(np.degrees(np.sqrt(nominal[5, 5]))),
+        agreement_image=image_agreement(query, match, pose),
+        agreement_cloud=cloud_agreement(query, match, pose),
+        prior_sigmas=prior_sigmas(query, match, pose, drift),
+        support=memory.support(query, match, pose),
+    )
+
+
+def image_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
+    """Whether the query's image features reappear where the pose says, in standard deviations of chance.
+
+    Each lifted feature of the query is projected into the match's image. Of the match's features at about the same
+    row, is the one at that place among the most similar? Ranks mean the same for any weights. NaN without any.
+    """
+    ours, theirs = query.embedding.image, match.embedding.image
+    if ours is None or theirs is None:
+        return float("nan")
+    ours, theirs, camera = strongest(ours, AGREEMENT_COMPARED), strongest(theirs, AGREEMENT_COMPARED), match.camera
+    pixels, depth = camera.project(transform(pose, ours.points.astype(float)), match.body_T_camera)
+    offset = pixels[:, None] - theirs.positions[None].astype(float)
+    distance = np.hypot(offset[..., 0], offset[..., 1])
+    peers = (np.abs(offset[..., 1]) < AGREEMENT_ROWS * camera.height) & (depth > 0)[:, None]
+    return _rank_agreement(ours, theirs, distance, AGREEMENT_PIXELS * camera.width, peers)
+
+
+def cloud_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
+    """The same for the scan's features: peers are those at about the same distance from the match."""
+    ours, theirs = query.embedding.cloud, match.embedding.cloud
+    if ours is None or theirs is None:
+        return float("nan")
+    ours, theirs = strongest(ours, AGREEMENT_COMPARED), strongest(theirs, AGREEMENT_COMPARED)
+    moved = transform(pose, ours.positions.astype(float))
+    distance = np.linalg.norm(moved[:, None] - theirs.positions[None], axis=2)
+    range_ours = np.linalg.norm(moved, axis=1)[:, None]
+    range_theirs = np.linalg.norm(theirs.positions, axis=1)[None]
+    peers = np.abs(range_ours - range_theirs) < AGREEMENT_RANGE * range_theirs + AGREEMENT_RANGE_M
+    return _rank_agreement(ours, theirs, distance, AGREEMENT_M, peers)
+
+
+def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan, query: PreparedScan) -> Measurement:
+    """Tests of how two scans fit."""
+    fit = evaluate(match.elevation, query.elevation, alignment.pose)
+    size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, NO_FIT_M)
+    return replace(
+        known,
+        kind=SCAN,
+        residual_m=float(np.median(size)),
+        residual_p90_m=float(np.percentile(size, 90)),
+        noise_m=max(match.noise_m, MIN_SURFACE_NOISE_M),
+        overlap=alignment.overlap,
+        points=float(len(alignment.points)),
+        relief_m=shared_relief(match.elevation, query.elevation, alignment.pose),
+        terrain_correlation=fit.correlation,
+        terrain_score=fit.score,
+    )
+
+
+def _measure_pairs(known: Measurement, alignment: Alignment) -> Measurement:
+    """Tests of how pairs of lifted features fit, where there are no two scans."""
+    residuals = alignment.residuals
+    return replace(
+        known,
+        kind=IMAGE,
+        residual_m=float(np.sqrt(np.mean(residuals**2))) if len(residuals) else INLIER_M,
+        overlap=alignment.overlap,
+        pose_inliers=float(len(alignment.points)),
+        spread=_spread(alignment.points),
+    )
+
+
+def _spread(points: Array) -> float:
+    """How wide the points lie across the view: the smaller standard deviation of bearing and log range."""
+    if len(points) < 3:
+        return 0.0
+    bearing = np.arctan2(points[:, 1], points[:, 0])
+    distance = np.log(np.maximum(np.linalg.norm(points, axis=1), 0.1))
+    return float(min(bearing.std(), distance.std()))
+
+
+def _rank_agreement(ours: LocalFeatures, theirs: LocalFeatures, distance: Array, reach: float, peers: Array) -> float:
+    """Mean rank of the similarity of the nearest counterpart among its peers, as a z-score."""
+    if 0 in distance.shape:
+        return float("nan")
+    distance = np.where(np.isfinite(distance), distance, np.inf)
+    nearest = distance.argmin(axis=1)
+    rows = np.arange(len(distance))
+    usable = (distance[rows, nearest] < reach) & (peers.sum(axis=1) >= AGREEMENT_PEERS)
+    if not usable.any():
+        return float("nan")
+    similarity = similarities(ours.descriptors[rows[usable]], theirs.descriptors)
+    own = similarity[np.arange(len(similarity)), nearest[usable]]
+    below = ((similarity < own[:, None]) & peers[usable]).sum(axis=1)
+    rank = below / np.maximum(peers[usable].sum(axis=1) - 1, 1)
+    return float((np.minimum(rank, 1).mean() - 0.5) * np.sqrt(12 * len(similarity)))
