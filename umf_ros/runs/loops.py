@@ -44,7 +44,7 @@ def judge(
 ) -> JudgedClosure:
     """Hold one closure against the truth.
 
-    True means: both keyframes within 12 m and 30 deg of heading of each other (thesis 5.1.2), and the
+    True means: both keyframes within 12 m and 30 deg of heading of each other [UMF 5.1.2], and the
     published relative pose within 0.5 m and 5 deg. A truth of positions alone (RTKLIB) checks distances only.
     """
     truth = relative(world_T_match, world_T_query)

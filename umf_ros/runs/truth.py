@@ -86,7 +86,7 @@ def trajectory_error(estimate: Trajectory | None, truth: Trajectory) -> float | 
 
 
 def absolute_trajectory_error(estimate: Array, truth: Array) -> float:
-    """Root mean square distance in metres of (N, 3) positions after rigid alignment (Sturm 2012)."""
+    """Root mean square distance in metres of (N, 3) positions after rigid alignment [Sturm 2012]."""
     aligned = transform(align_rigidly(estimate, truth), estimate)
     return float(np.sqrt(np.mean(np.sum((aligned - truth) ** 2, axis=1))))
 
@@ -110,7 +110,7 @@ def positions_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Arra
 
 
 def align_rigidly(estimate: Array, truth: Array) -> Array:
-    """Pose `truth_T_estimate` that brings two (N, 3) point sets together best (Horn 1987).
+    """Pose `truth_T_estimate` that brings two (N, 3) point sets together best [Horn 1987].
 
     Raises:
         ValueError: fewer than three points, or sets of different size.

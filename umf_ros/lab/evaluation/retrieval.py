@@ -1,4 +1,4 @@
-"""Places embedded, retrieved by their descriptors and reranked by their local features (thesis 5.2 and 5.5.2)."""
+"""Places embedded, retrieved by their descriptors and reranked by their local features [UMF 5.2, 5.5.2]."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOTHING = -1
 """Stands in a ranking where there is no further reference."""
 
 TOP_K = 20
-"""Candidates that are reranked (thesis 5.5.2)."""
+"""Candidates that are reranked [UMF 5.5.2]."""
 
 RERANKERS = ("superfeatures", "ransac")
 PARTS = {"image": "image", "lidar": "cloud", "both": "both"}
