@@ -38,7 +38,7 @@ class Extent:
     longest_m: float
 
 
-QUICK, FULL = Extent(2, 4.0, 60.0), Extent(3, 1.6, 130.0)
+QUICK, FULL = Extent(2, 4.0, 60.0), Extent(3, 3.0, 120.0)
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,7 @@ def hard_world(seed: int, step_m: float) -> dict[str, Any]:
 def recall_at_1(descriptors: Array, poses: Array, first: NDArray[np.bool_]) -> float:
     """Share of revisits whose most similar frame of the first pass is the same place, where there is one."""
     similarity = descriptors[~first] @ descriptors[first].T
-    places, turns = poses[:, :2, 3], np.array([heading(pose) for pose in poses])
+    places, turns = poses[:, :2, 3], heading(poses)
     away = np.linalg.norm(places[~first][:, None] - places[first][None], axis=2)
     turned = np.abs(np.degrees(wrap_angle(turns[~first][:, None] - turns[first][None])))
     same = (away <= NEAR_M) & (turned <= NEAR_DEG)

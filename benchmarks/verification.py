@@ -31,6 +31,7 @@ from umf_ros.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.embedding import make_embedder
 from umf_ros.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.geometry import Array, heading, wrap_angle
+from umf_ros.keyframes import is_past
 from umf_ros.lab.simulation.seeds import TEST
 from umf_ros.lab.training.acceptance_fit import inside_ellipsoid
 from umf_ros.places.database import PlaceDatabase
@@ -151,13 +152,10 @@ def _record(
 def _revisited(drive: Drive, query: int) -> set[int]:
     """Earlier keyframes within 5 m and 30 deg whose view overlaps by 30 % or more."""
     rules, truth, travelled = Loop(), drive.truth, drive.travelled
-    earlier = (travelled[query] - travelled[:query] > rules.min_travel_m) & (
-        drive.frames[query].stamp_ns - np.array([frame.stamp_ns for frame in drive.frames[:query]])
-        > rules.min_time_gap_s * 1e9
-    )
+    stamps = np.array([frame.stamp_ns for frame in drive.frames[: query + 1]])
+    earlier = is_past(stamps[query] - stamps[:query], travelled[query] - travelled[:query], rules)
     away = np.linalg.norm(truth[:query, :2, 3] - truth[query, :2, 3], axis=1)
-    headings = np.array([heading(pose) for pose in truth[:query]])
-    turned = np.abs(wrap_angle(headings - heading(truth[query])))
+    turned = np.abs(wrap_angle(heading(truth[:query]) - heading(truth[query])))
     near = np.flatnonzero(earlier & (away <= REVISIT_M) & (turned <= np.radians(REVISIT_DEG)))
     return {int(match) for match in near if drive.overlap(query, int(match)) >= REVISIT_OVERLAP}
 

@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from umf_ros.geometry import Array, gtsam_to_ros_covariance, make_pose, ros_to_gtsam_covariance
+from umf_ros.geometry import Array, gtsam_to_ros_covariance, heading, interpolate, make_pose, ros_to_gtsam_covariance
 
 POSES = [gtsam.Pose3.Expmap(np.random.default_rng(seed).normal(0, 1.5, 6)).matrix() for seed in range(5)]
 
@@ -47,3 +47,21 @@ def test_a_quarter_turn_swaps_the_axes_of_the_position() -> None:
     pose = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [5, 0, 0])
     converted = ros_to_gtsam_covariance(np.diag([1.0, 2, 3, 4, 5, 6]), pose)
     np.testing.assert_allclose(np.diag(converted), [5, 4, 6, 2, 1, 3])
+
+
+def test_poses_between_two_are_those_of_the_shortest_arc() -> None:
+    a, b = np.stack(POSES[:-1]), np.stack(POSES[1:])
+    np.testing.assert_array_equal(interpolate(a, b, np.zeros(len(a))), a)
+    np.testing.assert_allclose(interpolate(a, b, np.ones(len(a))), b, atol=1e-12)
+    shares = np.array([0.2, 0.5, 0.7, 1.3])
+    for first, second, share, found in zip(a, b, shares, interpolate(a, b, shares), strict=True):
+        turn = gtsam.Rot3(first[:3, :3]).between(gtsam.Rot3(second[:3, :3]))
+        expected = first[:3, :3] @ gtsam.Rot3.Expmap(share * gtsam.Rot3.Logmap(turn)).matrix()
+        np.testing.assert_allclose(found, make_pose(expected, (1 - share) * first[:3, 3] + share * second[:3, 3]))
+        np.testing.assert_array_equal(interpolate(first, second, share), found)
+
+
+def test_heading_of_one_pose_and_of_many() -> None:
+    turned = [gtsam.Pose3(gtsam.Rot3.Rz(angle), gtsam.Point3(0, 0, 0)).matrix() for angle in (-2.0, 0.0, 3.0)]
+    np.testing.assert_allclose(heading(np.stack(turned)), [-2.0, 0.0, 3.0])
+    assert heading(turned[2]) == pytest.approx(3.0)

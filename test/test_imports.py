@@ -12,8 +12,8 @@ from pathlib import Path
 from sources import PACKAGE, ROOT, distributions, imports, required
 
 STILL_SHARED = {
-    *("Bag", "Calibration", "Embedding", "Entry", "Evidence", "PoseGraph", "Progress"),
-    *("Sample", "Scan", "Task", "Worker", "World"),
+    *("Bag", "Calibration", "Embedding", "Entry", "Evidence", "Hits", "Picture", "PoseGraph", "Progress"),
+    *("Scan", "Task", "Worker", "World"),
 }
 """Names of classes that mean two things."""
 

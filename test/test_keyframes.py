@@ -6,9 +6,9 @@ import numpy as np
 from conftest import make_frame
 from scipy.spatial.transform import Rotation
 
-from umf_ros.config import KeyframePolicy
+from umf_ros.config import KeyframePolicy, Loop
 from umf_ros.geometry import make_pose
-from umf_ros.keyframes import KeyframeSelector
+from umf_ros.keyframes import KeyframeSelector, is_past
 
 
 def at(x_m: float, yaw_deg: float = 0.0) -> np.ndarray:
@@ -66,3 +66,13 @@ def test_reset_starts_a_new_path() -> None:
     frame = make_frame(0, at(100))
     assert selector.select(frame)
     assert selector.travelled_m(frame) == 0
+
+
+def test_the_past_is_old_enough_and_far_enough_back() -> None:
+    rules = Loop(min_time_gap_s=20, min_travel_m=15)
+    age_ns = np.array([20, 19.999, 60, 60, 60, 60]) * 1e9
+    way_m = np.array([15, 40, 14.99, 15, np.nan, 3.0])
+    same_session = np.array([True, True, True, True, True, False])
+    found = is_past(age_ns.astype(np.int64), way_m, rules, same_session)
+    assert found.tolist() == [True, False, False, True, True, True]
+    assert is_past(age_ns.astype(np.int64), way_m, rules).tolist() == [True, False, False, True, True, False]

@@ -22,6 +22,10 @@ class Group(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
 
+Dataset = Literal["simulated", "s3li-etna", "s3li-vulcano"]
+"""Data sets known by name: their topics stand in `bags.presets`, their rig in `config/calibration/<name>.yaml`."""
+
+
 class Topics(Group):
     """Names of the input topics; the defaults are S3LI Etna's."""
 
@@ -166,7 +170,7 @@ class Database(Group):
     cached_keyframes: int = Field(400, ge=20, description="keyframes whose local features stay in memory")
 
 
-class Worker(Group):
+class WorkerSettings(Group):
     """The thread that does the work of the live node."""
 
     queue_size: int = Field(10, ge=1, le=1000, description="frames that may wait; the oldest is dropped and counted")
@@ -175,9 +179,7 @@ class Worker(Group):
 class Settings(Group):
     """All settings."""
 
-    dataset: Literal["simulated", "s3li-etna", "s3li-vulcano"] = Field(
-        "simulated", description="preset of calibration and topics"
-    )
+    dataset: Dataset = Field("simulated", description="preset of calibration and topics")
     calibration: str = Field("", description="calibration file (YAML); empty: the data set's")
     topics: Topics = Topics()
     qos: Qos = Qos()
@@ -189,7 +191,7 @@ class Settings(Group):
     pose_graph: PoseGraph = PoseGraph()
     frames: Frames = Frames()
     database: Database = Database()
-    worker: Worker = Worker()
+    worker: WorkerSettings = WorkerSettings()
 
 
 def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:

@@ -62,9 +62,9 @@ def rotation_angle(pose: ArrayLike) -> float:
     return float(Rotation.from_matrix(np.asarray(pose)[:3, :3]).magnitude())
 
 
-def heading(world_T_body: Array) -> float:
-    """Direction of the body's x axis in the world's x-y plane, radians from the x axis."""
-    return float(np.arctan2(world_T_body[1, 0], world_T_body[0, 0]))
+def heading(world_T_body: Array) -> Any:
+    """Direction of the body's x axis in the world's x-y plane, radians from the x axis; of one pose or (..., 4, 4)."""
+    return np.arctan2(world_T_body[..., 1, 0], world_T_body[..., 0, 0])
 
 
 def wrap_angle(angle: Any) -> Any:
@@ -72,14 +72,22 @@ def wrap_angle(angle: Any) -> Any:
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
 
 
-def interpolate(a: Array, b: Array, fraction: float) -> Array:
+def interpolate(a: Array, b: Array, fraction: ArrayLike) -> Array:
     """Pose between `a` (fraction 0) and `b` (1): linear in translation, shortest arc in rotation.
 
     Fractions outside [0, 1] extrapolate at the same rate.
+
+    Args:
+        a: (..., 4, 4) poses.
+        b: (..., 4, 4) poses.
+        fraction: (...) one for each pair.
     """
-    turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
-    rotation = a[:3, :3] @ Rotation.from_rotvec(fraction * turn).as_matrix()
-    return make_pose(rotation, (1 - fraction) * a[:3, 3] + fraction * b[:3, 3])
+    share = np.asarray(fraction, float)[..., None]
+    turn = Rotation.from_matrix(np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3]).as_rotvec()
+    pose = np.array(a, float)
+    pose[..., :3, :3] = a[..., :3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+    pose[..., :3, 3] = (1 - share) * a[..., :3, 3] + share * b[..., :3, 3]
+    return pose
 
 
 def ros_to_gtsam_covariance(covariance: ArrayLike, pose: Array) -> Array:

@@ -1,17 +1,34 @@
-"""When a frame becomes a keyframe."""
+"""When a frame becomes a keyframe, and from when on a keyframe is the past."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from umf_ros.config import KeyframePolicy
+from umf_ros.config import KeyframePolicy, Loop
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array, relative, rotation_angle
 
+Mask = NDArray[np.bool_]
+
 # Odometry noise of a parked rover must not add up to metres: motion counts from this distance on.
 COUNTED_STEP_M = 0.05
+
+
+def is_past(age_ns: NDArray[np.int64], way_m: Array, rules: Loop, same_session: Mask | bool = True) -> Mask:
+    """Whether earlier keyframes are old enough and far enough back to be a place seen again.
+
+    Args:
+        age_ns: (...) by how much they are older, ns.
+        way_m: (...) metres driven since; where it is unknown (NaN), age alone decides.
+        rules: how old and how far back.
+        same_session: (...) the way is compared within a session only.
+    """
+    old = age_ns >= round(rules.min_time_gap_s * 1e9)
+    near = way_m < rules.min_travel_m  # False for NaN
+    return np.asarray(old & ~(near & same_session), bool)
 
 
 class KeyframeSelector:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from umf_ros.errors import OutputError
-from umf_ros.geometry import Array, to_quaternion
+from umf_ros.geometry import Array, interpolate, to_quaternion
 
 MAX_GAP_S = 2.0
 """Nothing is interpolated across a longer gap."""
@@ -48,14 +47,10 @@ class Trajectory:
         before = np.where(exact, after, after - 1)
         known = (before >= 0) & (stamps <= self.stamps_ns[-1])
         known &= self.stamps_ns[after] - self.stamps_ns[before] <= MAX_GAP_S * 1e9
-        if len(self) == 1:
-            poses[known] = self.poses[0]
-        elif known.any():
-            # relative to the first stamp: nanoseconds since the epoch do not fit a float
-            times, wanted = ((s - self.stamps_ns[0]).astype(float) for s in (self.stamps_ns, stamps[known]))
-            poses[known, :3, :3] = Slerp(times, Rotation.from_matrix(self.poses[:, :3, :3]))(wanted).as_matrix()
-            for axis in range(3):
-                poses[known, axis, 3] = np.interp(wanted, times, self.poses[:, axis, 3])
+        before, after = before[known], after[known]
+        steps = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
+        fractions = (stamps[known] - self.stamps_ns[before]) / steps
+        poses[known] = interpolate(self.poses[before], self.poses[after], fractions)
         return poses, known
 
     def of_body(self, body_T_sensor: Array) -> Trajectory:

@@ -28,6 +28,7 @@ from umf_ros.bags.presets import TOPICS, detect_dataset
 from umf_ros.bags.reader import open_bag
 from umf_ros.config import load_settings
 from umf_ros.errors import BagError
+from umf_ros.sensors.messages import OdometrySample
 from umf_ros.trajectory import Trajectory
 
 ENTRIES = traverse(3.0)
@@ -46,6 +47,26 @@ def test_a_recording_becomes_one_frame_per_scan(tmp_path: Path) -> None:
         assert np.allclose(frame.odom_T_body, drive((frame.stamp_ns - START_NS) / 1e9), atol=1e-3)
     assert sum(frame.right is not None for frame in frames) > SCANS // 2
     assert {name: counter.lost for name, counter in reader.counters.items()} == dict.fromkeys(reader.counters, 0)
+
+
+@pytest.mark.parametrize("from_file", [False, True])
+def test_the_stream_holds_every_message_of_the_odometry_before_the_frames_that_need_it(
+    tmp_path: Path, from_file: bool
+) -> None:
+    bag = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES))
+    stamps = START_NS + np.arange(60) * 50_000_000
+    trajectory = Trajectory(stamps, np.stack([drive(i * 0.05) for i in range(60)])) if from_file else None
+    heard: list[int] = []
+    frames = 0
+    for item in FrameReader(bag, small_settings(tmp_path), trajectory).stream():
+        if isinstance(item, OdometrySample):
+            heard.append(item.stamp_ns)
+            assert np.allclose(item.odom_T_body, drive((item.stamp_ns - START_NS) / 1e9))
+            continue
+        frames += 1
+        assert heard[-1] >= item.stamp_ns
+    assert frames == SCANS
+    assert heard == stamps.tolist()
 
 
 def test_the_format_does_not_matter(tmp_path: Path) -> None:

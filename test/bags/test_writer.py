@@ -7,7 +7,8 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from umf_ros.bags.reader import message_types, open_bag
+from umf_ros.bags.reader import open_bag
+from umf_ros.bags.records import message_types
 from umf_ros.bags.writer import BagWriter
 from umf_ros.errors import OutputError
 

@@ -25,6 +25,7 @@ def test_a_closure_survives_the_wire(rng: np.random.Generator) -> None:
     assert (found.query_stamp_ns, found.match_stamp_ns) == (closure.query_stamp_ns, closure.match_stamp_ns)
     np.testing.assert_allclose(found.match_T_query, closure.match_T_query, atol=1e-12)
     np.testing.assert_array_equal(found.covariance, closure.covariance)
+    assert np.isnan(found.probability)  # it does not travel: the back-end must not claim one
 
 
 def test_the_message_names_its_ends_as_documented(rng: np.random.Generator) -> None:

@@ -10,11 +10,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 from processes import Process, wait_until
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
+from umf_ros.bags.trajectories import read_tum
 from umf_ros.config import load_settings
 from umf_ros.loop_detector import LoopDetector, make_detector_embedder
 from umf_ros.replay import Replay
@@ -83,6 +85,13 @@ def test_live_and_offline_find_exactly_the_same(live: LiveRun, offline: Path) ->
     assert rows(live.folder / "keyframes.csv") == rows(offline / "keyframes.csv")
     assert rows(live.folder / "closures.csv") == rows(offline / "closures.csv")
     assert len(rows(live.folder / "closures.csv")) >= 3
+
+
+def test_live_and_offline_optimise_the_same_graph(live: LiveRun, offline: Path) -> None:
+    assert rows(live.folder / "graph_verdicts.csv") == rows(offline / "graph_verdicts.csv")
+    poses = [read_tum(folder / "trajectory_optimized.tum") for folder in (live.folder, offline)]
+    np.testing.assert_array_equal(poses[0].stamps_ns, poses[1].stamps_ns)
+    np.testing.assert_allclose(poses[0].poses, poses[1].poses, atol=1e-5)
 
 
 def test_every_scan_with_an_image_becomes_a_pair(live: LiveRun, offline: Path) -> None:

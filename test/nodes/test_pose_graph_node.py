@@ -136,6 +136,8 @@ def test_a_drive_ends_on_its_true_path_and_wrong_closures_stay_out(rig: Rig, pro
     right = {name for name, closure in zip(names, rig.world.closures, strict=True) if closure.right}
     rig.until(lambda: sum(v == "accepted" for v in verdicts(rig).values()) >= len(right) - 2)
     assert {name for name, verdict in verdicts(rig).items() if verdict == "accepted"} <= right
+    told = rig.heard["verdicts"][-1].status[-1]
+    assert [pair.key for pair in told.values] == ["verdict", "mahalanobis", "misfit_m"]
 
     # the pose follows the odometry with the newest correction, whatever the optimiser does
     rig.heard["pose"].clear()

@@ -6,12 +6,12 @@ import logging
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from umf_ros.bags.presets import topics_of
-from umf_ros.bags.reader import Bag, RawMessage, decode
+from umf_ros.bags.presets import calibration_of, topics_of
+from umf_ros.bags.reader import Bag, decode
+from umf_ros.bags.records import RawMessage
 from umf_ros.config import Settings, Topics
 from umf_ros.errors import BagError, MessageError
 from umf_ros.frames import Frame
-from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.counters import InputCounter
 from umf_ros.sensors.intake import Intake, wanted_inputs
 from umf_ros.sensors.messages import OdometrySample, stamp_ns
@@ -64,7 +64,7 @@ class FrameReader:
             _check_overlap(odometry, bag)
             topics = topics.model_copy(update={"odometry": ""})
             inputs.add("odometry")
-        calibration = load_calibration(settings.calibration or settings.dataset)
+        calibration = calibration_of(settings)
         self.progress = 0.0
         self._bag = bag
         self._odometry = odometry

@@ -15,7 +15,7 @@ from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
-from umf_ros.bags.reader import RawMessage, TopicInfo
+from umf_ros.bags.records import RawMessage, TopicInfo
 from umf_ros.errors import BagError
 
 # what the mcap library and the decompressors raise on damaged data

@@ -1,19 +1,18 @@
-"""Which data set a recording belongs to."""
+"""Data sets known by name: the topics and the rig of their recordings."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from umf_ros.bags.reader import Bag
-from umf_ros.config import Settings, Topics, load_settings
+from umf_ros.config import Dataset, Settings, Topics, load_settings
 from umf_ros.errors import BagError
-
-Dataset = Literal["simulated", "s3li-etna", "s3li-vulcano"]
+from umf_ros.sensors.calibration import Calibration, load_calibration
 
 GROUND_TRUTH_TOPIC = "/ground_truth/pose"
 
-TOPICS: dict[str, Topics] = {
+TOPICS: dict[Dataset, Topics] = {
     "simulated": Topics(),
     "s3li-etna": Topics(),
     "s3li-vulcano": Topics(
@@ -68,3 +67,12 @@ def topics_of(settings: Settings) -> Topics:
     defaults = Topics().model_dump()
     own = {name: topic for name, topic in settings.topics.model_dump().items() if topic != defaults[name]}
     return TOPICS[settings.dataset].model_copy(update=own)
+
+
+def calibration_of(settings: Settings) -> Calibration:
+    """The calibration the settings name, else that of the data set.
+
+    Raises:
+        CalibrationError: the file cannot be read, or a key is missing, unknown or wrong.
+    """
+    return load_calibration(settings.calibration or settings.dataset)

@@ -4,59 +4,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
-from rosbags.typesys.store import Typestore
 
+from umf_ros.bags.records import RawMessage, Storage, message_types
+from umf_ros.bags.storages import open_storage
 from umf_ros.errors import BagError, MessageError
-
-
-@dataclass(frozen=True, slots=True)
-class TopicInfo:
-    """A topic of a recording.
-
-    Attributes:
-        type: message type, as in `sensor_msgs/msg/Image`.
-        count: number of messages.
-    """
-
-    type: str
-    count: int
-
-
-@dataclass(frozen=True, slots=True)
-class RawMessage:
-    """A recorded message.
-
-    Attributes:
-        topic: where.
-        log_ns: when it was recorded.
-        type: message type.
-        data: the message as ROS 2 serialises it (CDR), whatever the format of the recording.
-    """
-
-    topic: str
-    log_ns: int
-    type: str
-    data: bytes
-
-
-class Storage(Protocol):
-    """One recording in one format."""
-
-    topics: dict[str, TopicInfo]
-    start_ns: int
-    end_ns: int
-    warning: str
-
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of some topics in the order of their recording."""
-        ...
 
 
 class Bag:
@@ -112,12 +67,6 @@ def decode(raw: RawMessage) -> Any:
         raise MessageError("undecodable", f"message is not what its type {raw.type} says ({cause})") from None
 
 
-@cache
-def message_types() -> Typestore:
-    """The message definitions of ROS 2 Jazzy."""
-    return get_typestore(Stores.ROS2_JAZZY)
-
-
 def open_bag(path: str | Path) -> Bag:
     """Open an mcap file, a ROS 2 folder (mcap or db3), a db3 file or a ROS 1 `.bag`.
 
@@ -126,8 +75,6 @@ def open_bag(path: str | Path) -> Bag:
     Raises:
         BagError: there is no such recording, it is none, or it holds no message.
     """
-    from umf_ros.bags.storages import open_storage
-
     path = Path(path)
     if not path.exists():
         raise BagError(f"there is no recording {path}")

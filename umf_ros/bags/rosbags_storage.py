@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as Error2
 from rosbags.serde import SerdeError
 
-from umf_ros.bags.reader import RawMessage, TopicInfo, message_types
+from umf_ros.bags.records import RawMessage, TopicInfo, message_types
 from umf_ros.errors import BagError
 
 

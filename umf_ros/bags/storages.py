@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from umf_ros.bags.mcap_storage import McapStorage
-from umf_ros.bags.reader import Storage
+from umf_ros.bags.records import Storage
 from umf_ros.bags.rosbags_storage import Ros1Storage, Ros2Storage
 from umf_ros.errors import BagError
 

@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
+from umf_ros.bags.presets import GROUND_TRUTH_TOPIC, calibration_of
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.rtklib import read_rtklib
 from umf_ros.bags.textfiles import read_lines
 from umf_ros.config import Settings
 from umf_ros.errors import BagError, MessageError
 from umf_ros.geometry import Array, make_pose
-from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.messages import decode_pose, stamp_ns
 from umf_ros.trajectory import Trajectory
 
@@ -59,7 +58,7 @@ def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajector
         BagError: the file cannot be read, or there is no such frame.
         CalibrationError: the mounting of the frame is not known.
     """
-    calibration = load_calibration(settings.calibration or settings.dataset)
+    calibration = calibration_of(settings)
     mountings = {
         "body": np.eye(4),
         "imu": calibration.body_T_imu,

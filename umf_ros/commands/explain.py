@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.embedding import CHOICES
+from umf_ros.commands.recordings import BagPath, ConfigPath, DatasetName, EmbedderName, WeightsPath, open_recording
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -18,34 +18,25 @@ Optional = typer.Option
 
 
 def command(
-    bag: Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")],
+    bag: BagPath,
     query: Annotated[str, typer.Argument(help="The later moment: stamp in ns, or seconds from the start.")],
     match: Annotated[str, typer.Argument(help="The earlier moment, likewise.")],
     out: Annotated[Path, Optional(help="Picture to write.")] = Path("explanation.png"),
-    config: Annotated[Path | None, Optional(help="Parameter file (YAML).")] = None,
-    dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
-    embedder: Annotated[str | None, Optional(help=f"How places are embedded: {CHOICES}.")] = None,
-    weights: Annotated[Path | None, Optional(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
+    config: ConfigPath = None,
+    dataset: DatasetName = "auto",
+    embedder: EmbedderName = None,
+    weights: WeightsPath = None,
 ) -> None:
     """Show both images with their matching features, both scans aligned, and the decision's numbers."""
     from rich.console import Console
 
     from umf_ros.bags.frames import FrameReader
-    from umf_ros.bags.presets import settings_for
-    from umf_ros.bags.reader import open_bag
     from umf_ros.commands.explanation import draw, explain
     from umf_ros.loop_detector import make_detector_embedder, make_keyframe
 
     console = Console()
     moments = [_moment(text) for text in (query, match)]
-    recording = open_bag(bag)
-    settings = settings_for(
-        recording,
-        config,
-        dataset,
-        embedding__method=embedder,
-        embedding__weights=str(weights) if weights else None,
-    )
+    recording, settings = open_recording(bag, config, dataset, embedder, weights)
     network = make_detector_embedder(settings)
     with console.status("looking for the two moments"):
         frames = _nearest(FrameReader(recording, settings), moments)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from umf_ros.commands.recordings import BagPath
 from umf_ros.errors import UmfError
 
 
 def command(
-    bag: Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")],
+    bag: BagPath,
     rate: Annotated[float, typer.Option(min=0.01, max=100, help="Speed; 1 is that of the recording.")] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="Start again at the end, until Ctrl-C.")] = False,
     wait_for_subscribers: Annotated[

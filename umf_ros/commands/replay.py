@@ -7,24 +7,36 @@ from typing import Annotated
 
 import typer
 
-from umf_ros.embedding import CHOICES
+from umf_ros.commands.recordings import (
+    BagPath,
+    ConfigPath,
+    DatasetName,
+    EmbedderName,
+    OdometryFrame,
+    OdometryPath,
+    RunsFolder,
+    TruthPath,
+    WeightsPath,
+    open_frames,
+    open_recording,
+)
 
-Optional = typer.Option
+MinProbability = Annotated[
+    float | None, typer.Option("--min-probability", min=0, max=1, help="Publish closures from here on.")
+]
 
 
 def command(
-    bag: Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")],
-    config: Annotated[Path | None, Optional(help="Parameter file (YAML).")] = None,
-    out: Annotated[Path, Optional(help="Where results/<timestamp> goes.")] = Path("results"),
-    dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
-    embedder: Annotated[str | None, Optional(help=f"How places are embedded: {CHOICES}.")] = None,
-    weights: Annotated[Path | None, Optional(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
-    odometry: Annotated[Path | None, Optional(help="Odometry as a TUM file, where the bag has none.")] = None,
-    odometry_frame: Annotated[
-        str, Optional(help="Whose poses --odometry holds: body, imu, camera or lidar (S3LI's Eval/BASALT: imu).")
-    ] = "body",
-    ground_truth: Annotated[Path | None, Optional(help="Truth as RTKLIB .pos or TUM file.")] = None,
-    min_probability: Annotated[float | None, Optional(min=0, max=1, help="Publish closures from here on.")] = None,
+    bag: BagPath,
+    config: ConfigPath = None,
+    out: RunsFolder = Path("results"),
+    dataset: DatasetName = "auto",
+    embedder: EmbedderName = None,
+    weights: WeightsPath = None,
+    odometry: OdometryPath = None,
+    odometry_frame: OdometryFrame = "body",
+    ground_truth: TruthPath = None,
+    min_probability: MinProbability = None,
 ) -> None:
     """Find loop closures in a recording as fast as the machine goes.
 
@@ -33,11 +45,8 @@ def command(
     """
     from rich.console import Console
 
-    from umf_ros.bags.frames import FrameReader
-    from umf_ros.bags.presets import settings_for
-    from umf_ros.bags.reader import open_bag
-    from umf_ros.bags.trajectories import read_ground_truth, read_odometry
-    from umf_ros.commands.progress import WARNING, FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.bags.trajectories import read_ground_truth
+    from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
     from umf_ros.loop_detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
     from umf_ros.runs.folder import create_run_folder
@@ -45,17 +54,10 @@ def command(
     from umf_ros.runs.report import finish_run
 
     console = Console()
-    recording = open_bag(bag)
-    settings = settings_for(
-        recording,
-        config,
-        dataset,
-        embedding__method=embedder,
-        embedding__weights=str(weights) if weights else None,
-        verification__min_probability=min_probability,
+    recording, settings = open_recording(
+        bag, config, dataset, embedder, weights, verification__min_probability=min_probability
     )
-    path = read_odometry(odometry, odometry_frame, settings) if odometry else None
-    reader = FrameReader(recording, settings, path, warn=lambda text: console.print(text, **WARNING))
+    reader = open_frames(recording, settings, console, odometry, odometry_frame)
     if ground_truth is not None:
         read_ground_truth(recording, ground_truth)  # what is wrong with it is said now, not after the run
     detector = LoopDetector(settings, make_detector_embedder(settings))

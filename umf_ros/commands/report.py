@@ -7,11 +7,13 @@ from typing import Annotated
 
 import typer
 
+from umf_ros.commands.recordings import TruthPath
+
 
 def command(
     folder: Annotated[Path, typer.Argument(help="A run folder, such as results/latest.")],
     bag: Annotated[Path, typer.Argument(help="The recording the run was made on.")],
-    ground_truth: Annotated[Path | None, typer.Option(help="Truth as RTKLIB .pos or TUM file.")] = None,
+    ground_truth: TruthPath = None,
 ) -> None:
     """Judge a run against the truth, draw its matches and trajectory, and write report.html."""
     from rich.console import Console

@@ -19,7 +19,7 @@ def conv_norm(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: i
 
 
 class ResidualBlock(nn.Module):
-    """Residual block of ResNet [He 2016]: basic (two 3x3), or a bottleneck (1x1, 3x3, 1x1 with four times the width)."""
+    """Residual block [He 2016]: basic (two 3x3), or a bottleneck (1x1, 3x3, 1x1 with four times the width)."""
 
     def __init__(self, inputs: int, width: int, stride: int, bottleneck: bool) -> None:
         super().__init__()

@@ -21,7 +21,7 @@ START_TIMEOUT_S = 180.0
 STOP_TIMEOUT_S = 60.0
 READY = "ready"
 # a recording on this machine must arrive whole, however busy the machine is
-PARAMETERS = ("use_sim_time:=true", "qos.reliability:=reliable", "qos.depth:=200")
+WHOLE = ("qos.reliability:=reliable", "qos.depth:=200")
 
 
 class NodeProcess:
@@ -98,10 +98,12 @@ class LiveGraph:
     Args:
         folder: run folder for results and logs.
         console: where closures are shown as they come.
+        config: parameter file of both nodes; None: a recording of the simulator, received whole.
     """
 
-    def __init__(self, folder: Path, console: Console) -> None:
+    def __init__(self, folder: Path, console: Console, config: Path | None = None) -> None:
         self._folder = folder
+        self._config = config
         self._console = console
         self._nodes: list[NodeProcess] = []
 
@@ -110,10 +112,7 @@ class LiveGraph:
         try:
             with self._console.status("Starting loop_closure_node and pose_graph_node"):
                 for name in ("loop_closure_node", "pose_graph_node"):
-                    own = [f"results_dir:={self._folder.resolve()}", *PARAMETERS]
-                    self._nodes.append(
-                        self._start(name, ["--ros-args", *(word for text in own for word in ("-p", text))])
-                    )
+                    self._nodes.append(self._start(name, self._parameters()))
                 for node in self._nodes:
                     node.wait_ready()
         except BaseException:
@@ -145,6 +144,11 @@ class LiveGraph:
             player.stop()
         if player.exit_code:
             raise UmfError(f"the bag player ended with status {player.exit_code}; see {self._folder / 'logs'}")
+
+    def _parameters(self) -> list[str]:
+        own = [f"results_dir:={self._folder.resolve()}", "use_sim_time:=true", *([] if self._config else WHOLE)]
+        words = [word for text in own for word in ("-p", text)]
+        return ["--ros-args", *(["--params-file", str(self._config.resolve())] if self._config else []), *words]
 
     def _watch(self, player: NodeProcess, seconds: float) -> None:
         columns = (TextColumn("[progress.description]{task.description}"), BarColumn(), TimeRemainingColumn())

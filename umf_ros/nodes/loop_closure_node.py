@@ -15,7 +15,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
-from umf_ros.bags.presets import topics_of
+from umf_ros.bags.presets import calibration_of, topics_of
 from umf_ros.config import Settings
 from umf_ros.errors import OutputError, UmfError
 from umf_ros.frames import Frame, LoopClosure
@@ -29,7 +29,6 @@ from umf_ros.nodes.process import run
 from umf_ros.nodes.qos import sensor_qos
 from umf_ros.nodes.worker import Worker
 from umf_ros.runs.recorder import RunRecorder, count_drops
-from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.intake import Intake, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
 
@@ -57,7 +56,7 @@ class LoopClosureNode(Node):
         self._settings, own = declare(self, results_dir="folder for closures and summary; empty: none")
         embedder = make_detector_embedder(self._settings)
         self._detector = LoopDetector(self._settings, embedder)
-        calibration = load_calibration(self._settings.calibration or self._settings.dataset)
+        calibration = calibration_of(self._settings)
         topics = topics_of(self._settings)
         self._synchronizer = Synchronizer(self._settings.sync, calibration, wanted_inputs(topics))
         self._intake = Intake(self._synchronizer, topics, self.get_logger().warning)

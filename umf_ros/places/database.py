@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from umf_ros.config import Database, Loop
 from umf_ros.frames import Candidate, Keyframe
+from umf_ros.keyframes import is_past
 from umf_ros.places.index import DescriptorIndex, Mask
-from umf_ros.places.store import Entry, KeyframeStore
+from umf_ros.places.store import KeyframeStore, PlaceEntry
 
 
 class PlaceDatabase:
@@ -50,7 +50,7 @@ class PlaceDatabase:
     def add(self, keyframe: Keyframe) -> int:
         """Remember a keyframe and return its index."""
         self._store.add(keyframe)
-        return self._register(Entry.of(keyframe))
+        return self._register(PlaceEntry.of(keyframe))
 
     def query(self, keyframe: Keyframe, rules: Loop) -> list[Candidate]:
         """The most similar earlier places, best first, by exhaustive search.
@@ -90,17 +90,13 @@ class PlaceDatabase:
         """Release the file."""
         self._store.close()
 
-    def _register(self, entry: Entry) -> int:
+    def _register(self, entry: PlaceEntry) -> int:
         self._stamps.append(entry.stamp_ns)
         self._travelled.append(entry.travelled_m)
         self._sessions.append(entry.session)
         return self._index.add(entry.descriptor)
 
     def _admissible(self, keyframe: Keyframe, rules: Loop) -> Mask:
-        stamps = np.array(self._stamps, np.int64)
-        travelled: NDArray[np.float64] = np.array(self._travelled, np.float64)
-        old = keyframe.stamp_ns - stamps >= round(rules.min_time_gap_s * 1e9)
-        # comparisons with NaN are False: an unknown path length never excludes
-        near = keyframe.travelled_m - travelled < rules.min_travel_m
-        foreign = np.array(self._sessions, np.int64) != keyframe.session
-        return old & (foreign | ~near)
+        age_ns = keyframe.stamp_ns - np.array(self._stamps, np.int64)
+        way_m = keyframe.travelled_m - np.array(self._travelled, np.float64)
+        return is_past(age_ns, way_m, rules, np.array(self._sessions, np.int64) == keyframe.session)

@@ -30,7 +30,7 @@ _TABLES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class PlaceEntry:
     """What retrieval needs of a keyframe.
 
     Attributes:
@@ -46,7 +46,7 @@ class Entry:
     descriptor: NDArray[np.float32]
 
     @classmethod
-    def of(cls, keyframe: Keyframe) -> Entry:
+    def of(cls, keyframe: Keyframe) -> PlaceEntry:
         """The entry of a keyframe."""
         return cls(keyframe.stamp_ns, keyframe.session, keyframe.travelled_m, keyframe.embedding.descriptor)
 
@@ -92,7 +92,7 @@ class KeyframeStore:
             self._cache.move_to_end(row)
             return self._cache[row]
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[PlaceEntry]:
         """What retrieval needs of every keyframe, in their order; the keyframes themselves stay on disk.
 
         Raises:
@@ -103,7 +103,7 @@ class KeyframeStore:
             for stamp_ns, session, travelled_m, descriptor in self._connection.execute(columns):
                 # SQLite keeps a NaN as NULL
                 metres = float("nan") if travelled_m is None else travelled_m
-                yield Entry(stamp_ns, session, metres, np.frombuffer(descriptor, np.float32))
+                yield PlaceEntry(stamp_ns, session, metres, np.frombuffer(descriptor, np.float32))
         except sqlite3.Error as error:
             raise UmfError(f"{self.path} is damaged: {error}") from None
 
@@ -115,7 +115,7 @@ class KeyframeStore:
         """
         with self._lock:
             row = self._rows[-1] + 1 if self._rows else 1
-            entry = Entry.of(keyframe)
+            entry = PlaceEntry.of(keyframe)
             descriptor = np.ascontiguousarray(entry.descriptor, np.float32).tobytes()
             values = (row, entry.stamp_ns, entry.session, entry.travelled_m, descriptor, pack(keyframe))
             with self._changing():

@@ -63,7 +63,6 @@ class PoseGraph:
         self._judge = Judge(self._settings, self._sessions)
         self._waiting: list[_Waiting] = []
         self._seen: set[tuple[int, int, bytes]] = set()
-        self._late = False
         self._refused: list[ClosureVerdict] = []
         self.counts: Counter[str] = Counter()
 
@@ -114,19 +113,16 @@ class PoseGraph:
     def settle(self) -> list[ClosureVerdict]:
         """Come to the final decision and the exact optimum, as at the end of a mission.
 
-        Closures that could not be judged are accepted if nothing speaks against them. When odometry
-        came late, all closures are decided anew in order of their stamps, so that the order of
-        arrival leaves no trace.
+        All closures are decided anew in order of their stamps, so that the time of arrival leaves no trace: a
+        live run and a replay end with the same verdicts. Closures that could not be judged are accepted if
+        nothing speaks against them.
         """
-        verdicts = self.update()
-        if self._late:
-            verdicts += self._attempt(self._replay)
+        verdicts = self.update() + self._attempt(self._replay)
         return verdicts + self._attempt(self._judge.settle)
 
     def _refresh(self) -> None:
         if self._sessions.update():
             self.counts["odometry out of order"] += 1
-            self._late = True
             self._attempt(self._judge.renew)
 
     def _attempt(self, step: Callable[[], list[ClosureVerdict]]) -> list[ClosureVerdict]:
@@ -208,7 +204,6 @@ class PoseGraph:
             self._judge.consider([tracked])
         for closure in vetoed:
             self.revoke(closure.match_stamp_ns, closure.query_stamp_ns)
-        self._late = False
         return [c.verdict for c in self._judge.closures if before[id(c.closure)] is not c.verdict.state]
 
     def closures(self) -> list[ClosureVerdict]:

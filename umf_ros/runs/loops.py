@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from umf_ros.config import Loop
 from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, invert, relative, rotation_angle, wrap_angle
+from umf_ros.geometry import Array, heading, invert, relative, rotation_angle, wrap_angle
+from umf_ros.keyframes import is_past
 
 PLACE_RADIUS_M = 12.0
 PLACE_ANGLE_DEG = 30.0
@@ -65,7 +66,7 @@ def judge(
 
 def heading_difference(world_T_a: Array, world_T_b: Array) -> float:
     """Difference of the headings in the world's x-y plane, radians in [-pi, pi)."""
-    return float(wrap_angle(_headings(world_T_b) - _headings(world_T_a)))
+    return float(wrap_angle(heading(world_T_b) - heading(world_T_a)))
 
 
 def count_revisits(
@@ -80,17 +81,12 @@ def count_revisits(
         rules: which earlier keyframes are admissible.
         has_orientation: whether the truth knows headings.
     """
-    positions, headings = world_T_body[:, :3, 3], _headings(world_T_body)
+    positions, headings = world_T_body[:, :3, 3], heading(world_T_body)
     revisits = 0
     for i in range(len(stamps)):
         near = np.linalg.norm(positions[:i] - positions[i], axis=1) <= PLACE_RADIUS_M
         if has_orientation:
             near &= np.abs(wrap_angle(headings[:i] - headings[i])) <= radians(PLACE_ANGLE_DEG)
-        old = stamps[i] - stamps[:i] >= rules.min_time_gap_s * 1e9
-        recent = travelled_m[i] - travelled_m[:i] < rules.min_travel_m
-        revisits += bool((near & old & ~recent).any())
+        past = is_past(stamps[i] - stamps[:i], travelled_m[i] - travelled_m[:i], rules)
+        revisits += bool((near & past).any())
     return revisits
-
-
-def _headings(poses: Array) -> Array:
-    return np.arctan2(poses[..., 1, 0], poses[..., 0, 0])

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from umf_ros.config import Group, find
+from umf_ros.config import Dataset, Group, find
 from umf_ros.errors import CalibrationError
 from umf_ros.frames import StereoCamera
 from umf_ros.geometry import Array, from_quaternion
@@ -77,8 +77,8 @@ def load_calibration(source: str | Path) -> Calibration:
 
 
 def _path_of(source: str | Path) -> Path:
-    if isinstance(source, str) and source in ("simulated", "s3li-etna", "s3li-vulcano"):
-        return find(f"config/calibration/{source.replace('-', '_')}.yaml")
+    if source in get_args(Dataset):
+        return find(f"config/calibration/{str(source).replace('-', '_')}.yaml")
     return Path(source)
 
 

@@ -14,6 +14,7 @@ from umf_ros.errors import UmfError
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array, make_pose
 from umf_ros.lab.evaluation.bag_run import BagEvaluation, BagResult
+from umf_ros.loop_detector import LoopDetector
 from umf_ros.trajectory import Trajectory
 
 LAPS = 2
@@ -80,6 +81,21 @@ def test_the_second_lap_is_recognised(settings: Settings) -> None:
     # the first lap has no past but its neighbours; the very last place meets the first again
     assert found.queries == PLACES and found.recall1 == 1.0 and found.recall_at_precision1 == 1.0
     assert result.scores["ransac both"].recall1 == 1.0
+
+
+def test_keyframes_are_those_of_the_live_detector(settings: Settings) -> None:
+    often = [  # ten frames a place: most are passed over
+        dataclasses.replace(frame, stamp_ns=frame.stamp_ns + tick * 10**8, odom_T_body=on_the_circle(step + tick / 99))
+        for step, frame in enumerate(frames())
+        for tick in range(10)
+    ]
+    evaluation, detector = BagEvaluation(settings, Sharp()), LoopDetector(settings, Sharp())
+    evaluation.remember(often, lambda frame, count: None)
+    live = [found.keyframe for found in map(detector.process, often) if found.keyframe is not None]
+    assert len(often) > 2 * len(live) > 0
+    for ours, theirs in zip(evaluation.keyframes, live, strict=True):
+        assert (ours.stamp_ns, ours.travelled_m, ours.session) == (theirs.stamp_ns, theirs.travelled_m, theirs.session)
+        np.testing.assert_array_equal(ours.embedding.descriptor, theirs.embedding.descriptor)
 
 
 def test_confused_places_are_missed_and_won_back(settings: Settings) -> None:

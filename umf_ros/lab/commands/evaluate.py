@@ -8,6 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from umf_ros.commands.recordings import (
+    DatasetName,
+    OdometryFrame,
+    OdometryPath,
+    RunsFolder,
+    TruthPath,
+    WeightsPath,
+    open_frames,
+    open_recording,
+)
 from umf_ros.embedding import CHOICES
 from umf_ros.errors import ConfigError
 
@@ -31,17 +41,15 @@ def command(
     seed: Annotated[int | None, Optional(min=0, help="First of the four worlds' seeds.")] = None,
     quick: Annotated[bool, Optional("--quick", help="A smaller sample of every world.")] = False,
     methods: Annotated[str, Optional(help="umf, or all: methods that need no training too.")] = "umf",
-    weights: Annotated[Path | None, Optional(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
+    weights: WeightsPath = None,
     json_file: Annotated[Path | None, Optional("--json", help="Write the figures here too.")] = None,
-    out: Annotated[Path, Optional(help="Where results/<timestamp> goes.")] = Path("results"),
+    out: RunsFolder = Path("results"),
     config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording.")] = None,
-    dataset: Annotated[str, Optional(help="auto, simulated, s3li-etna or s3li-vulcano.")] = "auto",
+    dataset: DatasetName = "auto",
     embedder: Annotated[str | None, Optional(help=f"How the places of a recording are embedded: {CHOICES}.")] = None,
-    odometry: Annotated[Path | None, Optional(help="Odometry as a TUM file, where the recording has none.")] = None,
-    odometry_frame: Annotated[
-        str, Optional(help="Whose poses --odometry holds: body, imu, camera or lidar (S3LI's Eval/BASALT: imu).")
-    ] = "body",
-    ground_truth: Annotated[Path | None, Optional(help="Truth as RTKLIB .pos or TUM file.")] = None,
+    odometry: OdometryPath = None,
+    odometry_frame: OdometryFrame = "body",
+    ground_truth: TruthPath = None,
     rule: Annotated[str, Optional(help="What is the same place in listed sequences: s3li or robotcar.")] = "s3li",
 ) -> None:
     """Recall, precision, rerankers, lost modalities and cost.
@@ -129,30 +137,18 @@ def _on_recording(
 ) -> Figures:
     from rich.console import Console
 
-    from umf_ros.bags.frames import FrameReader
-    from umf_ros.bags.presets import settings_for
-    from umf_ros.bags.reader import open_bag
-    from umf_ros.bags.trajectories import read_ground_truth, read_odometry
-    from umf_ros.commands.progress import WARNING
+    from umf_ros.bags.trajectories import read_ground_truth
     from umf_ros.embedding import make_embedder
     from umf_ros.frames import Frame
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
     from umf_ros.runs.folder import create_run_folder
 
     console = Console()
-    recording = open_bag(bag)
-    settings = settings_for(
-        recording,
-        config,
-        dataset,
-        embedding__method=embedder,
-        embedding__weights=str(weights) if weights else None,
-    )
+    recording, settings = open_recording(bag, config, dataset, embedder, weights)
     truth = read_ground_truth(recording, ground_truth)
     if truth is None:
         raise ConfigError(f"{bag} holds no ground truth; name a file with --ground-truth")
-    path = read_odometry(odometry, odometry_frame, settings) if odometry else None
-    frames = FrameReader(recording, settings, path, warn=lambda text: console.print(text, **WARNING))
+    frames = open_frames(recording, settings, console, odometry, odometry_frame)
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, super_features=True))
     folder = create_run_folder(out)
     with _bar(console) as bar:

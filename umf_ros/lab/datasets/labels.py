@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array, wrap_angle
+from umf_ros.geometry import Array, heading, wrap_angle
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +45,9 @@ class Places:
 
 def places_of(world: int, world_T_body: Array, passage: NDArray | None = None) -> Places:
     """Places of (N, 4, 4) poses in one world; without `passage` (N,) they are of one pass."""
-    heading = np.arctan2(world_T_body[:, 1, 0], world_T_body[:, 0, 0])
     count = len(world_T_body)
     passage = np.zeros(count) if passage is None else passage.astype(float)
-    return Places(np.full(count, world), world_T_body[:, :2, 3], heading, passage)
+    return Places(np.full(count, world), world_T_body[:, :2, 3], heading(world_T_body), passage)
 
 
 def distances(a: Places, b: Places) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 
 from pydantic import Field, ValidationError
 
-from umf_ros.config import Group, problems, read_yaml
+from umf_ros.config import Dataset, Group, problems, read_yaml
 from umf_ros.errors import ConfigError
 from umf_ros.lab.datasets.robotcar import read_evaluation, read_training
 from umf_ros.lab.datasets.s3li import ETNA_TEST, ETNA_TRAINING, read_bag, read_toolkit
@@ -82,7 +82,7 @@ class ToolkitEntry(ListEntry):
 
     toolkit: list[Path] = Field(min_length=1, description="pickles; several are passes of one place")
     images: Path | None = Field(None, description="where the images are now")
-    dataset: Literal["s3li-etna", "s3li-vulcano"] = Field("s3li-etna", description="whose calibration holds")
+    dataset: Dataset = Field("s3li-etna", description="whose calibration holds")
 
     def read(self, base: Path) -> Sequence[SampleSequence]:
         """One sequence."""

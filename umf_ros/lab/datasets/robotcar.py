@@ -1,4 +1,4 @@
-"""Oxford RobotCar [Maddern 2017] in the layout of MinkLoc++ [Komorowski 2021]: submaps of the laser scanner, and images by their stamps.
+"""Oxford RobotCar [Maddern 2017] in the layout of MinkLoc++ [Komorowski 2021]: laser submaps, images by stamps.
 
     <root>/oxford/<traversal>/pointcloud_20m_10overlap/<stamp>.bin    4096 x 3 float64 in [-1, 1]
     <root>/training_queries_baseline.pickle, ...                      {number: TrainingTuple}

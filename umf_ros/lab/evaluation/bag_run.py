@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.config import Settings
+from umf_ros.config import Database, Settings
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.errors import UmfError
-from umf_ros.frames import Frame
-from umf_ros.keyframes import KeyframeSelector
+from umf_ros.frames import Frame, Keyframe
 from umf_ros.lab.evaluation.protocol import RetrievalTask, loop_closure
 from umf_ros.lab.evaluation.results import (
     HEADINGS,
@@ -23,8 +22,9 @@ from umf_ros.lab.evaluation.results import (
     rounded,
     scores_table,
 )
-from umf_ros.lab.evaluation.retrieval import METHODS, PlaceCollection, rank, rerank_all
+from umf_ros.lab.evaluation.retrieval import METHODS, rank, rerank_all
 from umf_ros.lab.evaluation.scores import Scores, score
+from umf_ros.loop_detector import LoopDetector
 from umf_ros.trajectory import Trajectory
 
 PICTURES = {"Precision and recall": "precision_recall.png", "Recall": "recall.png"}
@@ -66,26 +66,30 @@ class BagResult:
 
 
 class BagEvaluation:
-    """Chooses keyframes, embeds them and asks each for its own past.
+    """Has the detector choose and embed keyframes, and asks each for its own past.
 
     Args:
         settings: of keyframes, of the gaps and of reranking.
         embedder: the same as the node's.
+
+    Attributes:
+        keyframes: what the detector would remember.
     """
 
     def __init__(self, settings: Settings, embedder: Embedder) -> None:
         self._settings = settings
-        self._selector = KeyframeSelector(settings.keyframe)
-        self._places = PlaceCollection(embedder)
+        # places of earlier runs are not asked for
+        self._detector = LoopDetector(settings.model_copy(update={"database": Database()}), embedder)
+        self.keyframes: list[Keyframe] = []
 
     def remember(self, frames: Iterable[Frame], report: Callable[[Frame, int], None]) -> None:
         """Embed the keyframes among the frames of the recording's first session."""
         for frame in frames:
             if frame.session:
                 break
-            if self._selector.select(frame):
-                self._places.add(frame, travelled_m=self._selector.travelled_m(frame))
-            report(frame, len(self._places.keyframes))
+            if self._detector.select(frame):
+                self.keyframes.append(self._detector.embed(frame))
+            report(frame, len(self.keyframes))
 
     def judge(self, truth: Trajectory, report: Callable[[], None] = lambda: None) -> BagResult:
         """Score against the truth.
@@ -93,7 +97,7 @@ class BagEvaluation:
         Raises:
             UmfError: the truth covers none of the keyframes.
         """
-        keyframes = self._places.keyframes
+        keyframes = self.keyframes
         stamps = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
         poses, known = truth.at(stamps)
         if not known.any():
@@ -104,11 +108,11 @@ class BagEvaluation:
         return BagResult(len(rows), self._scores(task, rows, report))
 
     def _scores(self, task: RetrievalTask, rows: np.ndarray, report: Callable[[], None]) -> dict[str, Scores]:
-        descriptors = self._places.descriptors("fused")[rows]
+        kept = [self.keyframes[row] for row in rows]
+        descriptors = np.stack([keyframe.embedding.descriptor for keyframe in kept])
         similarity = descriptors @ descriptors.T
         ranking = rank(similarity, task.admissible)
         scores = {"fused": score(task, ranking, unanswerable_count=True)}
-        kept = [self._places.keyframes[row] for row in rows]
         if not any(keyframe.embedding.image or keyframe.embedding.cloud for keyframe in kept):
             return scores  # a baseline has no local features
         reranking = rerank_all(kept, kept, ranking, similarity, self._settings.verification, report)

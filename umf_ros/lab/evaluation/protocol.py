@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from umf_ros.config import Loop
 from umf_ros.geometry import Array
+from umf_ros.keyframes import is_past
 from umf_ros.lab.datasets.labels import Rule, distances, label, places_of
 from umf_ros.lab.evaluation.retrieval import Indices, Mask
 
@@ -95,9 +96,8 @@ def loop_closure(
         rule: what is a true match.
     """
     every = np.arange(len(stamps))
-    age_s = (stamps[:, None] - stamps[None]) * 1e-9
-    recent = travelled_m[:, None] - travelled_m[None] < gaps.min_travel_m  # False where unknown
-    admissible = (every[None] < every[:, None]) & (age_s >= gaps.min_time_gap_s) & ~recent
+    past = is_past(stamps[:, None] - stamps[None], travelled_m[:, None] - travelled_m[None], gaps)
+    admissible = (every[None] < every[:, None]) & past
     if not has_orientation:
         flat = np.tile(np.eye(4), (len(stamps), 1, 1))
         flat[:, :3, 3] = world_T_body[:, :3, 3]

@@ -14,7 +14,7 @@ from umf_ros.lab.simulation.camera import resized
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.passes import SETTINGS, Pass, plan_passes
 from umf_ros.lab.simulation.seeds import TEST, VALIDATION
-from umf_ros.lab.simulation.shards import Sample, Survey
+from umf_ros.lab.simulation.survey import Survey, SurveyFrame
 from umf_ros.lab.simulation.world import World, ground
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
@@ -114,7 +114,7 @@ def _every(drive: Pass, stride: int) -> Pass:
     return replace(drive, path=drive.path[::stride], yaw=drive.yaw[::stride], tilt=drive.tilt[::stride])
 
 
-def _visit(stamp: int, sample: Sample, calibration: Calibration) -> Visit:
+def _visit(stamp: int, sample: SurveyFrame, calibration: Calibration) -> Visit:
     height, width = sample.image.shape
     points = sample.points.astype(np.float32)
     frame = Frame(

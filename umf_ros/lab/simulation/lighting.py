@@ -21,6 +21,11 @@ class Sun:
     azimuth_deg: float
     elevation_deg: float
 
+    @classmethod
+    def drawn(cls, lowest_deg: float, highest_deg: float, rng: np.random.Generator) -> Sun:
+        """A sun anywhere around, within a range of elevations."""
+        return cls(float(rng.uniform(0, 360)), float(rng.uniform(lowest_deg, highest_deg)))
+
     @property
     def direction(self) -> Array:
         """(3,) float32 unit vector towards the sun, world frame."""

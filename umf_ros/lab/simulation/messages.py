@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.bags.reader import message_types
+from umf_ros.bags.records import message_types
 from umf_ros.frames import StereoCamera
 from umf_ros.geometry import Array, to_quaternion
 from umf_ros.lab.simulation.lidar import Scan

@@ -39,10 +39,10 @@ class Motion:
         self.duration_s = float(times[-1])
         knots = np.linspace(0, self.duration_s, max(round(self.duration_s / _KNOT_S), 4))
         way = np.interp(knots, times, self._travelled)
-        x, y, yaw = (np.interp(way, route.travelled, values) for values in (*route.path.T, np.unwrap(route.yaw)))
+        path, yaw = route.at(way)
         sway = gaussian_filter1d(rng.standard_normal((len(knots), 2)), 4, axis=0)
         sway *= np.radians(tilt_deg) / max(float(sway.std()), 1e-9)
-        poses = stand(relief, x, y, yaw, sway)
+        poses = stand(relief, path[:, 0], path[:, 1], yaw, sway)
         angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX")
         angles[:, 0] = np.unwrap(angles[:, 0])
         soft = gaussian_filter1d(np.column_stack([poses[:, :3, 3], angles]), 2.5, axis=0, mode="nearest")
@@ -82,8 +82,8 @@ class Motion:
 def _schedule(relief: Relief, route: Route, speed_m_s: float) -> tuple[Array, Array]:
     """Times and metres driven along the route."""
     travelled = np.arange(0, route.length_m, 0.1)
-    x, y = (np.interp(travelled, route.travelled, values) for values in route.path.T)
-    grade = gaussian_filter1d(np.gradient(relief.height(x, y), 0.1), 10)
+    path, _ = route.at(travelled)
+    grade = gaussian_filter1d(np.gradient(relief.height(*path.T), 0.1), 10)
     speed = speed_m_s * (1 - 0.5 * np.clip(np.abs(grade) / 0.4, 0, 1))
     ramp = np.minimum(travelled, travelled[-1] - travelled) / (speed_m_s * _SETTLING_S)
     speed *= np.clip(np.sqrt(ramp), 0.15, 1)

@@ -67,7 +67,7 @@ def plan_passes(trail: Array, labels: tuple[str, ...], setting: Setting, step_m:
         seed: source of offsets, swings and light.
     """
     rng = np.random.default_rng([seed, 3])
-    sun = Sun(float(rng.uniform(0, 360)), float(rng.uniform(15, 45)))
+    sun = Sun.drawn(15, 45, rng)
     passes = []
     for index, label in enumerate(labels):
         path, heading = resample(trail if label != "crossing" else _across(trail, rng), step_m)
@@ -78,20 +78,26 @@ def plan_passes(trail: Array, labels: tuple[str, ...], setting: Setting, step_m:
         swing = 0.0 if first else np.radians(setting.yaw_deg) * _wave(len(path), 7, rng)
         tilt = np.radians(setting.tilt_deg) * rng.standard_normal((len(path), 2))
         exposure = float(np.exp(0.12 * rng.standard_normal()))
-        passes.append(Pass(label, path, _direction(path) + swing, tilt, sun.moved(index * setting.sun_deg), exposure))
+        passes.append(Pass(label, path, direction(path) + swing, tilt, sun.moved(index * setting.sun_deg), exposure))
     return passes
 
 
 def resample(curve: Array, step_m: float) -> tuple[Array, Array]:
     """Places every `step_m` along a closed (N, 2) curve, and the direction there, rad."""
     closed = np.vstack([curve, curve[:1]])
-    travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    travelled = metres_along(closed)
     wanted = np.arange(0, travelled[-1] - step_m / 2, step_m)
     path = np.stack([np.interp(wanted, travelled, closed[:, axis]) for axis in range(2)], 1)
-    return path, _direction(path)
+    return path, direction(path)
 
 
-def _direction(path: Array) -> Array:
+def metres_along(points: Array) -> Array:
+    """(N,) metres along a polyline of (N, 2) or (N, 3) points."""
+    return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def direction(path: Array) -> Array:
+    """(N,) where a (N, 2) path leads at each of its points, rad from the x axis."""
     along = np.gradient(path, axis=0)
     return np.arctan2(along[:, 1], along[:, 0])
 

@@ -27,7 +27,7 @@ from umf_ros.lab.simulation.messages import (
     pose_message,
 )
 from umf_ros.lab.simulation.pool import ahead
-from umf_ros.lab.simulation.simulator import START_NS, Simulator
+from umf_ros.lab.simulation.simulator import START_NS, Simulator, stamp_ns
 from umf_ros.trajectory import Trajectory, write_tum
 
 Event = tuple[int, int, str, Any]
@@ -73,7 +73,7 @@ def write_side_files(simulator: Simulator, bag: Path) -> None:
         OutputError: a file cannot be written.
     """
     run = simulator.odometry
-    stamps = np.array([_stamp(time_s) for time_s in run.times_s], np.int64)
+    stamps = np.array([stamp_ns(time_s) for time_s in run.times_s], np.int64)
     write_tum(bag.with_suffix(".odometry.tum"), Trajectory(stamps, run.poses))
     text = gnss.rtklib_text(gnss.measure(simulator.motion, simulator.duration_s, simulator.seed), START_NS)
     try:
@@ -145,14 +145,14 @@ def _clouds(simulator: Simulator, pool: ThreadPoolExecutor) -> Iterator[Event]:
 def _imu(simulator: Simulator) -> Iterator[Event]:
     data = imu.measure(simulator.motion, simulator.calibration.body_T_imu, simulator.duration_s, simulator.seed)
     for time_s, rate, force in zip(data.times_s, data.rate, data.force, strict=True):
-        stamp = _stamp(time_s)
+        stamp = stamp_ns(time_s)
         yield stamp, 2, "/imu/data", imu_message(rate, force, stamp)
 
 
 def _odometry(simulator: Simulator) -> Iterator[Event]:
     run = simulator.odometry
     for time_s, pose, twist, deviations in zip(run.times_s, run.poses, run.twists, run.deviations, strict=True):
-        stamp = _stamp(time_s)
+        stamp = stamp_ns(time_s)
         message = odometry_message(pose, twist, deviations, stamp, ("odom", "base_link"))
         yield stamp + _ODOMETRY_DELAY_NS, 3, "/odom", message
 
@@ -160,16 +160,12 @@ def _odometry(simulator: Simulator) -> Iterator[Event]:
 def _ground_truth(simulator: Simulator) -> Iterator[Event]:
     times = simulator.odometry.times_s
     for time_s, pose in zip(times, simulator.motion.poses(times), strict=True):
-        stamp = _stamp(time_s)
+        stamp = stamp_ns(time_s)
         yield stamp, 4, "/ground_truth/pose", pose_message(pose, stamp, "world")
 
 
 def _fixes(simulator: Simulator) -> Iterator[Event]:
     track = gnss.measure(simulator.motion, simulator.duration_s, simulator.seed)
     for time_s, geodetic, deviation in zip(track.times_s, track.geodetic, track.deviation_m, strict=True):
-        stamp = _stamp(time_s)
+        stamp = stamp_ns(time_s)
         yield stamp, 5, "/gnss/fix", fix_message(geodetic, float(deviation), stamp)
-
-
-def _stamp(time_s: float) -> int:
-    return START_NS + round(float(time_s) * 1e9)

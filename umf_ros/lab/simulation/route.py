@@ -9,7 +9,8 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from umf_ros.geometry import Array
-from umf_ros.lab.simulation.passes import resample
+from umf_ros.lab.simulation.noise import smooth_step
+from umf_ros.lab.simulation.passes import direction, metres_along, resample
 
 STEP_M = 0.25
 _EASE_M = 6.0
@@ -35,6 +36,11 @@ class Route:
     def length_m(self) -> float:
         """Length of the path."""
         return float(self.travelled[-1])
+
+    def at(self, metres: Array) -> tuple[Array, Array]:
+        """(N, 2) places and (N,) headings, rad, at metres along the route."""
+        path = np.stack([np.interp(metres, self.travelled, values) for values in self.path.T], 1)
+        return path, np.interp(metres, self.travelled, np.unwrap(self.yaw))
 
     def legs(self) -> list[tuple[str, float, float]]:
         """Label, first and last metre of each part."""
@@ -64,8 +70,7 @@ class Walker:
     def forward(self, length_m: float, lateral_m: float = 0.0) -> Walker:
         """Follow the trail, up to `lateral_m` beside it; labels itself by whether the place is new."""
         count = round(length_m / STEP_M)
-        ease = np.clip(np.arange(count) * STEP_M / _EASE_M, 0, 1)
-        ease = ease * ease * (3 - 2 * ease)
+        ease = smooth_step(np.arange(count) * STEP_M, 0, _EASE_M)
         waves = np.arange(count) * STEP_M / 45 * 2 * np.pi
         wobble = sum(np.sin(k * waves + self._rng.uniform(0, 2 * np.pi)) for k in (1, 2.3)) / 2
         offset = self._offset * (1 - ease) + lateral_m * wobble * ease
@@ -109,7 +114,7 @@ class Walker:
             self._points[crossing] + 9 * outward + 9 * onward,
             self._points[joining],
         ]
-        lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+        lengths = metres_along(np.array(corners))
         end = self._direction * self._along(joining)
         curve = CubicSpline(lengths, np.array(corners), bc_type=((1, ahead), (1, end)))
         points = curve(np.arange(STEP_M, lengths[-1], STEP_M))
@@ -126,10 +131,9 @@ class Walker:
             length_m: cut here; None keeps all.
         """
         path = gaussian_filter1d(np.concatenate(self._path), 4, axis=0, mode="nearest")
-        travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+        travelled = metres_along(path)
         keep = slice(0, int(np.searchsorted(travelled, length_m or np.inf)) + 1)
-        along = np.gradient(path, axis=0)
-        yaw = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))
+        yaw = np.unwrap(direction(path))
         swing = np.sin(travelled * 2 * np.pi / 37 + self._rng.uniform(0, 2 * np.pi))
         swing += 0.5 * np.sin(travelled * 2 * np.pi / 13 + self._rng.uniform(0, 2 * np.pi))
         yaw += np.radians(swing_deg) * swing / 1.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -53,11 +54,10 @@ def sampled(preset: Preset, route: Route, seed: int, day: int = 0) -> list[Pass]
     """A route as passes for a shard: as many samples as the preset says, the sun moving on with each hundred."""
     rng = np.random.default_rng([seed, 15, day])
     metres = np.linspace(0, route.length_m, preset.samples)
-    path = np.stack([np.interp(metres, route.travelled, axis) for axis in route.path.T], 1)
-    yaw = np.interp(metres, route.travelled, np.unwrap(route.yaw))
+    path, yaw = route.at(metres)
     tilt = np.radians(preset.tilt_deg) * rng.standard_normal((len(metres), 2))
     labels = [route.labels[int(i)] for i in np.searchsorted(route.travelled, metres - 1e-6)]
-    sun = Sun(float(rng.uniform(0, 360)), float(rng.uniform(18, 40)))
+    sun = Sun.drawn(18, 40, rng)
     borders = [i for i in range(1, len(metres)) if labels[i] != labels[i - 1] or i % _CHUNK == 0]
     passes = []
     for start, end in zip([0, *borders], [*borders, len(metres)], strict=True):
@@ -82,8 +82,6 @@ def first_samples(passes: list[Pass], count: int) -> list[Pass]:
     for drive in passes:
         size = min(len(drive.path), count)
         if size:
-            kept.append(
-                Pass(drive.label, drive.path[:size], drive.yaw[:size], drive.tilt[:size], drive.sun, drive.exposure)
-            )
+            kept.append(replace(drive, path=drive.path[:size], yaw=drive.yaw[:size], tilt=drive.tilt[:size]))
         count -= size
     return kept

@@ -22,7 +22,7 @@ import numpy as np
 
 from umf_ros.errors import OutputError
 from umf_ros.geometry import Array
-from umf_ros.lab.simulation.survey import Sample, Survey
+from umf_ros.lab.simulation.survey import Survey, SurveyFrame
 
 
 def write_shard(
@@ -69,7 +69,7 @@ def save(path: Path, arrays: dict[str, Array]) -> None:
         raise OutputError(f"cannot write {path}: {error.strerror}") from None
 
 
-def _arrays(survey: Survey, samples: list[Sample], setting: str) -> dict[str, Array]:
+def _arrays(survey: Survey, samples: list[SurveyFrame], setting: str) -> dict[str, Array]:
     world, calibration = survey.world, survey.calibration
     most = max(len(sample.points) for sample in samples)
     points = np.full((len(samples), most, 4), np.nan, np.float16)

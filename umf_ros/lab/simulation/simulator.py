@@ -98,11 +98,11 @@ class Simulator:
 
     def pose(self, stamp_ns: int) -> Array:
         """True (4, 4) `world_T_body` at a time."""
-        return self.motion.pose((stamp_ns - START_NS) * 1e-9)
+        return self.motion.pose(_seconds(stamp_ns))
 
     def sun(self, stamp_ns: int) -> Sun:
         """Where the sun stands at a time; the hours pass quickly."""
-        way = self.motion.travelled((stamp_ns - START_NS) * 1e-9) / self.route.length_m
+        way = self.motion.travelled(_seconds(stamp_ns)) / self.route.length_m
         return self._sun.moved(float(way) * self.preset.sun_deg)
 
     def scan(self, number: int) -> Scan:
@@ -118,7 +118,7 @@ class Simulator:
         """One picture of an exposure, with the truth behind it."""
         rng = np.random.default_rng([self.seed, 12, exposure.number, int(right)])
         eye = self._eyes[int(right)]
-        turning = self.motion.angular((exposure.stamp_ns - START_NS) * 1e-9)[0] @ eye.body_T_camera[:3, :3]
+        turning = self.motion.angular(_seconds(exposure.stamp_ns))[0] @ eye.body_T_camera[:3, :3]
         # a turn about the camera's y axis moves the picture along x, and the other way round
         smear = turning[[1, 0]] * eye.camera.intrinsics.fx * _EXPOSURE_S
         pose = self.pose(exposure.stamp_ns) @ eye.body_T_camera
@@ -159,7 +159,7 @@ class Simulator:
 
     def _odometry_at(self, stamp_ns: int) -> Array:
         """Odometry at any time: the last sample, moved on by the true motion since."""
-        time_s = (stamp_ns - START_NS) * 1e-9
+        time_s = _seconds(stamp_ns)
         last = int(np.searchsorted(self.odometry.times_s, time_s, side="right")) - 1
         since = relative(self.motion.pose(self.odometry.times_s[last]), self.motion.pose(time_s))
         return self.odometry.poses[last] @ since
@@ -169,8 +169,7 @@ class Simulator:
         return self.pose(stamp) @ mounting, self.pose(stamp + PERIOD_NS) @ mounting
 
     def _morning(self) -> Sun:
-        rng = np.random.default_rng([self.seed, 13])
-        return Sun(float(rng.uniform(0, 360)), float(rng.uniform(18, 40)))
+        return Sun.drawn(18, 40, np.random.default_rng([self.seed, 13]))
 
     def _exposures(self, rate_hz: float | None) -> list[Exposure]:
         rng = np.random.default_rng([self.seed, 14])
@@ -193,3 +192,13 @@ class Simulator:
                 f"duration {duration_s:g} s is not between {SHORTEST_S:g} and {longest:.0f} s, the whole drive"
             )
         return duration_s
+
+
+def stamp_ns(time_s: float) -> int:
+    """Stamp of a time on the drive's own clock, which starts at 0."""
+    return START_NS + round(float(time_s) * 1e9)
+
+
+def _seconds(stamp: int) -> float:
+    """The drive's own time at a stamp."""
+    return (stamp - START_NS) * 1e-9

@@ -24,7 +24,7 @@ DEPTH_STRIDE = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class SurveyFrame:
     """One frame for training; arrays as in a shard."""
 
     image: Image
@@ -46,10 +46,10 @@ class Survey:
     def __len__(self) -> int:
         return sum(len(drive.path) for drive in self.passes)
 
-    def __iter__(self) -> Iterator[Sample]:
+    def __iter__(self) -> Iterator[SurveyFrame]:
         return self.samples()
 
-    def samples(self, workers: int = 2) -> Iterator[Sample]:
+    def samples(self, workers: int = 2) -> Iterator[SurveyFrame]:
         """All samples in order, the same for any number of rendering threads."""
         tasks = [(index, step) for index, drive in enumerate(self.passes) for step in range(len(drive.path))]
         with ThreadPoolExecutor(workers) as pool:
@@ -61,7 +61,7 @@ class Survey:
         x, y = drive.path[here].T
         return stand(self.world.relief, x, y, drive.yaw[here], drive.tilt[here])[0]
 
-    def sample(self, index: int, step: int) -> Sample:
+    def sample(self, index: int, step: int) -> SurveyFrame:
         """One sample of a numbered pass."""
         drive, calibration = self.passes[index], self.calibration
         pose = self.pose(index, step)
@@ -73,7 +73,7 @@ class Survey:
         points = np.column_stack([in_body, scan.intensity[kept]]).astype(np.float16)
         depth = picture.depth[2::DEPTH_STRIDE, 2::DEPTH_STRIDE].astype(np.float16)
         sun = (drive.sun.azimuth_deg, drive.sun.elevation_deg)
-        return Sample(picture.image, points, depth, pose.astype(np.float32), index, sun)
+        return SurveyFrame(picture.image, points, depth, pose.astype(np.float32), index, sun)
 
 
 def survey_world(seed: int, family: str, setting: str, calibration: Calibration | None = None) -> Survey:

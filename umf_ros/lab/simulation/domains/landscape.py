@@ -9,16 +9,14 @@ from umf_ros.geometry import Array
 from umf_ros.lab.simulation.domains.solids import Scene
 from umf_ros.lab.simulation.world import GROUND, HORIZON, ROCK, World
 
-ALIASING = 0.6
-
 
 class Landscape:
-    """A world of one of `families.FAMILIES`."""
+    """A world of one of `families.FAMILIES`, for the domains."""
 
     lateral_m = 3.0
 
-    def __init__(self, seed: int, family: str) -> None:
-        self._world = World(seed, family, ALIASING)
+    def __init__(self, world: World) -> None:
+        self._world = world
         self.trail = self._world.relief.trail
         albedo = self._world.traits.albedo
         cells = len(self._world.relief.heights) - 1

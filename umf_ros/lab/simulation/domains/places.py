@@ -16,6 +16,9 @@ from umf_ros.lab.simulation.domains.quarry import Quarry
 from umf_ros.lab.simulation.domains.solids import Scene
 from umf_ros.lab.simulation.domains.street import Street
 from umf_ros.lab.simulation.domains.trees import Trees
+from umf_ros.lab.simulation.world import World
+
+ALIASING = 0.6  # of the landscapes: most of their rocks and lumps come again elsewhere
 
 
 class Place(Protocol):
@@ -49,6 +52,10 @@ class Kind:
     scale: float
 
 
+def _landscape(seed: int, family: str) -> Landscape:
+    return Landscape(World(seed, family, ALIASING))
+
+
 PLACES: dict[str, Kind] = {
     "corridor": Kind(Corridor, 0.5),
     "rooms": Kind(Rooms, 0.4),
@@ -56,8 +63,8 @@ PLACES: dict[str, Kind] = {
     "orchard": Kind(partial(Trees, regular=True), 0.8),
     "woods": Kind(partial(Trees, regular=False), 0.8),
     "quarry": Kind(Quarry, 1.0),
-    "etna": Kind(partial(Landscape, family="etna"), 1.0),
-    "moon": Kind(partial(Landscape, family="moon"), 1.0),
-    "canyon": Kind(partial(Landscape, family="canyon"), 1.0),
-    "dunes": Kind(partial(Landscape, family="dunes"), 1.0),
+    "etna": Kind(partial(_landscape, family="etna"), 1.0),
+    "moon": Kind(partial(_landscape, family="moon"), 1.0),
+    "canyon": Kind(partial(_landscape, family="canyon"), 1.0),
+    "dunes": Kind(partial(_landscape, family="dunes"), 1.0),
 }

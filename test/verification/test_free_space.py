@@ -1,0 +1,78 @@
+"""What rays say about the points of another scan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from umf_ros.geometry import invert, make_pose, transform
+from umf_ros.verification.free_space import RangeImage, Sight, contradiction
+
+RNG = np.random.default_rng(3)
+TURN = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [2.0, 1.0, 0.0])
+
+
+def rays(count=40_000, half_width_deg=180.0):
+    azimuth = np.radians(RNG.uniform(-half_width_deg, half_width_deg, count))
+    elevation = np.radians(RNG.uniform(-20, 20, count))
+    return np.column_stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+
+
+def hall(pose, directions, pillar=False):
+    """Points seen from a pose in a hall of 20 by 14 m with an open roof, and perhaps a pillar of 2 by 2 m in it."""
+    origin, world = pose[:3, 3], directions @ pose[:3, :3].T
+    reach = np.full(len(world), np.inf)
+    for axis, half in ((0, 10.0), (1, 7.0)):
+        reach = np.minimum(reach, (np.sign(world[:, axis]) * half - origin[axis]) / world[:, axis])
+    if pillar:
+        slabs = (np.array([[4.0, 2.0], [6.0, 4.0]])[:, None] - origin[:2]) / world[None, :, :2]
+        near, far = slabs.min(0).max(1), slabs.max(0).min(1)
+        reach = np.where((near < far) & (near > 0), np.minimum(reach, near), reach)
+    return directions * reach[:, None]
+
+
+def test_the_same_hall_from_another_pose_contradicts_nothing():
+    here, there = hall(np.eye(4), rays()), hall(TURN, rays())
+    assert contradiction(RangeImage(here).look_at(transform(TURN, there))) < 0.01
+    assert contradiction(RangeImage(there).look_at(transform(invert(TURN), here))) < 0.01
+
+
+def test_a_wrong_pose_puts_walls_into_free_space():
+    here, there = hall(np.eye(4), rays()), hall(TURN, rays())
+    shifted = make_pose(TURN[:3, :3], [4.0, 1.0, 0.0])
+    assert contradiction(RangeImage(there).look_at(transform(invert(shifted), here))) > 0.1
+
+
+def test_what_stands_in_free_space_is_passed_and_what_is_gone_was_met_by_nobody():
+    empty, furnished = hall(np.eye(4), rays()), hall(np.eye(4), rays(), pillar=True)
+    on_pillar = np.abs(furnished[:, :2] - [5.0, 3.0]).max(axis=1) < 1.01
+    assert on_pillar.sum() > 500
+    sight = RangeImage(empty).look_at(furnished)
+    assert (sight[on_pillar] == Sight.PASSED).mean() > 0.99
+    assert (sight[~on_pillar] == Sight.MET).mean() > 0.99
+    # seen the other way round the wall behind the pillar is only hidden: no contradiction
+    back = RangeImage(furnished).look_at(empty)
+    assert (back == Sight.HIDDEN).mean() == pytest.approx(on_pillar.mean(), abs=0.02)
+    assert contradiction(back) < 0.01
+
+
+def test_outside_a_narrow_view_nothing_is_known():
+    narrow = RangeImage(hall(np.eye(4), rays(half_width_deg=35.0)))
+    points = hall(np.eye(4), rays())
+    bearing = np.abs(np.degrees(np.arctan2(points[:, 1], points[:, 0])))
+    sight = narrow.look_at(points)
+    assert (sight[bearing > 40] == Sight.UNSEEN).all()
+    assert (sight[bearing < 30] == Sight.MET).mean() > 0.99
+
+
+def test_the_view_does_not_end_behind_the_sensor():
+    wall = np.column_stack([np.full(900, -5.0), RNG.uniform(-2, 2, 900), RNG.uniform(-1, 1, 900)])
+    nearer = 0.6 * wall[np.abs(wall[:, 1]) < 0.3]
+    assert (RangeImage(wall).look_at(nearer) == Sight.PASSED).all()
+
+
+def test_scans_that_see_nothing_of_each_other_count_as_contradiction():
+    ahead, behind = hall(np.eye(4), rays(half_width_deg=20.0)), -hall(np.eye(4), rays(half_width_deg=20.0))
+    assert contradiction(RangeImage(ahead).look_at(behind)) == 1.0

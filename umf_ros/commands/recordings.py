@@ -1,0 +1,87 @@
+"""Opening a recording with its settings: the same options and the same way in for every command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from umf_ros.embedding import CHOICES
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from umf_ros.bags.frames import FrameReader
+    from umf_ros.bags.reader import Bag
+    from umf_ros.config import Settings
+
+# written out: the settings, which know the names, are too heavy for `umf --help`
+DATASETS = "auto, simulated, s3li-etna or s3li-vulcano."
+
+BagPath = Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")]
+ConfigPath = Annotated[Path | None, typer.Option("--config", help="Parameter file (YAML).")]
+DatasetName = Annotated[str, typer.Option("--dataset", help=DATASETS)]
+EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"How places are embedded: {CHOICES}.")]
+WeightsPath = Annotated[
+    Path | None, typer.Option("--weights", help="Weights file, or umf_resnet50; default: umf_light.")
+]
+OdometryPath = Annotated[
+    Path | None, typer.Option("--odometry", help="Odometry as a TUM file, where the recording has none.")
+]
+OdometryFrame = Annotated[
+    str,
+    typer.Option(
+        "--odometry-frame",
+        help="Whose poses --odometry holds: body, imu, camera or lidar (S3LI's Eval/BASALT: imu).",
+    ),
+]
+TruthPath = Annotated[Path | None, typer.Option("--ground-truth", help="Truth as RTKLIB .pos or TUM file.")]
+RunsFolder = Annotated[Path, typer.Option("--out", help="Where results/<timestamp> goes.")]
+
+
+def open_recording(
+    bag: Path,
+    config: Path | None = None,
+    dataset: str = "auto",
+    embedder: str | None = None,
+    weights: Path | None = None,
+    **overrides: Any,
+) -> tuple[Bag, Settings]:
+    """A recording, and the settings to read it with.
+
+    Args:
+        bag: the recording.
+        config: parameter file.
+        dataset: name of its data set, or auto.
+        embedder: method, before what the file says.
+        weights: file or name, likewise.
+        overrides: as in `load_settings`.
+
+    Raises:
+        BagError: it cannot be opened, or its data set is not known.
+        ConfigError: the file cannot be read, or a name, type or value is wrong.
+    """
+    from umf_ros.bags.presets import settings_for
+    from umf_ros.bags.reader import open_bag
+
+    recording = open_bag(bag)
+    overrides |= {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}
+    return recording, settings_for(recording, config, dataset, **overrides)
+
+
+def open_frames(
+    recording: Bag, settings: Settings, console: Console, odometry: Path | None, odometry_frame: str
+) -> FrameReader:
+    """The frames of a recording, with the odometry of a file where one is named; faults are told on the console.
+
+    Raises:
+        BagError: the recording or the file cannot be read as frames or odometry.
+        CalibrationError: the calibration cannot be read.
+    """
+    from umf_ros.bags.frames import FrameReader
+    from umf_ros.bags.trajectories import read_odometry
+    from umf_ros.commands.progress import WARNING
+
+    path = read_odometry(odometry, odometry_frame, settings) if odometry else None
+    return FrameReader(recording, settings, path, warn=lambda text: console.print(text, **WARNING))
