@@ -72,5 +72,5 @@ def test_the_changelog_has_the_version() -> None:
 def test_the_citation_is_a_citation() -> None:
     content = yaml.safe_load(text_of("CITATION.cff"))
     assert {"cff-version", "message", "title", "authors"} <= set(content)
-    assert [author["family-names"] for author in content["preferred-citation"]["authors"]][0] == "García-Hernández"
+    assert next(author["family-names"] for author in content["preferred-citation"]["authors"]) == "García-Hernández"
     assert content["references"][0]["type"] == "thesis"

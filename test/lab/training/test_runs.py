@@ -324,7 +324,11 @@ def test_pretraining_from_the_command_line(folder, tmp_path):
     image = umf("pretrain", "image", folder, "--out", tmp_path / "image", "--mask-ratio", 0.5, *options)
     assert "tiny_image.safetensors" in image.replace("\n", "")
     assert read_card(tmp_path / "image" / "tiny_image.safetensors")["settings"]["mask_ratio"] == 0.5
-    lidar = umf("pretrain", "lidar", folder, "--out", tmp_path / "lidar", *options)
+    (tmp_path / "wide.yaml").write_text("ring_ratios: [0.9, 0.2, 0.1]\nsteps: 7\n")
+    config = ["--config", tmp_path / "wide.yaml"]
+    lidar = umf("pretrain", "lidar", folder, "--out", tmp_path / "lidar", *config, *options)
+    settings = load_run(tmp_path / "lidar" / "training.yaml")
+    assert settings.ring_ratios == (0.9, 0.2, 0.1) and settings.steps == 1
     assert "tiny_lidar.safetensors" in lidar.replace("\n", "")
     assert len(list((tmp_path / "lidar").glob("reconstructions_*.png"))) == 1
 

@@ -19,17 +19,12 @@ import torch
 from torch import Tensor, nn
 
 from umf_ros.errors import ConfigError
+from umf_ros.lab import training
 from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.training.settings import RunSettings
 from umf_ros.networks.umf import UMF
 
 SUFFIX = "_objective"
-METHODS = tuple(
-    module.name.removesuffix(SUFFIX)
-    for module in pkgutil.iter_modules([str(Path(__file__).parent)])
-    if module.name.endswith(SUFFIX)
-)
-"""Names of the ways of training."""
 
 
 class Batch(Protocol):
@@ -103,14 +98,21 @@ class Objective(nn.Module, ABC):
         return {}
 
 
+def find_methods() -> list[str]:
+    """Names of the ways of training that have a file here."""
+    names = (module.name for module in pkgutil.iter_modules(training.__path__))
+    return [name.removesuffix(SUFFIX) for name in names if name.endswith(SUFFIX)]
+
+
 def find_objective(method: str) -> type[Objective]:
     """The objective of a way of training.
 
     Raises:
         ConfigError: there is none of that name.
     """
-    if method not in METHODS:
-        raise ConfigError(f"method: unknown method {method!r}; known: {', '.join(METHODS)}")
+    known = find_methods()
+    if method not in known:
+        raise ConfigError(f"method: unknown method {method!r}; known: {', '.join(known)}")
     found: type[Objective] = import_module(f"{__package__}.{method}{SUFFIX}").OBJECTIVE
     return found
 
