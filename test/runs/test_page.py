@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import make_pose
-from umf_ros.runs.loops import JudgedClosure
 from umf_ros.runs.page import MAX_PICTURES, describe, print_summary, write_page
-from umf_ros.runs.truth import JudgedRun
+from umf_ros.runs.truth import JudgedClosure, JudgedRun
 
 NASTY = "<script>alert('x')</script> & \"quotes\" [red]"
 STAMP = 1_625_680_800_000_000_000

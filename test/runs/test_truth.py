@@ -17,7 +17,9 @@ from umf_ros.runs.truth import (
     JudgedRun,
     absolute_trajectory_error,
     align_rigidly,
+    count_revisits,
     endpoints,
+    judge_closure,
     judge_run,
     positions_in_truth,
     trajectory_error,
@@ -211,3 +213,68 @@ def test_over_a_truth_without_headings_it_is_laid_best() -> None:
 def test_without_a_truth_to_speak_of_it_stays_where_it_is(other: Trajectory | None) -> None:
     own = truth()
     np.testing.assert_array_equal(positions_in_truth(own, other), positions(own))
+
+
+def place(x: float, y: float = 0.0, yaw_deg: float = 0.0) -> np.ndarray:
+    return make_pose(Rotation.from_euler("zyx", [yaw_deg, 4, -3], degrees=True).as_matrix(), [x, y, 0.1 * x])
+
+
+def claim(match_T_query: np.ndarray) -> LoopClosure:
+    return LoopClosure(2, 1, match_T_query, np.eye(6))
+
+
+MATCH, QUERY = place(10, 5, 170), place(12, 4, -172)
+
+
+def test_an_exact_closure_is_true() -> None:
+    found = judge_closure(claim(relative(MATCH, QUERY)), QUERY, MATCH)
+    assert found.is_true and found.translation_error_m < 1e-9 and found.rotation_error_deg < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "turn_deg", "expected"), [(0.45, 0, True), (0.55, 0, False), (0, 4.5, True), (0, 5.5, False)]
+)
+def test_the_pose_must_be_right(shift_m: float, turn_deg: float, expected: bool) -> None:
+    error = make_pose(Rotation.from_euler("y", turn_deg, degrees=True).as_matrix(), [0, shift_m, 0])
+    found = judge_closure(claim(relative(MATCH, QUERY) @ error), QUERY, MATCH)
+    assert found.is_true is expected
+    assert found.translation_error_m == pytest.approx(shift_m, abs=1e-6)
+    assert found.rotation_error_deg == pytest.approx(turn_deg, abs=1e-4)
+
+
+def test_far_or_turned_keyframes_are_no_place_even_with_the_right_pose() -> None:
+    far, turned = place(22.5, 5, 170), place(10, 5, 135)
+    assert not judge_closure(claim(relative(MATCH, far)), far, MATCH).is_true
+    assert not judge_closure(claim(relative(MATCH, turned)), turned, MATCH).is_true
+
+
+def test_the_inverse_closure_is_false() -> None:
+    assert not judge_closure(claim(relative(QUERY, MATCH)), QUERY, MATCH).is_true
+
+
+def test_a_truth_of_positions_checks_distances_only() -> None:
+    def position_only(pose: np.ndarray) -> np.ndarray:
+        return make_pose(np.eye(3), pose[:3, 3])
+
+    found = judge_closure(
+        claim(relative(MATCH, QUERY)), position_only(QUERY), position_only(MATCH), has_orientation=False
+    )
+    assert found.is_true and math.isnan(found.rotation_error_deg)
+    longer = relative(MATCH, QUERY)
+    longer[:3, 3] *= 1.5
+    found = judge_closure(claim(longer), position_only(QUERY), position_only(MATCH), has_orientation=False)
+    assert not found.is_true
+
+
+def test_revisits_are_counted_like_the_database_admits_them() -> None:
+    # 1 m/s: out 40 m, back along the same line facing back, then out again
+    xs = [*range(0, 40), *range(40, 0, -1), *range(0, 40)]
+    yaws = [0] * 40 + [180] * 40 + [0] * 40
+    poses = np.stack([place(x, 0, yaw) for x, yaw in zip(xs, yaws, strict=True)])
+    stamps = np.arange(120) * 10**9
+    travelled = np.arange(120, dtype=float)
+    rules = Loop(min_time_gap_s=20, min_travel_m=15)
+    assert count_revisits(stamps, poses, travelled, rules) == 40
+    assert count_revisits(stamps, poses, travelled, rules, has_orientation=False) > 60
+    assert count_revisits(stamps, poses, np.full(120, np.nan), rules) == 40
+    assert count_revisits(stamps, poses, travelled, Loop(min_time_gap_s=1000)) == 0

@@ -25,7 +25,7 @@ Summary = Mapping[str, Any]
 """What `summary.json` holds."""
 
 
-class Picture(NamedTuple):
+class InlinePicture(NamedTuple):
     """An image inside the page: a `data:` address, and what is said below."""
 
     address: str
@@ -63,7 +63,7 @@ def write_page(folder: Path, summary: Summary, closures: Iterable[LoopClosure], 
         verdict=verdict,
         mark=mark,
         facts=_facts(summary),
-        trajectory=Picture(_address("png", (folder / "trajectory.png").read_bytes()), "seen from above"),
+        trajectory=InlinePicture(_address("png", (folder / "trajectory.png").read_bytes()), "seen from above"),
         matches=[_photograph(path, path.stem.replace("_", " matched with ")) for path in matches],
         closures=[_row(closure, known.get(endpoints(closure))) for closure in closures],
         version=summary["version"],
@@ -132,11 +132,11 @@ def _size(closure: LoopClosure) -> tuple[float, float]:
     return float(np.linalg.norm(pose[:3, 3])), float(np.degrees(rotation_angle(pose)))
 
 
-def _photograph(path: Path, caption: str) -> Picture:
+def _photograph(path: Path, caption: str) -> InlinePicture:
     """A picture as JPEG, which is a fraction of a camera image's size."""
     image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
     _, data = cv2.imencode(".jpg", np.asarray(image), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return Picture(_address("jpeg", data.tobytes()), caption)
+    return InlinePicture(_address("jpeg", data.tobytes()), caption)
 
 
 def _address(kind: str, content: bytes) -> str:

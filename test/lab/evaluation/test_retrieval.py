@@ -157,8 +157,8 @@ def test_a_keyframe_of_the_evaluation_keeps_what_retrieval_needs() -> None:
 
     frame = replace(frame_of(5, 2), odom_T_body=at(2), session=3)
     embedding = LandmarkEmbedder().embed(frame)
-    keyframe = as_keyframe(frame, embedding, 12.5)
-    assert (keyframe.stamp_ns, keyframe.travelled_m, keyframe.session) == (5, 12.5, 3)
+    keyframe = as_keyframe(frame, embedding)
+    assert (keyframe.stamp_ns, keyframe.session) == (5, 3)
     assert keyframe.embedding is embedding and keyframe.odom_T_body is frame.odom_T_body
     assert keyframe.points.shape == (0, 3)
 

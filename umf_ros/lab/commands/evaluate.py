@@ -116,7 +116,7 @@ def _on_worlds(name: str, seed: int | None, quick: bool, others: bool, weights: 
         names = ", ".join(world.name for world in chosen)
         notes = [
             f"Worlds: {names}; hard setting (offset path up to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing)"
-            f"{', quick' if quick else ''}. A match is true within 12 m and 30 deg (thesis 5.1.2). Times are "
+            f"{', quick' if quick else ''}. A match is true within 12 m and 30 deg [UMF 5.1.2]. Times are "
             "medians on this machine, as busy as it was."
         ]
         report = run.write(summary, folder, notes)

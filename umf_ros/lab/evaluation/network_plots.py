@@ -1,4 +1,4 @@
-"""What the network makes of places: descriptors in the plane, attention and key-points (thesis figures 5.5 to 5.11)."""
+"""What the network makes of places: descriptors in the plane, attention and key-points [UMF figures 5.5 to 5.11]."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which references a query is compared with, and which of them are true matches (thesis 5.1.2, 5.2)."""
+"""Which references a query is compared with, and which of them are true matches [UMF 5.1.2, 5.2]."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Places embedded, retrieved by their descriptors and reranked by their local features (thesis 5.2 and 5.5.2)."""
+"""Places embedded, retrieved by their descriptors and reranked by their local features [UMF 5.2, 5.5.2]."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOTHING = -1
 """Stands in a ranking where there is no further reference."""
 
 TOP_K = 20
-"""Candidates that are reranked (thesis 5.5.2)."""
+"""Candidates that are reranked [UMF 5.5.2]."""
 
 RERANKERS = ("superfeatures", "ransac")
 PARTS = {"image": "image", "lidar": "cloud", "both": "both"}
@@ -52,7 +52,7 @@ class PlaceCollection:
         self._descriptors: dict[str, list[Descriptors]] = {mode: [] for mode in MODES}
         self.keyframes: list[Keyframe] = []
 
-    def add(self, frame: Frame, modes: Collection[str] = ("fused",), travelled_m: float = float("nan")) -> None:
+    def add(self, frame: Frame, modes: Collection[str] = ("fused",)) -> None:
         """Embed a frame whole ("fused") and in further modes; in the others it holds NaN."""
         for mode, change in MODES.items():
             row = np.full(self._embedder.dimension, np.nan, np.float32)
@@ -60,7 +60,7 @@ class PlaceCollection:
                 embedding = self._embedder.embed(change(frame))
                 row = embedding.descriptor
                 if mode == "fused":
-                    self.keyframes.append(as_keyframe(frame, embedding, travelled_m))
+                    self.keyframes.append(as_keyframe(frame, embedding))
             self._descriptors[mode].append(row)
 
     def descriptors(self, mode: str) -> Descriptors:
@@ -68,7 +68,7 @@ class PlaceCollection:
         return np.stack(self._descriptors[mode])
 
 
-def as_keyframe(frame: Frame, embedding: Embedding, travelled_m: float) -> Keyframe:
+def as_keyframe(frame: Frame, embedding: Embedding) -> Keyframe:
     """A keyframe that can be retrieved and reranked; it keeps no points for registration."""
     return Keyframe(
         stamp_ns=frame.stamp_ns,
@@ -77,7 +77,6 @@ def as_keyframe(frame: Frame, embedding: Embedding, travelled_m: float) -> Keyfr
         body_T_camera=frame.body_T_camera,
         points=NO_POINTS,
         odom_T_body=frame.odom_T_body,
-        travelled_m=travelled_m,
         session=frame.session,
     )
 

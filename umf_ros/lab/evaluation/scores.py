@@ -1,4 +1,4 @@
-"""Every figure of merit of a ranking (thesis 5.2)."""
+"""Every figure of merit of a ranking [UMF 5.2]."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ YAW_BINS = ((0.0, 10.0), (10.0, 20.0), (20.0, 30.0), (OPPOSITE_DEG, 180.0))
 
 @dataclass(frozen=True, slots=True)
 class PrecisionRecall:
-    """Precision against recall when only matches above a threshold are believed (thesis figure 5.13).
+    """Precision against recall when only matches above a threshold are believed [UMF figure 5.13].
 
     One row per distinct score, the highest first.
 
@@ -170,7 +170,7 @@ def recall_by_yaw(task: RetrievalTask, ranking: Ranking) -> list[YawBin]:
     """Recall@1 by difference of heading; revisits in the opposite direction are a bin of their own.
 
     A query belongs to the bin of the least turned reference within the radius. In the opposite
-    direction the thesis knows no true match: there, any reference within the radius is one.
+    direction [UMF] knows no true match: there, any reference within the radius is one.
     """
     here = task.admissible & (task.metres < THESIS_RULE.positive_m)
     least = np.where(here, task.turn_deg, np.inf).min(axis=1, initial=np.inf)

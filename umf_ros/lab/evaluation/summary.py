@@ -25,7 +25,7 @@ from umf_ros.sensors.calibration import load_calibration
 WARM_UP = 3
 
 ETNA_RECALL1 = {
-    # thesis table 5.7: what the method reached on the real data of Mt Etna, in per cent
+    # [UMF table 5.7]: what the method reached on the real data of Mt Etna, in per cent
     "fused": 73.5,
     "superfeatures image": 74.5,
     "superfeatures lidar": 73.7,
@@ -38,7 +38,7 @@ ETNA_RECALL1 = {
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What a network costs (thesis table 5.9).
+    """What a network costs [UMF table 5.9].
 
     Attributes:
         name: for people.
@@ -99,7 +99,7 @@ class WorldsSummary:
     Attributes:
         results: one per world.
         baselines: scores of other methods, by name and world.
-        default, resnet50: costs of the evaluated weights, and of the thesis's network with random ones.
+        default, resnet50: costs of the evaluated weights, and of the network of [UMF] with random ones.
     """
 
     results: Sequence[WorldResult]

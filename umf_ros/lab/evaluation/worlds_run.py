@@ -1,4 +1,4 @@
-"""An evaluation on simulated worlds, in every way the thesis compares: from the weights to the report."""
+"""An evaluation on simulated worlds, in every way that [UMF 5.5] compares: from the weights to the report."""
 
 from __future__ import annotations
 
