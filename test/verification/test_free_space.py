@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from umf_ros.geometry import invert, make_pose, transform
-from umf_ros.verification.free_space import RangeImage, Sight, contradiction
+from umf_ros.verification.free_space import RangeImage, Sight, contradiction, counterparts
 
 RNG = np.random.default_rng(3)
 TURN = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [2.0, 1.0, 0.0])
@@ -76,3 +77,26 @@ def test_the_view_does_not_end_behind_the_sensor():
 def test_scans_that_see_nothing_of_each_other_count_as_contradiction():
     ahead, behind = hall(np.eye(4), rays(half_width_deg=20.0)), -hall(np.eye(4), rays(half_width_deg=20.0))
     assert contradiction(RangeImage(ahead).look_at(behind)) == 1.0
+
+
+def share_with_counterpart(match, query, pose):
+    moved = transform(pose, query)
+    distance = cKDTree(match).query(moved)[0]
+    return counterparts(RangeImage(match).look_at(moved), distance, np.linalg.norm(moved, axis=1))
+
+
+def test_a_right_pose_gives_counterparts_to_nearly_all_points_and_a_wrong_one_does_not():
+    here, there = hall(np.eye(4), rays()), hall(TURN, rays(4000))
+    shifted = make_pose(TURN[:3, :3], [4.0, 1.0, 0.0])
+    assert share_with_counterpart(here, there, TURN) > 0.97
+    assert share_with_counterpart(here, there, shifted) < 0.8
+
+
+def test_what_is_hidden_or_outside_the_view_needs_no_counterpart():
+    here = hall(np.eye(4), rays(half_width_deg=35.0), pillar=True)
+    there = hall(np.eye(4), rays(4000))
+    everything = cKDTree(here).query(there)[0] < 0.4
+    assert everything.mean() < 0.4
+    # a cell around edges is in doubt: whether the wall beside the pillar is hidden
+    assert share_with_counterpart(here, there, np.eye(4)) > 0.9
+    assert counterparts(np.full(3, Sight.UNSEEN, np.int8), np.zeros(3), np.ones(3)) == 0

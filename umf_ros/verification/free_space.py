@@ -17,6 +17,7 @@ from umf_ros.geometry import Array
 CELL_DEG = 2.0
 ROWS, COLUMNS = 90, 180
 MARGIN_M, MARGIN_SHARE = 0.3, 0.03  # noise, motion and the error of the pose, which grows with the range
+NEAR_M, NEAR_SHARE = 0.3, 0.01  # to a counterpart: rays lie further apart with the range
 KNOWN_SHARE = 0.3  # of a cell's neighbourhood that must have returns for its rays to be known
 
 
@@ -63,6 +64,22 @@ def contradiction(sight: NDArray[np.int8]) -> float:
     """Share of the points that should be visible which the rays passed by; 1 where none should be visible."""
     passed, met = int((sight == Sight.PASSED).sum()), int((sight == Sight.MET).sum())
     return passed / (passed + met) if passed + met else 1.0
+
+
+def counterparts(sight: NDArray[np.int8], distance: Array, reach: Array) -> float:
+    """Share of the points that should be visible which have a counterpart; 0 where none should be visible.
+
+    Unlike `contradiction` it also counts what is seen through between two rays, and it knows how far apart
+    the scans lie: of all measures it tells streets apart best.
+
+    Args:
+        sight: (N,) of the points.
+        distance: (N,) to the nearest point of the other scan, m.
+        reach: (N,) distance from the other scan's sensor, m.
+    """
+    visible = (sight == Sight.MET) | (sight == Sight.PASSED)
+    near = distance[visible] < NEAR_M + NEAR_SHARE * reach[visible]
+    return float(near.mean()) if len(near) else 0.0
 
 
 def _polar(points: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:

@@ -1,0 +1,84 @@
+"""Reading a plain folder of scans, and counting what was made of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import make_keyframe
+from recordings import RealPair, cropped, draw_pairs, read_pairs, read_scan, summary
+
+from umf_ros.frames import Candidate, LoopClosure, Verdict
+from umf_ros.geometry import make_pose
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".bin"])
+def test_scans_are_read_without_what_is_not_finite(tmp_path, suffix):
+    points = np.arange(12, dtype=np.float32).reshape(3, 4)
+    points[1, 2] = np.nan
+    path = tmp_path / f"scan{suffix}"
+    np.save(path, points) if suffix == ".npy" else points.tofile(path)
+    assert read_scan(path) == pytest.approx(points[[0, 2]])
+
+
+def test_pairs_are_read_with_their_pose_where_it_is_known(tmp_path):
+    path = tmp_path / "pairs.csv"
+    path.write_text(
+        "match_scan,query_scan,same_place,x,y,z,qx,qy,qz,qw\na.npy,b.npy,1,1,2,3,0,0,0,1\nc.npy,d.npy,0,,,,,,,\n"
+    )
+    known, unknown = read_pairs(path)
+    assert (known.match, known.query, known.same_place) == ("a.npy", "b.npy", True)
+    assert known.match_T_query == pytest.approx(make_pose(np.eye(3), [1, 2, 3]))
+    assert not unknown.same_place
+    assert unknown.match_T_query is None
+
+
+def test_cropping_leaves_a_view_ahead():
+    points = np.array([[5, 0, 1], [5, 4, 0], [-5, 0, 0]], np.float32)
+    assert cropped(points, 36.0) == pytest.approx(points[:1])
+    assert len(cropped(points, 180.0)) == 3
+
+
+def test_drawn_pairs_are_far_apart_and_half_of_them_alike(tmp_path):
+    (tmp_path / "scans").mkdir()
+    for number in range(60):
+        np.save(tmp_path / "scans" / f"{number:03d}.npy", np.zeros((1, 3)))
+    keyframes = {f"scans/{n:03d}.npy": make_keyframe(n, seed=n % 25) for n in range(60)}  # n and n + 25 look the same
+    pairs = list(draw_pairs(tmp_path, keyframes.__getitem__, 40, 20))
+    numbers = [(int(pair.match[6:9]), int(pair.query[6:9])) for pair in pairs]
+    assert len(pairs) == 40
+    assert all(query - match > 20 for match, query in numbers)
+    alike = [query for match, query in numbers if (query - match) % 25 == 0]
+    assert len(alike) >= sum(query >= 25 for _, query in numbers) / 2
+    assert not any(pair.same_place for pair in pairs)
+
+
+def test_true_false_and_misplaced_closures_are_told_apart():
+    pose = make_pose(np.eye(3), [1.0, 0.0, 0.0])
+    off = make_pose(np.eye(3), [2.5, 0.0, 0.0])
+
+    def verdict(estimate):
+        closure = None if estimate is None else LoopClosure(2, 1, estimate, np.eye(6) * 0.01)
+        return Verdict(Candidate(0, 1, 0.5), "", closure=closure)
+
+    true, false = RealPair("a", "b", True, pose), RealPair("a", "c", False)
+    unknown = RealPair("a", "d", True)
+    figures = summary(
+        [
+            (true, verdict(pose)),
+            (true, verdict(off)),
+            (true, verdict(None)),
+            (unknown, verdict(off)),
+            (false, verdict(pose)),
+            (false, verdict(None)),
+        ]
+    )
+    counted = {key: figures[key] for key in figures if key.startswith(("true", "false"))}
+    assert counted == {
+        "true_pairs": 4,
+        "true_accepted": 2,
+        "true_misplaced": 1,
+        "false_pairs": 2,
+        "false_accepted": 1,
+    }
+    assert figures["error_median_m"] == pytest.approx(0)
+    assert figures["inside_95"] == 1
