@@ -23,29 +23,28 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from umf_ros.config import PoseGraph as Settings
-from umf_ros.geometry import Array
+from umf_ros.config import PoseGraphSettings
+from umf_ros.geometry import Array, invert
 from umf_ros.lab.simulation.pose_graphs import (
     WORLDS,
+    GraphWorld,
     Kind,
-    World,
     WorldClosure,
     rover_loops,
     with_bias,
     with_lone_end,
     with_wrong_closures,
 )
-from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.condensed import Edge, between
-from umf_ros.pose_graph.g2o import read_g2o
-from umf_ros.pose_graph.graph import PoseGraph
-from umf_ros.pose_graph.replay import PERIOD_NS, as_recording
+from umf_ros.pose_graph.g2o import PERIOD_NS, as_recording, read_g2o
+from umf_ros.pose_graph.pose_graph import PoseGraph
 
 FIRST_SEED = 20_000
 MOST_CLOSURES_OF_A_FILE = 1500
 MOST_SOLUTIONS_OF_A_FILE = 150
-SETTINGS = Settings(keyframe_spacing_m=1e-6, max_gap_s=1.5, max_closure_m=1e7)
+SETTINGS = PoseGraphSettings(keyframe_spacing_m=1e-6, max_gap_s=1.5, max_closure_m=1e7)
+BELIEVING = SETTINGS.model_copy(update={"reject_outliers": False})
 KINDS: tuple[Kind, ...] = ("random", "groups", "near")
 # per metre; a tenth of it is what the stated noise makes of a hundred metres
 BIAS = np.array([0, 0, np.deg2rad(0.1), 0.01, 0, 0])
@@ -63,7 +62,7 @@ class Outcome:
 
 
 def drive(
-    world: World, reference: Array, stated: float = 1.0, settings: Settings = SETTINGS, batch: int = 1
+    world: GraphWorld, reference: Array, stated: float = 1.0, settings: PoseGraphSettings = SETTINGS, batch: int = 1
 ) -> Outcome:
     """Feed a world in order; `stated` multiplies the odometry's stated standard deviations."""
     graph, vertex, seconds, wrong_events = PoseGraph(settings), 0, [], 0
@@ -90,7 +89,7 @@ def drive(
     )
 
 
-def feed_odometry(graph: PoseGraph, world: World, start: int, end: int, stated: float) -> int:
+def feed_odometry(graph: PoseGraph, world: GraphWorld, start: int, end: int, stated: float) -> int:
     for k in range(start, end):
         if k and k in world.chains:
             graph.begin_session()
@@ -105,10 +104,10 @@ def judged(graph: PoseGraph, right: dict[tuple[int, int], bool]) -> list[bool]:
     return [right[c.match_stamp_ns, c.query_stamp_ns] for c in accepted]
 
 
-def batch_optimum(world: World, initial: Array) -> tuple[Array, float]:
+def batch_optimum(world: GraphWorld, initial: Array) -> tuple[Array, float]:
     """(N, 4, 4) Levenberg-Marquardt optimum of odometry and right closures, and its seconds of CPU."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    steps = lie.invert(world.odometry[:-1]) @ world.odometry[1:]
+    steps = invert(world.odometry[:-1]) @ world.odometry[1:]
     for k, pose in enumerate(initial):
         values.insert(k, gtsam.Pose3(pose))
         if k not in world.chains:
@@ -123,7 +122,7 @@ def batch_optimum(world: World, initial: Array) -> tuple[Array, float]:
     return np.stack([result.atPose3(k).matrix() for k in range(len(initial))]), seconds
 
 
-def optimum_near_truth(world: World) -> Array:
+def optimum_near_truth(world: GraphWorld) -> Array:
     """The outlier-free optimum, reached to the last digit by starting again from where it was found."""
     poses = world.truth
     for _ in range(3):
@@ -144,7 +143,7 @@ class Trial:
     """A world with the cells it is driven through; closures come in batches; whether its figures are the hard ones."""
 
     name: str
-    world: World
+    world: GraphWorld
     cells: list[Cell]
     batch: int = 1
     hard: bool = False
@@ -167,7 +166,7 @@ def generated(first_seed: int, quick: bool) -> list[Trial]:
     ]
 
 
-def hard(world: World, seed: int) -> list[Trial]:
+def hard(world: GraphWorld, seed: int) -> list[Trial]:
     """The world with what its stated noise does not tell, and with a last closure that no other supports."""
     chosen = [Cell(0.0, "random", 1.0), *(Cell(0.5, kind, 1.0) for kind in KINDS)]
     return [
@@ -183,8 +182,8 @@ def from_file(path: Path, quick: bool) -> Trial:
     chosen = np.unique(np.linspace(0, len(recording.closures) - 1, MOST_CLOSURES_OF_A_FILE).astype(int))
     edges = [recording.closures[row] for row in chosen] if len(recording.closures) else []
     closures = [WorldClosure(e.first, e.second, e.pose, e.covariance, True) for e in edges]
-    world = World(recording.odometry, recording.odometry, recording.steps, closures, tuple(recording.chains))
-    graph = PoseGraph(SETTINGS.model_copy(update={"use_gate": False, "use_support": False, "estimate_scale": False}))
+    world = GraphWorld(recording.odometry, recording.odometry, recording.steps, closures, tuple(recording.chains))
+    graph = PoseGraph(BELIEVING)
     feed_odometry(graph, world, 0, len(world.truth), 1.0)
     graph.add_closures([world.message(row) for row in range(len(closures))])
     graph.settle()
@@ -260,10 +259,9 @@ def cost(seed: int) -> dict[str, float]:
     return result | {"growth_1k_10k": medians[10000] / medians[1000]}
 
 
-def equality(worlds: list[World]) -> dict[str, float]:
+def equality(worlds: list[GraphWorld]) -> dict[str, float]:
     """Largest RMS distance to the batch optimum in mm with nothing wrong and everything accepted."""
-    settings = SETTINGS.model_copy(update={"use_gate": False, "use_support": False, "estimate_scale": False})
-    errors = [drive(world, optimum_near_truth(world), settings=settings, batch=20).error_m for world in worlds]
+    errors = [drive(world, optimum_near_truth(world), settings=BELIEVING, batch=20).error_m for world in worlds]
     return {"batch_equality_mm": 1e3 * max(errors)}
 
 

@@ -8,22 +8,23 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from umf_ros.config import PoseGraph as Settings
-from umf_ros.geometry import Array, make_pose
-from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, World, WorldClosure
-from umf_ros.pose_graph import lie
+from umf_ros.config import PoseGraphSettings
+from umf_ros.geometry import Array, expmap, invert, make_pose, relative
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, WorldClosure
 from umf_ros.pose_graph.closures import ClosureVerdict, State, TrackedClosure
 from umf_ros.pose_graph.condensed import Edge, between
-from umf_ros.pose_graph.graph import PoseGraph
+from umf_ros.pose_graph.g2o import G2oGraph, GraphRecording
+from umf_ros.pose_graph.g2o import drive as drive_recording
 from umf_ros.pose_graph.odometry import OdometryChain
+from umf_ros.pose_graph.pose_graph import PoseGraph
 
-SETTINGS = Settings(keyframe_spacing_m=1e-6, max_gap_s=1.5)
+SETTINGS = PoseGraphSettings(keyframe_spacing_m=1e-6, max_gap_s=1.5)
 LAP = 100
 ODOMETRY_SIGMAS = np.array([*np.deg2rad([0.2] * 3), 0.02, 0.02, 0.02])
 CLOSURE_COVARIANCE = np.diag([*np.deg2rad([0.5] * 3), 0.05, 0.05, 0.05]) ** 2
 
 
-def two_laps(seed: int = 0, noise: float = 1.0, bias: Array | None = None) -> World:
+def two_laps(seed: int = 0, noise: float = 1.0, bias: Array | None = None) -> GraphWorld:
     """Twice round a circle of 100 m, a pose per metre: pose k + 100 is where pose k was.
 
     Args:
@@ -34,25 +35,25 @@ def two_laps(seed: int = 0, noise: float = 1.0, bias: Array | None = None) -> Wo
     count = 2 * LAP
     turn = np.array([0, 0, 2 * np.pi / LAP, 1.0, 0, 0])
     errors = noise * np.random.default_rng(seed).normal(size=(count - 1, 6)) * ODOMETRY_SIGMAS
-    steps = lie.exp(turn[None]) @ lie.exp(errors if bias is None else errors + bias)
+    steps = expmap(turn[None]) @ expmap(errors if bias is None else errors + bias)
     odometry = [np.eye(4)]
     for step in steps:
         odometry.append(odometry[-1] @ step)
     covariances = np.tile(np.diag(ODOMETRY_SIGMAS**2), (count, 1, 1))
-    return World(lie.exp(np.arange(count)[:, None] * turn), np.stack(odometry), covariances, [])
+    return GraphWorld(expmap(np.arange(count)[:, None] * turn), np.stack(odometry), covariances, [])
 
 
 def closing(
-    world: World,
+    world: GraphWorld,
     pairs: Iterable[tuple[int, int]],
     shift_m: tuple[float, float, float] = (0, 0, 0),
     noise: float = 0.0,
-) -> World:
+) -> GraphWorld:
     """The world with more closures: exact but for a shift of the second pose in the map, and noise if wanted."""
     shift, closures = make_pose(np.eye(3), shift_m), list(world.closures)
     for first, second in pairs:
         error = noise * np.random.default_rng(second).normal(0, np.sqrt(np.diag(CLOSURE_COVARIANCE)))
-        pose = lie.invert(world.truth[first]) @ shift @ world.truth[second] @ lie.exp(error[None])[0]
+        pose = invert(world.truth[first]) @ shift @ world.truth[second] @ expmap(error[None])[0]
         closures.append(WorldClosure(first, second, pose, CLOSURE_COVARIANCE, not any(shift_m)))
     return replace(world, closures=closures)
 
@@ -62,7 +63,7 @@ def lap_pairs(*first: int) -> list[tuple[int, int]]:
     return [(k, k + LAP) for k in first]
 
 
-def chain_of(world: World, settings: Settings = SETTINGS, stated: float = 1.0) -> OdometryChain:
+def chain_of(world: GraphWorld, settings: PoseGraphSettings = SETTINGS, stated: float = 1.0) -> OdometryChain:
     """The world's odometry alone."""
     chain = OdometryChain(settings)
     for k, pose in enumerate(world.odometry):
@@ -72,7 +73,7 @@ def chain_of(world: World, settings: Settings = SETTINGS, stated: float = 1.0) -
     return chain
 
 
-def tracked(world: World) -> list[TrackedClosure]:
+def tracked(world: GraphWorld) -> list[TrackedClosure]:
     """The world's closures as the graph holds them."""
     messages = [world.message(row) for row in range(len(world.closures))]
     covariances = [closure.covariance for closure in world.closures]
@@ -82,14 +83,14 @@ def tracked(world: World) -> list[TrackedClosure]:
     ]
 
 
-def feed_odometry(graph: PoseGraph, world: World, poses: Iterable[int], stated: float = 1.0) -> None:
+def feed_odometry(graph: PoseGraph, world: GraphWorld, poses: Iterable[int], stated: float = 1.0) -> None:
     for k in poses:
         covariance = world.step_covariance(k)
         given = None if covariance is None else covariance * stated**2
         graph.add_odometry(k * PERIOD_NS, world.odometry[k], given)
 
 
-def drive(world: World, settings: Settings = SETTINGS, stated: float = 1.0) -> PoseGraph:
+def drive(world: GraphWorld, settings: PoseGraphSettings = SETTINGS, stated: float = 1.0) -> PoseGraph:
     """Odometry and closures in the order of a live drive, settled."""
     graph, done = PoseGraph(settings), 0
     for row, closure in enumerate(world.closures):
@@ -106,15 +107,15 @@ def accepted(graph: PoseGraph) -> set[tuple[int, int]]:
     return {(c.match_stamp_ns // PERIOD_NS, c.query_stamp_ns // PERIOD_NS) for c in closures}
 
 
-def right(world: World) -> set[tuple[int, int]]:
+def right(world: GraphWorld) -> set[tuple[int, int]]:
     return {(c.first, c.second) for c in world.closures if c.right}
 
 
-def batch_optimum(world: World) -> Array:
+def batch_optimum(world: GraphWorld) -> Array:
     """Levenberg-Marquardt over every pose, right closures only."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(world.odometry[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
-    steps = lie.invert(world.odometry[:-1]) @ world.odometry[1:]
+    steps = invert(world.odometry[:-1]) @ world.odometry[1:]
     for k, pose in enumerate(world.truth):
         values.insert(k, gtsam.Pose3(pose))
         if k:
@@ -129,3 +130,21 @@ def batch_optimum(world: World) -> Array:
 
 def rms(a: Array, b: Array) -> float:
     return float(np.sqrt(((a[:, :3, 3] - b[:, :3, 3]) ** 2).sum(axis=1).mean()))
+
+
+def content_of(world: GraphWorld, first_id: int = 0, stride: int = 1) -> G2oGraph:
+    """The world as a file would give it."""
+    ids = [first_id + stride * k for k in range(len(world.truth))]
+    edges = [
+        Edge(ids[k - 1], ids[k], relative(world.odometry[k - 1], world.odometry[k]), world.step_covariances[k])
+        for k in range(1, len(ids))
+    ]
+    edges += [Edge(ids[c.first], ids[c.second], c.pose, c.covariance) for c in world.closures]
+    return G2oGraph(dict(zip(ids, world.odometry, strict=True)), edges)
+
+
+def driven_file(recording: GraphRecording) -> PoseGraph:
+    graph = PoseGraph(recording.settings(SETTINGS))
+    for _ in drive_recording(graph, recording):
+        pass
+    return graph

@@ -4,7 +4,20 @@ import gtsam
 import numpy as np
 import pytest
 
-from umf_ros.geometry import Array, gtsam_to_ros_covariance, heading, interpolate, make_pose, ros_to_gtsam_covariance
+from umf_ros.geometry import (
+    Array,
+    adjoint,
+    expmap,
+    gtsam_to_ros_covariance,
+    heading,
+    interpolate,
+    invert,
+    logmap,
+    make_pose,
+    propagate,
+    right_jacobian,
+    ros_to_gtsam_covariance,
+)
 
 POSES = [gtsam.Pose3.Expmap(np.random.default_rng(seed).normal(0, 1.5, 6)).matrix() for seed in range(5)]
 
@@ -65,3 +78,44 @@ def test_heading_of_one_pose_and_of_many() -> None:
     turned = [gtsam.Pose3(gtsam.Rot3.Rz(angle), gtsam.Point3(0, 0, 0)).matrix() for angle in (-2.0, 0.0, 3.0)]
     np.testing.assert_allclose(heading(np.stack(turned)), [-2.0, 0.0, 3.0])
     assert heading(turned[2]) == pytest.approx(3.0)
+
+
+def twists(seed: int, size: float) -> Array:
+    return np.random.default_rng(seed).normal(0, size, (20, 6))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 0.5, 1.2])
+def test_exp_log_and_adjoint_are_those_of_gtsam(size: float) -> None:
+    poses = expmap(twists(0, size))
+    for twist, pose, matrix in zip(twists(0, size), poses, adjoint(poses), strict=True):
+        expected = gtsam.Pose3.Expmap(twist)
+        np.testing.assert_allclose(pose, expected.matrix(), atol=1e-12)
+        np.testing.assert_allclose(matrix, expected.AdjointMap(), atol=1e-12)
+    expected_logs = [gtsam.Pose3.Logmap(gtsam.Pose3(pose)) for pose in poses]
+    np.testing.assert_allclose(logmap(poses), expected_logs, atol=1e-8)
+
+
+@pytest.mark.parametrize("angle", [3.0, 3.1, 3.1415, np.pi])
+def test_log_near_half_a_turn(angle: float) -> None:
+    axis = np.array([0.6, -0.48, 0.64])
+    pose = expmap(np.array([[*(angle * axis), 1.0, 2.0, 3.0]]))
+    np.testing.assert_allclose(expmap(logmap(pose)), pose, atol=1e-7)
+
+
+def test_right_jacobian_is_the_derivative_of_exp() -> None:
+    twist, step = twists(1, 0.05)[:1], 1e-6
+    pose = expmap(twist)
+    columns = [logmap(invert(pose) @ expmap(twist + step * axis))[0] / step for axis in np.eye(6)]
+    np.testing.assert_allclose(right_jacobian(twist)[0], np.stack(columns, axis=1), atol=1e-5)
+
+
+def test_inverting_a_stack_inverts_each() -> None:
+    stack = np.stack(POSES)
+    np.testing.assert_allclose(invert(stack), np.linalg.inv(stack), atol=1e-12)
+    np.testing.assert_allclose(invert(stack[3]), np.linalg.inv(stack[3]), atol=1e-12)
+
+
+def test_propagating_is_what_samples_do() -> None:
+    matrix, before = adjoint(POSES[1]), covariance(5)
+    samples = np.random.default_rng(0).multivariate_normal(np.zeros(6), before, 200_000) @ matrix.T
+    np.testing.assert_allclose(propagate(matrix, before), np.cov(samples.T), rtol=0.05, atol=0.5)

@@ -117,7 +117,7 @@ class Verification(Group):
     calibration: str = Field("", description="fitted acceptance model (JSON); empty: the shipped one")
 
 
-class PoseGraph(Group):
+class PoseGraphSettings(Group):
     """The GTSAM back-end."""
 
     keyframe_period_s: float = Field(0.5, gt=0, le=60, description="odometry is sampled this often, s")
@@ -132,26 +132,25 @@ class PoseGraph(Group):
     gate_chi2: float = Field(
         27.9, gt=0, description="largest squared Mahalanobis distance to the map (6 degrees of freedom)"
     )
-    pair_chi2: float = Field(33.6, gt=0, description="the same between two closures that shall agree")
+    pair_chi2: float = Field(33.6, gt=0, description="the same between two closures, to be consistent")
     alias_radius_m: float = Field(15.0, gt=0, description="wrong closures to similar places are expected this close, m")
     max_chance: float = Field(
-        0.02, gt=0, le=1, description="a closure is accepted at once where a wrong one had at most this chance to agree"
+        0.02, gt=0, le=1, description="a closure is accepted at once up to this false-alarm probability"
     )
     min_support: float = Field(
         8.0,
         ge=0,
         description="evidence that makes closures of several places believed, nats; a further place gives up to 4",
     )
-    place_m: float = Field(10.0, ge=0, description="closures this close along the path are one witness, m")
+    place_m: float = Field(10.0, ge=0, description="closures this close along the path are of one place, m")
     support_range_m: float = Field(80.0, gt=0, description="closures this close along the path are compared, m")
     patience_m: float = Field(
         60.0, ge=0, description="an uncertain closure nothing speaks against is believed after this way, m"
     )
     max_pending_s: float = Field(30.0, gt=0, description="a closure waits this long for its odometry, stream time, s")
-    use_gate: bool = Field(True, description="reject closures that contradict the map")
-    use_gnc: bool = Field(True, description="ask graduated non-convexity for a second opinion where closures conflict")
-    use_support: bool = Field(True, description="believe uncertain closures only when others support them")
-    estimate_scale: bool = Field(True, description="estimate by how much the stated noise is wrong")
+    reject_outliers: bool = Field(
+        True, description="find out which closures are wrong and which stated noise is; false: believe all of it"
+    )
 
 
 class Frames(Group):
@@ -188,7 +187,7 @@ class Settings(Group):
     embedding: EmbeddingSettings = EmbeddingSettings()
     loop: Loop = Loop()
     verification: Verification = Verification()
-    pose_graph: PoseGraph = PoseGraph()
+    pose_graph: PoseGraphSettings = PoseGraphSettings()
     frames: Frames = Frames()
     database: Database = Database()
     worker: WorkerSettings = WorkerSettings()

@@ -1,7 +1,8 @@
 """Rigid transforms in 3-D.
 
 A pose `a_T_b` is a (4, 4) float64 homogeneous matrix: the pose of frame b in frame a, so that
-`p_a = a_T_b @ p_b`. Lengths in metres, angles in radians, quaternions as (x, y, z, w).
+`p_a = a_T_b @ p_b`. Lengths in metres, angles in radians, quaternions as (x, y, z, w). Twists are in
+GTSAM's tangent order: (rx, ry, rz, x, y, z) in the child frame.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 Array = NDArray[np.floating[Any]]
 
@@ -42,9 +43,13 @@ def to_quaternion(pose: ArrayLike) -> Array:
 
 
 def invert(a_T_b: Array) -> Array:
-    """`b_T_a`."""
-    rotation = a_T_b[:3, :3].T
-    return make_pose(rotation, -rotation @ a_T_b[:3, 3])
+    """`b_T_a` of a (4, 4) pose, or of each of a stack (..., 4, 4)."""
+    inverse = np.zeros(a_T_b.shape)
+    turned = np.swapaxes(a_T_b[..., :3, :3], -1, -2)
+    inverse[..., :3, :3] = turned
+    inverse[..., :3, 3] = -(turned @ a_T_b[..., :3, 3, None])[..., 0]
+    inverse[..., 3, 3] = 1.0
+    return inverse
 
 
 def relative(world_T_a: Array, world_T_b: Array) -> Array:
@@ -88,6 +93,54 @@ def interpolate(a: Array, b: Array, fraction: ArrayLike) -> Array:
     pose[..., :3, :3] = a[..., :3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
     pose[..., :3, 3] = (1 - share) * a[..., :3, 3] + share * b[..., :3, 3]
     return pose
+
+
+def expmap(twists: Array) -> Array:
+    """(N, 4, 4) poses of (N, 6) twists."""
+    return RigidTransform.from_exp_coords(twists).as_matrix()
+
+
+def logmap(poses: Array) -> Array:
+    """(N, 6) twists of (N, 4, 4) poses, the inverse of `expmap`."""
+    return RigidTransform.from_matrix(poses).as_exp_coords()
+
+
+def orthonormal(poses: Array) -> Array:
+    """(N, 4, 4) poses with the rotation nearest to each: products of many poses drift off it."""
+    result = poses.copy()
+    result[..., :3, :3] = Rotation.from_matrix(poses[..., :3, :3]).as_matrix()
+    return result
+
+
+def adjoint(poses: Array) -> Array:
+    """(..., 6, 6) adjoints of (..., 4, 4) poses: a twist at the child, seen at the parent."""
+    result = np.zeros((*poses.shape[:-2], 6, 6))
+    rotation = poses[..., :3, :3]
+    result[..., :3, :3] = rotation
+    result[..., 3:, 3:] = rotation
+    result[..., 3:, :3] = _skew(poses[..., :3, 3]) @ rotation
+    return result
+
+
+def right_jacobian(twists: Array) -> Array:
+    """(N, 6, 6) right Jacobians of `expmap` for small (N, 6) twists, to third order."""
+    turned, moved = _skew(twists[..., :3]), _skew(twists[..., 3:])
+    ad = np.zeros((*twists.shape[:-1], 6, 6))
+    ad[..., :3, :3] = ad[..., 3:, 3:] = turned
+    ad[..., 3:, :3] = moved
+    return np.eye(6) - ad / 2 + ad @ ad / 6 - ad @ ad @ ad / 24
+
+
+def propagate(matrices: Array, covariances: Array) -> Array:
+    """`A S A'` for stacks of matrices and covariances."""
+    return matrices @ covariances @ np.swapaxes(matrices, -1, -2)
+
+
+def _skew(vectors: Array) -> Array:
+    """(..., 3, 3) cross-product matrices of (..., 3) vectors."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vectors.shape[:-1], 3, 3)
 
 
 def ros_to_gtsam_covariance(covariance: ArrayLike, pose: Array) -> Array:

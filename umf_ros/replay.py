@@ -8,8 +8,8 @@ from pathlib import Path
 from umf_ros.config import Settings
 from umf_ros.frames import Frame
 from umf_ros.loop_detector import Detection, LoopDetector
-from umf_ros.pose_graph.graph import PoseGraph
-from umf_ros.pose_graph.results import write_results
+from umf_ros.pose_graph.export import write_results
+from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.runs.recorder import RunRecorder
 from umf_ros.sensors.messages import OdometrySample
 from umf_ros.sensors.odometry_feed import OdometryFeed

@@ -73,7 +73,7 @@ def test_a_parameter_file_reads_like_for_the_command_line(tmp_path) -> None:
         ("loop.min_travel_m:=.nan", r"loop\.min_travel_m: .*got nan"),
         ("topics.cloud:=5", r"topics\.cloud: .*string.*got 5"),
         ("qos.reliability:=sometimes", r"qos\.reliability: .*'best_effort' or 'reliable'.*got 'sometimes'"),
-        ("pose_graph.use_gate:=perhaps", r"pose_graph\.use_gate: .*boolean.*got 'perhaps'"),
+        ("pose_graph.reject_outliers:=perhaps", r"pose_graph\.reject_outliers: .*boolean.*got 'perhaps'"),
         ("loop.top_k:=[1, 2]", r"loop\.top_k: .*integer"),
         ("loop:=5", r"loop: .*got 5"),
         ("dataset:=kitti", r"dataset: .*got 'kitti'"),
@@ -101,7 +101,7 @@ def test_every_parameter_is_described_typed_and_read_only() -> None:
     doubles = ["verification.max_shift_m", "pose_graph.max_gap_s", "loop.min_travel_m"]
     assert [described[name].type for name in doubles] == [ParameterType.PARAMETER_DOUBLE] * 3
     assert described["loop.top_k"].type == ParameterType.PARAMETER_INTEGER
-    assert described["pose_graph.use_gate"].type == ParameterType.PARAMETER_BOOL
+    assert described["pose_graph.reject_outliers"].type == ParameterType.PARAMETER_BOOL
 
 
 def documented_names() -> list[str]:

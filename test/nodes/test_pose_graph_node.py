@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from umf_ros.geometry import Array
-from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, World, rover_loops, with_wrong_closures
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
 from umf_ros.nodes.announcer import CLOSURES_QOS, LATCHED_QOS
 from umf_ros.nodes.conversions import closure_to_message, from_time, to_pose, to_time
 from umf_ros.pose_graph.g2o import read_g2o
@@ -33,7 +33,7 @@ MODULE = "umf_ros.nodes.pose_graph_node"
 class Rig(Node):
     """A rover's odometry and front-end, and ears for everything the back-end says."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: GraphWorld) -> None:
         super().__init__("rig")
         self.world = world
         self.odometry = self.create_publisher(Odometry, "/odom", 50)

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 from graph_worlds import SETTINGS, accepted, batch_optimum, drive, feed_odometry, right, rms
 
-from umf_ros.config import PoseGraph as Settings
+from umf_ros.config import PoseGraphSettings
 from umf_ros.errors import GraphError
 from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, make_pose
+from umf_ros.geometry import Array, expmap, invert, make_pose
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops, with_wrong_closures
-from umf_ros.pose_graph import lie
 from umf_ros.pose_graph.closures import State
+from umf_ros.pose_graph.export import write_results
 from umf_ros.pose_graph.g2o import read_g2o
-from umf_ros.pose_graph.graph import PoseGraph
-from umf_ros.pose_graph.results import write_results
+from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.sessions import Sessions
 
 WORLD = with_wrong_closures(rover_loops(300, 12), 0.3, "groups", 1)
@@ -49,11 +48,11 @@ def test_dense_odometry_in_random_order_is_thinned_alike() -> None:
     rng = np.random.default_rng(1)
     stamps = np.arange(30_000) * 50_000_000
     angle = stamps / 1e9 * 0.05
-    poses = lie.exp(np.stack([0 * angle, 0 * angle, 0.05 + 0 * angle, 0.5 + 0 * angle, 0 * angle, 0 * angle], axis=1))
+    poses = expmap(np.stack([0 * angle, 0 * angle, 0.05 + 0 * angle, 0.5 + 0 * angle, 0 * angle, 0 * angle], axis=1))
     poses[:, :3, 3] = np.stack([10 * np.cos(angle), 10 * np.sin(angle), 0.01 * angle], axis=1)
     graphs = []
     for order in (np.arange(len(stamps)), rng.permutation(len(stamps))):
-        graph = PoseGraph(Settings())
+        graph = PoseGraph(PoseGraphSettings())
         for k in order.tolist():
             graph.add_odometry(int(stamps[k]), poses[k])
         graph.settle()
@@ -180,7 +179,7 @@ def test_a_failing_optimiser_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> N
 def test_two_sessions_are_joined_by_their_closures() -> None:
     world = rover_loops(400, 13)
     cut = 200
-    gauge = lie.exp(np.array([[0.1, 0, 2.0, 30, -20, 5]]))[0]
+    gauge = expmap(np.array([[0.1, 0, 2.0, 30, -20, 5]]))[0]
     odometry = world.odometry.copy()
     odometry[cut:] = gauge @ odometry[cut:]
     world = replace(world, odometry=odometry, chains=(0, cut))
@@ -210,7 +209,7 @@ def test_the_newest_pose_has_the_marginal_of_the_full_graph() -> None:
     full, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     poses = graph.trajectory()[1]
     full.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(poses[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
-    steps = lie.invert(world.odometry[:-1]) @ world.odometry[1:]
+    steps = invert(world.odometry[:-1]) @ world.odometry[1:]
     for k, pose in enumerate(poses):
         values.insert(k, gtsam.Pose3(pose))
         if k:

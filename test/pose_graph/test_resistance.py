@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from graph_worlds import SETTINGS, accepted, batch_optimum, drive, feed_odometry, right, rms
 
-from umf_ros.lab.simulation.pose_graphs import Kind, World, garage, rover_loops, sphere, with_wrong_closures
-from umf_ros.pose_graph.ends import Scale
-from umf_ros.pose_graph.graph import PoseGraph
+from umf_ros.lab.simulation.pose_graphs import GraphWorld, Kind, garage, rover_loops, sphere, with_wrong_closures
+from umf_ros.pose_graph.noise_scale import NoiseScale
+from umf_ros.pose_graph.pose_graph import PoseGraph
 
 ROVER = rover_loops(400, 11)
 
@@ -32,7 +32,7 @@ def test_odometry_stated_three_times_too_well_or_too_badly(kind: Kind, stated: f
 
 
 @pytest.mark.parametrize("world", [sphere(240, 1), garage(300, 1)], ids=["sphere", "garage"])
-def test_other_shapes(world: World) -> None:
+def test_other_shapes(world: GraphWorld) -> None:
     graph = drive(with_wrong_closures(world, 0.3, "groups", 1))
     assert accepted(graph) == right(world)
     assert rms(graph.trajectory()[1], batch_optimum(world)) < 0.03
@@ -79,18 +79,18 @@ def test_the_last_closures_of_a_drive_support_each_other() -> None:
 def test_overlapping_aliases_are_not_taken_for_noise() -> None:
     world = with_wrong_closures(rover_loops(400, 10003), 0.5, "near", 1)
     graph = drive(world)
-    assert graph.scale == Scale()
+    assert graph.scale == NoiseScale()
     assert accepted(graph) == right(world)
 
 
 def test_accepting_everything_gives_the_batch_optimum() -> None:
-    everything = SETTINGS.model_copy(update={"use_gate": False, "use_support": False, "estimate_scale": False})
+    everything = SETTINGS.model_copy(update={"reject_outliers": False})
     graph = drive(ROVER, everything)
     assert accepted(graph) == right(ROVER)
     assert rms(graph.trajectory()[1], batch_optimum(ROVER)) < 1e-3
 
 
 def test_without_its_guards_the_graph_swallows_wrong_closures() -> None:
-    everything = SETTINGS.model_copy(update={"use_gate": False, "use_support": False})
+    everything = SETTINGS.model_copy(update={"reject_outliers": False})
     world = with_wrong_closures(ROVER, 0.3, "groups", 1)
     assert not accepted(drive(world, everything)) <= right(world)

@@ -4,27 +4,29 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
-from graph_worlds import LAP, SETTINGS, accepted, closing, feed_odometry, lap_pairs, rms, two_laps
+from graph_worlds import LAP, SETTINGS, accepted, chain_of, closing, feed_odometry, lap_pairs, rms, two_laps
 
-from umf_ros.geometry import Array
-from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, World
-from umf_ros.pose_graph import lie
+from umf_ros.geometry import Array, expmap, invert
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.graph import PoseGraph
+from umf_ros.pose_graph.condensed import Edge, Linearisation, between
+from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.pose_graph.sessions import CorrectedPath
 
-GAUGE = lie.exp(np.array([[0.05, -0.1, 2.5, 40, -25, 3]]))[0]
+GAUGE = expmap(np.array([[0.05, -0.1, 2.5, 40, -25, 3]]))[0]
 
 
-def cut_in_two(world: World) -> World:
+def cut_in_two(world: GraphWorld) -> GraphWorld:
     """The second lap as a session of its own, its odometry in another frame."""
     odometry = world.odometry.copy()
     odometry[LAP:] = GAUGE @ odometry[LAP:]
     return replace(world, odometry=odometry, chains=(0, LAP))
 
 
-def drive(world: World, closures: bool = True) -> PoseGraph:
+def drive(world: GraphWorld, closures: bool = True) -> PoseGraph:
     graph = PoseGraph(SETTINGS)
     for start, end in zip(world.chains, [*world.chains[1:], len(world.truth)], strict=True):
         if start:
@@ -51,7 +53,7 @@ def test_a_session_stays_out_of_the_map_until_a_closure_joins_it() -> None:
     graph.settle()
     assert accepted(graph) == {(k, k + LAP) for k in (0, 15, 30, 45)}
     assert rms(in_map(graph), world.truth) < 1.0
-    np.testing.assert_allclose(graph.map_T_odom(), lie.invert(GAUGE), atol=1.0)
+    np.testing.assert_allclose(graph.map_T_odom(), invert(GAUGE), atol=1.0)
 
 
 def test_wrong_closures_alone_may_not_join_sessions_live() -> None:
@@ -111,7 +113,7 @@ def test_a_clock_that_starts_again_belongs_to_the_newest_session() -> None:
     assert len(graph.trajectory()[0]) == 2 * LAP
     np.testing.assert_allclose(in_map(graph), before, atol=1e-9)
     closure = closing(two_laps(), [(3, 40)]).message(0)
-    graph.add_closure(replace(closure, match_T_query=lie.invert(world.odometry[3]) @ world.odometry[40]))
+    graph.add_closure(replace(closure, match_T_query=invert(world.odometry[3]) @ world.odometry[40]))
     graph.settle()
     # both stamps exist in both sessions: the newest one that knows the query is meant
     assert graph.verdict_counts()[State.ACCEPTED] == 5
@@ -138,3 +140,84 @@ def test_odometry_that_comes_late_moves_no_gauge_and_loses_no_closure(late: rang
         in_order.add_closure(world.message(row))
     in_order.settle()
     np.testing.assert_allclose(graph.trajectory()[1], in_order.trajectory()[1], atol=1e-6)
+
+
+DRIFTING = two_laps(3)
+ODOMETRY = chain_of(DRIFTING)
+STAMPS = np.arange(200) * PERIOD_NS
+
+
+def moved(pose: Array, turn_deg: float, *metres: float) -> Array:
+    return pose @ expmap(np.array([[0, 0, np.deg2rad(turn_deg), *metres]]))[0]
+
+
+def path_through(rows: list[int], poses: list[Array], linearisation: Linearisation | None = None) -> CorrectedPath:
+    stamps, linearisation = np.array(rows) * PERIOD_NS, linearisation or Linearisation(ODOMETRY)
+    return CorrectedPath(linearisation, stamps, linearisation.at(stamps), np.stack(poses))
+
+
+def full_optimum(rows: list[int], poses: list[Array], last: int) -> Array:
+    """Levenberg-Marquardt over every pose with the given ones held."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k in range(last + 1):
+        values.insert(k, gtsam.Pose3(DRIFTING.odometry[k]))
+        if k:
+            step = invert(DRIFTING.odometry[k - 1]) @ DRIFTING.odometry[k]
+            graph.add(between(Edge(k - 1, k, step, DRIFTING.step_covariances[k])))
+    for row, pose in zip(rows, poses, strict=True):
+        graph.add(gtsam.PriorFactorPose3(row, gtsam.Pose3(pose), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return np.stack([result.atPose3(k).matrix() for k in range(last + 1)])
+
+
+def test_unsolved_it_is_the_odometry() -> None:
+    np.testing.assert_allclose(path_through([0], [DRIFTING.odometry[0]]).at(STAMPS), DRIFTING.odometry, atol=1e-9)
+
+
+def test_at_the_solved_stamps_it_is_the_solution() -> None:
+    rows = [0, 60, 150]
+    poses = [moved(DRIFTING.odometry[k], 0.02 * k, 0.01 * k, 0.0, 0.0) for k in rows]
+    np.testing.assert_allclose(path_through(rows, poses).at(np.array(rows) * PERIOD_NS), poses, atol=1e-9)
+
+
+def test_beyond_the_last_solved_pose_it_follows_the_odometry() -> None:
+    poses = [DRIFTING.odometry[0], moved(DRIFTING.odometry[60], 5.0, 1.0, 2.0, 0.0)]
+    found = path_through([0, 60], poses).at(STAMPS[60:])
+    np.testing.assert_allclose(
+        invert(found[:1]) @ found, invert(DRIFTING.odometry[60:61]) @ DRIFTING.odometry[60:], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(("turn_deg", "metres"), [(0.0, 0.3), (1.0, 0.0), (-1.5, -0.5)])
+def test_between_it_is_close_to_the_optimum_of_the_full_graph(turn_deg: float, metres: float) -> None:
+    poses = [DRIFTING.odometry[0], moved(DRIFTING.odometry[80], turn_deg, metres, 0.0, 0.1)]
+    found = path_through([0, 80], poses).at(STAMPS[:81])
+    correction = rms(found, DRIFTING.odometry[:81])
+    assert rms(found, full_optimum([0, 80], poses, 80)) < 0.05 * correction
+
+
+def test_repeated_linearisation_converges_to_the_full_graph() -> None:
+    poses = [DRIFTING.odometry[0], moved(DRIFTING.odometry[80], 12.0, 2.0, -3.0, 0.5)]
+    exact = full_optimum([0, 80], poses, 80)
+    current = path_through([0, 80], poses)
+    errors = [rms(current.at(STAMPS[:81]), exact)]
+    for _ in range(4):
+        linearisation = current.linearisation.around(ODOMETRY.stamps, current.at(ODOMETRY.stamps))
+        current = path_through([0, 80], poses, linearisation)
+        errors.append(rms(current.at(STAMPS[:81]), exact))
+    assert errors[0] > 1e-3 and errors[-1] < 1e-4
+
+
+def test_linearising_keeps_what_is_solved() -> None:
+    poses = [DRIFTING.odometry[0], moved(DRIFTING.odometry[90], 3.0, 1.0, 0.0, 0.0)]
+    current = path_through([0, 90], poses)
+    linearisation = current.linearisation.around(ODOMETRY.stamps, current.at(ODOMETRY.stamps))
+    shaped = CorrectedPath(linearisation, current.stamps, linearisation.at(current.stamps), current.poses)
+    np.testing.assert_allclose(shaped.at(STAMPS[[0, 90]]), poses, atol=1e-9)
+    np.testing.assert_allclose(shaped.at(STAMPS[90:]), current.at(STAMPS[90:]), atol=1e-6)
+
+
+def test_stamps_between_messages_are_between_their_poses() -> None:
+    current = path_through([0], [DRIFTING.odometry[0]])
+    half = current.at(np.array([10 * PERIOD_NS, 21 * PERIOD_NS // 2, 11 * PERIOD_NS]))
+    np.testing.assert_allclose(half[1, :3, 3], (half[0, :3, 3] + half[2, :3, 3]) / 2, atol=1e-9)

@@ -13,10 +13,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from umf_ros.pose_graph.closures import ClosureVerdict
-    from umf_ros.pose_graph.graph import PoseGraph
-    from umf_ros.pose_graph.replay import Recording
+    from umf_ros.pose_graph.g2o import GraphRecording
+    from umf_ros.pose_graph.pose_graph import PoseGraph
 
-LAYERS = ("gate", "support", "gnc", "scale")
 MOST_ROWS = 20
 
 app = typer.Typer(help="Optimise and draw pose graphs in g2o files.", no_args_is_help=True)
@@ -27,26 +26,23 @@ File = Annotated[Path, typer.Argument(help="g2o (or TORO) file, 2-D or 3-D.")]
 def optimize(
     file: File,
     reject: Annotated[
-        str,
-        typer.Option(
-            help="Guards against wrong closures: all, none, or some of gate, support, gnc, scale (comma between)."
-        ),
+        str, typer.Option(help="Guards against wrong closures and misstated noise: all or none.")
     ] = "all",
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the optimised graph here (g2o).")] = None,
     verdicts: Annotated[Path | None, typer.Option(help="Write every closure's verdict here (CSV).")] = None,
 ) -> None:
     """Drive a graph file through the back-end as if it came live, and say which closures it rejects."""
-    layers = _layers(reject)
+    if reject not in ("all", "none"):
+        raise ConfigError(f"--reject {reject}: expected all or none")
 
     from rich.console import Console
     from rich.progress import track
 
-    from umf_ros.config import PoseGraph as PoseGraphSettings
+    from umf_ros.config import PoseGraphSettings
     from umf_ros.errors import OutputError
-    from umf_ros.pose_graph.g2o import read_g2o
-    from umf_ros.pose_graph.graph import PoseGraph
-    from umf_ros.pose_graph.replay import as_recording, drive
-    from umf_ros.pose_graph.results import verdict_table
+    from umf_ros.pose_graph.export import verdict_table
+    from umf_ros.pose_graph.g2o import as_recording, drive, read_g2o
+    from umf_ros.pose_graph.pose_graph import PoseGraph
 
     console, content = Console(), read_g2o(file)
     for problem in content.problems[:MOST_ROWS]:
@@ -54,13 +50,7 @@ def optimize(
     if len(content.problems) > MOST_ROWS:
         console.print(f"[yellow]... and {len(content.problems) - MOST_ROWS} more lines")
     recording = as_recording(content)
-    settings = PoseGraphSettings(
-        use_gate="gate" in layers,
-        use_support="support" in layers,
-        use_gnc="gnc" in layers,
-        estimate_scale="scale" in layers,
-    )
-    graph = PoseGraph(recording.settings(settings))
+    graph = PoseGraph(recording.settings(PoseGraphSettings(reject_outliers=reject == "all")))
     for _ in track(drive(graph, recording), "Optimising", console=console, transient=True):
         pass
     _report(console, graph, recording)
@@ -80,23 +70,15 @@ def plot(
     output: Annotated[Path, typer.Option("--output", "-o", help="Picture to write.")] = Path("graph.png"),
 ) -> None:
     """Draw a graph file: odometry dark, closures green, from above and from the side."""
-    from umf_ros.pose_graph.g2o import read_g2o
-    from umf_ros.pose_graph.picture import draw
+    from umf_ros.pose_graph.export import draw
+    from umf_ros.pose_graph.g2o import as_recording, read_g2o
 
-    draw(read_g2o(file), output)
+    content = read_g2o(file)
+    draw(as_recording(content), content.poses, output)
     typer.echo(f"picture: {output}")
 
 
-def _layers(text: str) -> set[str]:
-    if text in ("all", "none"):
-        return set(LAYERS) if text == "all" else set()
-    layers = {word.strip() for word in text.split(",")}
-    if not layers <= set(LAYERS):
-        raise ConfigError(f"--reject {text}: expected all, none, or some of {', '.join(LAYERS)}")
-    return layers
-
-
-def _report(console: Console, graph: PoseGraph, recording: Recording) -> None:
+def _report(console: Console, graph: PoseGraph, recording: GraphRecording) -> None:
     from rich.table import Table
 
     from umf_ros.pose_graph.closures import State
@@ -124,7 +106,7 @@ def _report(console: Console, graph: PoseGraph, recording: Recording) -> None:
         console.print(f"... and {len(bad) - MOST_ROWS} more (--verdicts FILE writes all)")
 
 
-def _row(verdict: ClosureVerdict, recording: Recording) -> list[str]:
-    ends = (verdict.closure.match_stamp_ns, verdict.closure.query_stamp_ns)
-    names = [str(recording.vertex_of(stamp)) for stamp in ends]
+def _row(verdict: ClosureVerdict, recording: GraphRecording) -> list[str]:
+    endpoints = (verdict.closure.match_stamp_ns, verdict.closure.query_stamp_ns)
+    names = [str(recording.vertex_of(stamp)) for stamp in endpoints]
     return [*names, verdict.state, verdict.reason, f"{verdict.residual:.1f}", f"{verdict.residual_m:.2f}"]

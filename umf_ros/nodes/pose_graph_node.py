@@ -32,8 +32,8 @@ from umf_ros.nodes.process import run
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
 from umf_ros.nodes.worker import Worker
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.pose_graph.graph import PoseGraph
-from umf_ros.pose_graph.results import write_results
+from umf_ros.pose_graph.export import write_results
+from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.runs.folder import check_writable
 from umf_ros.sensors.messages import OdometrySample, decode_odometry
 from umf_ros.sensors.odometry_feed import OdometryFeed

@@ -1,7 +1,8 @@
-"""A loop closure inside the pose graph, and what was decided about it."""
+"""Loop closures inside the pose graph: checked, with what was decided about them, and as arrays."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -10,6 +11,7 @@ import numpy as np
 from umf_ros.errors import GraphError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, ros_to_gtsam_covariance
+from umf_ros.pose_graph.odometry import GrowingArray, OdometryChain
 
 _SKEWED = 1e-3
 
@@ -46,7 +48,7 @@ class ClosureVerdict:
 
 @dataclass
 class TrackedClosure:
-    """A closure whose ends are known, with its latest verdict.
+    """A closure whose endpoints are known, with its latest verdict.
 
     Attributes:
         match: session of the matched keyframe.
@@ -69,10 +71,70 @@ class TrackedClosure:
         """Whether the closure shapes the map."""
         return self.verdict.state is State.ACCEPTED
 
-    def decide(self, state: State, reason: str, residual: float, residual_m: float) -> ClosureVerdict:
-        """Replace the verdict and return the new one."""
+    def decide(self, state: State, reason: str, residual: float = np.nan, residual_m: float = np.nan) -> None:
+        """Replace the verdict."""
         self.verdict = ClosureVerdict(self.closure, state, reason, residual, residual_m)
-        return self.verdict
+
+
+class Endpoints:
+    """One endpoint of N closures: its session, stamp, and the odometry there."""
+
+    def __init__(self) -> None:
+        self.session = GrowingArray(dtype=np.int64)
+        self.stamp = GrowingArray(dtype=np.int64)
+        self.travel = GrowingArray()
+        self.pose = GrowingArray((4, 4))
+        self.noise = GrowingArray((6, 6))
+
+    def append(self, chain: OdometryChain, session: int, stamp: int) -> None:
+        """Append an endpoint by session and stamp."""
+        at = np.array([stamp], np.int64)
+        pose = chain.poses_at(at)
+        self.session.extend([session])
+        self.stamp.extend(at)
+        self.travel.extend(chain.travel_at(at))
+        self.pose.extend(chain.at_origin(pose))
+        self.noise.extend(chain.noise_at(at, pose))
+
+    def renew(self, chains: Sequence[OdometryChain]) -> None:
+        """Look the odometry up again after its past changed."""
+        for session in np.unique(self.session.view):
+            mine, chain = self.session.view == session, chains[session]
+            stamps = self.stamp.view[mine]
+            poses = chain.poses_at(stamps)
+            self.travel.view[mine] = chain.travel_at(stamps)
+            self.pose.view[mine] = chain.at_origin(poses)
+            self.noise.view[mine] = chain.noise_at(stamps, poses)
+
+    def distances(self, row: int) -> Array:
+        """(N,) metres along the path from endpoint `row` to every other; infinite between sessions."""
+        same = self.session.view == self.session.view[row]
+        return np.where(same, np.abs(self.travel.view - self.travel.view[row]), np.inf)
+
+
+class ClosureArrays:
+    """Both endpoints of N closures and their measurements."""
+
+    def __init__(self) -> None:
+        self.match = Endpoints()
+        self.query = Endpoints()
+        self.pose = GrowingArray((4, 4))
+        self.covariance = GrowingArray((6, 6))
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    def append(self, chains: Sequence[OdometryChain], tracked: TrackedClosure) -> None:
+        """Append one closure."""
+        self.match.append(chains[tracked.match], tracked.match, tracked.closure.match_stamp_ns)
+        self.query.append(chains[tracked.query], tracked.query, tracked.closure.query_stamp_ns)
+        self.pose.extend(tracked.closure.match_T_query[None])
+        self.covariance.extend(tracked.covariance[None])
+
+    def renew(self, chains: Sequence[OdometryChain]) -> None:
+        """Look the odometry up again after its past changed."""
+        self.match.renew(chains)
+        self.query.renew(chains)
 
 
 def check_closure(closure: LoopClosure, max_length_m: float) -> Array:

@@ -1,24 +1,39 @@
-"""Pose graphs as g2o files, in three dimensions and in two, and the older TORO spelling of both.
+"""Pose graphs from g2o files, in three dimensions and in two, and the older TORO spelling of both.
 
 An information matrix is read as GTSAM reads it: tangent space of the second vertex, translation
 first, rotation in radians. A plane graph is lifted into space; what it does not say about height,
-roll and pitch is given the weight of what it does say.
+roll and pitch is given the weight of what it does say. A graph can be driven through the back-end
+as if it were live.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.errors import GraphError, OutputError
-from umf_ros.geometry import Array, from_quaternion, heading, make_pose, to_quaternion
+from umf_ros.config import PoseGraphSettings
+from umf_ros.errors import GraphError
+from umf_ros.frames import LoopClosure
+from umf_ros.geometry import (
+    Array,
+    adjoint,
+    from_quaternion,
+    gtsam_to_ros_covariance,
+    invert,
+    make_pose,
+    propagate,
+)
 from umf_ros.pose_graph.closures import check_covariance
 from umf_ros.pose_graph.condensed import Edge
+from umf_ros.pose_graph.pose_graph import PoseGraph
 
+PERIOD_NS = 1_000_000_000
+_MOST_SOLUTIONS = 150
 _IGNORED = ("FIX", "PARAMS_", "VERTEX_XY", "VERTEX_TRACKXYZ", "EDGE_SE2_XY", "EDGE_SE3_TRACKXYZ")
 _SWAP = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 
@@ -106,12 +121,12 @@ def _read_covariance(tag: str, values: Array) -> Array:
         plane = _symmetric(values, 3)
     else:
         information = _symmetric(values, 6)
-        return _invert(information[_SWAP])
+        return _covariance_of(information[_SWAP])
     kept = np.ix_([3, 4, 2], [3, 4, 2])
     information[kept] = plane
     information[0, 0] = information[1, 1] = plane[2, 2]
     information[5, 5] = np.sqrt(plane[0, 0] * plane[1, 1])
-    return _invert(information)
+    return _covariance_of(information)
 
 
 def _symmetric(upper: Array, size: int) -> Array:
@@ -120,76 +135,100 @@ def _symmetric(upper: Array, size: int) -> Array:
     return matrix + np.triu(matrix, 1).T
 
 
-def _invert(information: Array) -> Array:
+def _covariance_of(information: Array) -> Array:
     check_covariance(information)
     covariance = np.linalg.inv(information)
     return 0.5 * (covariance + covariance.T)
 
 
-def write_g2o(
-    path: str | Path,
-    poses: Sequence[Array],
-    edges: Sequence[Edge],
-    planar: bool = False,
-    ids: Sequence[int] | None = None,
-) -> None:
-    """Write vertices and edges.
+@dataclass(frozen=True)
+class GraphRecording:
+    """A graph file as odometry chains and loop closures; vertex number k gets the stamp of k seconds.
 
-    Args:
-        path: the file.
-        poses: (4, 4) of each vertex.
-        edges: between vertices by their place in `poses`.
-        planar: keep x, y and heading only.
-        ids: of the vertices in the file; None: 0, 1, ...
-
-    Raises:
-        OutputError: the file cannot be written.
+    Attributes:
+        ids: (N,) vertex ids in the file, ascending.
+        chains: first vertex number of every chain of consecutive ids that odometry joins.
+        odometry: (N, 4, 4) poses composed from the odometry edges of each chain.
+        steps: (N, 6, 6) covariance in GTSAM's order of the step that ends at a vertex; zero where a chain begins.
+        closures: the other edges, from the earlier vertex number to the later, in order of the later.
     """
-    names = range(len(poses)) if ids is None else ids
-    vertex, edge = (_planar_vertex, _planar_edge) if planar else (_spatial_vertex, _spatial_edge)
-    lines = [vertex(pose, name) for pose, name in zip(poses, names, strict=True)]
-    _write(path, lines + [edge(item, names[item.first], names[item.second]) for item in edges])
+
+    ids: NDArray[np.int64]
+    chains: list[int]
+    odometry: Array
+    steps: Array
+    closures: list[Edge]
+
+    def settings(self, settings: PoseGraphSettings) -> PoseGraphSettings:
+        """The settings with every vertex a keyframe and no limit on a closure's length."""
+        return settings.model_copy(update={"keyframe_spacing_m": 1e-6, "max_gap_s": 1.5, "max_closure_m": 1e7})
+
+    def vertex_of(self, stamp_ns: int) -> int:
+        """Id in the file of the vertex with a stamp."""
+        return int(self.ids[stamp_ns // PERIOD_NS])
+
+    def message(self, row: int) -> LoopClosure:
+        """Closure `row` with stamps for keys."""
+        edge = self.closures[row]
+        covariance = gtsam_to_ros_covariance(edge.covariance, edge.pose)
+        return LoopClosure(edge.second * PERIOD_NS, edge.first * PERIOD_NS, edge.pose, covariance)
+
+    def step_covariance(self, vertex: int) -> Array | None:
+        """Covariance of the odometry step that ends at a vertex in ROS order, None where a chain begins."""
+        if vertex in self.chains:
+            return None
+        step = invert(self.odometry[vertex - 1]) @ self.odometry[vertex]
+        return gtsam_to_ros_covariance(self.steps[vertex], step)
 
 
-def write_vertex_table(path: str | Path, vertices: Mapping[tuple[int, int], int]) -> None:
-    """Write which vertex of a g2o file is which stamp: `id,session,stamp_ns` lines.
-
-    Args:
-        path: the file.
-        vertices: vertex id by session and stamp.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    _write(path, ["id,session,stamp_ns", *(f"{v},{session},{stamp}" for (session, stamp), v in vertices.items())])
-
-
-def _write(path: str | Path, lines: Iterable[str]) -> None:
-    try:
-        Path(path).write_text("".join(line + "\n" for line in lines), encoding="ascii")
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from None
-
-
-def _spatial_vertex(pose: Array, name: int) -> str:
-    return f"VERTEX_SE3:QUAT {name} {_numbers([*pose[:3, 3], *to_quaternion(pose)])}"
-
-
-def _spatial_edge(edge: Edge, first: int, second: int) -> str:
-    information = np.linalg.inv(edge.covariance)[_SWAP][np.triu_indices(6)]
-    measured = [*edge.pose[:3, 3], *to_quaternion(edge.pose)]
-    return f"EDGE_SE3:QUAT {first} {second} {_numbers(measured)} {_numbers(information)}"
+def as_recording(content: G2oGraph) -> GraphRecording:
+    """Tell odometry from closures: the first edge between successive vertices is odometry."""
+    used = {vertex for edge in content.edges for vertex in (edge.first, edge.second)}
+    ids = np.array(sorted(used), np.int64)
+    number = {int(vertex): k for k, vertex in enumerate(ids)}
+    odometry: dict[int, Edge] = {}
+    closures: list[Edge] = []
+    for edge in content.edges:
+        forward = _forward(edge, number)
+        if forward.second == forward.first + 1 and forward.second not in odometry:
+            odometry[forward.second] = forward
+        else:
+            closures.append(forward)
+    chains = [k for k in range(len(ids)) if k not in odometry]
+    poses, steps = np.tile(np.eye(4), (len(ids), 1, 1)), np.zeros((len(ids), 6, 6))
+    for k, vertex in enumerate(ids.tolist()):
+        if k in odometry:
+            poses[k] = poses[k - 1] @ odometry[k].pose
+            steps[k] = odometry[k].covariance
+        else:
+            poses[k] = content.poses.get(vertex, np.eye(4))
+    closures.sort(key=lambda edge: (edge.second, edge.first))
+    return GraphRecording(ids, chains, poses, steps, closures)
 
 
-def _planar_vertex(pose: Array, name: int) -> str:
-    return f"VERTEX_SE2 {name} {_numbers([*pose[:2, 3], heading(pose)])}"
+def _forward(edge: Edge, number: dict[int, int]) -> Edge:
+    first, second = number[edge.first], number[edge.second]
+    if first < second:
+        return Edge(first, second, edge.pose, edge.covariance)
+    return Edge(second, first, invert(edge.pose), propagate(adjoint(edge.pose), edge.covariance))
 
 
-def _planar_edge(edge: Edge, first: int, second: int) -> str:
-    plane = np.linalg.inv(edge.covariance[np.ix_([3, 4, 2], [3, 4, 2])])[np.triu_indices(3)]
-    measured = [*edge.pose[:2, 3], heading(edge.pose)]
-    return f"EDGE_SE2 {first} {second} {_numbers(measured)} {_numbers(plane)}"
+def drive(graph: PoseGraph, recording: GraphRecording) -> Iterator[int]:
+    """Feed a recording to a graph in order of its vertices; yields the number of closures fed so far."""
+    batch = max(1, len(recording.closures) // _MOST_SOLUTIONS)
+    vertex = 0
+    for start in range(0, len(recording.closures), batch):
+        rows = range(start, min(start + batch, len(recording.closures)))
+        vertex = _advance(graph, recording, vertex, recording.closures[rows[-1]].second + 1)
+        graph.add_closures([recording.message(row) for row in rows])
+        yield rows[-1] + 1
+    _advance(graph, recording, vertex, len(recording.ids))
+    graph.settle()
 
 
-def _numbers(values: Iterable[float]) -> str:
-    return " ".join(f"{value:.12g}" for value in values)
+def _advance(graph: PoseGraph, recording: GraphRecording, start: int, end: int) -> int:
+    for vertex in range(start, end):
+        if vertex and vertex in recording.chains:
+            graph.begin_session()
+        graph.add_odometry(vertex * PERIOD_NS, recording.odometry[vertex], recording.step_covariance(vertex))
+    return max(start, end)

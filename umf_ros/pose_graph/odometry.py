@@ -2,25 +2,57 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
-from umf_ros.config import PoseGraph as PoseGraphSettings
-from umf_ros.geometry import Array, relative, ros_to_gtsam_covariance
-from umf_ros.pose_graph import lie
-from umf_ros.pose_graph.rows import Rows
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from umf_ros.config import PoseGraphSettings
+from umf_ros.geometry import Array, adjoint, interpolate, orthonormal, propagate, relative, ros_to_gtsam_covariance
 
 Stamps = NDArray[np.int64]
 _TURN_M_PER_RAD = 0.5
 _DRIFT_M_PER_S = 1e-4
 
 
+class GrowingArray:
+    """An array that grows at its end in amortised constant time, and can be cut back."""
+
+    def __init__(self, shape: tuple[int, ...] = (), dtype: DTypeLike = float) -> None:
+        self._data: NDArray[Any] = np.empty((64, *shape), dtype)
+        self._size = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    @property
+    def view(self) -> NDArray[Any]:
+        """The rows so far; valid until the next change."""
+        return self._data[: self._size]
+
+    def extend(self, rows: ArrayLike) -> None:
+        """Append (N, ...) rows."""
+        added = np.asarray(rows)
+        size = self._size + len(added)
+        if size > len(self._data):
+            grown = np.empty((max(size, 2 * len(self._data)), *self._data.shape[1:]), self._data.dtype)
+            grown[: self._size] = self.view
+            self._data = grown
+        self._data[self._size : size] = added
+        self._size = size
+
+    def truncate(self, size: int) -> None:
+        """Keep the first `size` rows."""
+        self._size = min(size, self._size)
+
+
 class OdometryLog:
     """Odometry messages sorted by stamp; a second message of the same stamp is dropped."""
 
     def __init__(self) -> None:
-        self._stamps = Rows(dtype=np.int64)
-        self._poses = Rows((3, 4))
+        self._stamps = GrowingArray(dtype=np.int64)
+        self._poses = GrowingArray((3, 4))
         self._arrived: list[tuple[int, Array]] = []
         self.duplicates = 0
 
@@ -38,7 +70,7 @@ class OdometryLog:
         if not self._arrived:
             return None
         stamps = np.array([stamp for stamp, _ in self._arrived], np.int64)
-        poses = lie.orthonormal(np.stack([pose for _, pose in self._arrived]))
+        poses = orthonormal(np.stack([pose for _, pose in self._arrived]))
         self._arrived = []
         return self._merge(stamps, poses[:, :3])
 
@@ -83,7 +115,10 @@ class OdometryLog:
         lower = np.where(exact, upper, np.maximum(upper - 1, 0))
         span = np.maximum(self.stamps[upper] - self.stamps[lower], 1)
         fractions = np.clip((stamps - self.stamps[lower]) / span, 0.0, 1.0)
-        return lie.interpolate(self.poses(lower), self.poses(upper), fractions)
+        poses, between = self.poses(lower), np.flatnonzero(fractions)
+        if len(between):
+            poses[between] = interpolate(poses[between], self.poses(upper[between]), fractions[between])
+        return poses
 
 
 class OdometryChain:
@@ -98,12 +133,12 @@ class OdometryChain:
         self._settings = settings
         self.log = OdometryLog()
         self._covariances: dict[int, Array] = {}
-        self._samples = Rows(dtype=np.int64)
-        self._sample_travel = Rows()
-        self._stamps = Rows(dtype=np.int64)
-        self._poses = Rows((4, 4))
-        self._travel = Rows()
-        self._noise = Rows((6, 6))
+        self._samples = GrowingArray(dtype=np.int64)
+        self._sample_travel = GrowingArray()
+        self._stamps = GrowingArray(dtype=np.int64)
+        self._poses = GrowingArray((4, 4))
+        self._travel = GrowingArray()
+        self._noise = GrowingArray((6, 6))
         self._origin: Array = np.zeros(3)
 
     @property
@@ -165,7 +200,7 @@ class OdometryChain:
     def _steps_beyond(self, stamps: Stamps, poses: Array) -> Array:
         last = np.broadcast_to(self.poses[-1], poses.shape)
         steps = _path_steps(last, poses, stamps - self.stamps[-1])
-        return lie.conjugate(lie.adjoint(self.at_origin(poses)), self._model(steps))
+        return propagate(adjoint(self.at_origin(poses)), self._model(steps))
 
     def _model(self, travel: Array) -> Array:
         turn = np.deg2rad(self._settings.odometry_sigma_deg) ** 2
@@ -219,7 +254,7 @@ class OdometryChain:
         model = self._model(np.maximum(steps, 0.0))
         if self._covariances:
             self._take_given(model, stamps, poses)
-        carried = lie.conjugate(lie.adjoint(self.at_origin(poses)), model)
+        carried = propagate(adjoint(self.at_origin(poses)), model)
         start = self._noise.view[-1] if len(self._noise) else np.zeros((6, 6))
         self._stamps.extend(stamps)
         self._poses.extend(poses)
@@ -238,6 +273,6 @@ class OdometryChain:
 
 def _path_steps(a: Array, b: Array, elapsed_ns: Stamps) -> Array:
     """(N,) lengths of the steps from `a` to `b` in metres, counting turns and, barely, time."""
-    turns = np.linalg.norm(lie.rotation_vectors(np.swapaxes(a[:, :3, :3], -1, -2) @ b[:, :3, :3]), axis=1)
+    turns = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], -1, -2) @ b[:, :3, :3]).magnitude()
     moved = np.linalg.norm(b[:, :3, 3] - a[:, :3, 3], axis=1)
     return moved + _TURN_M_PER_RAD * turns + _DRIFT_M_PER_S * np.asarray(elapsed_ns) / 1e9

@@ -5,22 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from umf_ros.geometry import invert, logmap
 from umf_ros.lab.simulation.pose_graphs import (
     WORLDS,
+    GraphWorld,
     Kind,
-    World,
     rover_loops,
     with_bias,
     with_lone_end,
     with_wrong_closures,
 )
-from umf_ros.pose_graph import lie
 
 
-def off_by(world: World, right: bool) -> np.ndarray:
+def off_by(world: GraphWorld, right: bool) -> np.ndarray:
     """Metres by which closures miss the truth."""
     chosen = [closure for closure in world.closures if closure.right is right]
-    misses = [lie.invert(world.truth[c.first] @ c.pose) @ world.truth[c.second] for c in chosen]
+    misses = [invert(world.truth[c.first] @ c.pose) @ world.truth[c.second] for c in chosen]
     return np.linalg.norm(np.array(misses)[:, :3, 3], axis=1)
 
 
@@ -54,7 +54,7 @@ def test_no_pair_of_poses_is_closed_twice() -> None:
 def test_groups_agree_with_each_other() -> None:
     world = with_wrong_closures(rover_loops(400, 3), 0.3, "groups", 1)
     wrong = [closure for closure in world.closures if not closure.right]
-    shifts = np.stack([world.truth[c.first] @ c.pose @ lie.invert(world.truth[c.second]) for c in wrong])
+    shifts = np.stack([world.truth[c.first] @ c.pose @ invert(world.truth[c.second]) for c in wrong])
     following = [k for k in range(1, len(wrong)) if wrong[k].second == wrong[k - 1].second + 1]
     alike = [np.abs(shifts[k] - shifts[k - 1]).max() < 3.0 for k in following]
     assert len(following) > len(wrong) / 2 and np.mean(alike) > 0.8
@@ -81,9 +81,9 @@ def test_a_bias_is_the_same_in_every_metre_and_not_stated() -> None:
     biased = with_bias(world, twist)
     np.testing.assert_array_equal(biased.odometry[0], world.odometry[0])
     np.testing.assert_array_equal(biased.step_covariances, world.step_covariances)
-    steps, wrong = (lie.invert(w.odometry[:-1]) @ w.odometry[1:] for w in (world, biased))
+    steps, wrong = (invert(w.odometry[:-1]) @ w.odometry[1:] for w in (world, biased))
     lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
-    np.testing.assert_allclose(lie.log(lie.invert(steps) @ wrong), lengths[:, None] * twist, atol=1e-9)
+    np.testing.assert_allclose(logmap(invert(steps) @ wrong), lengths[:, None] * twist, atol=1e-9)
 
 
 def test_a_lone_end_leaves_one_closure_in_the_second_half() -> None:

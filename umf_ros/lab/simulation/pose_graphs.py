@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, gtsam_to_ros_covariance, relative
-from umf_ros.pose_graph import lie
+from umf_ros.geometry import Array, expmap, gtsam_to_ros_covariance, invert, relative
 
 Kind = Literal["random", "groups", "near"]
 PERIOD_NS = 1_000_000_000
@@ -33,7 +32,7 @@ class WorldClosure(NamedTuple):
 
 
 @dataclass(frozen=True)
-class World:
+class GraphWorld:
     """A graph with its truth.
 
     Attributes:
@@ -64,7 +63,7 @@ class World:
         return gtsam_to_ros_covariance(self.step_covariances[row], step)
 
 
-def rover_loops(size: int, seed: int) -> World:
+def rover_loops(size: int, seed: int) -> GraphWorld:
     """A rover that drives circuits of 80 to 250 m about its lander, each twice, a pose per metre."""
     rng = np.random.default_rng(seed)
     points: list[Array] = []
@@ -73,7 +72,7 @@ def rover_loops(size: int, seed: int) -> World:
     return _drive(np.concatenate(points)[:size], rng, spacing=8)
 
 
-def sphere(size: int, seed: int) -> World:
+def sphere(size: int, seed: int) -> GraphWorld:
     """Rings of 60 poses about a ball, 4 m apart or nearer, with closures to the ring before."""
     rng = np.random.default_rng(seed)
     height = np.pi * (0.05 + 0.9 * np.arange(size) / size)
@@ -83,7 +82,7 @@ def sphere(size: int, seed: int) -> World:
     return _drive(radius * ring, rng, spacing=5, reach_m=6.0)
 
 
-def garage(size: int, seed: int) -> World:
+def garage(size: int, seed: int) -> GraphWorld:
     """Five floors of 40 x 25 m, 3 m apart, driven round, up, and down again."""
     rng = np.random.default_rng(seed)
     corners = np.array([[0, 0], [40, 0], [40, 25], [0, 25], [0, 0]], float)
@@ -95,10 +94,10 @@ def garage(size: int, seed: int) -> World:
     return _drive(np.column_stack([plan, level])[:size], rng, spacing=6)
 
 
-WORLDS: dict[str, Callable[[int, int], World]] = {"rover": rover_loops, "sphere": sphere, "garage": garage}
+WORLDS: dict[str, Callable[[int, int], GraphWorld]] = {"rover": rover_loops, "sphere": sphere, "garage": garage}
 
 
-def with_wrong_closures(world: World, share: float, kind: Kind, seed: int) -> World:
+def with_wrong_closures(world: GraphWorld, share: float, kind: Kind, seed: int) -> GraphWorld:
     """The world with as many wrong closures that they are `share` of all.
 
     `random`: between places far apart. `groups`: five to eight in a row that agree with each other.
@@ -121,41 +120,41 @@ def with_wrong_closures(world: World, share: float, kind: Kind, seed: int) -> Wo
     return replace(world, closures=order)
 
 
-def with_bias(world: World, twist: Array) -> World:
+def with_bias(world: GraphWorld, twist: Array) -> GraphWorld:
     """The world with every metre of its odometry wrong by the same (6,) twist, which its covariances do not state."""
-    steps = lie.invert(world.odometry[:-1]) @ world.odometry[1:]
+    steps = invert(world.odometry[:-1]) @ world.odometry[1:]
     lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
     odometry = [world.odometry[0]]
-    for step in steps @ lie.exp(lengths[:, None] * twist):
+    for step in steps @ expmap(lengths[:, None] * twist):
         odometry.append(odometry[-1] @ step)
     return replace(world, odometry=np.array(odometry))
 
 
-def with_lone_end(world: World) -> World:
+def with_lone_end(world: GraphWorld) -> GraphWorld:
     """The world with the closures of its first half and, after a long way without any, its last one alone."""
     early = [closure for closure in world.closures if closure.second < len(world.truth) // 2]
     return replace(world, closures=[*early, world.closures[-1]])
 
 
-def _alias(world: World, i: int, j: int, length: int, rng: np.random.Generator) -> list[WorldClosure]:
+def _alias(world: GraphWorld, i: int, j: int, length: int, rng: np.random.Generator) -> list[WorldClosure]:
     """Closures that all say place j is place i: one wrong shift of the world for the whole group."""
-    claimed = lie.exp(rng.normal(0, [0, 0, 0.05, 0.7, 0.7, 0.1])[None])[0]
+    claimed = expmap(rng.normal(0, [0, 0, 0.05, 0.7, 0.7, 0.1])[None])[0]
     wrong_by = np.linalg.norm((world.truth[i] @ claimed)[:3, 3] - world.truth[j][:3, 3])
     if wrong_by < _LEAST_WRONG_M:
         return []
-    shift = world.truth[i] @ claimed @ lie.invert(world.truth[j])
+    shift = world.truth[i] @ claimed @ invert(world.truth[j])
     covariance = world.closures[int(rng.integers(len(world.closures)))].covariance
     lower = np.linalg.cholesky(covariance)
     group = []
     for k in range(length):
         if i + k < j and j + k < len(world.truth):
-            noise = lie.exp((lower @ rng.normal(size=6))[None])[0]
-            pose = lie.invert(world.truth[i + k]) @ shift @ world.truth[j + k] @ noise
+            noise = expmap((lower @ rng.normal(size=6))[None])[0]
+            pose = invert(world.truth[i + k]) @ shift @ world.truth[j + k] @ noise
             group.append(WorldClosure(i + k, j + k, pose, covariance, False))
     return group
 
 
-def _far_pair(world: World, rng: np.random.Generator) -> tuple[int, int]:
+def _far_pair(world: GraphWorld, rng: np.random.Generator) -> tuple[int, int]:
     # a small world has no places 20 m apart: half its extent is far there
     far_m = min(20.0, 0.5 * float(np.linalg.norm(np.ptp(world.truth[:, :3, 3], axis=0))))
     while True:
@@ -164,7 +163,7 @@ def _far_pair(world: World, rng: np.random.Generator) -> tuple[int, int]:
             return i, j
 
 
-def _near_pairs(world: World, closest_m: float, farthest_m: float) -> NDArray[np.int64]:
+def _near_pairs(world: GraphWorld, closest_m: float, farthest_m: float) -> NDArray[np.int64]:
     """(M, 2) pairs of poses passed in the same direction within 30 deg, at least 40 poses apart."""
     positions = world.truth[:, :3, 3]
     pairs = cKDTree(positions).query_pairs(farthest_m, output_type="ndarray")
@@ -197,7 +196,7 @@ def _resample(corners: Array, step: float) -> Array:
     return np.stack([np.interp(at, way, corners[:, k]) for k in range(corners.shape[1])], axis=1)
 
 
-def _drive(points: Array, rng: np.random.Generator, spacing: int, reach_m: float = 2.5) -> World:
+def _drive(points: Array, rng: np.random.Generator, spacing: int, reach_m: float = 2.5) -> GraphWorld:
     """Look along the way, drift, and close a loop about every `spacing` poses where a place is passed again."""
     forward = np.gradient(points, axis=0)
     yaw = np.arctan2(forward[:, 1], forward[:, 0])
@@ -206,15 +205,15 @@ def _drive(points: Array, rng: np.random.Generator, spacing: int, reach_m: float
     truth[:, :3, :3] = Rotation.from_euler("ZY", np.stack([yaw, pitch], axis=1)).as_matrix()
     truth[:, :3, 3] = points
     odometry, covariances = _drift(truth, rng)
-    world = World(truth, odometry, covariances, [])
+    world = GraphWorld(truth, odometry, covariances, [])
     return replace(world, closures=_true_closures(world, rng, spacing, reach_m))
 
 
 def _drift(truth: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    steps = lie.invert(truth[:-1]) @ truth[1:]
+    steps = invert(truth[:-1]) @ truth[1:]
     lengths = np.maximum(np.linalg.norm(steps[:, :3, 3], axis=1), 0.05)
     sigmas = np.sqrt(lengths)[:, None] * _ODOMETRY_SIGMAS
-    steps = steps @ lie.exp(rng.normal(size=sigmas.shape) * sigmas)
+    steps = steps @ expmap(rng.normal(size=sigmas.shape) * sigmas)
     odometry = [truth[0]]
     for step in steps:
         odometry.append(odometry[-1] @ step)
@@ -223,14 +222,14 @@ def _drift(truth: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     return np.array(odometry), covariances
 
 
-def _true_closures(world: World, rng: np.random.Generator, spacing: int, reach_m: float) -> list[WorldClosure]:
+def _true_closures(world: GraphWorld, rng: np.random.Generator, spacing: int, reach_m: float) -> list[WorldClosure]:
     pairs = _near_pairs(world, 0.0, reach_m)
     covariance = np.diag(_CLOSURE_SIGMAS**2)
     closures = []
     for j in np.unique(pairs[:, 1]):
         if rng.random() < 1 / spacing:
             i = int(rng.choice(pairs[pairs[:, 1] == j, 0]))
-            noise = lie.exp((rng.normal(size=6) * _CLOSURE_SIGMAS)[None])[0]
+            noise = expmap((rng.normal(size=6) * _CLOSURE_SIGMAS)[None])[0]
             pose = relative(world.truth[i], world.truth[j]) @ noise
             closures.append(WorldClosure(i, int(j), pose, covariance, True))
     return closures

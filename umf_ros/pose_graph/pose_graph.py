@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.config import PoseGraph as PoseGraphSettings
+from umf_ros.config import PoseGraphSettings
 from umf_ros.errors import GraphError
 from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, gtsam_to_ros_covariance
-from umf_ros.pose_graph import lie
+from umf_ros.geometry import Array, gtsam_to_ros_covariance, invert
 from umf_ros.pose_graph.closures import (
     ClosureVerdict,
     State,
@@ -23,13 +22,11 @@ from umf_ros.pose_graph.closures import (
     check_covariance,
     check_pose,
 )
-from umf_ros.pose_graph.condensed import Edge, Edges, odometry_edges
-from umf_ros.pose_graph.ends import Scale
-from umf_ros.pose_graph.g2o import write_g2o, write_vertex_table
-from umf_ros.pose_graph.judge import Judge
+from umf_ros.pose_graph.export import write_g2o, write_vertex_table
+from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.odometry import Stamps
+from umf_ros.pose_graph.outlier_rejection import OutlierRejection
 from umf_ros.pose_graph.sessions import Sessions
-from umf_ros.pose_graph.shape import Shape
 from umf_ros.trajectory import Trajectory, write_tum
 
 logger = logging.getLogger(__name__)
@@ -60,7 +57,7 @@ class PoseGraph:
     def __init__(self, settings: PoseGraphSettings | None = None) -> None:
         self._settings = settings or PoseGraphSettings()
         self._sessions = Sessions(self._settings)
-        self._judge = Judge(self._settings, self._sessions)
+        self._rejection = OutlierRejection(self._settings, self._sessions)
         self._waiting: list[_Waiting] = []
         self._seen: set[tuple[int, int, bytes]] = set()
         self._refused: list[ClosureVerdict] = []
@@ -108,7 +105,7 @@ class PoseGraph:
         """Take in odometry that has arrived and decide about closures that waited for it; returns new verdicts."""
         self._refresh()
         verdicts, arrived = self._take_waiting()
-        return verdicts + self._attempt(lambda: self._judge.consider(arrived))
+        return verdicts + self._attempt(lambda: self._rejection.consider(arrived))
 
     def settle(self) -> list[ClosureVerdict]:
         """Come to the final decision and the exact optimum, as at the end of a mission.
@@ -118,12 +115,12 @@ class PoseGraph:
         nothing speaks against them.
         """
         verdicts = self.update() + self._attempt(self._replay)
-        return verdicts + self._attempt(self._judge.settle)
+        return verdicts + self._attempt(self._rejection.settle)
 
     def _refresh(self) -> None:
         if self._sessions.update():
             self.counts["odometry out of order"] += 1
-            self._attempt(self._judge.renew)
+            self._attempt(self._rejection.renew)
 
     def _attempt(self, step: Callable[[], list[ClosureVerdict]]) -> list[ClosureVerdict]:
         """Run a step that solves; a failure of the optimiser is counted and the last trajectory stays."""
@@ -140,12 +137,12 @@ class PoseGraph:
         Raises:
             GraphError: there is no such closure, or the graph cannot be solved without it.
         """
-        ends = (match_stamp_ns, query_stamp_ns)
-        closures = enumerate(tracked.closure for tracked in self._judge.closures)
-        rows = [row for row, closure in closures if (closure.match_stamp_ns, closure.query_stamp_ns) == ends]
+        endpoints = (match_stamp_ns, query_stamp_ns)
+        closures = enumerate(tracked.closure for tracked in self._rejection.closures)
+        rows = [row for row, closure in closures if (closure.match_stamp_ns, closure.query_stamp_ns) == endpoints]
         if not rows:
             raise GraphError(f"no closure between keyframes {match_stamp_ns} and {query_stamp_ns}")
-        return [verdict for row in rows for verdict in self._judge.veto(row)]
+        return [verdict for row in rows for verdict in self._rejection.revoke(row)]
 
     def _receive(self, closure: LoopClosure) -> ClosureVerdict | None:
         try:
@@ -194,27 +191,27 @@ class PoseGraph:
         return TrackedClosure(match, query, ClosureVerdict(closure, State.UNDECIDED, "new"), covariance)
 
     def _replay(self) -> list[ClosureVerdict]:
-        before = {id(c.closure): c.verdict.state for c in self._judge.closures}
-        order = sorted(self._judge.closures, key=lambda c: (c.closure.query_stamp_ns, c.closure.match_stamp_ns))
-        vetoed = self._judge.vetoed
-        self._sessions.forget()
-        self._judge = Judge(self._settings, self._sessions)
+        before = {id(c.closure): c.verdict.state for c in self._rejection.closures}
+        order = sorted(self._rejection.closures, key=lambda c: (c.closure.query_stamp_ns, c.closure.match_stamp_ns))
+        revoked = self._rejection.revoked
+        self._sessions.reset()
+        self._rejection = OutlierRejection(self._settings, self._sessions)
         for tracked in order:
-            tracked.decide(State.UNDECIDED, "new", float("nan"), float("nan"))
-            self._judge.consider([tracked])
-        for closure in vetoed:
+            tracked.decide(State.UNDECIDED, "new")
+            self._rejection.consider([tracked])
+        for closure in revoked:
             self.revoke(closure.match_stamp_ns, closure.query_stamp_ns)
-        return [c.verdict for c in self._judge.closures if before[id(c.closure)] is not c.verdict.state]
+        return [c.verdict for c in self._rejection.closures if before[id(c.closure)] is not c.verdict.state]
 
     def closures(self) -> list[ClosureVerdict]:
         """The latest verdict of every closure, in order of arrival."""
         waiting = [ClosureVerdict(w.closure, State.WAITING, _NO_ODOMETRY_YET) for w in self._waiting]
-        return [tracked.verdict for tracked in self._judge.closures] + waiting + self._refused
+        return [tracked.verdict for tracked in self._rejection.closures] + waiting + self._refused
 
     @property
-    def scale(self) -> Scale:
+    def scale(self) -> NoiseScale:
         """By how much the true standard deviations are estimated to exceed the stated ones."""
-        return self._judge.scale
+        return self._rejection.scale
 
     def verdict_counts(self) -> Counter[State]:
         """How many closures have which verdict."""
@@ -225,17 +222,17 @@ class PoseGraph:
         self._refresh()
         stamps: list[Stamps] = [np.empty(0, np.int64)]
         poses: list[Array] = [np.empty((0, 4, 4))]
-        for session, chain in enumerate(self._sessions.chains):
-            if len(chain.stamps) and self._sessions.parts[session] == 0:
-                stamps.append(chain.stamps.copy())
-                poses.append(self._sessions.at(session, chain.stamps))
+        for session in self._sessions.joined:
+            stamps.append(self._sessions.chains[session].stamps)
+            poses.append(self._sessions.at(session, stamps[-1]))
         return np.concatenate(stamps), np.concatenate(poses)
 
     def odometry(self) -> tuple[Stamps, Array]:
         """Stamps (N,) in ns and `odom_T_body` (N, 4, 4) of the same keyframes as `trajectory`."""
         self._refresh()
-        joined = [c for c, part in zip(self._sessions.chains, self._sessions.parts, strict=True) if part == 0]
-        return np.concatenate([c.stamps for c in joined]), np.concatenate([c.poses for c in joined])
+        chains = [self._sessions.chains[session] for session in self._sessions.joined]
+        stamps = [np.empty(0, np.int64), *(chain.stamps for chain in chains)]
+        return np.concatenate(stamps), np.concatenate([np.empty((0, 4, 4)), *(chain.poses for chain in chains)])
 
     def map_T_odom(self) -> Array:
         """(4, 4) pose of the newest session's odometry frame in the map: where its newest pose went."""
@@ -244,7 +241,7 @@ class PoseGraph:
         if not len(chain.stamps):
             return np.eye(4)
         last = chain.log.stamps[-1:]
-        return self._sessions.at(len(self._sessions.chains) - 1, last)[0] @ lie.invert(chain.poses_at(last)[0])
+        return self._sessions.at(len(self._sessions.chains) - 1, last)[0] @ invert(chain.poses_at(last)[0])
 
     def covariance(self) -> Array:
         """(6, 6) marginal covariance of the newest pose in ROS order about the map's axes; zero without odometry."""
@@ -253,7 +250,7 @@ class PoseGraph:
         last = self._sessions.chains[session].log.stamps[-1:]
         if not len(last):
             return np.zeros((6, 6))
-        covariance = self._sessions.covariance(session, int(last[0]), self._judge.scale)
+        covariance = self._sessions.covariance(session, int(last[0]), self._rejection.scale)
         return gtsam_to_ros_covariance(covariance, self._sessions.at(session, last)[0])
 
     def write_tum(self, path: str | Path, optimized: bool = True) -> None:
@@ -267,9 +264,9 @@ class PoseGraph:
         write_tum(path, Trajectory(stamps[order], poses[order]))
 
     def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
-        """Verdicts of the N closures with known ends, and (N, 2, 3) map positions of match and query."""
+        """Verdicts of the N closures with known endpoints, and (N, 2, 3) map positions of match and query."""
         self._refresh()
-        return [tracked.verdict for tracked in self._judge.closures], self._judge.positions()
+        return [tracked.verdict for tracked in self._rejection.closures], self._rejection.endpoint_positions()
 
     def write_g2o(self, path: str | Path, planar: bool = False, vertex_of: Callable[[int], int] | None = None) -> None:
         """Write keyframes, odometry and accepted closures, with the covariances that the solution used.
@@ -284,23 +281,9 @@ class PoseGraph:
             OutputError: a file cannot be written.
         """
         self._refresh()
-        poses: list[Array] = []
-        parts: list[Edges] = []
-        vertices: dict[tuple[int, int], int] = {}
-        for session, chain in enumerate(self._sessions.chains):
-            stamps = np.union1d(chain.stamps, self._judge.ends_of(session))
-            if len(stamps):
-                parts.append(odometry_edges(Shape(chain).at(stamps), len(poses), self._judge.scale.odometry))
-                vertices |= {(session, stamp): len(poses) + row for row, stamp in enumerate(stamps.tolist())}
-                poses += list(self._sessions.at(session, stamps))
-        edges = [part[row] for part in parts for row in range(len(part))]
-        for c in self._judge.closures:
-            if c.accepted:
-                match = vertices[c.match, c.closure.match_stamp_ns]
-                query = vertices[c.query, c.closure.query_stamp_ns]
-                covariance = self._judge.scale.closures**2 * c.covariance
-                edges.append(Edge(match, query, c.closure.match_T_query, covariance))
-        ids = [row if vertex_of is None else vertex_of(stamp) for (_, stamp), row in vertices.items()]
-        write_g2o(path, poses, edges, planar, ids)
+        endpoints = [self._rejection.endpoints_in(session) for session in range(len(self._sessions.chains))]
+        full = self._sessions.expand(self._rejection.accepted, endpoints, self._rejection.scale)
+        ids = [row if vertex_of is None else vertex_of(stamp) for row, (_, stamp) in enumerate(full.vertices)]
+        write_g2o(path, full.poses, full.edges, planar, ids)
         if vertex_of is None:
-            write_vertex_table(Path(path).with_suffix(".csv"), vertices)
+            write_vertex_table(Path(path).with_suffix(".csv"), full.vertices)

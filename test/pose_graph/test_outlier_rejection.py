@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from graph_worlds import SETTINGS, accepted, closing, feed_odometry, lap_pairs, rms, two_laps
 
-from umf_ros.config import PoseGraph as Settings
-from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, World
+from umf_ros.config import PoseGraphSettings
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.pose_graph.graph import PoseGraph
+from umf_ros.pose_graph.pose_graph import PoseGraph
 
 TURN = np.array([0, 0, np.deg2rad(0.3), 0.03, 0, 0])
 """What odometry with a bias gets wrong per metre."""
 
 
-def driven(world: World, settings: Settings = SETTINGS, stated: float = 1.0) -> PoseGraph:
+def driven(world: GraphWorld, settings: PoseGraphSettings = SETTINGS, stated: float = 1.0) -> PoseGraph:
     graph = PoseGraph(settings)
     feed_odometry(graph, world, range(len(world.truth)), stated)
     return graph
@@ -178,7 +178,7 @@ def test_each_guard_can_be_switched_off(guard: str) -> None:
 
 def test_without_support_and_gate_everything_is_accepted_at_once() -> None:
     world = closing(two_laps(), lap_pairs(10), (9.0, 0, 0))
-    graph = driven(world, SETTINGS.model_copy(update={"use_gate": False, "use_support": False}))
+    graph = driven(world, SETTINGS.model_copy(update={"reject_outliers": False}))
     (verdict,) = graph.add_closure(world.message(0))
     assert verdict.state is State.ACCEPTED
 

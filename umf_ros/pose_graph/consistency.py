@@ -1,0 +1,285 @@
+"""Which closures are consistent with the map and with each other, and how much that says.
+
+Two closures are consistent when the loop through both closes (pairwise consistency maximisation, kept
+up incrementally). How much that says depends on how easily a wrong closure would have passed: the area
+that the prediction leaves open over the area in which wrong closures to similar places are found.
+Closures of one place count once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.stats import chi2
+
+from umf_ros.config import PoseGraphSettings
+from umf_ros.geometry import Array, adjoint, invert, propagate
+from umf_ros.pose_graph.closures import ClosureArrays
+from umf_ros.pose_graph.noise_scale import LoopResiduals, NoiseScale, loop_residuals
+from umf_ros.pose_graph.sessions import CorrectedPath, Sessions
+
+_MOST_COMPARED = 40
+_DEGREES = 6
+# nats: where one place is mistaken for another, the next is too more often than by chance
+_MOST_PER_PLACE = 4.0
+# metres at which an angular error counts like a displacement when ways through the graph are compared
+_LEVER_M = 10.0
+
+
+def squared_mahalanobis(twists: Array, covariances: Array) -> Array:
+    """(N,) squared Mahalanobis lengths of (N, 6) twists."""
+    return np.einsum("...i,...i->...", twists, np.linalg.solve(covariances, twists[..., None])[..., 0])
+
+
+def false_alarm_probability(covariances: Array, settings: PoseGraphSettings) -> Array:
+    """(N,) share of wrong closures that pass for right ones under predictions of the (N, 6, 6) covariances."""
+    spreads = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[..., 3:, 3:])[..., 1:], 0.0))
+    return np.minimum(settings.gate_chi2 * spreads.prod(axis=-1) / settings.alias_radius_m**2, 1.0)
+
+
+def likelihood_ratio(false_alarms: Array, distances: Array, settings: PoseGraphSettings) -> Array:
+    """(N,) how much likelier wrong closures are to miss predictions by this than right ones; one at most.
+
+    Args:
+        false_alarms: (N,) false-alarm probabilities of the predictions.
+        distances: (N,) squared Mahalanobis distances from them; better than most right ones says no more.
+        settings: of the pose graph.
+    """
+    likeliest = _DEGREES - 2
+    right = chi2.pdf(np.maximum(distances, likeliest), _DEGREES)
+    wrong = false_alarms / settings.gate_chi2
+    return np.minimum(wrong / np.maximum(right, 1e-12), 1.0)
+
+
+class ConsistencyGraph:
+    """Which closures are consistent; a row is the number of a closure in `ClosureArrays`.
+
+    Attributes:
+        place_of: for each closure the first one of the same place.
+    """
+
+    def __init__(self, closures: ClosureArrays, settings: PoseGraphSettings) -> None:
+        self._closures = closures
+        self._settings = settings
+        self._consistent: list[dict[int, float]] = []
+        self._inconsistent: list[set[int]] = []
+        self.place_of: list[int] = []
+
+    def add(self, row: int, scale: NoiseScale) -> LoopResiduals:
+        """Compare the newest closure with all near ones; returns the loops it makes with them."""
+        assert row == len(self._consistent)
+        self._consistent.append({})
+        self._inconsistent.append(set())
+        near = self._near(row)
+        known = sorted({self.place_of[other] for other in near})
+        self.place_of.append(next((first for first in known if self._same_place(row, [first])), row))
+        loops = loop_residuals(self._closures, np.full(len(near), row), near)
+        self._compare(row, near, loops, scale)
+        return loops
+
+    def renew(self, scale: NoiseScale) -> None:
+        """Compare all again, as after a change of scale or of the odometry's past."""
+        count = len(self._consistent)
+        self._consistent, self._inconsistent, self.place_of = [], [], []
+        for row in range(count):
+            self.add(row, scale)
+
+    def consistency_set(self, row: int, members: NDArray[np.bool_]) -> tuple[list[int], float]:
+        """Closures out of `members` consistent with `row` and among each other, and the evidence for them in nats."""
+        consistent = [other for other in self._consistent[row] if members[other]]
+        consistent.sort(key=lambda other: -sum(1 for third in consistent if third in self._consistent[other]))
+        found = [row]
+        for other in consistent:
+            if not any(other in self._inconsistent[member] for member in found):
+                found.append(other)
+        return self._well_linked(found)
+
+    def _well_linked(self, found: list[int]) -> tuple[list[int], float]:
+        """The set without what only hangs on to it, and the evidence for it.
+
+        From the two places that are linked best on, every further place adds the improbability that it is
+        consistent with the nearest by chance. Once that is enough, a place must be believable for itself: a
+        wrong one is consistent with right ones too where little would have shown it.
+        """
+        linked, others, evidence = [self._best_linked(found)], found, 0.0
+        while others := [other for other in others if not self._same_place(other, linked[-1:])]:
+            ratio, nearest = min(
+                (min((self._consistent[other][k] for k in linked if k in self._consistent[other]), default=1.0), other)
+                for other in others
+            )
+            if evidence >= self._settings.min_support and ratio > self._settings.max_chance:
+                break
+            evidence += min(-float(np.log(max(ratio, 1e-9))), _MOST_PER_PLACE)
+            linked.append(nearest)
+        return [member for member in found if member not in others], evidence
+
+    def _best_linked(self, found: list[int]) -> int:
+        """One of the two most consistent closures of different places."""
+        inside = set(found)
+        pairs = [
+            (ratio, one, other)
+            for one in found
+            for other, ratio in self._consistent[one].items()
+            if one < other and other in inside and self.place_of[one] != self.place_of[other]
+        ]
+        return next((one for _, one, other in sorted(pairs) if not self._same_place(one, [other])), found[0])
+
+    def companions(self, row: int, members: NDArray[np.bool_]) -> list[int]:
+        """Closures out of `members` of the same place that are consistent with this one."""
+        return [other for other in self._consistent[row] if members[other] and self._same_place(other, [row])]
+
+    def opponents(self, row: int, members: NDArray[np.bool_]) -> list[int]:
+        """Closures out of `members` that are inconsistent with this one."""
+        return [other for other in self._inconsistent[row] if members[other]]
+
+    def count_places(self, rows: list[int]) -> int:
+        """How many different places closures are of."""
+        counted: list[int] = []
+        for row in rows:
+            if not self._same_place(row, counted):
+                counted.append(row)
+        return len(counted)
+
+    def _near(self, row: int) -> NDArray[np.int64]:
+        apart = np.maximum(self._closures.match.distances(row), self._closures.query.distances(row))
+        return np.flatnonzero(apart[:row] <= self._settings.support_range_m)[-_MOST_COMPARED:]
+
+    def _compare(self, row: int, near: NDArray[np.int64], loops: LoopResiduals, scale: NoiseScale) -> None:
+        covariances = loops.covariances(scale)
+        distances = squared_mahalanobis(loops.residuals, covariances)
+        false_alarms = false_alarm_probability(covariances, self._settings)
+        ratios = likelihood_ratio(false_alarms, distances, self._settings)
+        for other, distance, false_alarm, ratio in zip(near.tolist(), distances, false_alarms, ratios, strict=True):
+            if false_alarm >= 1:  # says nothing
+                continue
+            if distance <= self._settings.pair_chi2:
+                self._consistent[row][other] = self._consistent[other][row] = float(ratio)
+            else:
+                self._inconsistent[row].add(other)
+                self._inconsistent[other].add(row)
+
+    def _same_place(self, row: int, others: list[int]) -> bool:
+        match, query = self._closures.match, self._closures.query
+        for other in others:
+            same = match.session.view[row] == match.session.view[other]
+            same &= query.session.view[row] == query.session.view[other]
+            apart = min(
+                abs(match.travel.view[row] - match.travel.view[other]),
+                abs(query.travel.view[row] - query.travel.view[other]),
+            )
+            if same and apart < self._settings.place_m:
+                return True
+        return False
+
+
+class Prediction(NamedTuple):
+    """What the map says about a pair of stamps.
+
+    Attributes:
+        pose: (4, 4) `match_T_query`.
+        covariance: (6, 6) upper bound in GTSAM's order, tangent space of the query; None when no way joins them.
+    """
+
+    pose: Array
+    covariance: Array | None
+
+
+class RelativePoses:
+    """Relative poses of the map as it was last solved, with a bound on their covariance.
+
+    The covariance of a relative pose is at most that along any single way through odometry and
+    accepted closures; the best such way is found by Dijkstra. Being an upper bound it never rejects a
+    right closure too early, and it needs no marginals of the whole system.
+    """
+
+    def __init__(self, sessions: Sessions, scale: NoiseScale) -> None:
+        self._sessions = sessions
+        self._variance_scale = scale.odometry**2
+        solution = sessions.solution
+        assert solution is not None
+        self._starts, self._edges, self._poses = solution.starts, solution.edges, solution.poses
+        first, second, size = self._edges.first, self._edges.second, len(self._poses)
+        lengths = _length(self._edges.covariances)
+        # of parallel edges the shortest counts: a sparse matrix would add them up
+        order = np.lexsort((lengths, np.maximum(first, second), np.minimum(first, second)))
+        low, high = np.minimum(first, second)[order], np.maximum(first, second)[order]
+        best = np.ones(len(order), bool)
+        best[1:] = (np.diff(low) != 0) | (np.diff(high) != 0)
+        self._rows, low, high = order[best], low[best], high[best]
+        self._keys = low * size + high
+        self._ways = csr_matrix((lengths[self._rows], (low, high)), shape=(size, size))
+
+    def predict(self, match: int, match_stamp: int, query: int, query_stamp: int) -> Prediction:
+        """The map's relative pose from stamp `match_stamp` of session `match` to the query's."""
+        a = _Place(self._sessions.path(match), match_stamp, int(self._starts[match]))
+        b = _Place(self._sessions.path(query), query_stamp, int(self._starts[query]))
+        return Prediction(invert(a.pose) @ b.pose, self._bound(a, b, match == query))
+
+    def _bound(self, a: _Place, b: _Place, same_session: bool) -> Array | None:
+        back = invert(b.pose)
+        leave = {vertex: self._variance_scale * a.noise_to_vertex(vertex, back) for vertex in a.vertices}
+        enter = {vertex: self._variance_scale * b.noise_to_vertex(vertex, back) for vertex in b.vertices}
+        sources = list(leave)
+        lengths, before = dijkstra(self._ways, directed=False, indices=sources, return_predecessors=True)
+        total, source, target = min(
+            (_length(leave[u]) + lengths[k, v] + _length(enter[v]), k, v) for k, u in enumerate(sources) for v in enter
+        )
+        direct = self._variance_scale * a.noise_to(b, back) if same_session else None
+        if direct is not None and _length(direct) <= total:
+            return direct
+        if not np.isfinite(total):
+            return None
+        return leave[sources[source]] + enter[target] + self._along(before[source], target, back)
+
+    def _along(self, before: NDArray[np.int32], vertex: int, back: Array) -> Array:
+        """Covariance along the way that ends at a vertex, in the tangent space `back` leads to."""
+        way = [vertex]
+        while before[way[-1]] >= 0:
+            way.append(int(before[way[-1]]))
+        if len(way) == 1:
+            return np.zeros((6, 6))
+        low, high = np.minimum(way[1:], way[:-1]), np.maximum(way[1:], way[:-1])
+        rows = self._rows[np.searchsorted(self._keys, low * len(self._poses) + high)]
+        carry = adjoint(back @ self._poses[self._edges.second[rows]])
+        return propagate(carry, self._edges.covariances[rows]).sum(axis=0)
+
+
+@dataclass
+class _Place:
+    """A stamp of a session, whose first vertex is `start`, with the solved vertices before and after it."""
+
+    path: CorrectedPath
+    stamp: int
+    start: int
+
+    def __post_init__(self) -> None:
+        at = np.array([self.stamp], np.int64)
+        points = self.path.linearisation.at(at)
+        self.noise = points.noise[0]
+        self.pose = self.path.at(at)[0]
+        self.turn = self.pose @ invert(points.poses[0])
+        after = int(np.searchsorted(self.path.stamps, self.stamp))
+        last = len(self.path.stamps) - 1
+        self.vertices = sorted({self.start + min(after, last), self.start + max(after - 1, 0)})
+
+    def noise_to_vertex(self, vertex: int, back: Array) -> Array:
+        """Noise of the odometry between here and a vertex beside it, in the tangent space `back` leads to."""
+        row = vertex - self.start
+        sign = 1.0 if self.stamp >= self.path.stamps[row] else -1.0
+        return propagate(adjoint(back @ self.turn), sign * (self.noise - self.path.points.noise[row]))
+
+    def noise_to(self, other: _Place, back: Array) -> Array:
+        """Noise of the odometry from here to another place of the session."""
+        sign = 1.0 if other.stamp >= self.stamp else -1.0
+        return propagate(adjoint(back @ other.turn), sign * (other.noise - self.noise))
+
+
+def _length(covariances: Array) -> Array:
+    """What a way costs, m^2; never zero, which a sparse matrix would read as no edge."""
+    diagonal = np.diagonal(covariances, axis1=-2, axis2=-1)
+    return diagonal[..., 3:].sum(axis=-1) + _LEVER_M**2 * diagonal[..., :3].sum(axis=-1) + 1e-12
