@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from graph_worlds import SETTINGS, accepted, batch_optimum, drive, feed_odometry, right, rms
 
-from umf_ros.lab.simulation.pose_graphs import GraphWorld, Kind, garage, rover_loops, sphere, with_wrong_closures
+from umf_ros.lab.simulation.pose_graphs import (
+    GraphWorld,
+    Kind,
+    garage,
+    rover_loops,
+    sphere,
+    with_bias,
+    with_lone_end,
+    with_wrong_closures,
+)
 from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
@@ -94,3 +104,23 @@ def test_without_its_guards_the_graph_swallows_wrong_closures() -> None:
     everything = SETTINGS.model_copy(update={"reject_outliers": False})
     world = with_wrong_closures(ROVER, 0.3, "groups", 1)
     assert not accepted(drive(world, everything)) <= right(world)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_odometry_wrong_in_one_direction_is_overruled(sign: int) -> None:
+    """A tenth of a degree and a centimetre per metre that no covariance states: every right closure contradicts it."""
+    biased = with_bias(rover_loops(400, 20000), sign * np.array([0, 0, np.deg2rad(0.1), 0.01, 0, 0]))
+    world = with_wrong_closures(biased, 0.5, "near", 1)
+    graph = drive(world)
+    assert accepted(graph) == right(world)
+    assert rms(graph.trajectory()[1], batch_optimum(world)) < 0.03
+
+
+def test_a_wrong_set_of_few_places_overrules_nothing() -> None:
+    world = with_wrong_closures(sphere(400, 20001), 0.5, "groups", 1)
+    assert accepted(drive(world)) == right(world)
+
+
+def test_a_lone_closure_at_the_end_is_accepted_among_wrong_ones() -> None:
+    world = with_wrong_closures(with_lone_end(rover_loops(400, 20000)), 0.5, "near", 1)
+    assert accepted(drive(world)) == right(world)

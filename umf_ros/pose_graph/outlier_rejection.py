@@ -9,7 +9,7 @@ the map moves, what was rejected is looked at again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ from umf_ros.pose_graph.consistency import (
     squared_mahalanobis,
 )
 from umf_ros.pose_graph.noise_scale import NoiseScale, NoiseScaleEstimator
-from umf_ros.pose_graph.odometry import Stamps
+from umf_ros.pose_graph.odometry import GrowingArray, Stamps
 from umf_ros.pose_graph.sessions import Sessions
 
 _LOOPS_PER_CLOSURE = 3
@@ -82,6 +82,7 @@ class OutlierRejection:
         self._consistency = ConsistencyGraph(self._arrays, settings)
         self._estimator = NoiseScaleEstimator()
         self._map: RelativePoses | None = None
+        self._states = GrowingArray(dtype="U16")
         self._changed: set[int] = set()
         self._revoked: set[int] = set()
         self._too_far: set[int] = set()
@@ -182,6 +183,7 @@ class OutlierRejection:
     def _take(self, tracked: TrackedClosure) -> int:
         row = len(self.closures)
         self.closures.append(tracked)
+        self._states.extend([tracked.verdict.state])
         self._arrays.append(self._sessions.chains, tracked)
         loops = self._consistency.add(row, self.scale)
         self._estimator.add(loops[-_LOOPS_PER_CLOSURE:], self._consistency.place_of[row])
@@ -236,7 +238,8 @@ class OutlierRejection:
 
     def _supported_sets(self, rows: Iterable[int], state: State) -> list[list[int]]:
         """Consistency sets among the closures of one state, each with one of `rows`, that no chance explains."""
-        members = self._mask(lambda closure: closure.verdict.state is state, but=self._revoked | self._too_far)
+        members = self._in_state(state)
+        members[list(self._too_far)] = False
         sets: list[list[int]] = []
         for row in rows:
             if members[row] and not any(row in found for found in sets):
@@ -249,7 +252,7 @@ class OutlierRejection:
 
     def _overrule(self, rows: Iterable[int]) -> list[int]:
         """A set that the map contradicts, of more places than what it is inconsistent with, which is revoked."""
-        accepted = self._mask(lambda closure: closure.accepted)
+        accepted = self._in_state(State.ACCEPTED)
         for found in self._supported_sets(rows, State.REJECTED):
             losers = sorted({loser for row in found for loser in self._consistency.opponents(row, accepted)})
             if self._consistency.count_places(losers) < self._consistency.count_places(found):
@@ -259,23 +262,27 @@ class OutlierRejection:
         return []
 
     def _revoke_outvoted(self) -> bool:
-        """Revoke accepted closures that too little supports and accepted ones of more places are inconsistent with."""
-        accepted = self._mask(lambda closure: closure.accepted)
-        outvoted = []
-        for row in np.flatnonzero(accepted).tolist():
-            opponents = self._consistency.opponents(row, accepted)
-            if not opponents:
-                continue
-            found, evidence = self._consistency.consistency_set(row, accepted)
-            # where enough supports it, the odometry between is wrong, not the closure
-            places = self._consistency.count_places
-            if evidence < self._settings.min_support and places(opponents) > places(found):
-                outvoted.append(row)
-        for row in outvoted:
+        """Revoke what was accepted too early: more places contradict it, and so does the map without it."""
+        accepted = self._in_state(State.ACCEPTED)
+        outvoted = [row for row in np.flatnonzero(accepted).tolist() if self._is_outvoted(row, accepted)]
+        if not outvoted:
+            return False
+        self._solve(without=outvoted)
+        wrong = [row for row in outvoted if self._compare(row).distance > self._settings.gate_chi2]
+        for row in wrong:
             self._note(row, State.REJECTED, _OUTVOTED)
-        if outvoted:
-            self._solve()
-        return bool(outvoted)
+        self._solve()
+        return bool(wrong)
+
+    def _is_outvoted(self, row: int, members: NDArray[np.bool_]) -> bool:
+        """Whether members of more places contradict a closure than support it, and not enough support it."""
+        opponents = self._consistency.opponents(row, members)
+        if not opponents:
+            return False
+        found, evidence = self._consistency.consistency_set(row, members)
+        more = self._consistency.count_places(opponents) > self._consistency.count_places(found)
+        # where enough supports it, the odometry between is wrong, not the closure
+        return more and evidence < self._settings.min_support
 
     def _unopposed(self, last_word: bool = False) -> list[int]:
         """Undecided closures of the place that fits best of those that have waited long enough.
@@ -286,8 +293,11 @@ class OutlierRejection:
         into account how many closures were wrong and what other places say, though it did not suffice.
         """
         patience_m = 0.0 if last_word else self._settings.patience_m
-        waiting = [row for row in np.flatnonzero(self._undecided()).tolist() if self._waited(row) >= patience_m]
-        companions = self._mask(lambda closure: not closure.accepted, but=self._revoked)
+        waiting = [
+            row for row in np.flatnonzero(self._in_state(State.UNDECIDED)).tolist() if self._waited(row) >= patience_m
+        ]
+        companions = ~self._in_state(State.ACCEPTED)
+        companions[list(self._revoked)] = False
         places = [[row, *self._consistency.companions(row, companions)] for row in waiting]
         self._gate(sorted({member for place in places for member in place}))
         against = self._credible()
@@ -306,24 +316,22 @@ class OutlierRejection:
         odds = np.array([self._ratios[row] for row in place])
         if not last_word:
             return odds
-        rejected = sum(closure.verdict.state is State.REJECTED for closure in self.closures)
-        prior = (_WRONG_BEFORE + rejected) / (_RIGHT_BEFORE + len(self.accepted))
-        _, evidence = self._consistency.consistency_set(place[0], self._undecided())
+        rejected, accepted = (int((self._states.view == state).sum()) for state in (State.REJECTED, State.ACCEPTED))
+        prior = (_WRONG_BEFORE + rejected) / (_RIGHT_BEFORE + accepted)
+        _, evidence = self._consistency.consistency_set(place[0], self._in_state(State.UNDECIDED))
         return odds * prior * np.exp(-evidence) * (_WRONG_ALONE if len(place) == 1 else 1.0)
 
     def _credible(self) -> NDArray[np.bool_]:
         """Closures that may speak against others: those the map itself finds wrong rather than right may not."""
-        credible = self._mask(lambda closure: closure.accepted)
+        credible = self._in_state(State.ACCEPTED)
         credible[[row for row, ratio in self._ratios.items() if ratio < _EVEN]] = True
         return credible
 
-    def _undecided(self) -> NDArray[np.bool_]:
-        return self._mask(lambda closure: closure.verdict.state is State.UNDECIDED)
-
-    def _mask(self, condition: Callable[[TrackedClosure], bool], but: Iterable[int] = ()) -> NDArray[np.bool_]:
-        mask = np.array([condition(closure) for closure in self.closures], bool)
-        mask[list(but)] = False
-        return mask
+    def _in_state(self, state: State) -> NDArray[np.bool_]:
+        """Which closures have a verdict, except those revoked for good."""
+        members = self._states.view == state
+        members[list(self._revoked)] = False
+        return members
 
     def _waited(self, row: int) -> float:
         """Metres driven since a closure's query; infinite when that was in another session than the newest one's."""
@@ -340,18 +348,20 @@ class OutlierRejection:
             self._solve()
         return bool(reasons)
 
-    def _solve(self) -> None:
-        self._sessions.solve(self.accepted, self.scale)
+    def _solve(self, without: Sequence[int] = ()) -> None:
+        closures = [closure for row, closure in enumerate(self.closures) if closure.accepted and row not in without]
+        self._sessions.solve(closures, self.scale)
         self._map = RelativePoses(self._sessions, self.scale)
 
     def _worth_another_look(self) -> list[int]:
         """Closures not accepted that the moved map now comes close to."""
-        rows = np.flatnonzero(self._mask(lambda closure: not closure.accepted))
-        if not len(rows):
-            return []
+        rows = np.flatnonzero(~self._in_state(State.ACCEPTED))
+        return rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
+
+    def _misfits(self, rows: NDArray[np.int64]) -> Array:
+        """(N, 4, 4) from what closures say to what the map says."""
         ways = invert(self._poses(self._arrays.match, rows)) @ self._poses(self._arrays.query, rows)
-        misfits = invert(self._arrays.pose.view[rows]) @ ways
-        return rows[np.linalg.norm(misfits[:, :3, 3], axis=1) < _CLOSE_M].tolist()
+        return invert(self._arrays.pose.view[rows]) @ ways
 
     def _poses(self, endpoints: Endpoints, rows: NDArray[np.int64]) -> Array:
         poses = np.zeros((len(rows), 4, 4))
@@ -364,6 +374,7 @@ class OutlierRejection:
         self, row: int, state: State, reason: str, squared: float = float("nan"), metres: float = float("nan")
     ) -> None:
         before = self.closures[row].verdict.state
+        self._states.view[row] = state
         self.closures[row].decide(state, reason, float(np.sqrt(squared)), metres)
         if before is not state:
             self._changed.add(row)
