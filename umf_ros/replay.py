@@ -8,7 +8,6 @@ from pathlib import Path
 from umf_ros.config import Settings
 from umf_ros.frames import Frame
 from umf_ros.loop_detector import Detection, LoopDetector
-from umf_ros.pose_graph.export import write_results
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.runs.recorder import RunRecorder
 from umf_ros.sensors.messages import OdometrySample
@@ -59,5 +58,5 @@ class Replay:
         self._recorder.close()
         self._detector.database.close()
         if self._has_odometry:
-            write_results(self._graph, self._folder)
+            self._graph.write_results(self._folder)
         return self._has_odometry

@@ -1,4 +1,4 @@
-"""What leaves the pose graph: results, graph files, pictures."""
+"""What leaves the pose graph: results and graph files."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from umf_ros.bags.trajectories import read_tum
 from umf_ros.errors import OutputError
 from umf_ros.geometry import make_pose
 from umf_ros.pose_graph.condensed import Edge
-from umf_ros.pose_graph.export import VERDICT_COLUMNS, draw, verdict_table, write_g2o, write_results
-from umf_ros.pose_graph.g2o import PERIOD_NS, G2oGraph, as_recording, drive, read_g2o
+from umf_ros.pose_graph.export import VERDICT_COLUMNS, verdict_table, write_g2o
+from umf_ros.pose_graph.g2o import PERIOD_NS, as_recording, drive, read_g2o
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
 WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))
@@ -38,7 +38,7 @@ def finished() -> PoseGraph:
 
 
 def test_results_hold_both_trajectories_for_evaluation(finished: PoseGraph, tmp_path: Path) -> None:
-    write_results(finished, tmp_path / "new" / "folder")
+    finished.write_results(tmp_path / "new" / "folder")
     optimized = read_tum(tmp_path / "new" / "folder" / "trajectory_optimized.tum")
     odometry = read_tum(tmp_path / "new" / "folder" / "trajectory_odometry.tum")
     np.testing.assert_allclose(optimized.poses, finished.trajectory()[1], atol=1e-8)
@@ -130,7 +130,7 @@ def test_a_place_that_cannot_be_written_is_one_clear_error(finished: PoseGraph, 
     blocker.write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         if target == "results":
-            write_results(finished, blocker / "folder")
+            finished.write_results(blocker / "folder")
         elif target == "tum":
             finished.write_tum(blocker / "a.tum")
         else:
@@ -145,34 +145,3 @@ def test_a_plane_file_stays_a_plane_file(tmp_path: Path) -> None:
     lines = (tmp_path / "out.g2o").read_text().splitlines()
     assert [line.split()[0] for line in lines] == ["VERTEX_SE2"] * 6 + ["EDGE_SE2"] * 5
     assert lines[5] == "VERTEX_SE2 5 5 0.5 0"
-
-
-@pytest.mark.parametrize(("lift_m", "views"), [(0.0, 1), (5.0, 2)])
-def test_a_picture_shows_the_side_only_where_there_is_height(tmp_path: Path, lift_m: float, views: int) -> None:
-    from matplotlib.image import imread
-
-    content = content_of(WORLD)
-    for vertex, pose in content.poses.items():
-        pose[2, 3] = lift_m * np.sin(vertex / 20)
-    draw(as_recording(content), content.poses, tmp_path / "a.png")
-    height, width = imread(tmp_path / "a.png").shape[:2]
-    assert width / height == pytest.approx(views * 7 / 6.5, rel=0.01)
-
-
-def test_a_picture_of_thousands_of_closures_still_shows_the_path(tmp_path: Path) -> None:
-    from matplotlib.image import imread
-
-    pairs = [(a, b) for a in range(0, 100, 2) for b in range(100, 200, 2)]
-    content = content_of(closing(two_laps(), pairs))
-    draw(as_recording(content), content.poses, tmp_path / "a.png")
-    image = imread(tmp_path / "a.png")[..., :3]
-    dark = (image.max(axis=-1) < 0.45).sum()
-    pure_green = ((image - [0.17, 0.63, 0.17]) ** 2).sum(axis=-1) < 0.01
-    assert dark > 2000 and pure_green.mean() < 0.2
-
-
-def test_a_picture_of_edges_alone_is_composed_from_odometry(tmp_path: Path) -> None:
-    content = content_of(WORLD)
-    draw(as_recording(G2oGraph({}, content.edges)), {}, tmp_path / "a.png")
-    draw(as_recording(content), content.poses, tmp_path / "b.png")
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()

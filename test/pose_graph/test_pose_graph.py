@@ -15,7 +15,6 @@ from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, expmap, invert, make_pose
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops, with_wrong_closures
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.export import write_results
 from umf_ros.pose_graph.g2o import read_g2o
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.sessions import Sessions
@@ -222,7 +221,7 @@ def test_the_newest_pose_has_the_marginal_of_the_full_graph() -> None:
 
 
 def test_results_can_be_read_back(driven: PoseGraph, tmp_path: Path) -> None:
-    write_results(driven, tmp_path)
+    driven.write_results(tmp_path)
     content = read_g2o(tmp_path / "graph.g2o")
     stamps, poses = driven.trajectory()
     assert len(content.edges) == len(stamps) - 1 + len(accepted(driven))
@@ -244,7 +243,7 @@ def test_an_empty_graph_answers_everything(tmp_path: Path) -> None:
     assert len(graph.trajectory()[0]) == len(graph.odometry()[0]) == 0
     np.testing.assert_array_equal(graph.map_T_odom(), np.eye(4))
     np.testing.assert_array_equal(graph.covariance(), np.zeros((6, 6)))
-    write_results(graph, tmp_path)
+    graph.write_results(tmp_path)
     assert (tmp_path / "trajectory_optimized.tum").read_text() == ""
 
 

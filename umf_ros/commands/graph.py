@@ -70,11 +70,11 @@ def plot(
     output: Annotated[Path, typer.Option("--output", "-o", help="Picture to write.")] = Path("graph.png"),
 ) -> None:
     """Draw a graph file: odometry dark, closures green, from above and from the side."""
-    from umf_ros.pose_graph.export import draw
     from umf_ros.pose_graph.g2o import as_recording, read_g2o
+    from umf_ros.runs.plots import plot_graph
 
     content = read_g2o(file)
-    draw(as_recording(content), content.poses, output)
+    plot_graph(as_recording(content), content.poses, output)
     typer.echo(f"picture: {output}")
 
 

@@ -32,7 +32,6 @@ from umf_ros.nodes.process import run
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
 from umf_ros.nodes.worker import Worker
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.pose_graph.export import write_results
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.runs.folder import check_writable
 from umf_ros.sensors.messages import OdometrySample, decode_odometry
@@ -75,7 +74,7 @@ class PoseGraphNode(Node):
         """Take in what is queued, settle the graph and write the results."""
         self._worker.close(timeout_s=60.0)
         if self._results:
-            write_results(self._graph, self._results)
+            self._graph.write_results(self._results)
 
     def _subscribe(self, name: str, topic: str, take: Callable[[Odometry], None], qos: QoSProfile) -> None:
         watch = InputWatch(self, name, topic)
@@ -210,7 +209,7 @@ class PoseGraphNode(Node):
         try:
             self._worker.drain(10.0)
             with self._lock:
-                write_results(self._graph, folder)
+                self._graph.write_results(folder)
             response.success, response.message = True, f"results written to {folder}"
         except UmfError as error:
             response.success, response.message = False, str(error)

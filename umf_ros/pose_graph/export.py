@@ -1,4 +1,4 @@
-"""What leaves the pose graph: graphs as g2o files and as pictures, trajectories, and verdicts.
+"""What leaves the pose graph: graphs as g2o files, and verdicts as tables.
 
 An information matrix is written as GTSAM reads it, see `umf_ros.pose_graph.g2o`.
 """
@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,32 +17,8 @@ from umf_ros.geometry import Array, heading, to_quaternion
 from umf_ros.pose_graph.closures import ClosureVerdict
 from umf_ros.pose_graph.condensed import Edge
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from umf_ros.pose_graph.g2o import GraphRecording
-    from umf_ros.pose_graph.pose_graph import PoseGraph
-
 VERDICT_COLUMNS = ("match_stamp_ns", "query_stamp_ns", "verdict", "reason", "mahalanobis", "misfit_m")
 _ROTATION_LAST = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
-
-
-def write_results(graph: PoseGraph, folder: str | Path) -> None:
-    """Settle the graph and write trajectories (TUM), the graph (g2o and id-stamp table) and all verdicts (CSV).
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
-    folder = Path(folder)
-    graph.settle()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "graph_verdicts.csv").write_text(verdict_table(graph.closures()), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"cannot write to {folder}: {error.strerror}") from None
-    graph.write_tum(folder / "trajectory_odometry.tum", optimized=False)
-    graph.write_tum(folder / "trajectory_optimized.tum")
-    graph.write_g2o(folder / "graph.g2o")
 
 
 def verdict_table(verdicts: list[ClosureVerdict], vertex_of: Callable[[int], int] | None = None) -> str:
@@ -132,51 +107,3 @@ def _planar_edge(edge: Edge, first: int, second: int) -> str:
 
 def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.12g}" for value in values)
-
-
-def draw(recording: GraphRecording, given: Mapping[int, Array], path: str | Path) -> None:
-    """Draw odometry (dark) and closures (green) from above, and from the side where height varies.
-
-    Args:
-        recording: the graph.
-        given: (4, 4) poses by vertex id; others are composed from the odometry.
-        path: the picture.
-
-    Raises:
-        OutputError: the picture cannot be written.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    composed = zip(recording.ids.tolist(), recording.odometry, strict=True)
-    at = np.array([given.get(vertex, pose)[:3, 3] for vertex, pose in composed])
-    closures = np.array([[edge.first, edge.second] for edge in recording.closures], int).reshape(-1, 2)
-    views = [("x [m]", "y [m]", at[:, :2])]
-    if np.ptp(at[:, 2]) > 0.01 * np.ptp(at[:, :2]):
-        views.append(("x [m]", "z [m]", at[:, [0, 2]]))
-    figure = Figure(figsize=(7 * len(views), 6.5), layout="constrained")
-    FigureCanvasAgg(figure)
-    for column, (across, up, points) in enumerate(views, start=1):
-        axes = figure.add_subplot(1, len(views), column, xlabel=across, ylabel=up, aspect="equal")
-        _draw_lines(axes, points, recording.chains, closures)
-    figure.suptitle(f"{len(at)} poses, {len(closures)} closures")
-    try:
-        figure.savefig(path, dpi=120)
-    except (OSError, ValueError) as error:
-        raise OutputError(f"cannot write {path}: {error}") from None
-
-
-def _draw_lines(axes: Axes, points: Array, chains: list[int], closures: Array) -> None:
-    from matplotlib.collections import LineCollection
-
-    for start, end in zip(chains, [*chains[1:], len(points)], strict=True):
-        axes.plot(*points[start:end].T, color="0.2", linewidth=0.8, zorder=3, label="odometry" if start == 0 else None)
-    if len(closures):
-        # thousands of closures would bury the path
-        alpha = float(np.clip(500 / len(closures), 0.05, 0.8))
-        lines = LineCollection(list(points[closures]), colors="tab:green", linewidths=0.6, alpha=alpha)
-        axes.add_collection(lines)
-        axes.plot([], [], color="tab:green", label="closures")
-    axes.plot(*points[:1].T, "o", color="tab:blue", markersize=5, zorder=4, label="start")
-    axes.legend(loc="best", fontsize="small")
-    axes.grid(alpha=0.3)

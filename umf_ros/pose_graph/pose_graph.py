@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from umf_ros.config import PoseGraphSettings
-from umf_ros.errors import GraphError
+from umf_ros.errors import GraphError, OutputError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, gtsam_to_ros_covariance, invert
 from umf_ros.pose_graph.closures import (
@@ -22,7 +22,7 @@ from umf_ros.pose_graph.closures import (
     check_covariance,
     check_pose,
 )
-from umf_ros.pose_graph.export import write_g2o, write_vertex_table
+from umf_ros.pose_graph.export import verdict_table, write_g2o, write_vertex_table
 from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.odometry import Stamps
 from umf_ros.pose_graph.outlier_rejection import OutlierRejection
@@ -287,3 +287,20 @@ class PoseGraph:
         write_g2o(path, full.poses, full.edges, planar, ids)
         if vertex_of is None:
             write_vertex_table(Path(path).with_suffix(".csv"), full.vertices)
+
+    def write_results(self, folder: str | Path) -> None:
+        """Settle, and write trajectories (TUM), the graph (g2o and id-stamp table) and all verdicts (CSV).
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        folder = Path(folder)
+        self.settle()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "graph_verdicts.csv").write_text(verdict_table(self.closures()), encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"cannot write to {folder}: {error.strerror}") from None
+        self.write_tum(folder / "trajectory_odometry.tum", optimized=False)
+        self.write_tum(folder / "trajectory_optimized.tum")
+        self.write_g2o(folder / "graph.g2o")
