@@ -299,6 +299,8 @@ def _explain(problem: Any) -> str:
         return str(problem["msg"]).removeprefix("Value error, ")
     if problem["type"] == "extra_forbidden":
         return f"unknown parameter {name}"
+    if problem["type"] == "missing":
+        return f"{name} is missing"
     return f"{name}: {problem['msg'][0].lower()}{problem['msg'][1:]} (got {problem['input']!r})"
 
 

@@ -55,7 +55,7 @@ def rover(duration_s: float = 10.0) -> dict[str, list[Measurement]]:
 def feed(synchronizer: Synchronizer, measurements: list[Measurement]) -> list[Frame]:
     frames: list[Frame] = []
     for name, stamp, value in measurements:
-        getattr(synchronizer, f"add_{name}")(stamp, value)
+        synchronizer.add(name, stamp, value)
         frames += synchronizer.pop()
     return frames
 
@@ -388,7 +388,7 @@ def test_nothing_is_interpolated_across_a_gap_of_the_odometry(calibration: Calib
 def test_an_image_of_another_size_is_refused_and_counted_once(calibration: Calibration) -> None:
     synchronizer = Synchronizer(Sync(), calibration)
     with pytest.raises(MessageError, match="32 x 24 pixels, the calibration is for 64 x 48") as caught:
-        synchronizer.add_left(T0, np.zeros((24, 32), np.uint8))
+        synchronizer.add("left", T0, np.zeros((24, 32), np.uint8))
     synchronizer.reject("left", caught.value.kind)
     assert synchronizer.counters["left"].dropped == {"size": 1}
     check_accounts(synchronizer)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,14 +60,14 @@ def assemble(
     """Build the frame at `anchor.stamp_ns`: images rectified, motion between the measurements removed."""
     odom_T_body = odometry.at(anchor.stamp_ns)
     points, intensity = _scan(anchor, odometry, calibration, odom_T_body)
-    left_image, right_image = _rectified(left, right, calibration)
+    rectifier = calibration.rectifier
     return Frame(
         stamp_ns=anchor.stamp_ns,
         camera=calibration.camera,
         body_T_camera=_camera_pose(left, odometry, calibration, odom_T_body),
         body_T_lidar=calibration.body_T_lidar,
-        left=left_image,
-        right=right_image,
+        left=_pixels(left, rectifier.left if rectifier else None),
+        right=_pixels(right, rectifier.right if rectifier else None),
         points=points,
         intensity=intensity,
         odom_T_body=odom_T_body,
@@ -75,17 +76,8 @@ def assemble(
     )
 
 
-def _rectified(
-    left: StampedImage | None, right: StampedImage | None, calibration: Calibration
-) -> tuple[Image | None, Image | None]:
-    images = left.image if left else None, right.image if right else None
-    rectifier = calibration.rectifier
-    if rectifier is None:
-        return images
-    return (
-        None if images[0] is None else rectifier.left(images[0]),
-        None if images[1] is None else rectifier.right(images[1]),
-    )
+def _pixels(image: StampedImage | None, rectify: Callable[[Image], Image] | None) -> Image | None:
+    return rectify(image.image) if image and rectify else image and image.image
 
 
 def _camera_pose(

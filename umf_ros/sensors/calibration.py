@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
-import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from umf_ros.config import Dataset, Group, find
-from umf_ros.errors import CalibrationError
+from umf_ros.config import Dataset, Group, find, problems, read_values
+from umf_ros.errors import CalibrationError, ConfigError
 from umf_ros.frames import StereoCamera
 from umf_ros.geometry import Array, from_quaternion
-from umf_ros.sensors.rectification import RawCamera, StereoRectifier
+from umf_ros.sensors.rectification import Pinhole, RawCamera, StereoRectifier
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,32 +62,14 @@ def load_calibration(source: str | Path) -> Calibration:
     Raises:
         CalibrationError: the file cannot be read, or a key is missing, unknown or wrong; names the key.
     """
-    path = _path_of(source)
+    known = source in get_args(Dataset)
+    path = find(f"config/calibration/{str(source).replace('-', '_')}.yaml") if known else Path(source)
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
-    try:
-        return _File.model_validate(content).calibration()
+        return _File.model_validate(read_values(path)).calibration()
+    except ConfigError as error:
+        raise CalibrationError(str(error)) from None
     except ValidationError as error:
-        raise CalibrationError(f"{path}: {'; '.join(_explain(problem) for problem in error.errors())}") from None
-
-
-def _path_of(source: str | Path) -> Path:
-    if source in get_args(Dataset):
-        return find(f"config/calibration/{str(source).replace('-', '_')}.yaml")
-    return Path(source)
-
-
-def _explain(problem: Any) -> str:
-    name = ".".join(str(part) for part in problem["loc"])
-    if problem["type"] == "extra_forbidden":
-        return f"unknown key {name}"
-    if problem["type"] == "missing":
-        return f"{name} is missing"
-    return f"{name or 'the file'}: {problem['msg'][0].lower()}{problem['msg'][1:]}"
+        raise CalibrationError(f"{path}: {problems(error)}") from None
 
 
 class _Pose(Group):
@@ -107,52 +88,23 @@ class _Pose(Group):
         return from_quaternion(self.translation, self.quaternion)
 
 
-class _Pinhole(Group):
-    """Pixels."""
-
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
-    fx: float = Field(gt=0)
-    fy: float = Field(gt=0)
-    cx: float
-    cy: float
-
-
-class _Camera(_Pinhole):
+class _Camera(Pinhole):
     """A rectified pair."""
 
     baseline: float = Field(ge=0)
 
 
-class _RawCamera(_Pinhole):
-    """One camera whose images arrive as they were taken."""
-
-    distortion: list[float]
-
-    @field_validator("distortion")
-    @classmethod
-    def _in_opencv_order(cls, distortion: list[float]) -> list[float]:
-        if len(distortion) not in (0, 4, 5, 8):
-            raise ValueError("expected 0, 4, 5 or 8 coefficients: k1 k2 p1 p2 k3 k4 k5 k6")
-        return distortion
-
-    def raw(self) -> RawCamera:
-        return RawCamera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, tuple(self.distortion))
-
-
 class _RawPair(Group):
     """A pair to rectify, and the size of the result."""
 
-    left: _RawCamera
-    right: _RawCamera
+    left: RawCamera
+    right: RawCamera
     left_T_right: _Pose
     width: int = Field(gt=0)
     height: int = Field(gt=0)
 
     def rectifier(self) -> StereoRectifier:
-        return StereoRectifier(
-            self.left.raw(), self.right.raw(), self.left_T_right.matrix(), size=(self.width, self.height)
-        )
+        return StereoRectifier(self.left, self.right, self.left_T_right.matrix(), size=(self.width, self.height))
 
 
 class _File(Group):

@@ -15,20 +15,23 @@ from umf_ros.sensors.messages import (
     decode_odometry,
     stamp_ns,
 )
-from umf_ros.sensors.sessions import Input
+from umf_ros.sensors.sessions import ODOMETRY, Input
 from umf_ros.sensors.synchronizer import SILENCE_NS, Synchronizer
+
+_INPUTS: dict[str, Input] = {
+    "left_image": "left",
+    "right_image": "right",
+    "cloud": "cloud",
+    "odometry": ODOMETRY,
+    "left_info": "camera_info",
+    "right_info": "camera_info",
+}
+"""The input of every topic, by its name in `Topics`."""
 
 
 def wanted_inputs(topics: Topics) -> set[Input]:
-    """Inputs of the synchronizer for which there is a topic."""
-    names: dict[Input, str] = {
-        "left": topics.left_image,
-        "right": topics.right_image,
-        "cloud": topics.cloud,
-        "odometry": topics.odometry,
-        "camera_info": topics.left_info,
-    }
-    return {name for name, topic in names.items() if topic}
+    """Inputs of the synchronizer for which there is a topic; the right camera_info alone says nothing."""
+    return {name for entry, name in _INPUTS.items() if getattr(topics, entry) and entry != "right_info"}
 
 
 class Intake:
@@ -52,62 +55,44 @@ class Intake:
         self._stereo_info = bool(topics.right_info and topics.right_image)
         self._infos: dict[str, Any] = {}
         self._used: set[str] = set()
-        self._handlers: dict[str, tuple[Input, Callable[[Any], None]]] = {
-            topics.left_image: ("left", self._left),
-            topics.right_image: ("right", self._right),
-            topics.cloud: ("cloud", self._cloud),
-            topics.odometry: ("odometry", self._odometry),
-            topics.left_info: ("camera_info", self._left_info),
-            topics.right_info: ("camera_info", self._right_info),
-        }
-        self._handlers.pop("", None)
+        self._entries = {getattr(topics, entry): entry for entry in _INPUTS}
+        self._entries.pop("", None)
 
     @property
     def topics(self) -> list[str]:
         """Topics whose messages are taken."""
-        return list(self._handlers)
+        return list(self._entries)
 
     def take(self, topic: str, message: Any) -> None:
         """Add one message."""
+        entry = self._entries[topic]
         try:
-            self._handlers[topic][1](message)
+            if entry == ODOMETRY:
+                self.take_odometry(decode_odometry(message))
+            elif entry in ("left_info", "right_info"):
+                self._use_info(entry, message)
+            else:
+                decode = decode_cloud if entry == "cloud" else decode_image
+                self._synchronizer.add(_INPUTS[entry], stamp_ns(message), decode(message))
         except MessageError as error:
             self.refuse(topic, error)
 
     def take_odometry(self, sample: OdometrySample) -> None:
         """Add one pose of the odometry."""
         self._hear_odometry(sample)
-        self._synchronizer.add_odometry(sample.stamp_ns, sample.odom_T_body)
+        self._synchronizer.add(ODOMETRY, sample.stamp_ns, sample.odom_T_body)
 
     def refuse(self, topic: str, error: MessageError) -> None:
         """Count a message that cannot be used."""
-        self._synchronizer.reject(self._handlers[topic][0], error.kind)
+        self._synchronizer.reject(_INPUTS[self._entries[topic]], error.kind)
         if (topic, error.kind) not in self._warned:
             self._warned.add((topic, error.kind))
             self._warn(f"{topic}: {error}; such messages are skipped")
 
-    def _left(self, message: Any) -> None:
-        self._synchronizer.add_left(stamp_ns(message), decode_image(message))
-
-    def _right(self, message: Any) -> None:
-        self._synchronizer.add_right(stamp_ns(message), decode_image(message))
-
-    def _cloud(self, message: Any) -> None:
-        self._synchronizer.add_cloud(stamp_ns(message), decode_cloud(message))
-
-    def _odometry(self, message: Any) -> None:
-        self.take_odometry(decode_odometry(message))
-
-    def _left_info(self, message: Any) -> None:
-        self._use_info("left", message)
-
-    def _right_info(self, message: Any) -> None:
-        self._use_info("right", message)
-
-    def _use_info(self, side: str, message: Any) -> None:
+    def _use_info(self, entry: str, message: Any) -> None:
         """Use the first camera_info of the pair, or the left one alone when the right camera stays silent."""
-        left = self._infos.setdefault(side, message) if side == "left" else self._infos.get("left")
-        right = self._infos.setdefault(side, message) if side == "right" else self._infos.get("right")
+        self._infos.setdefault(entry, message)
+        left, right = self._infos.get("left_info"), self._infos.get("right_info")
         if left is None or self._used == set(self._infos):
             return
         if right is None and self._stereo_info and stamp_ns(message) - stamp_ns(left) < SILENCE_NS:

@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 from umf_ros.geometry import Array
 from umf_ros.sensors.sessions import ODOMETRY, Arrival, Reset, SessionClock
 
-
-class TakesOdometry(Protocol):
-    """What the feed needs of a pose graph."""
-
-    def begin_session(self) -> Any:
-        """Start a new chain; later odometry belongs to it."""
-        ...
-
-    def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> Any:
-        """Take one pose."""
-        ...
+if TYPE_CHECKING:
+    from umf_ros.pose_graph.pose_graph import PoseGraph
 
 
 class OdometryFeed:
@@ -31,7 +22,7 @@ class OdometryFeed:
         dropped: messages that were out of line, and wrong.
     """
 
-    def __init__(self, graph: TakesOdometry) -> None:
+    def __init__(self, graph: PoseGraph) -> None:
         self.newest_ns = -1
         self.dropped = 0
         self._graph = graph

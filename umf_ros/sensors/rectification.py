@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
+from pydantic import Field, field_validator
 
+from umf_ros.config import Group
 from umf_ros.frames import Image, StereoCamera
 from umf_ros.geometry import Array, invert, make_pose
 
 
-@dataclass(frozen=True, slots=True)
-class RawCamera:
-    """A camera with lens distortion: pixels, and k1 k2 p1 p2 k3 k4 k5 k6 as far as known."""
+class Pinhole(Group):
+    """Pixels."""
 
-    width: int
-    height: int
-    fx: float
-    fy: float
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
     cx: float
     cy: float
-    distortion: tuple[float, ...] = ()
+
+
+class RawCamera(Pinhole):
+    """A camera with lens distortion: k1 k2 p1 p2 k3 k4 k5 k6 as far as known."""
+
+    distortion: tuple[float, ...]
+
+    @field_validator("distortion")
+    @classmethod
+    def _in_opencv_order(cls, distortion: tuple[float, ...]) -> tuple[float, ...]:
+        if len(distortion) not in (0, 4, 5, 8):
+            raise ValueError("expected 0, 4, 5 or 8 coefficients: k1 k2 p1 p2 k3 k4 k5 k6")
+        return distortion
 
     def matrix(self, size: tuple[int, int]) -> Array:
         """(3, 3) intrinsics of the image scaled to `size`; pixel (0, 0) is a pixel's centre."""

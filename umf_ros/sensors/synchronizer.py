@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any
 
 from umf_ros.config import Sync
 from umf_ros.errors import MessageError
 from umf_ros.frames import Frame, Image, StereoCamera
-from umf_ros.geometry import Array
 from umf_ros.sensors.assembly import Anchor, assemble, filter_cloud
 from umf_ros.sensors.buffers import ImageBuffer, OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.counters import InputCounter
 from umf_ros.sensors.messages import Cloud
-from umf_ros.sensors.sessions import Arrival, Input, Reset, SessionClock
+from umf_ros.sensors.sessions import ODOMETRY, Arrival, Input, Reset, SessionClock
 
-INPUTS: tuple[Input, ...] = ("left", "right", "cloud", "odometry")
+INPUTS: tuple[Input, ...] = ("left", "right", "cloud", ODOMETRY)
 
 STEREO_SLOP_NS = 17_000_000
 """Exposures of a pair carry the same stamp; half a period at 30 Hz tells a pair from the neighbouring one."""
@@ -65,12 +64,6 @@ class Synchronizer:
         self._anchors: deque[Anchor] = deque()
         self._frames: list[Frame] = []
         self._given_up_ns = -1  # images up to here come too late
-        self._adders: dict[Input, Callable[[int, Any], None]] = {
-            "left": self._use_left,
-            "right": self._use_right,
-            "cloud": self._use_cloud,
-            "odometry": self._use_odometry,
-        }
 
     @property
     def waiting(self) -> int:
@@ -82,31 +75,31 @@ class Synchronizer:
         self._calibration = self._calibration.with_camera(camera)
         self._absent.add("camera_info")  # comes no second time
 
-    def add_left(self, stamp_ns: int, image: Image) -> None:
-        """Add a left image, (H, W) uint8, as the camera sends it.
+    def add(self, name: Input, stamp_ns: int, value: Any) -> None:
+        """Add a measurement.
+
+        Args:
+            name: its input.
+            stamp_ns: stamp of its message; a scan's is its start.
+            value: an image as the camera sends it, (H, W) uint8; a `Cloud`; or a (4, 4) pose of the odometry.
 
         Raises:
             MessageError: of kind "size" when the calibration is for other images.
         """
-        self._check_size(image)
-        self._take(Arrival("left", stamp_ns, image))
-
-    def add_right(self, stamp_ns: int, image: Image) -> None:
-        """Add a right image, (H, W) uint8, as the camera sends it.
-
-        Raises:
-            MessageError: of kind "size" when the calibration is for other images.
-        """
-        self._check_size(image)
-        self._take(Arrival("right", stamp_ns, image))
-
-    def add_cloud(self, stamp_ns: int, cloud: Cloud) -> None:
-        """Add a scan by the stamp of its message, the start of the scan."""
-        self._take(Arrival("cloud", stamp_ns, cloud))
-
-    def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
-        """Add a (4, 4) pose of the odometry."""
-        self._take(Arrival("odometry", stamp_ns, odom_T_body))
+        if name in ("left", "right"):
+            self._check_size(value)
+        ruling = self._clock.take(Arrival(name, stamp_ns, value))
+        self._count_dropped(ruling.dropped)
+        if ruling.reset is not None:
+            self._begin_session(ruling.reset)
+        for one in ruling.usable:
+            if one.fault:
+                self.reject(one.name, one.fault)
+                continue
+            self.counters[one.name].received += 1
+            self._absent.discard(one.name)
+            self._use(one.name, one.stamp_ns, one.value)
+            self._build()
 
     def reject(self, name: Input, reason: str) -> None:
         """Count a message that could not be used at all; a camera_info like that is not waited for again."""
@@ -127,21 +120,6 @@ class Synchronizer:
         self._clear()
         return self.pop()
 
-    def _take(self, arrival: Arrival) -> None:
-        ruling = self._clock.take(arrival)
-        self._count_dropped(ruling.dropped)
-        if ruling.reset is not None:
-            self._begin_session(ruling.reset)
-        for one in ruling.usable:
-            counter = self.counters[one.name]
-            counter.received += 1
-            if one.fault:
-                counter.dropped[one.fault] += 1
-                continue
-            self._absent.discard(one.name)
-            self._adders[one.name](one.stamp_ns, one.value)
-            self._build()
-
     def _count_dropped(self, wrong: list[Arrival]) -> None:
         for one in wrong:
             self.reject(one.name, one.fault)
@@ -154,21 +132,18 @@ class Synchronizer:
             self._odometry.clear()
         self.session = self._clock.session
 
-    def _use_left(self, stamp_ns: int, image: Image) -> None:
-        self._left.add(stamp_ns, image, late=stamp_ns <= self._given_up_ns)
-        if "cloud" not in self._inputs:
-            self._anchors.append(Anchor(stamp_ns, stamp_ns))
-
-    def _use_right(self, stamp_ns: int, image: Image) -> None:
-        self._right.add(stamp_ns, image, late=stamp_ns <= self._given_up_ns)
-
-    def _use_cloud(self, stamp_ns: int, cloud: Cloud) -> None:
-        key = stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
-        self._anchors.append(Anchor(key, stamp_ns, filter_cloud(cloud, self._calibration)))
-
-    def _use_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
-        self._odometry.add(stamp_ns, odom_T_body)
-        self.counters["odometry"].used += 1
+    def _use(self, name: Input, stamp_ns: int, value: Any) -> None:
+        if name == "cloud":
+            key = stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
+            self._anchors.append(Anchor(key, stamp_ns, filter_cloud(value, self._calibration)))
+        elif name == ODOMETRY:
+            self._odometry.add(stamp_ns, value)
+            self.counters[name].used += 1
+        else:
+            buffer = self._left if name == "left" else self._right
+            buffer.add(stamp_ns, value, late=stamp_ns <= self._given_up_ns)
+            if name == "left" and "cloud" not in self._inputs:
+                self._anchors.append(Anchor(stamp_ns, stamp_ns))
 
     def _check_size(self, image: Image) -> None:
         height, width = image.shape
