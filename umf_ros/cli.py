@@ -22,7 +22,7 @@ COMMANDS = {
     "play": "umf_ros.commands.play",
     "report": "umf_ros.commands.report",
     "evaluate": "umf_ros.lab.commands.evaluate",
-    "explain": "umf_ros.commands.explain",
+    "explain": "umf_ros.lab.commands.explain",
     "train": "umf_ros.lab.commands.train",
     "export": "umf_ros.commands.export",
     "doctor": "umf_ros.commands.doctor",

@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import MarkerArray
 
 from umf_ros.config import Frames
 from umf_ros.frames import Keyframe
@@ -54,13 +54,10 @@ class Announcer:
             pose = conversions.to_pose_stamped(keyframe.stamp_ns, self._frames.odom, keyframe.odom_T_body)
             self._keyframes.publish(pose)
         if detection.verdicts:
-            self._candidates.publish(self._report(keyframe, detection.verdicts))
+            report = DiagnosticArray(status=[_describe(keyframe, verdict) for verdict in detection.verdicts])
+            report.header.stamp = conversions.to_time(keyframe.stamp_ns)
+            self._candidates.publish(report)
             self._draw(keyframe, detection.verdicts, matches)
-
-    def _report(self, keyframe: Keyframe, verdicts: list[Verdict]) -> DiagnosticArray:
-        message = DiagnosticArray(status=[_describe(keyframe, verdict) for verdict in verdicts])
-        message.header.stamp = conversions.to_time(keyframe.stamp_ns)
-        return message
 
     def _draw(self, keyframe: Keyframe, verdicts: list[Verdict], matches: dict[int, Keyframe]) -> None:
         if keyframe.odom_T_body is None:
@@ -72,19 +69,9 @@ class Announcer:
                 continue
             lines = self._rejected if verdict.closure is None else self._accepted
             lines.append([conversions.to_point(match.odom_T_body[:3, 3]), here])
-        accepted = self._line_list(0, "accepted", self._accepted, keyframe.stamp_ns)
-        rejected = self._line_list(1, "rejected", self._rejected, keyframe.stamp_ns)
-        self._markers.publish(MarkerArray(markers=[accepted, rejected]))
-
-    def _line_list(self, number: int, name: str, lines: deque[list], stamp_ns: int) -> Marker:
-        marker = Marker(ns=name, id=number, type=Marker.LINE_LIST, action=Marker.ADD)
-        marker.header.frame_id = self._frames.odom
-        marker.header.stamp = conversions.to_time(stamp_ns)
-        marker.pose.orientation.w = 1.0
-        marker.scale.x = 0.05
-        marker.color = conversions.GREEN if name == "accepted" else conversions.RED
-        marker.points = [point for line in lines for point in line]
-        return marker
+        header = conversions.to_header(keyframe.stamp_ns, self._frames.odom)
+        chosen = {"accepted": self._accepted, "rejected": self._rejected}
+        self._markers.publish(MarkerArray(markers=[conversions.to_lines(*item, header) for item in chosen.items()]))
 
 
 def _describe(keyframe: Keyframe, verdict: Verdict) -> DiagnosticStatus:

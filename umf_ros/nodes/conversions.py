@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from nav_msgs.msg import Odometry
-from std_msgs.msg import ColorRGBA
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker
 
 from umf_ros.errors import MessageError
 from umf_ros.frames import LoopClosure
@@ -42,12 +44,25 @@ def to_pose(pose: Array) -> Pose:
     return Pose(position=to_point(pose[:3, 3]), orientation=Quaternion(x=x, y=y, z=z, w=w))
 
 
+def to_header(stamp_ns: int, frame: str) -> Header:
+    """Stamp and frame of a message."""
+    return Header(stamp=to_time(stamp_ns), frame_id=frame)
+
+
 def to_pose_stamped(stamp_ns: int, frame: str, pose: Array) -> PoseStamped:
     """Pose in `frame` with its stamp."""
-    message = PoseStamped(pose=to_pose(pose))
-    message.header.stamp = to_time(stamp_ns)
-    message.header.frame_id = frame
-    return message
+    return PoseStamped(header=to_header(stamp_ns, frame), pose=to_pose(pose))
+
+
+def to_lines(name: str, lines: Iterable[Iterable[Point]], header: Header) -> Marker:
+    """The "accepted" closures as green lines, or the "rejected" ones as red."""
+    accepted = name == "accepted"
+    marker = Marker(header=header, ns=name, id=int(not accepted), type=Marker.LINE_LIST, action=Marker.ADD)
+    marker.pose.orientation.w = 1.0
+    marker.scale.x = 0.05
+    marker.color = GREEN if accepted else RED
+    marker.points = [point for line in lines for point in line]
+    return marker
 
 
 def keyframe_frame(stamp_ns: int) -> str:
@@ -62,8 +77,7 @@ def closure_to_message(closure: LoopClosure) -> Odometry:
     covariance is in ROS order about the axes of the match body. The twist is unused.
     """
     message = Odometry(child_frame_id=keyframe_frame(closure.query_stamp_ns))
-    message.header.stamp = to_time(closure.query_stamp_ns)
-    message.header.frame_id = keyframe_frame(closure.match_stamp_ns)
+    message.header = to_header(closure.query_stamp_ns, keyframe_frame(closure.match_stamp_ns))
     message.pose.pose = to_pose(closure.match_T_query)
     message.pose.covariance = np.asarray(closure.covariance, dtype=float).ravel()
     message.twist.covariance[0] = -1.0

@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
 from umf_ros.bags.presets import calibration_of, topics_of
-from umf_ros.config import Settings
-from umf_ros.errors import OutputError, UmfError
+from umf_ros.errors import OutputError
 from umf_ros.frames import Frame, LoopClosure
 from umf_ros.geometry import rotation_angle
 from umf_ros.loop_detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.nodes.announcer import Announcer
-from umf_ros.nodes.conversions import from_time
-from umf_ros.nodes.diagnostics import OK, WARN, InputWatch, memory_mb, status
-from umf_ros.nodes.parameters import declare
+from umf_ros.nodes.base_node import BaseNode
+from umf_ros.nodes.diagnostics import OK, WARN, memory_mb, status
 from umf_ros.nodes.process import run
 from umf_ros.nodes.qos import sensor_qos
 from umf_ros.nodes.worker import Worker
@@ -44,7 +41,7 @@ MESSAGE_TYPES = {
 }
 
 
-class LoopClosureNode(Node):
+class LoopClosureNode(BaseNode):
     """Subscribes to the sensors, detects loop closures in a thread of its own, publishes them.
 
     Executor callbacks only enqueue. One thread decodes and synchronises, another embeds and verifies;
@@ -52,15 +49,15 @@ class LoopClosureNode(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__("loop_closure_node", automatically_declare_parameters_from_overrides=True)
-        self._settings, own = declare(self, results_dir="folder for closures and summary; empty: none")
+        super().__init__("loop_closure_node", "folder for closures and summary; empty: none")
         embedder = make_detector_embedder(self._settings)
         self._detector = LoopDetector(self._settings, embedder)
         calibration = calibration_of(self._settings)
         topics = topics_of(self._settings)
         self._synchronizer = Synchronizer(self._settings.sync, calibration, wanted_inputs(topics))
         self._intake = Intake(self._synchronizer, topics, self.get_logger().warning)
-        self._recorder = _make_recorder(own["results_dir"], self._settings, embedder.name)
+        folder = Path(self._results)
+        self._recorder = RunRecorder(folder, self._settings, embedder.name) if self._results else None
         self._announcer = Announcer(self, self._settings.frames)
         self._lock = threading.Lock()
         self._paused = False
@@ -69,12 +66,14 @@ class LoopClosureNode(Node):
         self._last_error = ""
         self._worker: Worker[Frame] = Worker(self._detect, self._complain, self._settings.worker.queue_size)
         self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._complain, INTAKE_QUEUE)
-        self._watches = [self._subscribe(name, topic) for name, topic in topics.model_dump().items() if topic]
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_timer(1.0, self._diagnose)
-        self.create_service(Trigger, "~/save", self._save)
-        self.create_service(Trigger, "~/reset", self._reset)
-        self.create_service(SetBool, "~/pause", self._pause)
+        for name, topic in topics.model_dump().items():
+            if topic:
+                qos = sensor_qos(self._settings.qos)
+                self._subscribe(name, MESSAGE_TYPES[name], topic, partial(self._enqueue, topic), qos)
+        self.create_timer(1.0, self._tick)
+        self._offer(Trigger, "~/save", self._save)
+        self._offer(Trigger, "~/reset", self._reset)
+        self._offer(SetBool, "~/pause", self._pause)
         self.get_logger().info("ready")
 
     def close(self) -> None:
@@ -90,21 +89,9 @@ class LoopClosureNode(Node):
         finally:
             self._detector.database.close()
 
-    def _subscribe(self, name: str, topic: str) -> InputWatch:
-        watch = InputWatch(self, name, topic)
-
-        def enqueue(message: Any) -> None:
-            watch.saw(from_time(message.header.stamp))
-            if not self._paused:
-                self._decoder.submit((topic, message))
-
-        def lost(event: Any) -> None:
-            watch.lost += event.total_count_change
-
-        events = SubscriptionEventCallbacks(message_lost=lost)
-        qos = sensor_qos(self._settings.qos)
-        self.create_subscription(MESSAGE_TYPES[name], topic, enqueue, qos, event_callbacks=events)
-        return watch
+    def _enqueue(self, topic: str, message: Any) -> None:
+        if not self._paused:
+            self._decoder.submit((topic, message))
 
     def _take(self, item: tuple[str, Any]) -> None:
         self._intake.take(*item)
@@ -128,18 +115,13 @@ class LoopClosureNode(Node):
 
     def _complain(self, error: Exception) -> None:
         self._last_error = f"{type(error).__name__}: {error}"
-        self.get_logger().error(self._last_error, throttle_duration_sec=10.0)
+        super()._complain(error)
 
     def _drops(self) -> dict[str, int]:
         return count_drops(self._synchronizer.counters, self._worker.dropped + self._decoder.dropped)
 
-    def _diagnose(self) -> None:
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        message.status = [self._own_status(), *(watch.status() for watch in self._watches)]
-        for line in message.status:
-            line.name = f"{self.get_name()}: {line.name}"
-        self._diagnostics.publish(message)
+    def _tick(self) -> None:
+        self._diagnose(self._own_status())
         for watch in self._watches:
             if watch.warning:
                 self.get_logger().warning(watch.warning, throttle_duration_sec=30.0)
@@ -169,25 +151,19 @@ class LoopClosureNode(Node):
             return status(WARN, "detector", "too slow: messages are being dropped", values)
         return status(OK, "detector", f"{self._closures} closures among {len(self._detector.database)} places", values)
 
-    def _save(self, _: Any, response: Any) -> Any:
+    def _save(self, _: Any) -> str:
         path = Path(self._settings.database.path or "places.sqlite").with_suffix(".saved.sqlite").resolve()
-        try:
-            self._detector.database.save(path)
-            response.success, response.message = True, f"{len(self._detector.database)} places saved to {path}"
-        except UmfError as error:
-            response.success, response.message = False, str(error)
-        return response
+        self._detector.database.save(path)
+        return f"{len(self._detector.database)} places saved to {path}"
 
-    def _reset(self, _: Any, response: Any) -> Any:
+    def _reset(self, _: Any) -> str:
         with self._lock:
             self._detector.reset()
-        response.success, response.message = True, "all places forgotten"
-        return response
+        return "all places forgotten"
 
-    def _pause(self, request: Any, response: Any) -> Any:
+    def _pause(self, request: Any) -> str:
         self._paused = request.data
-        response.success, response.message = True, "paused" if request.data else "running"
-        return response
+        return "paused" if request.data else "running"
 
 
 def describe(number: int, closure: LoopClosure) -> str:
@@ -207,16 +183,6 @@ def _counts(synchronizer: Synchronizer) -> dict[str, int]:
         dropped = dict(counter.dropped)  # the decoder adds reasons meanwhile
         counts |= {f"{name}_dropped_{reason.replace(' ', '_')}": count for reason, count in dropped.items()}
     return counts
-
-
-def _make_recorder(folder: str, settings: Settings, weights: str) -> RunRecorder | None:
-    if not folder:
-        return None
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot write to {folder}: {error.strerror}") from None
-    return RunRecorder(Path(folder), settings, weights)
 
 
 def main() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped, Vector3
 from nav_msgs.msg import Path
 from numpy.typing import NDArray
-from std_msgs.msg import ColorRGBA
-from visualization_msgs.msg import Marker, MarkerArray
+from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
 
 from umf_ros.config import Frames
 from umf_ros.geometry import Array
@@ -21,20 +21,16 @@ MAX_LINES = 500
 
 def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: Frames) -> Path:
     """The trajectory as a path, evenly thinned to at most `MAX_POSES` poses."""
-    message = Path()
-    message.header.frame_id = frames.map
-    if len(stamps_ns):
-        rows = np.unique(np.linspace(0, len(stamps_ns) - 1, MAX_POSES).astype(int))
-        message.header.stamp = conversions.to_time(int(stamps_ns[-1]))
-        message.poses = [conversions.to_pose_stamped(int(stamps_ns[row]), frames.map, map_T_body[row]) for row in rows]
-    return message
+    if not len(stamps_ns):
+        return Path(header=Header(frame_id=frames.map))
+    rows = np.unique(np.linspace(0, len(stamps_ns) - 1, MAX_POSES).astype(int))
+    poses = [conversions.to_pose_stamped(int(stamps_ns[row]), frames.map, map_T_body[row]) for row in rows]
+    return Path(header=conversions.to_header(int(stamps_ns[-1]), frames.map), poses=poses)
 
 
 def pose(stamp_ns: int, map_T_body: Array, covariance: Array, frames: Frames) -> PoseWithCovarianceStamped:
     """A pose in the map with its (6, 6) covariance in ROS order."""
-    message = PoseWithCovarianceStamped()
-    message.header.stamp = conversions.to_time(stamp_ns)
-    message.header.frame_id = frames.map
+    message = PoseWithCovarianceStamped(header=conversions.to_header(stamp_ns, frames.map))
     message.pose.pose = conversions.to_pose(map_T_body)
     message.pose.covariance = covariance.ravel()
     return message
@@ -42,9 +38,7 @@ def pose(stamp_ns: int, map_T_body: Array, covariance: Array, frames: Frames) ->
 
 def transform(stamp_ns: int, map_T_odom: Array, frames: Frames) -> TransformStamped:
     """`map_T_odom` as a transform."""
-    message = TransformStamped(child_frame_id=frames.odom)
-    message.header.stamp = conversions.to_time(stamp_ns)
-    message.header.frame_id = frames.map
+    message = TransformStamped(header=conversions.to_header(stamp_ns, frames.map), child_frame_id=frames.odom)
     rigid = conversions.to_pose(map_T_odom)
     message.transform.translation = Vector3(x=rigid.position.x, y=rigid.position.y, z=rigid.position.z)
     message.transform.rotation = rigid.orientation
@@ -54,19 +48,7 @@ def transform(stamp_ns: int, map_T_odom: Array, frames: Frames) -> TransformStam
 def markers(verdicts: list[ClosureVerdict], lines: Array, stamp_ns: int, frames: Frames) -> MarkerArray:
     """Closures as lines from match to query: accepted green, the others red."""
     accepted = np.array([verdict.state is State.ACCEPTED for verdict in verdicts], bool)
-    return MarkerArray(
-        markers=[
-            _lines(0, "accepted", lines[accepted], conversions.GREEN, stamp_ns, frames),
-            _lines(1, "rejected", lines[~accepted], conversions.RED, stamp_ns, frames),
-        ]
-    )
-
-
-def _lines(number: int, name: str, lines: Array, color: ColorRGBA, stamp_ns: int, frames: Frames) -> Marker:
-    marker = Marker(ns=name, id=number, type=Marker.LINE_LIST, action=Marker.ADD, color=color)
-    marker.header.frame_id = frames.map
-    marker.header.stamp = conversions.to_time(stamp_ns)
-    marker.pose.orientation.w = 1.0
-    marker.scale.x = 0.05
-    marker.points = [conversions.to_point(end) for line in lines[-MAX_LINES:] for end in line]
-    return marker
+    header = conversions.to_header(stamp_ns, frames.map)
+    chosen = {"accepted": lines[accepted], "rejected": lines[~accepted]}
+    points = {name: [map(conversions.to_point, line) for line in some[-MAX_LINES:]] for name, some in chosen.items()}
+    return MarkerArray(markers=[conversions.to_lines(name, some, header) for name, some in points.items()])

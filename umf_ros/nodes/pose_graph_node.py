@@ -7,7 +7,6 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -25,15 +23,14 @@ from umf_ros.bags.presets import topics_of
 from umf_ros.errors import MessageError, UmfError
 from umf_ros.geometry import Array
 from umf_ros.nodes import pose_graph_messages as messages
-from umf_ros.nodes.conversions import closure_from_message, from_time
-from umf_ros.nodes.diagnostics import OK, WARN, InputWatch, status
-from umf_ros.nodes.parameters import declare
+from umf_ros.nodes.base_node import BaseNode
+from umf_ros.nodes.conversions import closure_from_message
+from umf_ros.nodes.diagnostics import OK, WARN, status
 from umf_ros.nodes.process import run
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
 from umf_ros.nodes.worker import Worker
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.pose_graph import PoseGraph
-from umf_ros.runs.folder import check_writable
 from umf_ros.sensors.messages import OdometrySample, decode_odometry
 from umf_ros.sensors.odometry_feed import OdometryFeed
 
@@ -43,30 +40,25 @@ QUEUE = 100_000
 REJECT = re.compile(r"\s*keyframe/(\d+)\s+keyframe/(\d+)\s*")
 
 
-class PoseGraphNode(Node):
+class PoseGraphNode(BaseNode):
     """Keeps a pose graph in a thread of its own and publishes the pose in the map at the odometry's rate."""
 
     def __init__(self) -> None:
-        super().__init__("pose_graph_node", automatically_declare_parameters_from_overrides=True)
-        self._settings, own = declare(self, results_dir="folder for trajectories, graph and verdicts; empty: none")
-        self._results = own["results_dir"]
-        if self._results:
-            check_writable(Path(self._results))
+        super().__init__("pose_graph_node", "folder for trajectories, graph and verdicts; empty: none")
         self._frames = self._settings.frames
         self._lock = threading.Lock()
         self._begin()
         self._make_publishers()
         self._worker: Worker[Callable[[], None]] = Worker(self._run, self._complain, QUEUE)
-        self._watches: list[InputWatch] = []
         odometry_topic = topics_of(self._settings).odometry
         if odometry_topic:
             qos = sensor_qos(self._settings.qos, ODOMETRY_DEPTH)
-            self._subscribe("odometry", odometry_topic, self._on_odometry, qos)
-        self._subscribe("closures", "/loop_closures", self._on_closure, CLOSURES_QOS)
-        self.create_subscription(String, "~/reject_edge", self._on_reject, 10)
-        self.create_service(Trigger, "~/reject_last", self._reject_last)
-        self.create_service(Trigger, "~/save", self._save)
-        self.create_service(Trigger, "~/reset", self._reset)
+            self._subscribe("odometry", Odometry, odometry_topic, self._guarded(self._on_odometry), qos)
+        self._subscribe("closures", Odometry, "/loop_closures", self._guarded(self._on_closure), CLOSURES_QOS)
+        self.create_subscription(String, "~/reject_edge", self._guarded(self._on_reject), 10)
+        self._offer(Trigger, "~/reject_last", self._reject_last)
+        self._offer(Trigger, "~/save", self._save)
+        self._offer(Trigger, "~/reset", self._reset)
         self.create_timer(1.0, self._tick)
         self.get_logger().info("ready")
 
@@ -76,18 +68,18 @@ class PoseGraphNode(Node):
         if self._results:
             self._graph.write_results(self._results)
 
-    def _subscribe(self, name: str, topic: str, take: Callable[[Odometry], None], qos: QoSProfile) -> None:
-        watch = InputWatch(self, name, topic)
-        self._watches.append(watch)
+    def _guarded(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
+        """`take`, with messages that cannot be used counted and the first of each kind told."""
 
-        def receive(message: Odometry) -> None:
-            watch.saw(from_time(message.header.stamp))
+        def receive(message: Any) -> None:
             try:
                 take(message)
             except MessageError as error:
-                self._refuse(error)
+                self._refused[error.kind] += 1
+                if self._refused[error.kind] == 1:
+                    self.get_logger().warning(f"skipped: {error}")
 
-        self.create_subscription(Odometry, topic, receive, qos)
+        return receive
 
     def _begin(self) -> None:
         self._graph = PoseGraph(self._settings.pose_graph)
@@ -103,7 +95,6 @@ class PoseGraphNode(Node):
         self._marker_publisher = self.create_publisher(MarkerArray, "~/markers", LATCHED_QOS)
         self._verdict_publisher = self.create_publisher(DiagnosticArray, "~/verdicts", CLOSURES_QOS)
         self._transform_publisher = self.create_publisher(TransformStamped, "~/map_to_odom", 50)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._broadcast = _broadcaster(self) if self._frames.publish_tf else None
 
     def _on_odometry(self, message: Odometry) -> None:
@@ -126,7 +117,7 @@ class PoseGraphNode(Node):
         found = REJECT.fullmatch(message.data)
         if found is None:
             text = f"'{message.data}' on ~/reject_edge, expected 'keyframe/<match ns> keyframe/<query ns>'"
-            return self._refuse(MessageError("reject_edge", text))
+            raise MessageError("reject_edge", text)
         match, query = int(found[1]), int(found[2])
         self._worker.submit(lambda: self._announce(self._graph.revoke(match, query)))
 
@@ -166,11 +157,7 @@ class PoseGraphNode(Node):
 
     def _tick(self) -> None:
         self._worker.submit(self._keep_up)
-        report = DiagnosticArray(status=[self._own_status(), *(watch.status() for watch in self._watches)])
-        report.header.stamp = self.get_clock().now().to_msg()
-        for line in report.status:
-            line.name = f"{self.get_name()}: {line.name}"
-        self._diagnostics.publish(report)
+        self._diagnose(self._own_status())
 
     def _keep_up(self) -> None:
         """Decide about closures that waited for odometry, and show what has grown."""
@@ -187,39 +174,25 @@ class PoseGraphNode(Node):
         level = WARN if trouble or self._refused else OK
         return status(level, "pose graph", f"{values.get('accepted', 0)} closures accepted", values)
 
-    def _refuse(self, error: MessageError) -> None:
-        self._refused[error.kind] += 1
-        if self._refused[error.kind] == 1:
-            self.get_logger().warning(f"skipped: {error}")
-
-    def _complain(self, error: Exception) -> None:
-        self.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=10.0)
-
-    def _reject_last(self, _: Any, response: Any) -> Any:
+    def _reject_last(self, _: Any) -> str:
         with self._lock:
             accepted = [v.closure for v in self._graph.closures() if v.state is State.ACCEPTED]
-            if accepted:
-                self._announce(self._graph.revoke(accepted[-1].match_stamp_ns, accepted[-1].query_stamp_ns))
-        response.success = bool(accepted)
-        response.message = f"closure {_name(accepted[-1])} revoked" if accepted else "no closure is accepted"
-        return response
+            if not accepted:
+                raise UmfError("no closure is accepted")
+            self._announce(self._graph.revoke(accepted[-1].match_stamp_ns, accepted[-1].query_stamp_ns))
+        return f"closure {_name(accepted[-1])} revoked"
 
-    def _save(self, _: Any, response: Any) -> Any:
+    def _save(self, _: Any) -> str:
         folder = self._results or "pose_graph_results"
-        try:
-            self._worker.drain(10.0)
-            with self._lock:
-                self._graph.write_results(folder)
-            response.success, response.message = True, f"results written to {folder}"
-        except UmfError as error:
-            response.success, response.message = False, str(error)
-        return response
+        self._worker.drain(10.0)
+        with self._lock:
+            self._graph.write_results(folder)
+        return f"results written to {folder}"
 
-    def _reset(self, _: Any, response: Any) -> Any:
+    def _reset(self, _: Any) -> str:
         with self._lock:
             self._begin()
-        response.success, response.message = True, "graph forgotten"
-        return response
+        return "graph forgotten"
 
 
 def describe(verdict: ClosureVerdict) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -13,15 +12,6 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from umf_ros.errors import UmfError
-
-
-@runtime_checkable
-class Closing(Protocol):
-    """What a node's process needs of it."""
-
-    def close(self) -> None:
-        """Finish the work in hand and write the results."""
-        ...
 
 
 def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> int:
@@ -32,7 +22,9 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     """
     # our own handlers: rclpy's would shut the context down before the node has published its last words
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    stop = _StopRequest()
+    asked: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: asked.append(number))
     try:
         node = make_node()
     except UmfError as error:
@@ -43,14 +35,13 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     executor.add_node(node)
     status = 0
     try:
-        while not stop.requested and rclpy.ok():
+        while not asked and rclpy.ok():
             executor.spin_once(timeout_sec=0.2)
     except ExternalShutdownException:
         pass
     finally:
         try:
-            if isinstance(node, Closing):
-                node.close()
+            getattr(node, "close", lambda: None)()  # finish the work in hand and write the results
         except UmfError as error:
             complain(error)
             status = 1
@@ -63,15 +54,3 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
 def complain(error: UmfError) -> None:
     """Tell an error as the command line does: one line on stderr."""
     sys.stderr.write(f"umf: {error}\n")
-
-
-class _StopRequest:
-    """Remembers that a signal asked the process to end."""
-
-    def __init__(self) -> None:
-        self.requested = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._request)
-
-    def _request(self, *_: object) -> None:
-        self.requested = True

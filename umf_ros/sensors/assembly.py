@@ -77,7 +77,9 @@ def assemble(
 
 
 def _pixels(image: StampedImage | None, rectify: Callable[[Image], Image] | None) -> Image | None:
-    return rectify(image.image) if image and rectify else image and image.image
+    if image is None:
+        return None
+    return rectify(image.image) if rectify else image.image
 
 
 def _camera_pose(

@@ -31,7 +31,7 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.frames import FrameReader
-    from umf_ros.commands.explanation import draw, explain
+    from umf_ros.lab.evaluation.explanation import draw, explain
     from umf_ros.loop_detector import make_detector_embedder, make_keyframe
 
     console = Console()
