@@ -3,10 +3,12 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from umf_ros.geometry import (
     Array,
     adjoint,
+    align,
     expmap,
     gtsam_to_ros_covariance,
     heading,
@@ -17,6 +19,7 @@ from umf_ros.geometry import (
     propagate,
     right_jacobian,
     ros_to_gtsam_covariance,
+    transform,
 )
 
 POSES = [gtsam.Pose3.Expmap(np.random.default_rng(seed).normal(0, 1.5, 6)).matrix() for seed in range(5)]
@@ -119,3 +122,25 @@ def test_propagating_is_what_samples_do() -> None:
     matrix, before = adjoint(POSES[1]), covariance(5)
     samples = np.random.default_rng(0).multivariate_normal(np.zeros(6), before, 200_000) @ matrix.T
     np.testing.assert_allclose(propagate(matrix, before), np.cov(samples.T), rtol=0.05, atol=0.5)
+
+
+def random_pose(rng: np.random.Generator) -> np.ndarray:
+    return make_pose(Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 50, 3))
+
+
+def test_alignment_recovers_any_rigid_motion(rng: np.random.Generator) -> None:
+    truth = rng.normal(0, 20, (40, 3))
+    for _ in range(20):
+        pose = random_pose(rng)
+        np.testing.assert_allclose(align(transform(invert(pose), truth), truth)[0], pose, atol=1e-9)
+
+
+def test_alignment_never_mirrors(rng: np.random.Generator) -> None:
+    flat = np.c_[rng.normal(0, 5, (30, 2)), np.zeros(30)]
+    found, _ = align(flat * [1, -1, 1], flat)
+    assert np.linalg.det(found[:3, :3]) == pytest.approx(1)
+
+
+def test_too_few_positions_are_refused() -> None:
+    with pytest.raises(ValueError, match="cannot align 2 positions with 2"):
+        align(np.zeros((2, 3)), np.zeros((2, 3)))

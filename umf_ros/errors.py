@@ -1,5 +1,10 @@
 """The exceptions a user of the package can meet."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class UmfError(Exception):
     """Base of every error the package raises on purpose; its text is one line for a person."""
@@ -35,3 +40,13 @@ class OutputError(UmfError):
 
 class GraphError(UmfError):
     """A pose graph that cannot be read or solved."""
+
+
+@contextmanager
+def writing(what: object, *kinds: type[Exception]) -> Iterator[None]:
+    """Tell what goes wrong while the block writes `what` (an `OSError`, or one of `kinds`) as an `OutputError`."""
+    caught: tuple[type[Exception], ...] = (OSError, *kinds)
+    try:
+        yield
+    except caught as error:
+        raise OutputError(f"cannot write {what}: {getattr(error, 'strerror', None) or error}") from None

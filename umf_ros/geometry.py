@@ -95,6 +95,23 @@ def interpolate(a: Array, b: Array, fraction: ArrayLike) -> Array:
     return pose
 
 
+def align(a: Array, b: Array) -> tuple[Array, Array]:
+    """Pose that takes the points `a` (N, 3) to `b` (N, 3) with least squared distance [Kabsch 1976, Horn 1987].
+
+    Returns:
+        The pose `b_T_a`, and the three spreads of the points, largest first: on a line the second is zero.
+
+    Raises:
+        ValueError: fewer than three points, or sets of different size.
+    """
+    if a.shape != b.shape or len(a) < 3:
+        raise ValueError(f"cannot align {len(a)} positions with {len(b)}")
+    centre_a, centre_b = a.mean(axis=0), b.mean(axis=0)
+    u, spread, vt = np.linalg.svd((b - centre_b).T @ (a - centre_a))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return make_pose(rotation, centre_b - rotation @ centre_a), spread
+
+
 def expmap(twists: Array) -> Array:
     """(N, 4, 4) poses of (N, 6) twists."""
     return RigidTransform.from_exp_coords(twists).as_matrix()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.errors import OutputError
+from umf_ros.errors import writing
 from umf_ros.geometry import Array, interpolate, to_quaternion
 
 MAX_GAP_S = 2.0
@@ -68,7 +68,5 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     for stamp, pose in zip(trajectory.stamps_ns, trajectory.poses, strict=True):
         numbers = " ".join(f"{value:.9f}" for value in (*pose[:3, 3], *to_quaternion(pose)))
         lines.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers}\n")
-    try:
+    with writing(path):
         Path(path).write_text("".join(lines), encoding="ascii")
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from None

@@ -24,7 +24,7 @@ from recordings import (
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from umf_ros.bags.frames import read_frames
+from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import decode, open_bag
 from umf_ros.bags.records import RawMessage
 from umf_ros.errors import BagError, MessageError
@@ -112,8 +112,8 @@ def test_a_type_of_ros_1_that_ros_2_does_not_know_is_left_out(tmp_path: Path) ->
 def test_the_frames_of_a_ros_1_bag_are_those_of_an_mcap(tmp_path: Path) -> None:
     settings = small_settings(tmp_path)
     old = write_ros1(tmp_path / "a.bag", traverse(1.0, get_typestore(Stores.ROS1_NOETIC)))
-    ours = list(read_frames(open_bag(old), settings))
-    theirs = list(read_frames(open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), settings))
+    ours = list(FrameReader(open_bag(old), settings))
+    theirs = list(FrameReader(open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), settings))
     assert [frame.stamp_ns for frame in ours] == [frame.stamp_ns for frame in theirs] and len(ours) == 4
     for one, other in zip(ours, theirs, strict=True):
         for name in ("left", "right", "points", "intensity", "odom_T_body"):
@@ -178,4 +178,4 @@ def test_a_recording_of_one_message_has_no_duration(tmp_path: Path) -> None:
     (first,) = [entry for entry in ENTRIES if entry[0] == CLOUD][:1]
     bag = open_bag(write_mcap(tmp_path / "a.mcap", [first]))
     assert bag.duration_s == 0 and bag.start_ns == bag.end_ns == first[1]
-    assert len(list(read_frames(bag, small_settings(tmp_path)))) == 1
+    assert len(list(FrameReader(bag, small_settings(tmp_path)))) == 1

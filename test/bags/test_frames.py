@@ -22,8 +22,7 @@ from recordings import (
 )
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.bags.frames import FrameReader, read_frames
-from umf_ros.bags.images import read_left_images
+from umf_ros.bags.frames import FrameReader, read_left_images
 from umf_ros.bags.presets import TOPICS, detect_dataset
 from umf_ros.bags.reader import open_bag
 from umf_ros.config import load_settings
@@ -71,8 +70,8 @@ def test_the_stream_holds_every_message_of_the_odometry_before_the_frames_that_n
 
 def test_the_format_does_not_matter(tmp_path: Path) -> None:
     settings = small_settings(tmp_path)
-    first = list(read_frames(open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), settings))
-    second = list(read_frames(open_bag(write_db3(tmp_path / "b", ENTRIES)), settings))
+    first = list(FrameReader(open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), settings))
+    second = list(FrameReader(open_bag(write_db3(tmp_path / "b", ENTRIES)), settings))
     assert [(f.stamp_ns, f.image_stamp_ns) for f in first] == [(f.stamp_ns, f.image_stamp_ns) for f in second]
     assert all(np.array_equal(a.points, b.points) for a, b in zip(first, second, strict=True))
 
@@ -92,7 +91,7 @@ def test_odometry_can_come_from_a_file(tmp_path: Path) -> None:
     seconds = np.arange(0, 4, 0.1)
     path = Trajectory(START_NS + np.round(seconds * 1e9).astype(np.int64), np.stack([drive(s) for s in seconds]))
     bag = open_bag(write_mcap(tmp_path / "a.mcap", entries))
-    frames = list(read_frames(bag, small_settings(tmp_path), path))
+    frames = list(FrameReader(bag, small_settings(tmp_path), path))
     assert len(frames) == SCANS
     for frame in frames:
         assert frame.odom_T_body is not None
@@ -138,7 +137,7 @@ def test_a_recording_without_sensors_is_refused(tmp_path: Path) -> None:
 def test_images_of_chosen_frames(tmp_path: Path) -> None:
     settings = small_settings(tmp_path)
     bag = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES))
-    frames = list(read_frames(bag, settings))
+    frames = list(FrameReader(bag, settings))
     images = read_left_images(bag, settings, {frames[2].stamp_ns, frames[9].stamp_ns, 17})
     assert set(images) == {frames[2].stamp_ns, frames[9].stamp_ns}
     assert np.array_equal(images[frames[9].stamp_ns], frames[9].left)

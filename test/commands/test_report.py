@@ -17,7 +17,7 @@ from command_line import Ended, only_line, umf
 from conftest import make_keyframe
 from recordings import CLOUD, LEFT, START_NS, TRUTH, drive, small_settings, traverse, write_mcap
 
-from umf_ros.bags.frames import read_frames
+from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.frames import Candidate, Frame, LoopClosure
 from umf_ros.geometry import Array, make_pose, relative
@@ -42,7 +42,7 @@ def record_run(folder: Path, bag: Path, settings_folder: Path) -> list[Frame]:
     """A run with two true closures and a false one, written as the replay writes it."""
     folder.mkdir()
     settings = small_settings(settings_folder, loop__min_time_gap_s=1.0, loop__min_travel_m=0.5)
-    frames = list(read_frames(open_bag(bag), settings))
+    frames = list(FrameReader(open_bag(bag), settings))
     recorder = RunRecorder(folder, settings, "weights <v1>")
     closures = {10: verdict(frames[10], frames[5], 0.1, 0.99), 11: verdict(frames[11], frames[6], 0.3, 0.95)}
     closures[12] = verdict(frames[12], frames[7], 0.8, 0.9123)
@@ -163,7 +163,7 @@ def test_the_page_lists_every_closure_with_its_errors(run: Path, bag: Path) -> N
 
 def test_match_pictures_show_both_images_joined_at_the_inliers(run: Path, bag: Path, tmp_path: Path) -> None:
     report(run, bag)
-    frames = {frame.stamp_ns: frame for frame in read_frames(open_bag(bag), small_settings(tmp_path))}
+    frames = {frame.stamp_ns: frame for frame in FrameReader(open_bag(bag), small_settings(tmp_path))}
     paths = sorted((run / "matches").glob("*.png"))
     assert len(paths) == 3
     for path in paths:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 from umf_ros.bags.presets import calibration_of, topics_of
@@ -11,7 +11,7 @@ from umf_ros.bags.reader import Bag, decode
 from umf_ros.bags.records import RawMessage
 from umf_ros.config import Settings, Topics
 from umf_ros.errors import BagError, MessageError
-from umf_ros.frames import Frame
+from umf_ros.frames import Frame, Image
 from umf_ros.sensors.counters import InputCounter
 from umf_ros.sensors.intake import Intake, wanted_inputs
 from umf_ros.sensors.messages import OdometrySample, stamp_ns
@@ -124,9 +124,18 @@ class _Cursor:
             self._next += 1
 
 
-def read_frames(bag: Bag, settings: Settings, odometry: Trajectory | None = None) -> Iterator[Frame]:
-    """Frames of a recording, without the book-keeping of `FrameReader`."""
-    return iter(FrameReader(bag, settings, odometry))
+def read_left_images(bag: Bag, settings: Settings, stamps_ns: Collection[int]) -> dict[int, Image]:
+    """Left images, (H, W) uint8, of the frames with these keys, as far as they have one."""
+    wanted = set(stamps_ns)
+    images: dict[int, Image] = {}
+    if not wanted:
+        return images
+    for frame in FrameReader(bag, settings, warn=lambda _: None):
+        if frame.stamp_ns in wanted and frame.left is not None:
+            images[frame.stamp_ns] = frame.left
+        if len(images) == len(wanted):
+            break
+    return images
 
 
 def _present(topics: Topics, bag: Bag) -> Topics:

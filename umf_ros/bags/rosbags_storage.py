@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import apsw
 from rosbags.interfaces import Connection
@@ -35,18 +36,23 @@ def _faults_of(path: Path) -> Iterator[None]:
         raise BagError(f"{path} cannot be read: {' '.join(str(error).split()) or type(error).__name__}") from None
 
 
-class Ros2Storage:
-    """A folder of ROS 2, or db3 files written one after the other."""
+class RosbagsStorage:
+    """A folder of ROS 2, db3 files written one after the other, or a ROS 1 bag.
+
+    The messages of ROS 1 come out as those of ROS 2; types that ROS 2 does not know are left out.
+    """
 
     warning = ""
 
-    def __init__(self, paths: list[Path]) -> None:
+    def __init__(self, paths: list[Path], ros1: bool = False) -> None:
         self._paths = paths
+        self._reader: Any = Reader1 if ros1 else Reader2
+        self._to_cdr = message_types().ros1_to_cdr if ros1 else None
         connections: list[Connection] = []
         spans: list[tuple[int, int]] = []
         for path in paths:
-            with _faults_of(path), Reader2(path) as reader:
-                connections += reader.connections
+            with _faults_of(path), self._reader(path) as reader:
+                connections += self._readable(reader)
                 if reader.message_count:
                     spans.append((reader.start_time, reader.end_time - 1))
         self.topics = _summary(connections)
@@ -56,30 +62,12 @@ class Ros2Storage:
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Messages of some topics in the order of their recording."""
         for path in self._paths:
-            with _faults_of(path), Reader2(path) as reader:
-                wanted = [connection for connection in reader.connections if connection.topic in topics]
+            with _faults_of(path), self._reader(path) as reader:
+                wanted = [connection for connection in self._readable(reader) if connection.topic in topics]
                 for connection, log_ns, data in reader.messages(wanted) if wanted else ():
-                    yield RawMessage(connection.topic, log_ns, connection.msgtype, data)
+                    cdr = bytes(self._to_cdr(data, connection.msgtype)) if self._to_cdr else data
+                    yield RawMessage(connection.topic, log_ns, connection.msgtype, cdr)
 
-
-class Ros1Storage:
-    """A ROS 1 bag; its messages come out as those of ROS 2. Types that ROS 2 does not know are left out."""
-
-    warning = ""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._types = message_types()
-        with _faults_of(path), Reader1(path) as reader:
-            known = [connection for connection in reader.connections if connection.msgtype in self._types.fielddefs]
-            self.topics = _summary(known)
-            self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
-
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of some topics in the order of their recording."""
-        wanted_topics = self.topics.keys() & set(topics)
-        with _faults_of(self._path), Reader1(self._path) as reader:
-            wanted = [connection for connection in reader.connections if connection.topic in wanted_topics]
-            for connection, log_ns, data in reader.messages(wanted) if wanted else ():
-                cdr = self._types.ros1_to_cdr(data, connection.msgtype)
-                yield RawMessage(connection.topic, log_ns, connection.msgtype, bytes(cdr))
+    def _readable(self, reader: Any) -> list[Connection]:
+        known = message_types().fielddefs
+        return [one for one in reader.connections if self._to_cdr is None or one.msgtype in known]

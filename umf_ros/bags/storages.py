@@ -8,7 +8,7 @@ from pathlib import Path
 
 from umf_ros.bags.mcap_storage import McapStorage
 from umf_ros.bags.records import Storage
-from umf_ros.bags.rosbags_storage import Ros1Storage, Ros2Storage
+from umf_ros.bags.rosbags_storage import RosbagsStorage
 from umf_ros.errors import BagError
 
 _MCAP, _SQLITE, _ROS1 = b"\x89MCAP0\r\n", b"SQLite format 3\x00", b"#ROSBAG V2.0"
@@ -29,9 +29,9 @@ def open_storage(path: Path) -> Storage:
     if start.startswith(_MCAP):
         return McapStorage([path])
     if start.startswith(_SQLITE):
-        return Ros2Storage([path])
+        return RosbagsStorage([path])
     if start.startswith(_ROS1):
-        return Ros1Storage(path)
+        return RosbagsStorage([path], ros1=True)
     raise BagError(f"{path} is no recording: neither mcap nor db3 nor a ROS 1 bag")
 
 
@@ -40,9 +40,9 @@ def _open_folder(path: Path) -> Storage:
     if mcap:
         return McapStorage(mcap)
     if (path / "metadata.yaml").is_file():
-        return Ros2Storage([path])
+        return RosbagsStorage([path])
     if db3:  # the recorder was killed before it wrote its metadata
-        return Ros2Storage(db3)
+        return RosbagsStorage(db3)
     raise BagError(f"{path} is no recording: it holds neither metadata.yaml nor mcap or db3 files")
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import FrameType, TracebackType
+from contextlib import AbstractContextManager, contextmanager
+from types import FrameType
 from typing import Any
 
 from rich.console import Console
@@ -19,66 +19,50 @@ WARNING: dict[str, Any] = {"style": "yellow", "markup": False, "highlight": Fals
 """How a console prints a warning: names of files keep their brackets, and lines their length."""
 
 
-class FrameProgress:
+class FrameProgress(Progress):
     """A bar over the recording, with what was found beside it."""
 
     def __init__(self, console: Console) -> None:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[found]}"),
-            TimeRemainingColumn(),
-        )
-        self._progress = Progress(*columns, console=console, transient=True)
-        self._task = self._progress.add_task("Looking for loops", total=1.0, found="")
+        found = TextColumn("{task.fields[found]}")
+        columns = TextColumn("{task.description}"), BarColumn(), found, TimeRemainingColumn()
+        super().__init__(*columns, console=console, transient=True)
+        self._frames = self.add_task("Looking for loops", total=1.0, found="")
         self._places = 0
         self._closures = 0
-
-    def __enter__(self) -> FrameProgress:
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._progress.stop()
 
     def show(self, done: float, detection: Detection) -> None:
         """Advance to the part of the recording that is done, 0 to 1."""
         self._places += detection.keyframe is not None
         self._closures += len(detection.closures)
-        self._progress.update(self._task, completed=done, found=f"{self._places} places, {self._closures} closures")
+        self.update(self._frames, completed=done, found=f"{self._places} places, {self._closures} closures")
 
 
 @contextmanager
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     """Yield a function that says whether Ctrl-C was pressed, or SIGTERM came; a second one ends at once, as usual."""
-    asked = False
+    asked: list[int] = []
 
-    def remember(*_: object) -> None:
-        nonlocal asked
-        asked = True
+    def remember(number: int, _: FrameType | None) -> None:
+        asked.append(number)
         _restore(before)
 
-    before = _replace(remember)
-    try:
-        yield lambda: asked
-    finally:
-        _restore(before)
+    with _handled_by(remember) as before:
+        yield lambda: bool(asked)
+
+
+def undisturbed() -> AbstractContextManager[object]:
+    """Ignore Ctrl-C and SIGTERM for the few seconds in which results are written."""
+    return _handled_by(signal.SIG_IGN)
 
 
 @contextmanager
-def undisturbed() -> Iterator[None]:
-    """Ignore Ctrl-C and SIGTERM for the few seconds in which results are written."""
-    before = _replace(signal.SIG_IGN)
+def _handled_by(handler: Handler) -> Iterator[dict[signal.Signals, Handler]]:
+    """Give both signals to a handler; yields those they had before and shall have again."""
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield before
     finally:
         _restore(before)
-
-
-def _replace(handler: Handler) -> dict[signal.Signals, Handler]:
-    return {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
 
 
 def _restore(handlers: dict[signal.Signals, Handler]) -> None:

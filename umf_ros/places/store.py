@@ -8,7 +8,7 @@ import tempfile
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
-from umf_ros.errors import OutputError, UmfError
+from umf_ros.errors import UmfError, writing
 from umf_ros.frames import Keyframe
 from umf_ros.places.packing import pack, unpack
 
@@ -118,7 +118,7 @@ class KeyframeStore:
             entry = PlaceEntry.of(keyframe)
             descriptor = np.ascontiguousarray(entry.descriptor, np.float32).tobytes()
             values = (row, entry.stamp_ns, entry.session, entry.travelled_m, descriptor, pack(keyframe))
-            with self._changing():
+            with writing(self.path, sqlite3.Error), self._connection:
                 self._connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?, ?)", values)
             self._rows.append(row)
             self._remember(row, keyframe)
@@ -133,7 +133,7 @@ class KeyframeStore:
         with self._lock:
             kept = [self._rows[index] for index in indices]
             gone = set(self._rows) - set(kept)
-            with self._changing():
+            with writing(self.path, sqlite3.Error), self._connection:
                 self._connection.executemany("DELETE FROM keyframe WHERE id = ?", [(row,) for row in gone])
             self._rows = kept
             for row in gone:
@@ -146,15 +146,14 @@ class KeyframeStore:
             OutputError: the file cannot be written.
         """
         part = path.with_name(path.name + ".part")
-        try:
+        with writing(path, sqlite3.Error), self._lock:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with self._lock, closing(sqlite3.connect(part)) as target:
-                self._connection.backup(target)
-            part.replace(path)
-        except (OSError, sqlite3.Error) as error:
-            with suppress(OSError):
-                part.unlink()
-            raise OutputError(f"cannot write {path}: {error}") from None
+            try:
+                with closing(sqlite3.connect(part)) as target:
+                    self._connection.backup(target)
+                part.replace(path)
+            finally:
+                part.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the file; a temporary one is deleted."""
@@ -175,21 +174,10 @@ class KeyframeStore:
         except (sqlite3.Error, SafetensorError) as error:
             raise UmfError(f"{self.path} is damaged at its keyframe {row}: {error}") from None
 
-    @contextmanager
-    def _changing(self) -> Iterator[None]:
-        """All of the block is written, or nothing."""
-        try:
-            with self._connection:
-                yield
-        except sqlite3.Error as error:
-            raise OutputError(f"cannot write {self.path}: {error}") from None
-
     def _open(self, identity: dict[str, str]) -> sqlite3.Connection:
-        try:
+        with writing(self.path, sqlite3.Error):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             connection = sqlite3.connect(self.path, check_same_thread=False)
-        except (OSError, sqlite3.Error) as error:
-            raise OutputError(f"cannot write {self.path}: {error}") from None
         try:
             self._prepare(connection, identity)
             self._rows = [row for (row,) in connection.execute("SELECT id FROM keyframe ORDER BY id")]

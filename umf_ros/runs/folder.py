@@ -7,7 +7,7 @@ from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
-from umf_ros.errors import OutputError
+from umf_ros.errors import OutputError, writing
 
 
 def create_run_folder(out: Path) -> Path:
@@ -17,12 +17,13 @@ def create_run_folder(out: Path) -> Path:
         OutputError: `out` cannot be written.
     """
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    try:
+    with writing(f"to {out}"):
         out.mkdir(parents=True, exist_ok=True)
         folder = _make_unique(out, stamp)
-        _point(out / "latest", folder)
-    except OSError as error:
-        raise OutputError(f"cannot write to {out}: {error.strerror}") from None
+        # in one step, so that `latest` always leads somewhere
+        fresh = out / f".latest-{os.getpid()}"
+        fresh.symlink_to(folder.name, target_is_directory=True)
+        fresh.replace(out / "latest")
     return folder
 
 
@@ -32,10 +33,8 @@ def check_writable(out: Path) -> None:
     Raises:
         OutputError: `out` cannot be written.
     """
-    try:
+    with writing(f"to {out}"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot write to {out}: {error.strerror}") from None
     if not os.access(out, os.W_OK):
         raise OutputError(f"cannot write to {out}: permission denied")
 
@@ -48,13 +47,6 @@ def _make_unique(out: Path, name: str) -> Path:
     raise OutputError(f"too many runs named {name} in {out}")
 
 
-def _point(link: Path, folder: Path) -> None:
-    """Replace the link in one step, so that `latest` always leads somewhere."""
-    fresh = link.with_name(f".latest-{os.getpid()}")
-    fresh.symlink_to(folder.name, target_is_directory=True)
-    fresh.replace(link)
-
-
 def write_atomically(path: Path, text: str) -> None:
     """Write a text file that is never seen half-written.
 
@@ -62,10 +54,9 @@ def write_atomically(path: Path, text: str) -> None:
         OutputError: the file cannot be written.
     """
     part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink()
-        raise OutputError(f"cannot write {path}: {error.strerror}") from None
+    with writing(path):
+        try:
+            part.write_text(text, encoding="utf-8")
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)

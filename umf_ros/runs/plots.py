@@ -6,16 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from umf_ros.errors import OutputError
+from umf_ros.errors import writing
 from umf_ros.frames import Image
 from umf_ros.geometry import Array
 from umf_ros.pose_graph.g2o import GraphRecording
@@ -39,7 +36,8 @@ def plot_trajectories(
         closures: (K, 2, 3) positions of both ends of every closure.
         verdicts: K times true, false, or None when there is no truth.
     """
-    figure, axes = plt.subplots(figsize=(9, 7), layout="constrained")
+    figure = Figure(figsize=(9, 7), layout="constrained")
+    axes = figure.subplots()
     for name, colour, positions in curves:
         axes.plot(positions[:, 0], positions[:, 1], color=colour, linewidth=1.6, label=name)
     if curves:
@@ -62,7 +60,6 @@ def plot_trajectories(
     axes.grid(alpha=0.3)
     axes.legend(handles=handles, loc="best", fontsize=9)
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 def draw_match(query: Image, match: Image, inliers: Array, caption: str) -> Image:
@@ -111,17 +108,13 @@ def plot_graph(recording: GraphRecording, given: Mapping[int, Array], path: str 
     views = [("x [m]", "y [m]", at[:, :2])]
     if np.ptp(at[:, 2]) > 0.01 * np.ptp(at[:, :2]):
         views.append(("x [m]", "z [m]", at[:, [0, 2]]))
-    figure = plt.figure(figsize=(7 * len(views), 6.5), layout="constrained")
+    figure = Figure(figsize=(7 * len(views), 6.5), layout="constrained")
     for column, (across, up, points) in enumerate(views, start=1):
         axes = figure.add_subplot(1, len(views), column, xlabel=across, ylabel=up, aspect="equal")
         _draw_graph(axes, points, recording.chains, closures)
     figure.suptitle(f"{len(at)} poses, {len(closures)} closures")
-    try:
+    with writing(path, ValueError):
         figure.savefig(path, dpi=120)
-    except (OSError, ValueError) as error:
-        raise OutputError(f"cannot write {path}: {error}") from None
-    finally:
-        plt.close(figure)
 
 
 def _draw_graph(axes: Axes, points: Array, chains: list[int], closures: Array) -> None:

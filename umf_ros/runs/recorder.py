@@ -22,6 +22,7 @@ from umf_ros.runs.folder import write_atomically
 from umf_ros.sensors.counters import InputCounter
 from umf_ros.sensors.sessions import Input
 
+COUNTS = ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected")
 STAGES = ("embed", "query", "verify", "total")
 
 
@@ -47,7 +48,7 @@ class RunRecorder:
         self._keyframes = tables.Table(folder / "keyframes.csv", tables.KEYFRAMES)
         self._inliers = tables.Table(folder / "inliers.csv", tables.INLIERS)
         self._latency = {stage: array("f") for stage in STAGES}
-        self._counts = dict.fromkeys(("frames", "pairs", "keyframes", "queries", "closures", "rejected"), 0)
+        self._counts = dict.fromkeys(COUNTS, 0)
         self._started = time.monotonic()
         self._recorded_ns = 0
         self._last_stamp_ns: int | None = None
@@ -64,9 +65,9 @@ class RunRecorder:
         self._candidates.append([tables.candidate_row(keyframe.stamp_ns, verdict) for verdict in detection.verdicts])
         for verdict in detection.verdicts:
             if verdict.closure is None:
-                self._counts["rejected"] += 1
+                self._counts["closures_rejected"] += 1
                 continue
-            self._counts["closures"] += 1
+            self._counts["closures_published"] += 1
             self._closures.append([tables.closure_row(verdict.closure, verdict.candidate.similarity)])
             self._inliers.append(tables.inlier_rows(keyframe.stamp_ns, verdict))
         for stage, milliseconds in detection.latency_ms.items():
@@ -74,15 +75,9 @@ class RunRecorder:
 
     def summary(self, drops: Mapping[str, int]) -> dict[str, Any]:
         """What `summary.json` holds; `ground_truth` is filled in by the report."""
-        counts = self._counts
         elapsed_s = time.monotonic() - self._started
         return {
-            "frames": counts["frames"],
-            "pairs": counts["pairs"],
-            "keyframes": counts["keyframes"],
-            "queries": counts["queries"],
-            "closures_published": counts["closures"],
-            "closures_rejected": counts["rejected"],
+            **self._counts,
             "ground_truth": None,
             "latency_ms": {stage: _percentiles(values) for stage, values in self._latency.items()},
             "drops": dict(drops),

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from rich.console import Console
 
-from umf_ros.bags.images import read_left_images
+from umf_ros.bags.frames import read_left_images
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
 from umf_ros.config import Settings, load_settings

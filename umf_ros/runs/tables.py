@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 import numpy as np
 
-from umf_ros.errors import OutputError, UmfError
+from umf_ros.errors import UmfError, writing
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import from_quaternion, to_quaternion
 
@@ -30,21 +30,17 @@ class Table:
     """A CSV file with a header, flushed after every block of rows."""
 
     def __init__(self, path: Path, columns: list[str]) -> None:
-        try:
+        with writing(path):
             self._file: TextIO = path.open("w", newline="", encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror}") from None
         self._path = path
         self._writer = csv.writer(self._file)
         self.append([columns])
 
     def append(self, rows: list[Any]) -> None:
         """Write rows and hand them to the operating system."""
-        try:
+        with writing(self._path):
             self._writer.writerows(rows)
             self._file.flush()
-        except OSError as error:
-            raise OutputError(f"cannot write {self._path}: {error.strerror}") from None
 
     def close(self) -> None:
         """Close the file."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from umf_ros.config import Loop
 from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, heading, invert, make_pose, relative, rotation_angle, transform, wrap_angle
+from umf_ros.geometry import Array, align, heading, invert, relative, rotation_angle, transform, wrap_angle
 from umf_ros.keyframes import is_past
 from umf_ros.runs.tables import read_table
 from umf_ros.trajectory import Trajectory
@@ -117,7 +117,7 @@ def judge_closure(
         error = invert(truth) @ closure.match_T_query
         translation_m = float(np.linalg.norm(error[:3, 3]))
         rotation_deg = float(np.degrees(rotation_angle(error)))
-        heading_ok = abs(heading_difference(world_T_match, world_T_query)) <= radians(PLACE_ANGLE_DEG)
+        heading_ok = abs(wrap_angle(heading(world_T_query) - heading(world_T_match))) <= radians(PLACE_ANGLE_DEG)
     else:
         translation_m = abs(float(np.linalg.norm(closure.match_T_query[:3, 3])) - distance_m)
         rotation_deg, heading_ok = float("nan"), True
@@ -125,11 +125,6 @@ def judge_closure(
     return JudgedClosure(
         closure, distance_m, translation_m, rotation_deg, distance_m <= PLACE_RADIUS_M and heading_ok and pose_ok
     )
-
-
-def heading_difference(world_T_a: Array, world_T_b: Array) -> float:
-    """Difference of the headings in the world's x-y plane, radians in [-pi, pi)."""
-    return float(wrap_angle(heading(world_T_b) - heading(world_T_a)))
 
 
 def count_revisits(
@@ -167,7 +162,7 @@ def trajectory_error(estimate: Trajectory | None, truth: Trajectory) -> float | 
 
 def absolute_trajectory_error(estimate: Array, truth: Array) -> float:
     """Root mean square distance in metres of (N, 3) positions after rigid alignment [Sturm 2012]."""
-    aligned = transform(align_rigidly(estimate, truth), estimate)
+    aligned = transform(align(estimate, truth)[0], estimate)
     return float(np.sqrt(np.mean(np.sum((aligned - truth) ** 2, axis=1))))
 
 
@@ -184,24 +179,9 @@ def positions_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Arra
     if np.count_nonzero(known) < 3:
         return positions
     if not truth.has_orientation:
-        return transform(align_rigidly(positions[known], poses[known, :3, 3]), positions)
+        return transform(align(positions[known], poses[known, :3, 3])[0], positions)
     first = int(np.flatnonzero(known)[0])
     return transform(poses[first] @ invert(trajectory.poses[first]), positions)
-
-
-def align_rigidly(estimate: Array, truth: Array) -> Array:
-    """Pose `truth_T_estimate` that brings two (N, 3) point sets together best [Horn 1987].
-
-    Raises:
-        ValueError: fewer than three points, or sets of different size.
-    """
-    if estimate.shape != truth.shape or len(estimate) < 3:
-        raise ValueError(f"cannot align {len(estimate)} positions with {len(truth)}")
-    centre_estimate, centre_truth = estimate.mean(axis=0), truth.mean(axis=0)
-    u, _, vt = np.linalg.svd((truth - centre_truth).T @ (estimate - centre_estimate))
-    mirror = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))])
-    rotation = u @ mirror @ vt
-    return make_pose(rotation, centre_truth - rotation @ centre_estimate)
 
 
 def _judge_closures(closures: list[LoopClosure], truth: Trajectory) -> list[JudgedClosure]:

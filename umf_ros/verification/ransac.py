@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array, make_pose
+from umf_ros.geometry import Array, align
 from umf_ros.verification.constants import MAX_TILT_RAD, MIN_TRIANGLE
 
 Mask = NDArray[np.bool_]
@@ -89,13 +89,8 @@ def kabsch(a: Array, b: Array) -> Array | None:
     """Pose that takes the points `a` (N, 3) to `b` (N, 3) with least squared distance; None if they lie on a line."""
     if len(a) < 3:
         return None
-    centre_a, centre_b = a.mean(axis=0), b.mean(axis=0)
-    u, spread, vt = np.linalg.svd((b - centre_b).T @ (a - centre_a))
-    if spread[1] < 1e-6 * max(spread[0], 1e-12):
-        return None
-    flip = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
-    rotation = u @ flip @ vt
-    return make_pose(rotation, centre_b - rotation @ centre_a)
+    pose, spread = align(a, b)
+    return None if spread[1] < 1e-6 * max(spread[0], 1e-12) else pose
 
 
 @cache

@@ -20,11 +20,10 @@ from umf_ros.config import Settings
 from umf_ros.embedding.images import shrink
 from umf_ros.errors import BagError, UmfError
 from umf_ros.frames import Frame, Image
-from umf_ros.geometry import Array, transform
+from umf_ros.geometry import Array, align, transform
 from umf_ros.lab.datasets.pickles import load_data_frame
 from umf_ros.lab.datasets.recorded import RecordedSequence, course, detours, poses_of, travelled
 from umf_ros.lab.datasets.sample import Sample
-from umf_ros.runs.truth import align_rigidly
 from umf_ros.sensors.calibration import Calibration, load_calibration
 from umf_ros.trajectory import Trajectory
 
@@ -135,7 +134,7 @@ def _poses(frames: list[Frame], positions: Array, truth: Trajectory) -> Array:
 
 def _aligned(estimate: Array, positions: Array) -> Array:
     """(N, 3, 3) rotations of estimated (N, 4, 4) poses in the frame of (N, 3) positions; the course if they differ."""
-    truth_T_estimate = align_rigidly(estimate[:, :3, 3], positions)
+    truth_T_estimate = align(estimate[:, :3, 3], positions)[0]
     misfit = np.linalg.norm(transform(truth_T_estimate, estimate[:, :3, 3]) - positions, axis=1)
     if np.sqrt(np.mean(misfit**2)) > MAX_MISFIT * travelled(positions)[-1]:
         return course(positions)

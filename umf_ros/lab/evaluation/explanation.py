@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from umf_ros.config import Verification
-from umf_ros.errors import OutputError
+from umf_ros.errors import writing
 from umf_ros.frames import Candidate, Image, Keyframe, Points
 from umf_ros.geometry import transform
 from umf_ros.verification.acceptance import load_acceptance
@@ -66,11 +66,9 @@ def draw(explanation: Explanation, query_image: Image | None, match_image: Image
     Raises:
         OutputError: the file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15, 11), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 3, height_ratios=[1.0, 1.05], width_ratios=[1.1, 1, 0.9])
     _draw_images(figure.add_subplot(grid[0, :]), explanation, query_image, match_image)
     _draw_scans(figure.add_subplot(grid[1, 0]), explanation, 1, "left [m]", "from above")
@@ -78,10 +76,8 @@ def draw(explanation: Explanation, query_image: Image | None, match_image: Image
     _draw_contributions(figure.add_subplot(grid[1, 2]), explanation)
     stamps = f"query {explanation.query.stamp_ns}   match {explanation.match.stamp_ns}"
     figure.suptitle(f"{explanation.verdict}\n{stamps}", fontsize=14)
-    try:
+    with writing(path, ValueError):
         figure.savefig(path, dpi=100)
-    except (OSError, ValueError) as error:
-        raise OutputError(f"cannot write {path}: {error}") from None
 
 
 def _draw_images(axes: Any, explanation: Explanation, query: Image | None, match: Image | None) -> None:
