@@ -24,7 +24,7 @@ COMMANDS = {
     "evaluate": "umf_ros.lab.commands.evaluate",
     "explain": "umf_ros.lab.commands.explain",
     "train": "umf_ros.lab.commands.train",
-    "export": "umf_ros.commands.export",
+    "export": "umf_ros.lab.commands.export",
     "doctor": "umf_ros.commands.doctor",
     "pretrain": "umf_ros.lab.commands.pretrain",
     "graph": "umf_ros.commands.graph",
