@@ -1,8 +1,8 @@
-"""The exceptions a user of the package can meet."""
+"""The exceptions a user of the package can meet, and how they name a choice."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 
@@ -50,3 +50,8 @@ def writing(what: object, *kinds: type[Exception]) -> Iterator[None]:
         yield
     except caught as error:
         raise OutputError(f"cannot write {what}: {getattr(error, 'strerror', None) or error}") from None
+
+
+def either(names: Sequence[str]) -> str:
+    """The names as a choice, "a, b or c": for messages and help."""
+    return " or ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)

@@ -11,10 +11,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from umf_ros.config import find
 from umf_ros.errors import OutputError, WeightsError
 from umf_ros.networks.presets import NetworkConfig
 from umf_ros.networks.umf import UMF, channels_last
+from umf_ros.resources import find
 
 SHIPPED = ("umf_light", "umf_resnet50")
 DEFAULT = "umf_light"

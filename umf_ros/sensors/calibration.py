@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from umf_ros.config import Dataset, Group, find, problems, read_values
+from umf_ros.config import Group, load_preset, problems, read_values
 from umf_ros.errors import CalibrationError, ConfigError
 from umf_ros.frames import StereoCamera
 from umf_ros.geometry import Array, from_quaternion
+from umf_ros.resources import dataset_names
 from umf_ros.sensors.rectification import Pinhole, RawCamera, StereoRectifier
 
 
@@ -62,8 +62,7 @@ def load_calibration(source: str | Path) -> Calibration:
     Raises:
         CalibrationError: the file cannot be read, or a key is missing, unknown or wrong; names the key.
     """
-    known = source in get_args(Dataset)
-    path = find(f"config/calibration/{str(source).replace('-', '_')}.yaml") if known else Path(source)
+    path = load_preset(str(source)).calibration if source in dataset_names() else Path(source)
     try:
         return _File.model_validate(read_values(path)).calibration()
     except ConfigError as error:

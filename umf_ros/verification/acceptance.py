@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from umf_ros.config import find
 from umf_ros.errors import ConfigError
 from umf_ros.geometry import Array
+from umf_ros.resources import find
 from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
 from umf_ros.verification.registration import CovarianceModel, covariance_of
 
