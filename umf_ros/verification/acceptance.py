@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -146,14 +146,6 @@ def load_acceptance(path: str = "") -> AcceptanceModel:
         return AcceptanceModel(models, covariances)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{file}: not an acceptance model of this version ({error!r})") from None
-
-
-def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: str, results: dict[str, float]) -> None:
-    """Write a fitted decision for `load_acceptance`, with the command that made it and what it reached."""
-    content: dict[str, Any] = {"fitted_with": fitted_with, "results": results}
-    content["models"] = {kind: asdict(model.models[kind]) for kind in KINDS}
-    content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in KINDS}
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def _logistic(model: dict[str, Any], kind: str) -> Logistic:

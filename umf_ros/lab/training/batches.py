@@ -16,7 +16,7 @@ from umf_ros.lab.datasets.labels import Places
 from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.datasets.views import View, ViewMaker
 from umf_ros.lab.training.sampler import Draw, places_drawn
-from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import NetworkInput, to_device
 
 CHILDREN = 8
