@@ -27,13 +27,13 @@ def test_a_landmark_moved_sideways_changes_the_descriptor(network):
     left, right = torch.zeros_like(batch.image), torch.zeros_like(batch.image)
     left[..., 24:40, 16:32] = 3
     right[..., 24:40, 64:80] = 3
-    moved = (network(replace(batch, image=left)).descriptor - network(replace(batch, image=right)).descriptor).norm()
+    moved = (network(batch._replace(image=left)).descriptor - network(batch._replace(image=right)).descriptor).norm()
     assert moved > 1e-3
 
 
 def test_a_rock_moved_sideways_changes_the_descriptor(network):
     batch = some_input(TINY)
-    mirrored = replace(batch, grid=batch.grid.flip(2))
+    mirrored = batch._replace(grid=batch.grid.flip(2))
     assert (network(batch).descriptor - network(mirrored).descriptor).norm() > 1e-4
 
 
@@ -85,15 +85,14 @@ def test_each_modality_is_told_of_the_other(network):
 
 def test_the_content_of_a_missing_modality_does_not_matter(network):
     batch = some_input(TINY)
-    dark = replace(batch, image_present=torch.zeros(2, dtype=torch.bool))
-    other = replace(dark, image=torch.randn(dark.image.shape))
+    dark = batch._replace(image_present=torch.zeros(2, dtype=torch.bool))
+    other = dark._replace(image=torch.randn(dark.image.shape))
     torch.testing.assert_close(network(dark).descriptor, network(other).descriptor)
 
 
 def test_nothing_at_all_is_still_a_number(network):
     batch = some_input(TINY)
-    empty = replace(
-        batch,
+    empty = batch._replace(
         image_present=torch.zeros(2, dtype=torch.bool),
         grid=torch.zeros_like(batch.grid),
         coarse_mask=torch.zeros_like(batch.coarse_mask),
@@ -143,7 +142,7 @@ def test_super_features_are_only_made_when_asked_for(network):
 
 def test_cells_are_told_apart_by_their_place_where_nothing_else_differs(network):
     batch = some_input(TINY, 1)
-    empty = replace(batch, grid=torch.zeros_like(batch.grid), image=torch.zeros_like(batch.image))
+    empty = batch._replace(grid=torch.zeros_like(batch.grid), image=torch.zeros_like(batch.image))
     features = network.encode(empty)
     assert torch.equal(features.cloud.mask, batch.coarse_mask) and features.image.mask.all()
     assert torch.pdist(features.image.values[0].detach()).min() > 0.05

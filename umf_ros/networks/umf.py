@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Literal
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -19,9 +19,8 @@ from umf_ros.networks.voxel_encoder import CELLS, VoxelEncoder
 Branch = Literal["both", "image", "cloud"]
 
 
-@dataclass(frozen=True, slots=True)
-class NetworkInput:
-    """A batch of preprocessed frames.
+class NetworkInput(NamedTuple):
+    """A batch of preprocessed frames; the order of its tensors is that of an exported network's inputs.
 
     Attributes:
         image: (B, 1, H, W) float32, normalised.
@@ -41,10 +40,9 @@ class NetworkInput:
     fine_index: Tensor
     fine_mask: Tensor
 
-
-def to_device(batch: NetworkInput, device: torch.device) -> NetworkInput:
-    """The batch on another device."""
-    return NetworkInput(**{field.name: getattr(batch, field.name).to(device) for field in fields(batch)})
+    def to(self, device: torch.device) -> Self:
+        """The batch on another device."""
+        return type(self)(*(tensor.to(device) for tensor in self))
 
 
 @dataclass(frozen=True, slots=True)
