@@ -16,9 +16,8 @@ from typing import Any
 
 from umf_ros.config import find
 from umf_ros.errors import ConfigError
-from umf_ros.geometry import Array
 from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
-from umf_ros.verification.registration import CovarianceModel, covariance_of
+from umf_ros.verification.registration import CovarianceModel
 
 SHIPPED = "config/verification/calibration.json"
 KINDS = (SCAN, IMAGE)
@@ -124,10 +123,6 @@ class AcceptanceModel:
         """Log-odds of each criterion by name; "bias" is what has to be overcome."""
         model = self.models[measurement.kind]
         return model.contributions(scores(measurement)) | {"bias": model.bias}
-
-    def covariance(self, information: Array, kind: str) -> Array:
-        """Covariance (6, 6) of a pose with this information (6, 6), ROS order, m^2 and rad^2."""
-        return covariance_of(information, self.covariances[kind])
 
 
 def load_acceptance(path: str = "") -> AcceptanceModel:

@@ -22,7 +22,7 @@ from umf_ros.verification.hypotheses import (
     paired_points,
 )
 from umf_ros.verification.measurement import AlignedHypothesis, Measurement, measure, measure_candidate
-from umf_ros.verification.registration import ScanCache, align_features, align_scans
+from umf_ros.verification.registration import ScanCache, align_features, align_scans, covariance_of
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
 
@@ -179,7 +179,7 @@ class Verifier:
         objection = self._objection(judged)
         if objection:
             return Verdict(ranked.candidate, objection, measurement, None, pixels, probability)
-        covariance = self._acceptance.covariance(aligned.alignment.information, measurement.kind)
+        covariance = covariance_of(aligned.alignment.information, self._acceptance.covariances[measurement.kind])
         closure = LoopClosure(aligned.query.stamp_ns, ranked.candidate.stamp_ns, aligned.pose, covariance, probability)
         return Verdict(ranked.candidate, "accepted", measurement, closure, pixels, probability)
 
