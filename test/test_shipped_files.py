@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import umf_ros
-from umf_ros.config import find, share_folders
 from umf_ros.errors import UmfError
+from umf_ros.resources import find, share_folders
 
 PACKAGE = Path(umf_ros.__file__).parent
 CONFIG = "config/calibration/simulated.yaml"
@@ -21,14 +21,14 @@ def install(site_packages: Path) -> None:
     """The part of the package that finds files, as pip and colcon install it."""
     target = site_packages / "umf_ros"
     target.mkdir(parents=True)
-    for name in ("__init__.py", "errors.py", "config.py"):
+    for name in ("__init__.py", "errors.py", "resources.py"):
         shutil.copy(PACKAGE / name, target / name)
 
 
 def found_by(site_packages: Path, relative: str) -> str:
     """Where a fresh interpreter with this installation finds a file, or what it says."""
     code = (
-        "import sys\nfrom umf_ros.config import find\nfrom umf_ros.errors import UmfError\n"
+        "import sys\nfrom umf_ros.resources import find\nfrom umf_ros.errors import UmfError\n"
         "try:\n    print(find(sys.argv[1]))\nexcept UmfError as error:\n    print(error)"
     )
     done = subprocess.run(

@@ -1,19 +1,20 @@
 """Every setting of the package: one source for node parameters, command line and documentation.
 
 Settings are nested; a node parameter's name is the path with dots, as in `keyframe.min_translation_m`.
-Numbers carry their unit in the name. Shipped files are found in the checkout or in an installed share folder.
+Numbers carry their unit in the name.
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import PydanticCustomError
 
-from umf_ros.errors import ConfigError, UmfError
+from umf_ros.errors import ConfigError, either
+from umf_ros.resources import DEFAULT_DATASET, dataset_names, find
 
 
 class Group(BaseModel):
@@ -22,8 +23,16 @@ class Group(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
 
-Dataset = Literal["simulated", "s3li-etna", "s3li-vulcano"]
-"""Data sets known by name: their topics stand in `bags.presets`, their rig in `config/calibration/<name>.yaml`."""
+def _known(name: str) -> str:
+    names = dataset_names()
+    if name not in names:
+        find("config/datasets")  # a broken installation lacks them all
+        raise PydanticCustomError("dataset", "Input should be {names}", {"names": either([repr(one) for one in names])})
+    return name
+
+
+Dataset = Annotated[str, AfterValidator(_known)]
+"""Name of a data set that has a file in `config/datasets`."""
 
 
 class Topics(Group):
@@ -35,6 +44,14 @@ class Topics(Group):
     right_info: str = Field("/stereo/right/camera_info", description="right camera_info, for the baseline")
     cloud: str = Field("/bf_lidar/points_raw", description="LiDAR scan, sensor_msgs/PointCloud2")
     odometry: str = Field("/odom", description="odometry, nav_msgs/Odometry; empty: none")
+
+
+class DatasetPreset(Group):
+    """What is known of a data set by its name: a file in `config/datasets`."""
+
+    calibration: Path = Field(description="calibration file, relative to this one")
+    topics: Topics = Topics()
+    mark: str = Field("", description="topic that its recordings have and those of other data sets lack; empty: none")
 
 
 class Qos(Group):
@@ -178,7 +195,9 @@ class WorkerSettings(Group):
 class Settings(Group):
     """All settings."""
 
-    dataset: Dataset = Field("simulated", description="preset of calibration and topics")
+    dataset: Dataset = Field(
+        DEFAULT_DATASET, description="preset of calibration and topics, a file in `config/datasets` by its name"
+    )
     calibration: str = Field("", description="calibration file (YAML); empty: the data set's")
     topics: Topics = Topics()
     qos: Qos = Qos()
@@ -208,6 +227,21 @@ def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:
         if value is not None:
             _set(values, name.split("__"), value)
     return parse_settings(values)
+
+
+def load_preset(dataset: str) -> DatasetPreset:
+    """The preset of a data set, its calibration as a path that can be opened.
+
+    Raises:
+        UmfError: there is no such data set.
+        ConfigError: its file cannot be read, or a name, type or value is wrong.
+    """
+    path = find(f"config/datasets/{dataset}.yaml")
+    try:
+        preset = DatasetPreset.model_validate(read_values(path))
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {problems(error)}") from None
+    return preset.model_copy(update={"calibration": path.parent / preset.calibration})
 
 
 def parse_settings(values: dict[str, Any]) -> Settings:
@@ -300,24 +334,3 @@ def _explain(problem: Any) -> str:
     if problem["type"] == "extra_forbidden":
         return f"unknown parameter {name}"
     return f"{name}: {problem['msg'][0].lower()}{problem['msg'][1:]} (got {problem['input']!r})"
-
-
-def share_folders() -> list[Path]:
-    """Folders that can hold `config/` and `models/`, the most specific first."""
-    checkout = Path(__file__).resolve().parent.parent
-    folders = [checkout] if (checkout / "package.xml").is_file() else []
-    # <prefix>/lib/python3.x/site-packages/umf_ros -> <prefix>/share/umf_ros
-    folders += [parent / "share" / "umf_ros" for parent in Path(__file__).resolve().parents]
-    return [*folders, Path(sys.prefix) / "share" / "umf_ros"]
-
-
-def find(relative: str) -> Path:
-    """Path of a shipped file, such as `config/calibration/simulated.yaml`.
-
-    Raises:
-        UmfError: no such file is installed.
-    """
-    for folder in share_folders():
-        if (folder / relative).exists():
-            return folder / relative
-    raise UmfError(f"{relative} is not installed with umf_ros; reinstall the package")

@@ -1,4 +1,8 @@
-"""The exceptions a user of the package can meet."""
+"""The exceptions a user of the package can meet, and how they name a choice."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
 
 
 class UmfError(Exception):
@@ -35,3 +39,8 @@ class OutputError(UmfError):
 
 class GraphError(UmfError):
     """A pose graph that cannot be read or solved."""
+
+
+def either(names: Sequence[str]) -> str:
+    """The names as a choice, "a, b or c": for messages and help."""
+    return " or ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)

@@ -24,9 +24,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from umf_ros.bags.frames import FrameReader, read_frames
 from umf_ros.bags.images import read_left_images
-from umf_ros.bags.presets import TOPICS, detect_dataset
+from umf_ros.bags.presets import detect_dataset
 from umf_ros.bags.reader import open_bag
-from umf_ros.config import load_settings
+from umf_ros.config import load_preset, load_settings
 from umf_ros.errors import BagError
 from umf_ros.sensors.messages import OdometrySample
 from umf_ros.trajectory import Trajectory
@@ -165,7 +165,8 @@ def test_bytes_that_are_no_message_are_skipped_and_counted(tmp_path: Path) -> No
 
 def test_raw_bayer_images_of_vulcano_arrive_rectified(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
-    left, right = TOPICS["s3li-vulcano"].left_image, TOPICS["s3li-vulcano"].right_image
+    topics = load_preset("s3li-vulcano").topics
+    left, right = topics.left_image, topics.right_image
     pixels = np.full((1544, 2064), 90, np.uint8)
     entries = []
     for i in range(3):

@@ -21,10 +21,13 @@ from recordings import (
 )
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.bags.presets import TOPICS, detect_dataset, settings_for, topics_of
+from umf_ros import resources
+from umf_ros.bags.presets import calibration_of, detect_dataset, settings_for, topics_of
 from umf_ros.bags.reader import open_bag
-from umf_ros.config import load_settings
-from umf_ros.errors import BagError
+from umf_ros.config import load_preset, load_settings
+from umf_ros.errors import BagError, ConfigError
+from umf_ros.resources import find, share_folders
+from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.messages import decode_cloud, decode_image, decode_odometry, stamp_ns
 
 ENTRIES = traverse(1.0)
@@ -172,7 +175,7 @@ def test_data_sets_are_told_by_their_topics(tmp_path: Path) -> None:
     assert dataset("a.mcap", {LEFT, CLOUD, TRUTH}) == "simulated"
     assert dataset("b.mcap", {LEFT, CLOUD}) == "s3li-etna"
     assert dataset("c.mcap", {CLOUD}) == "s3li-etna"
-    raw = TOPICS["s3li-vulcano"].left_image
+    raw = load_preset("s3li-vulcano").topics.left_image
     bayer = [(raw, START_NS, image(START_NS, np.zeros((4, 4), np.uint8), "bayer_rggb8"))]
     assert detect_dataset(open_bag(write_mcap(tmp_path / "d.mcap", bayer))) == "s3li-vulcano"
     with pytest.raises(BagError, match="/odom"):
@@ -192,6 +195,27 @@ def test_a_recording_is_read_as_the_file_says_and_only_then_by_its_topics(tmp_pa
     assert settings_for(strange, config, "auto").topics.cloud == "/my/points"
     with pytest.raises(BagError, match="no topic of a known data set"):
         settings_for(strange, None, "auto")
+
+
+def test_a_data_set_is_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    datasets = tmp_path / "config" / "datasets"
+    datasets.mkdir(parents=True)
+    (tmp_path / "config" / "rig.yaml").write_text(find("config/calibration/simulated.yaml").read_text())
+    (datasets / "my-rover.yaml").write_text(
+        "calibration: ../rig.yaml\ntopics: {left_image: /nav/left}\nmark: /nav/left\n"
+    )
+    monkeypatch.setattr(resources, "share_folders", lambda: [tmp_path, *share_folders()])
+    scans = [entry for entry in ENTRIES if entry[0] == CLOUD]
+    picture = ("/nav/left", START_NS, image(START_NS, np.zeros((4, 4), np.uint8)))
+    settings = settings_for(open_bag(write_mcap(tmp_path / "a.mcap", [*scans, picture])), None, "auto")
+    assert settings.dataset == "my-rover" and topics_of(settings).left_image == "/nav/left"
+    assert calibration_of(settings).camera == load_calibration("simulated").camera
+    assert settings_for(open_bag(write_mcap(tmp_path / "b.mcap", scans)), None, "auto").dataset == "s3li-etna"
+    (datasets / "my-rover.yaml").write_text("topics: {left: /nav/left}\n")
+    with pytest.raises(ConfigError, match=r"my-rover\.yaml: calibration: .*required.*unknown parameter topics\.left"):
+        topics_of(settings)
+    with pytest.raises(ConfigError, match="dataset: input should be 'simulated', 'my-rover', 's3li-etna' or"):
+        load_settings(dataset="kitti")
 
 
 def test_topics_of_the_settings_win_over_those_of_the_data_set() -> None:

@@ -1,4 +1,4 @@
-"""Data sets known by name: the topics and the rig of their recordings."""
+"""Which data set a recording belongs to, and what its settings and its preset say together."""
 
 from __future__ import annotations
 
@@ -6,39 +6,34 @@ from pathlib import Path
 from typing import Any
 
 from umf_ros.bags.reader import Bag
-from umf_ros.config import Dataset, Settings, Topics, load_settings
+from umf_ros.config import DatasetPreset, Settings, Topics, load_preset, load_settings
 from umf_ros.errors import BagError
+from umf_ros.resources import dataset_names
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
 GROUND_TRUTH_TOPIC = "/ground_truth/pose"
 
-TOPICS: dict[Dataset, Topics] = {
-    "simulated": Topics(),
-    "s3li-etna": Topics(),
-    "s3li-vulcano": Topics(
-        left_image="/g319c_left/image_raw",
-        right_image="/g319c_right/image_raw",
-        # not in the recordings; what the data set's own node publishes there is no standard camera_info
-        left_info="",
-        right_info="",
-    ),
-}
 
-
-def detect_dataset(bag: Bag) -> Dataset:
-    """Data set of a recording, by its topics.
+def detect_dataset(bag: Bag) -> str:
+    """Data set of a recording: the one most of whose topics are there; its mark counts as one more.
 
     Raises:
         BagError: neither the images nor the scans of a known data set are there.
     """
     known = set(bag.topics)
-    if TOPICS["s3li-vulcano"].left_image in known:
-        return "s3li-vulcano"
-    etna = TOPICS["s3li-etna"]
-    if not known & {etna.left_image, etna.cloud}:
+    found = {name: _match(load_preset(name), known) for name in dataset_names()}
+    best = max(found, key=lambda name: found[name])
+    if not found[best]:
         names = ", ".join(sorted(known)) or "none"
         raise BagError(f"the recording has no topic of a known data set; name yours in a config file (topics: {names})")
-    return "simulated" if GROUND_TRUTH_TOPIC in known else "s3li-etna"
+    return best
+
+
+def _match(preset: DatasetPreset, known: set[str]) -> int:
+    topics = preset.topics
+    if not known & {topics.left_image, topics.cloud} or (preset.mark and preset.mark not in known):
+        return 0
+    return len(known.intersection(topics.model_dump().values())) + bool(preset.mark)
 
 
 def settings_for(bag: Bag, config: Path | None, dataset: str, **overrides: Any) -> Settings:
@@ -66,7 +61,7 @@ def topics_of(settings: Settings) -> Topics:
     """Input topics: those of the data set, except where the settings differ from the defaults."""
     defaults = Topics().model_dump()
     own = {name: topic for name, topic in settings.topics.model_dump().items() if topic != defaults[name]}
-    return TOPICS[settings.dataset].model_copy(update=own)
+    return load_preset(settings.dataset).topics.model_copy(update=own)
 
 
 def calibration_of(settings: Settings) -> Calibration:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from umf_ros.embedding import CHOICES
+from umf_ros.errors import either
+from umf_ros.resources import dataset_names
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,12 +18,9 @@ if TYPE_CHECKING:
     from umf_ros.bags.reader import Bag
     from umf_ros.config import Settings
 
-# written out: the settings, which know the names, are too heavy for `umf --help`
-DATASETS = "auto, simulated, s3li-etna or s3li-vulcano."
-
 BagPath = Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")]
 ConfigPath = Annotated[Path | None, typer.Option("--config", help="Parameter file (YAML).")]
-DatasetName = Annotated[str, typer.Option("--dataset", help=DATASETS)]
+DatasetName = Annotated[str, typer.Option("--dataset", help=f"{either(['auto', *dataset_names()])}.")]
 EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"How places are embedded: {CHOICES}.")]
 WeightsPath = Annotated[
     Path | None, typer.Option("--weights", help="Weights file, or umf_resnet50; default: umf_light.")

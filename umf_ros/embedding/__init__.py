@@ -10,7 +10,7 @@ import pkgutil
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from umf_ros.errors import ConfigError
+from umf_ros.errors import ConfigError, either
 
 if TYPE_CHECKING:
     from umf_ros.config import EmbeddingSettings
@@ -27,7 +27,7 @@ def find_methods() -> tuple[str, ...]:
 
 
 METHODS = find_methods()
-CHOICES = f"{', '.join(METHODS[:-1])} or {METHODS[-1]}"
+CHOICES = either(METHODS)
 """For help texts."""
 
 

@@ -10,10 +10,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from umf_ros.config import find
 from umf_ros.errors import WeightsError
 from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import UMF, channels_last
+from umf_ros.resources import find
 
 SHIPPED = ("umf_light", "umf_resnet50")
 DEFAULT = "umf_light"

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from umf_ros.config import Dataset, Group, find
+from umf_ros.config import Group, load_preset
 from umf_ros.errors import CalibrationError
 from umf_ros.frames import StereoCamera
 from umf_ros.geometry import Array, from_quaternion
+from umf_ros.resources import dataset_names
 from umf_ros.sensors.rectification import RawCamera, StereoRectifier
 
 
@@ -63,7 +64,7 @@ def load_calibration(source: str | Path) -> Calibration:
     Raises:
         CalibrationError: the file cannot be read, or a key is missing, unknown or wrong; names the key.
     """
-    path = _path_of(source)
+    path = load_preset(str(source)).calibration if source in dataset_names() else Path(source)
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -74,12 +75,6 @@ def load_calibration(source: str | Path) -> Calibration:
         return _File.model_validate(content).calibration()
     except ValidationError as error:
         raise CalibrationError(f"{path}: {'; '.join(_explain(problem) for problem in error.errors())}") from None
-
-
-def _path_of(source: str | Path) -> Path:
-    if source in get_args(Dataset):
-        return find(f"config/calibration/{str(source).replace('-', '_')}.yaml")
-    return Path(source)
 
 
 def _explain(problem: Any) -> str:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from umf_ros.config import find
 from umf_ros.errors import ConfigError
+from umf_ros.resources import find
 from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
 from umf_ros.verification.registration import CovarianceModel
 

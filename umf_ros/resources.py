@@ -1,0 +1,37 @@
+"""Files that come with the package, in a checkout or an installed share folder: cheap, for `umf --help` asks too."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from umf_ros.errors import UmfError
+
+DEFAULT_DATASET = "simulated"
+
+
+def share_folders() -> list[Path]:
+    """Folders that can hold `config/` and `models/`, the most specific first."""
+    checkout = Path(__file__).resolve().parent.parent
+    folders = [checkout] if (checkout / "package.xml").is_file() else []
+    # <prefix>/lib/python3.x/site-packages/umf_ros -> <prefix>/share/umf_ros
+    folders += [parent / "share" / "umf_ros" for parent in Path(__file__).resolve().parents]
+    return [*folders, Path(sys.prefix) / "share" / "umf_ros"]
+
+
+def find(relative: str) -> Path:
+    """Path of a shipped file, such as `config/calibration/simulated.yaml`.
+
+    Raises:
+        UmfError: no such file is installed.
+    """
+    for folder in share_folders():
+        if (folder / relative).exists():
+            return folder / relative
+    raise UmfError(f"{relative} is not installed with umf_ros; reinstall the package")
+
+
+def dataset_names() -> list[str]:
+    """Data sets that have a file in `config/datasets`, the default first."""
+    names = {path.stem for folder in share_folders() for path in (folder / "config" / "datasets").glob("*.yaml")}
+    return sorted(names, key=lambda name: (name != DEFAULT_DATASET, name))
