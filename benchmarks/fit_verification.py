@@ -33,11 +33,12 @@ from umf_ros.lab.training.acceptance_fit import (
     fit_covariance,
     fit_logistic,
     inside_ellipsoid,
+    save_acceptance,
     scale_covariance,
 )
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
-from umf_ros.verification.acceptance import KINDS, AcceptanceModel, load_acceptance, save_acceptance, scores
+from umf_ros.verification.acceptance import KINDS, AcceptanceModel, load_acceptance, scores
 from umf_ros.verification.measurement import IMAGE, SCAN
 from umf_ros.verification.verifier import JudgedHypothesis
 

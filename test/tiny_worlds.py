@@ -12,7 +12,7 @@ from umf_ros.frames import StereoCamera
 from umf_ros.geometry import make_pose
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.datasets.views import View, ViewMaker
-from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import NetworkInput
 
 TINY = NetworkConfig(

@@ -135,13 +135,13 @@ def adjoint(poses: Array) -> Array:
     rotation = poses[..., :3, :3]
     result[..., :3, :3] = rotation
     result[..., 3:, 3:] = rotation
-    result[..., 3:, :3] = _skew(poses[..., :3, 3]) @ rotation
+    result[..., 3:, :3] = skew(poses[..., :3, 3]) @ rotation
     return result
 
 
 def right_jacobian(twists: Array) -> Array:
     """(N, 6, 6) right Jacobians of `expmap` for small (N, 6) twists, to third order."""
-    turned, moved = _skew(twists[..., :3]), _skew(twists[..., 3:])
+    turned, moved = skew(twists[..., :3]), skew(twists[..., 3:])
     ad = np.zeros((*twists.shape[:-1], 6, 6))
     ad[..., :3, :3] = ad[..., 3:, 3:] = turned
     ad[..., 3:, :3] = moved
@@ -153,8 +153,8 @@ def propagate(matrices: Array, covariances: Array) -> Array:
     return matrices @ covariances @ np.swapaxes(matrices, -1, -2)
 
 
-def _skew(vectors: Array) -> Array:
-    """(..., 3, 3) cross-product matrices of (..., 3) vectors."""
+def skew(vectors: Array) -> Array:
+    """(..., 3, 3) matrices of (..., 3) vectors with `skew(v) @ x == cross(v, x)`."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vectors.shape[:-1], 3, 3)

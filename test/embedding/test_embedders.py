@@ -18,8 +18,8 @@ from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.embedding.umf_embedder import UmfEmbedder
 from umf_ros.errors import ConfigError, WeightsError
 from umf_ros.frames import Frame
+from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
-from umf_ros.networks.weights import save_weights
 
 
 def some_frame(seed: int = 0, **changes: object) -> Frame:

@@ -118,7 +118,7 @@ def test_a_blank_input_has_the_shapes_of_any_other():
         blank_input(TINY),
         pack([np.ones(TINY.image_size, np.float32)], [prepare_scan(None, None, TINY)], TINY),
     )
-    for name in blank.__dataclass_fields__:
+    for name in blank._fields:
         assert getattr(blank, name).shape == getattr(full, name).shape
         assert getattr(blank, name).dtype == getattr(full, name).dtype
         assert not getattr(blank, name).any()

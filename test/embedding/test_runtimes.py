@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import torch
 from tiny_worlds import TINY, some_input
 from torch import Tensor, nn
 
-from umf_ros.embedding.export import cached, convert, inputs_by_name, kept_or_made, save
+from umf_ros.embedding.export import cached, convert, kept_or_made, save
 from umf_ros.embedding.inputs import blank_input
 from umf_ros.embedding.runtimes import OUTPUTS, SUPERS, TorchRuntime, make_runtime
 from umf_ros.errors import ConfigError, OutputError
@@ -55,12 +54,6 @@ def test_torch_says_by_name_what_the_network_says(network):
 
 def test_super_features_are_left_out_unless_wanted(network):
     assert set(TorchRuntime(network, "cpu", 1, False).run(blank_input(TINY))) == set(OUTPUTS)
-
-
-def test_inputs_keep_the_order_of_the_networks_arguments():
-    batch = some_input(TINY, 1)
-    assert list(inputs_by_name(batch)) == list(type(batch).__dataclass_fields__)
-    assert inputs_by_name(replace(batch, image=batch.image + 1))["image"] is not batch.image
 
 
 @pytest.mark.parametrize(("runtime", "device"), [("openvino", "cuda"), ("torch", "abacus"), ("auto", "abacus")])

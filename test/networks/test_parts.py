@@ -6,13 +6,13 @@ from tiny_worlds import TINY
 from umf_ros.networks.attention import Attention, received
 from umf_ros.networks.fusion import GeneralisedMean, Tokens
 from umf_ros.networks.local_features import ImageLocal
-from umf_ros.networks.positions import image_positions, sine_encoding, voxel_positions
+from umf_ros.networks.positions import cell_positions, sine_encoding
 from umf_ros.networks.superfeatures import IterativeAttention
 from umf_ros.networks.voxel_encoder import parent_and_child, take
 
 
 def test_every_cell_has_its_own_code():
-    for positions in (image_positions(6, 8), voxel_positions((10, 10, 10))):
+    for positions in (cell_positions(6, 8), cell_positions(10, 10, 10)):
         codes = sine_encoding(positions, 64)
         distance = torch.cdist(codes, codes) + 10 * torch.eye(len(codes))
         assert distance.min() > 0.05

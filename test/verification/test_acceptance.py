@@ -9,6 +9,7 @@ import pytest
 from measurements import BAD, GOOD
 
 from umf_ros.errors import ConfigError
+from umf_ros.lab.training.acceptance_fit import save_acceptance
 from umf_ros.verification import Measurement
 from umf_ros.verification.acceptance import (
     KINDS,
@@ -16,7 +17,6 @@ from umf_ros.verification.acceptance import (
     Criterion,
     criteria_of,
     load_acceptance,
-    save_acceptance,
     scores,
 )
 

@@ -12,7 +12,9 @@ from typing import Any
 from torch import nn
 
 from umf_ros.errors import OutputError
-from umf_ros.networks.umf import NetworkInput
+
+FORMAT = 1
+"""Of what is kept; another number makes all anew."""
 
 
 def convert(flat: nn.Module, example: dict[str, Any]) -> Any:
@@ -66,11 +68,3 @@ def cached(weights: Path, super_features: bool) -> Path:
     digest.update(f"{openvino.__version__} {super_features} {FORMAT}".encode())
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(home) / "umf_ros" / f"{digest.hexdigest()[:20]}.xml"
-
-
-FORMAT = 1
-
-
-def inputs_by_name(batch: NetworkInput) -> dict[str, Any]:
-    """The tensors of a batch by name, in the order of the network's arguments."""
-    return {name: getattr(batch, name) for name in batch.__dataclass_fields__}

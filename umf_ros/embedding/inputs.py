@@ -12,7 +12,7 @@ from torch import Tensor
 from umf_ros.embedding.images import shrink, standardise
 from umf_ros.embedding.voxels import VoxelScan, voxelise
 from umf_ros.frames import Image, Points
-from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import NetworkInput
 
 

@@ -5,29 +5,19 @@ from __future__ import annotations
 import os
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from umf_ros.embedding.export import cached, convert, inputs_by_name, kept_or_made
+from umf_ros.embedding.export import cached, convert, kept_or_made
 from umf_ros.embedding.inputs import blank_input
 from umf_ros.errors import ConfigError
-from umf_ros.networks.umf import UMF, NetworkInput, NetworkOutput, to_device
+from umf_ros.networks.umf import UMF, NetworkInput, NetworkOutput
 
 Outputs = dict[str, NDArray[np.float32]]
-
-
-class Runtime(Protocol):
-    """Runs the network on a batch of one."""
-
-    name: str
-
-    def run(self, batch: NetworkInput) -> Outputs:
-        """Outputs by name, as in `OUTPUTS`, without the batch axis."""
-        ...
 
 
 OUTPUTS = ("descriptor", "image", "image_saliency", "cloud", "cloud_saliency")
@@ -60,8 +50,6 @@ class TorchRuntime:
         ConfigError: torch does not know the device.
     """
 
-    name = "torch"
-
     def __init__(self, network: UMF, device: str, threads: int, super_features: bool) -> None:
         if device == "cpu":
             torch.set_num_threads(threads)
@@ -72,24 +60,21 @@ class TorchRuntime:
             raise ConfigError(f"embedding.device: cannot use {device!r}: {str(error).splitlines()[0]}") from None
 
     def run(self, batch: NetworkInput) -> Outputs:
-        """Outputs by name."""
-        batch = to_device(batch, self._device)
+        """Outputs of a batch of one by name, as in `OUTPUTS`, without the batch axis."""
         with torch.inference_mode():
-            found = self._flat(*inputs_by_name(batch).values())
+            found = self._flat(*batch.to(self._device))
         return _named([value[0].float().cpu().numpy() for value in found])
 
 
 class OpenVinoRuntime:
     """OpenVINO on the CPU; the network is converted at the first start and kept in the user's cache."""
 
-    name = "openvino"
-
     def __init__(self, network: UMF, weights: Path, threads: int, super_features: bool) -> None:
         import openvino
 
         model = kept_or_made(
             cached(weights, super_features),
-            lambda: convert(Flat(network.eval(), super_features), inputs_by_name(blank_input(network.config))),
+            lambda: convert(Flat(network.eval(), super_features), blank_input(network.config)._asdict()),
         )
         # single precision: half of it moves similarities by more than a threshold can bear
         options: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": threads}
@@ -97,9 +82,12 @@ class OpenVinoRuntime:
         self._model = openvino.Core().compile_model(model, "CPU", options)
 
     def run(self, batch: NetworkInput) -> Outputs:
-        """Outputs by name."""
-        found = self._model([tensor.numpy() for tensor in inputs_by_name(batch).values()])
+        """As the other's."""
+        found = self._model([tensor.numpy() for tensor in batch])
         return _named([found[port][0].astype(np.float32) for port in self._model.outputs])
+
+
+Runtime = TorchRuntime | OpenVinoRuntime
 
 
 def make_runtime(runtime: str, network: UMF, weights: Path, device: str, threads: int, super_features: bool) -> Runtime:

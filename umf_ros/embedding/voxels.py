@@ -65,17 +65,14 @@ def voxelise(points: Points, intensity: Points | None, coarse_limit: int, fine_l
     means = np.stack([_mean(flat, values, occupied, weight) for values in (*cells.T, _brightness(intensity, inside))])
     grid = _fold(occupied, _features(occupied, means))
     fine = _most(occupied, count[occupied], fine_limit)
-    coarse, points_in = np.unique(_coarse(occupied), return_inverse=True)
+    coarse, points_in = np.unique(
+        np.ravel_multi_index(tuple(_corner(occupied) // 4), (CELLS // 4,) * 3), return_inverse=True
+    )
     kept = _most(coarse, np.bincount(points_in, weights=weight, minlength=len(coarse)), coarse_limit)
     centroids = np.zeros((fine_limit, 3), np.float32)
     rows = np.searchsorted(occupied, fine)
     centroids[: len(fine)] = means[:3, rows].T * VOXEL_M + ORIGIN_M
-    return VoxelScan(
-        grid,
-        *_pad(kept, coarse_limit),
-        *_pad(fine, fine_limit),
-        centroids,
-    )
+    return VoxelScan(grid, *_pad(kept, coarse_limit), *_pad(fine, fine_limit), centroids)
 
 
 def _mean(flat: NDArray[np.int64], values: Points, occupied: NDArray[np.int64], weight: Points) -> Points:
@@ -92,25 +89,26 @@ def _brightness(intensity: Points | None, inside: Any) -> Points:
 
 
 def _features(occupied: NDArray[np.int64], means: Points) -> Points:
-    corner = np.stack([occupied // CELLS**2, occupied // CELLS % CELLS, occupied % CELLS])
-    offset = means[:3] - corner - 0.5
+    offset = means[:3] - _corner(occupied) - 0.5
     height = (means[2] * VOXEL_M[2] + ORIGIN_M[2]) / -ORIGIN_M[2]
     return np.concatenate([np.ones((1, len(occupied))), offset, height[None], means[3:]]).astype(np.float32)
 
 
 def _fold(occupied: NDArray[np.int64], features: Points) -> Points:
     half = CELLS // 2
-    x, y, z = occupied // CELLS**2, occupied // CELLS % CELLS, occupied % CELLS
-    parent = (x // 2 * half + y // 2) * half + z // 2
+    corner = _corner(occupied)
+    parent, child = (
+        np.ravel_multi_index(tuple(corner // 2), (half,) * 3),
+        np.ravel_multi_index(tuple(corner % 2), (2,) * 3),
+    )
     grid = np.zeros((half**3, FEATURES, 8), np.float32)
-    grid[parent, :, x % 2 * 4 + y % 2 * 2 + z % 2] = features.T
+    grid[parent, :, child] = features.T
     return grid.reshape(half, half, half, FEATURES * 8)
 
 
-def _coarse(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
-    quarter = CELLS // 4
-    x, y, z = voxels // CELLS**2, voxels // CELLS % CELLS, voxels % CELLS
-    return (x // 4 * quarter + y // 4) * quarter + z // 4
+def _corner(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Places (3, N) of voxels along the axes."""
+    return np.stack(np.unravel_index(voxels, (CELLS,) * 3))
 
 
 def _most(cells: NDArray[np.int64], count: NDArray[Any], limit: int) -> NDArray[np.int64]:

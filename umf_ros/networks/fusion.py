@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from umf_ros.networks.attention import MASKED, Block
-from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.config import NetworkConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,14 +49,13 @@ class FusionLayer(nn.Module):
         self.image_self, self.cloud_self = Block(*sizes), Block(*sizes)
         self.image_cross, self.cloud_cross = Block(*sizes, cross=True), Block(*sizes, cross=True)
 
-    def forward(self, image: Tokens, cloud: Tokens) -> tuple[Tokens, Tokens, dict[str, Tensor]]:
-        """Both sets of tokens after the layer, and its attention maps by name."""
-        own_image, image_map = self.image_self(image.values, mask=image.mask)
-        own_cloud, cloud_map = self.cloud_self(cloud.values, mask=cloud.mask)
-        new_image, image_cross = self.image_cross(own_image, own_cloud, cloud.mask)
-        new_cloud, cloud_cross = self.cloud_cross(own_cloud, own_image, image.mask)
-        maps = {"image": image_map, "cloud": cloud_map, "image_cross": image_cross, "cloud_cross": cloud_cross}
-        return Tokens(new_image, image.mask), Tokens(new_cloud, cloud.mask), maps
+    def forward(self, image: Tokens, cloud: Tokens) -> tuple[Tokens, Tokens]:
+        """Both sets of tokens after the layer."""
+        own_image, _ = self.image_self(image.values, mask=image.mask)
+        own_cloud, _ = self.cloud_self(cloud.values, mask=cloud.mask)
+        new_image, _ = self.image_cross(own_image, own_cloud, cloud.mask)
+        new_cloud, _ = self.cloud_cross(own_cloud, own_image, image.mask)
+        return Tokens(new_image, image.mask), Tokens(new_cloud, cloud.mask)
 
 
 class GeneralisedMean(nn.Module):
@@ -80,14 +79,12 @@ class Fused(NamedTuple):
         descriptor: (B, D) float32, L2-normalised: both halves, weighted.
         image, cloud: (B, D/2) float32, L2-normalised halves; without meaning where the modality is absent.
         weights: (B, 2) share of the image and of the cloud in the descriptor, summing to one.
-        attention: maps of every layer by name.
     """
 
     descriptor: Tensor
     image: Tensor
     cloud: Tensor
     weights: Tensor
-    attention: list[dict[str, Tensor]]
 
 
 class Fusion(nn.Module):
@@ -109,10 +106,8 @@ class Fusion(nn.Module):
 
     def forward(self, image: Tokens, cloud: Tokens, image_present: Tensor, cloud_present: Tensor) -> Fused:
         """Fuse tokens of which the absent rows (present: (B,) bool) hold the learned token alone."""
-        maps = []
         for layer in self.layers:
-            image, cloud, attention = layer(image, cloud)
-            maps.append(attention)
+            image, cloud = layer(image, cloud)
         seen = self.image_pool(Tokens(self.image_norm(image.values), image.mask))
         felt = self.cloud_pool(Tokens(self.cloud_norm(cloud.values), cloud.mask))
         with torch.autocast(seen.device.type, enabled=False):
@@ -126,4 +121,4 @@ class Fusion(nn.Module):
             # not quite zero: the root's slope must stay finite
             shares = (weights + 1e-12).sqrt()
             descriptor = torch.cat([image_half * shares[:, :1], cloud_half * shares[:, 1:]], dim=-1)
-            return Fused(nn.functional.normalize(descriptor, dim=-1), image_half, cloud_half, weights, maps)
+            return Fused(nn.functional.normalize(descriptor, dim=-1), image_half, cloud_half, weights)

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.config import NetworkConfig
 
 RESNET_DEPTHS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3), "resnet50": (3, 4, 6, 3)}
 
 
-def conv_norm(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
+def conv_norm(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
     """Convolution without bias, and batch normalisation."""
-    conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False)
+    conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
     return nn.Sequential(conv, nn.BatchNorm2d(outputs))
 
 
@@ -40,27 +40,6 @@ class ResidualBlock(nn.Module):
             if number < len(self.layers) - 1:
                 y = F.relu(y)
         return F.relu(y + self.shortcut(x))
-
-
-class InvertedBlock(nn.Module):
-    """Inverted residual of the mobile networks: widen, depth-wise 3x3, narrow."""
-
-    def __init__(self, inputs: int, outputs: int, stride: int, expansion: int = 4) -> None:
-        super().__init__()
-        hidden = inputs * expansion
-        self.layers = nn.Sequential(
-            conv_norm(inputs, hidden, 1),
-            nn.Hardswish(),
-            conv_norm(hidden, hidden, 3, stride, groups=hidden),
-            nn.Hardswish(),
-            conv_norm(hidden, outputs, 1),
-        )
-        self.residual = stride == 1 and inputs == outputs
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to (B, C', H / stride, W / stride)."""
-        y = self.layers(x)
-        return x + y if self.residual else y
 
 
 class Backbone(nn.Module):
@@ -91,11 +70,6 @@ class Backbone(nn.Module):
 def _stage(name: str, inputs: int, width: int, level: int) -> tuple[nn.Sequential, int]:
     stride = 1 if level == 0 else 2
     blocks: list[nn.Module] = []
-    if name == "mobile":
-        for number in range(3):
-            blocks.append(InvertedBlock(inputs, width, stride if number == 0 else 1))
-            inputs = width
-        return nn.Sequential(*blocks), inputs
     bottleneck = name == "resnet50"
     for number in range(RESNET_DEPTHS[name][level]):
         blocks.append(ResidualBlock(inputs, width, stride if number == 0 else 1, bottleneck))
@@ -134,7 +108,3 @@ class ImageEncoder(nn.Module):
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Coarse (B, tokens, H/16, W/16) and fine (B, local, H/4, W/4) maps of an image (B, 1, H, W)."""
         return self.pyramid(self.backbone(image))
-
-    def fine_layers(self) -> list[nn.Module]:
-        """What only the fine map needs: without local features nothing teaches it."""
-        return [self.pyramid.fine, self.pyramid.laterals[0], self.pyramid.laterals[1]]

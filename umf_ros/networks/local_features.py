@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from umf_ros.networks.attention import Block, received
-from umf_ros.networks.positions import image_positions, sine_encoding
-from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.config import NetworkConfig
+from umf_ros.networks.positions import cell_positions, sine_encoding
 
 WINDOW = 8
 HEADS = 4
@@ -40,7 +40,7 @@ class ImageLocal(nn.Module):
         self.positions: Tensor
         self.rows, self.columns = config.image_size[0] // 4, config.image_size[1] // 4
         width = config.local
-        positions = sine_encoding(image_positions(self.rows, self.columns), width)
+        positions = sine_encoding(cell_positions(self.rows, self.columns), width)
         self.register_buffer("positions", positions.view(self.rows, self.columns, width), persistent=False)
         self.near, self.far = Block(width, HEADS, 2 * width), Block(width, HEADS, 2 * width)
         self.norm = nn.LayerNorm(width)

@@ -26,14 +26,7 @@ def sine_encoding(positions: Tensor, channels: int) -> Tensor:
     return torch.nn.functional.pad(code, (0, channels - code.shape[-1]))
 
 
-def image_positions(height: int, width: int) -> Tensor:
-    """(height * width, 2) centres of the cells of a map, row by row, in [0, 1]."""
-    rows = (torch.arange(height) + 0.5) / height
-    columns = (torch.arange(width) + 0.5) / width
-    return torch.stack(torch.meshgrid(rows, columns, indexing="ij"), dim=-1).reshape(-1, 2)
-
-
-def voxel_positions(shape: tuple[int, int, int]) -> Tensor:
-    """(X * Y * Z, 3) centres of the cells of a grid, z fastest, in [0, 1]."""
+def cell_positions(*shape: int) -> Tensor:
+    """(N, A) centres of the cells of a map or grid of A axes, the last of them fastest, in [0, 1]."""
     axes = [(torch.arange(size) + 0.5) / size for size in shape]
-    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, len(shape))

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Literal
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
+from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.fusion import AbsentToken, Fused, Fusion, Tokens
 from umf_ros.networks.image_encoder import ImageEncoder
 from umf_ros.networks.local_features import CloudLocal, ImageLocal, LocalMap
-from umf_ros.networks.positions import image_positions, sine_encoding, voxel_positions
-from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.positions import cell_positions, sine_encoding
 from umf_ros.networks.superfeatures import IterativeAttention, SuperMap
 from umf_ros.networks.voxel_encoder import CELLS, VoxelEncoder
 
 Branch = Literal["both", "image", "cloud"]
 
 
-@dataclass(frozen=True, slots=True)
-class NetworkInput:
-    """A batch of preprocessed frames.
+class NetworkInput(NamedTuple):
+    """A batch of preprocessed frames; the order of its tensors is that of an exported network's inputs.
 
     Attributes:
         image: (B, 1, H, W) float32, normalised.
@@ -41,10 +40,9 @@ class NetworkInput:
     fine_index: Tensor
     fine_mask: Tensor
 
-
-def to_device(batch: NetworkInput, device: torch.device) -> NetworkInput:
-    """The batch on another device."""
-    return NetworkInput(**{field.name: getattr(batch, field.name).to(device) for field in fields(batch)})
+    def to(self, device: torch.device) -> Self:
+        """The batch on another device."""
+        return type(self)(*(tensor.to(device) for tensor in self))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +69,6 @@ class NetworkOutput:
         descriptor: (B, D) float32, L2-normalised.
         image, cloud: local features.
         super_image, super_cloud: super-features, when asked for.
-        attention: maps of every fusion layer by name, when asked for.
     """
 
     descriptor: Tensor
@@ -79,7 +76,6 @@ class NetworkOutput:
     cloud: LocalMap
     super_image: SuperMap | None = None
     super_cloud: SuperMap | None = None
-    attention: list[dict[str, Tensor]] = field(default_factory=list)
 
 
 class UMF(nn.Module):
@@ -104,11 +100,11 @@ class UMF(nn.Module):
 
     def _add_positions(self, config: NetworkConfig) -> None:
         height, width = config.image_size
-        cells = image_positions(height // 16, width // 16)
+        cells = cell_positions(height // 16, width // 16)
         quarter = CELLS // 4
         self.register_buffer("cells", sine_encoding(cells, config.tokens), persistent=False)
-        coarse = sine_encoding(voxel_positions((quarter, quarter, quarter)), config.tokens)
-        fine = sine_encoding(voxel_positions((CELLS, CELLS, CELLS)), config.local)
+        coarse = sine_encoding(cell_positions(quarter, quarter, quarter), config.tokens)
+        fine = sine_encoding(cell_positions(CELLS, CELLS, CELLS), config.local)
         self.register_buffer("coarse_voxels", coarse, persistent=False)
         self.register_buffer("voxels", fine, persistent=False)
 
@@ -133,21 +129,10 @@ class UMF(nn.Module):
         return Features(Tokens(image, everywhere), Tokens(cloud, batch.coarse_mask), fine_image, fine_cloud)
 
     def fuse(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> Fused:
-        """Descriptors and attention maps, with the modalities that are present (B,) bool."""
+        """Descriptors, with the modalities that are present (B,) bool."""
         image = self.absent_image(features.image, image_present)
         cloud = self.absent_cloud(features.cloud, cloud_present)
         return self.fusion(image, cloud, image_present, cloud_present)
-
-    def branch_layers(self, branch: Literal["image", "cloud"]) -> list[nn.Module]:
-        """What belongs to one modality alone on the way to the descriptor."""
-        fusion = self.fusion
-        if branch == "image":
-            encoder: list[nn.Module] = [self.image_encoder, self.image_tokens]
-            own = [layer.get_submodule("image_self") for layer in fusion.layers]
-            return encoder + own + [fusion.image_norm, fusion.image_pool, fusion.image_head]
-        encoder = [self.voxel_encoder, self.cloud_tokens]
-        own = [layer.get_submodule("cloud_self") for layer in fusion.layers]
-        return encoder + own + [fusion.cloud_norm, fusion.cloud_pool, fusion.cloud_head]
 
     def describe_local(self, features: Features, batch: NetworkInput) -> tuple[LocalMap, LocalMap]:
         """Local features of the images and of the scans."""
@@ -155,7 +140,7 @@ class UMF(nn.Module):
         cloud = self.cloud_local(features.fine_cloud, positions, batch.fine_mask)
         return self.image_local(features.fine_image), cloud
 
-    def forward(self, batch: NetworkInput, super_features: bool = False, attention: bool = False) -> NetworkOutput:
+    def forward(self, batch: NetworkInput, super_features: bool = False) -> NetworkOutput:
         """Everything the network says of a batch."""
         features = self.encode(batch)
         fused = self.fuse(features, batch.image_present, batch.coarse_mask.any(1))
@@ -163,7 +148,7 @@ class UMF(nn.Module):
         supers: tuple[SuperMap | None, SuperMap | None] = (None, None)
         if super_features:
             supers = self.super_image(image.tokens, image.mask), self.super_cloud(cloud.tokens, cloud.mask)
-        return NetworkOutput(fused.descriptor, image, cloud, *supers, attention=fused.attention if attention else [])
+        return NetworkOutput(fused.descriptor, image, cloud, *supers)
 
 
 def count_parameters(network: nn.Module) -> int:

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.config import NetworkConfig
 
 CELLS = 40
 FEATURES = 6
@@ -84,10 +84,6 @@ class VoxelEncoder(nn.Module):
         coarse = take(self.coarse(middle), coarse_index)
         fine = fine + _double(self.up_fine(middle))
         return coarse, self._fine_features(fine, folded, fine_index)
-
-    def fine_layers(self) -> list[nn.Module]:
-        """What only the fine features need: without local features nothing teaches it."""
-        return [self.fine, self.up_fine]
 
     def _fine_features(self, cells: Tensor, folded: Tensor, index: Tensor) -> Tensor:
         parent, child = parent_and_child(index)

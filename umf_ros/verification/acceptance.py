@@ -10,15 +10,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from umf_ros.errors import ConfigError
-from umf_ros.geometry import Array
 from umf_ros.resources import find
 from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
-from umf_ros.verification.registration import CovarianceModel, covariance_of
+from umf_ros.verification.registration import CovarianceModel
 
 SHIPPED = "config/verification/calibration.json"
 KINDS = (SCAN, IMAGE)
@@ -125,10 +124,6 @@ class AcceptanceModel:
         model = self.models[measurement.kind]
         return model.contributions(scores(measurement)) | {"bias": model.bias}
 
-    def covariance(self, information: Array, kind: str) -> Array:
-        """Covariance (6, 6) of a pose with this information (6, 6), ROS order, m^2 and rad^2."""
-        return covariance_of(information, self.covariances[kind])
-
 
 def load_acceptance(path: str = "") -> AcceptanceModel:
     """The fitted decision; an empty path means the shipped one.
@@ -146,14 +141,6 @@ def load_acceptance(path: str = "") -> AcceptanceModel:
         return AcceptanceModel(models, covariances)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{file}: not an acceptance model of this version ({error!r})") from None
-
-
-def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: str, results: dict[str, float]) -> None:
-    """Write a fitted decision for `load_acceptance`, with the command that made it and what it reached."""
-    content: dict[str, Any] = {"fitted_with": fitted_with, "results": results}
-    content["models"] = {kind: asdict(model.models[kind]) for kind in KINDS}
-    content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in KINDS}
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def _logistic(model: dict[str, Any], kind: str) -> Logistic:

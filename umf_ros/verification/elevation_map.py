@@ -9,6 +9,7 @@ training and does not know about the sun.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -21,23 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.frames import Points
 from umf_ros.geometry import Array, make_pose, transform
-from umf_ros.verification.constants import (
-    BEHIND,
-    CELL_M,
-    COLUMNS,
-    HEADINGS,
-    MAX_RELIEF_M,
-    MAX_SHIFT,
-    MAX_SLOPE,
-    MIN_CELLS,
-    MIN_NEIGHBOURHOOD,
-    PLANE_RIDGE_M2,
-    PLANE_SIGMA_M,
-    RANGE_M,
-    ROWS,
-    SETTLE_M,
-    SETTLE_MEDIANS,
-)
+from umf_ros.verification import constants as const
 
 Grid = NDArray[np.float32]
 Cells = NDArray[np.intp]
@@ -69,7 +54,7 @@ class ElevationMap:
     def __init__(self, points: Points) -> None:
         """Args: points (M, 3) m, body frame; those behind the body are not used."""
         occupied, across, height = _ground(points)
-        self.height: Grid = np.full((ROWS, COLUMNS), np.nan, np.float32)
+        self.height: Grid = np.full((const.ROWS, const.COLUMNS), np.nan, np.float32)
         self.height[occupied, across] = height
         self.relief = _relief(np.nan_to_num(self.height), np.isfinite(self.height))
         known = np.isfinite(self.relief)
@@ -80,9 +65,7 @@ class ElevationMap:
     @cached_property
     def spectra(self) -> NDArray[Any]:
         """Spectra (3, ...) of relief, squared relief and mask."""
-        known = np.isfinite(self.relief)
-        relief = np.nan_to_num(self.relief)
-        return scipy.fft.rfft2(np.stack([relief, relief**2, known.astype(np.float32)]))
+        return _spectra(np.nan_to_num(self.relief), np.isfinite(self.relief))
 
 
 class TurnedMap:
@@ -90,33 +73,30 @@ class TurnedMap:
 
     def __init__(self, elevation: ElevationMap) -> None:
         x, y = elevation.cells[:, 0], elevation.cells[:, 1]
-        cos, sin = np.cos(HEADINGS)[:, None], np.sin(HEADINGS)[:, None]
-        rows, columns = _indices(cos * x - sin * y, sin * x + cos * y)
-        inside = (rows >= 0) & (rows < ROWS) & (columns >= 0) & (columns < COLUMNS)
-        heading = np.broadcast_to(np.arange(len(HEADINGS))[:, None], rows.shape)
-        keys = (heading[inside] * ROWS + rows[inside]) * COLUMNS + columns[inside]
-        size = len(HEADINGS) * ROWS * COLUMNS
-        count = np.bincount(keys, minlength=size)
-        total = np.bincount(keys, np.broadcast_to(elevation.values, rows.shape)[inside], size)
-        relief = (total / np.maximum(count, 1)).astype(np.float32)
-        stack = np.stack([relief, relief**2, (count > 0).astype(np.float32)])
+        cos, sin = np.cos(const.HEADINGS)[:, None], np.sin(const.HEADINGS)[:, None]
+        rows, columns, inside = _cells(cos * x - sin * y, sin * x + cos * y)
+        heading = np.broadcast_to(np.arange(len(const.HEADINGS))[:, None], rows.shape)
+        keys = (heading[inside] * const.ROWS + rows[inside]) * const.COLUMNS + columns[inside]
+        shape = len(const.HEADINGS), const.ROWS, const.COLUMNS
+        count = np.bincount(keys, minlength=math.prod(shape)).reshape(shape)
+        total = np.bincount(keys, np.broadcast_to(elevation.values, rows.shape)[inside], count.size).reshape(shape)
         self.elevation = elevation
-        self.spectra: NDArray[Any] = scipy.fft.rfft2(stack.reshape(3, len(HEADINGS), ROWS, COLUMNS)).conj()
+        self.spectra = _spectra((total / np.maximum(count, 1)).astype(np.float32), count > 0).conj()
 
 
 def search(match: ElevationMap, turned: TurnedMap, peaks: int = 2) -> list[MapFit]:
     """The best fits of the turned map within 6 m and 36 deg, best first, each in a basin of its own."""
-    if min(len(match.values), len(turned.elevation.values)) < MIN_CELLS:
+    if min(len(match.values), len(turned.elevation.values)) < const.MIN_CELLS:
         return []
     correlation, cells = _correlate_everywhere(match, turned)
-    score = np.where(cells >= MIN_CELLS, correlation * np.sqrt(np.maximum(cells, 0)), -np.inf)
+    score = np.where(cells >= const.MIN_CELLS, correlation * np.sqrt(np.maximum(cells, 0)), -np.inf)
     fits = []
     for _ in range(peaks):
         heading, row, column = np.unravel_index(int(score.argmax()), score.shape)
         if not score[heading, row, column] > 0:
             break
-        shift = (np.array([row, column]) - MAX_SHIFT) * CELL_M
-        pose = _settle(match, turned.elevation, float(HEADINGS[heading]), shift)
+        shift = (np.array([row, column]) - const.MAX_SHIFT) * const.CELL_M
+        pose = _settle(match, turned.elevation, float(const.HEADINGS[heading]), shift)
         fits.append(MapFit(pose, float(correlation[heading, row, column]), float(cells[heading, row, column])))
         score[max(heading - 1, 0) : heading + 2, max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4] = -np.inf
     return fits
@@ -125,7 +105,7 @@ def search(match: ElevationMap, turned: TurnedMap, peaks: int = 2) -> list[MapFi
 def evaluate(match: ElevationMap, query: ElevationMap, pose: Array) -> MapFit:
     """How well the maps fit at one pose; a correlation of 0 where too few cells are shared."""
     ours, theirs = _shared(match.relief, query, pose)
-    if len(ours) < MIN_CELLS / 2:
+    if len(ours) < const.MIN_CELLS / 2:
         return MapFit(pose, 0.0, float(len(ours)))
     norm = float(np.sqrt((ours**2).sum() * (theirs**2).sum()))
     return MapFit(pose, float((ours * theirs).sum()) / max(norm, 1e-9), float(len(ours)))
@@ -139,55 +119,59 @@ def shared_relief(match: ElevationMap, query: ElevationMap, pose: Array) -> floa
 
 def _ground(points: Points) -> tuple[Cells, Cells, Array]:
     """Rows, columns and mean heights of the occupied cells within range."""
-    near = points[(points[:, 0] > 0) & (np.hypot(points[:, 0], points[:, 1]) < RANGE_M)]
-    rows, columns = _indices(near[:, 0], near[:, 1])
-    inside = (rows < ROWS) & (columns >= 0) & (columns < COLUMNS)
-    keys, owner, count = np.unique(rows[inside] * COLUMNS + columns[inside], return_inverse=True, return_counts=True)
-    return keys // COLUMNS, keys % COLUMNS, np.bincount(owner, near[inside, 2]) / count
+    near = points[(points[:, 0] > 0) & (np.hypot(points[:, 0], points[:, 1]) < const.RANGE_M)]
+    rows, columns, inside = _cells(near[:, 0], near[:, 1])
+    keys = rows[inside] * const.COLUMNS + columns[inside]
+    keys, owner, count = np.unique(keys, return_inverse=True, return_counts=True)
+    return keys // const.COLUMNS, keys % const.COLUMNS, np.bincount(owner, near[inside, 2]) / count
 
 
-def _indices(x: Array, y: Array) -> tuple[Cells, Cells]:
-    return np.floor(x / CELL_M).astype(int) + BEHIND, np.floor(y / CELL_M).astype(int) + COLUMNS // 2
+def _cells(x: Array, y: Array) -> tuple[Cells, Cells, NDArray[np.bool_]]:
+    """Rows and columns of the cells under some places, and which of them lie on the map."""
+    rows = np.floor(x / const.CELL_M).astype(int) + const.BEHIND
+    columns = np.floor(y / const.CELL_M).astype(int) + const.COLUMNS // 2
+    return rows, columns, (rows >= 0) & (rows < const.ROWS) & (columns >= 0) & (columns < const.COLUMNS)
+
+
+def _spectra(relief: Grid, known: NDArray[np.bool_]) -> NDArray[Any]:
+    return scipy.fft.rfft2(np.stack([relief, relief**2, known.astype(np.float32)]))
 
 
 def _metres(rows: Cells, columns: Cells) -> Array:
     """Centres (N, 2) of cells in the body frame."""
-    return (np.column_stack([rows - BEHIND, columns - COLUMNS // 2]) + 0.5) * CELL_M
+    return (np.column_stack([rows - const.BEHIND, columns - const.COLUMNS // 2]) + 0.5) * const.CELL_M
 
 
 def _relief(height: Grid, known: NDArray[np.bool_]) -> Grid:
     """Height above a Gaussian-weighted local plane, clipped; NaN where a cell has no neighbourhood."""
     mask = known.astype(np.float32)
-    x, y = np.meshgrid(np.arange(ROWS) * CELL_M, np.arange(COLUMNS) * CELL_M, indexing="ij")
+    x, y = np.meshgrid(np.arange(const.ROWS) * const.CELL_M, np.arange(const.COLUMNS) * const.CELL_M, indexing="ij")
     weight = _blur(mask) + 1e-6
 
     def mean(values: Array) -> Grid:
         return _blur(mask * values.astype(np.float32)) / weight
 
     mean_x, mean_y, mean_z = mean(x), mean(y), mean(height)
-    xx, yy = mean(x * x) - mean_x**2 + PLANE_RIDGE_M2, mean(y * y) - mean_y**2 + PLANE_RIDGE_M2
+    xx, yy = mean(x * x) - mean_x**2 + const.PLANE_RIDGE_M2, mean(y * y) - mean_y**2 + const.PLANE_RIDGE_M2
     xy = mean(x * y) - mean_x * mean_y
     xz, yz = mean(x * height) - mean_x * mean_z, mean(y * height) - mean_y * mean_z
     determinant = xx * yy - xy**2
     plane = mean_z + (xz * yy - yz * xy) / determinant * (x - mean_x) + (yz * xx - xz * xy) / determinant * (y - mean_y)
-    relief = np.clip(height - plane, -MAX_RELIEF_M, MAX_RELIEF_M).astype(np.float32)
-    return np.where(known & (weight > MIN_NEIGHBOURHOOD), relief, np.nan).astype(np.float32)
+    relief = np.clip(height - plane, -const.MAX_RELIEF_M, const.MAX_RELIEF_M).astype(np.float32)
+    return np.where(known & (weight > const.MIN_NEIGHBOURHOOD), relief, np.nan).astype(np.float32)
 
 
 def _blur(values: Grid) -> Grid:
-    sigma = PLANE_SIGMA_M / CELL_M
-    blurred: Grid = cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT).astype(
-        np.float32, copy=False
-    )
-    return blurred
+    sigma = const.PLANE_SIGMA_M / const.CELL_M
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT), np.float32)
 
 
 def _correlate_everywhere(match: ElevationMap, turned: TurnedMap) -> tuple[Grid, Grid]:
     """Correlation and shared cells (headings, shifts, shifts)."""
     theirs, ours = match.spectra, turned.spectra
     products = np.stack([theirs[0] * ours[0], theirs[1] * ours[2], theirs[2] * ours[1], theirs[2] * ours[2]])
-    window = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
-    sums = scipy.fft.irfft2(products, s=(ROWS, COLUMNS))[:, :, window][..., window]
+    window = np.arange(-const.MAX_SHIFT, const.MAX_SHIFT + 1)
+    sums = scipy.fft.irfft2(products, s=(const.ROWS, const.COLUMNS))[:, :, window][..., window]
     energy = np.sqrt(np.maximum(sums[1], 1e-4) * np.maximum(sums[2], 1e-4))
     return sums[0] / energy, sums[3]
 
@@ -207,16 +191,15 @@ def _settle(match: ElevationMap, query: ElevationMap, heading: float, shift: Arr
         kept = design[keep]
         plane = np.linalg.solve(kept.T @ kept + 1e-3 * np.eye(3), kept.T @ offset[keep])
         residual = np.abs(offset - design @ plane)
-        keep = residual <= max(SETTLE_MEDIANS * float(np.median(residual)), SETTLE_M)
+        keep = residual <= max(const.SETTLE_MEDIANS * float(np.median(residual)), const.SETTLE_M)
     lift, slope_x, slope_y = plane
-    tilt = Rotation.from_rotvec(np.clip([slope_y, -slope_x, 0.0], -MAX_SLOPE, MAX_SLOPE)).as_matrix()
+    tilt = Rotation.from_rotvec(np.clip([slope_y, -slope_x, 0.0], -const.MAX_SLOPE, const.MAX_SLOPE)).as_matrix()
     return make_pose(np.eye(3), [0, 0, lift]) @ make_pose(tilt, [0, 0, 0]) @ planar
 
 
 def _look_up(grid: Grid, places: Array) -> Array:
     """Values of a map under places (N, >= 2), NaN outside it."""
-    rows, columns = _indices(places[:, 0], places[:, 1])
-    inside = (rows >= 0) & (rows < ROWS) & (columns >= 0) & (columns < COLUMNS)
+    rows, columns, inside = _cells(places[:, 0], places[:, 1])
     values = np.full(len(places), np.nan)
     values[inside] = grid[rows[inside], columns[inside]]
     return values

@@ -14,21 +14,7 @@ import numpy as np
 from umf_ros.config import Verification
 from umf_ros.frames import Keyframe, Points
 from umf_ros.geometry import Array, make_pose, relative, rotation_angle, transform
-from umf_ros.verification.constants import (
-    AGREE_M,
-    AGREE_RAD,
-    DISTINCT_M,
-    DISTINCT_RAD,
-    EXPECTED_M,
-    MEMORY_KEYFRAMES,
-    MIN_MAP_SCORE,
-    MIN_PIXELS,
-    MIN_POINTS,
-    ODOMETRY_REACH_M,
-    PIXEL_THRESHOLD,
-    POINT_THRESHOLD_M,
-    PRIOR_M,
-)
+from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import MapFit, TurnedMap, evaluate, search
 from umf_ros.verification.ransac import fit_rigid
 from umf_ros.verification.registration import PreparedScan
@@ -77,14 +63,14 @@ def find_hypotheses(
     fits = [evaluate(match.elevation, turned.elevation, pose) for pose in found]
     fits += search(match.elevation, turned)
     fits.sort(key=lambda fit: -fit.score)
-    return [Hypothesis(ranked, fit.pose, fit.score) for fit in _distinct(fits) if fit.score >= MIN_MAP_SCORE]
+    return [Hypothesis(ranked, fit.pose, fit.score) for fit in _distinct(fits) if fit.score >= const.MIN_MAP_SCORE]
 
 
 def pose_from_points(query: Keyframe, ranked: RankedCandidate, iterations: int, seed: int) -> Array | None:
     """`match_T_query` from 3-D/3-D pairs of both modalities at once, or None."""
     ours, theirs = paired_points(query, ranked)
-    consensus = fit_rigid(ours, theirs, POINT_THRESHOLD_M, iterations, seed)
-    return consensus.model if consensus is not None and consensus.count >= MIN_POINTS else None
+    consensus = fit_rigid(ours, theirs, const.POINT_THRESHOLD_M, iterations, seed)
+    return consensus.model if consensus is not None and consensus.count >= const.MIN_POINTS else None
 
 
 def pose_from_pixels(query: Keyframe, ranked: RankedCandidate, iterations: int) -> Array | None:
@@ -95,7 +81,7 @@ def pose_from_pixels(query: Keyframe, ranked: RankedCandidate, iterations: int) 
     points = ours.points[ranked.image_pairs[:, 0]].astype(float)
     pixels = theirs.positions[ranked.image_pairs[:, 1]].astype(float)
     known = np.isfinite(points).all(axis=1)
-    if known.sum() < MIN_PIXELS:
+    if known.sum() < const.MIN_PIXELS:
         return None
     camera = ranked.keyframe.camera
     found, rotation, translation, inliers = cv2.solvePnPRansac(
@@ -104,10 +90,10 @@ def pose_from_pixels(query: Keyframe, ranked: RankedCandidate, iterations: int) 
         np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]]),
         None,
         iterationsCount=iterations,
-        reprojectionError=PIXEL_THRESHOLD * camera.width,
+        reprojectionError=const.PIXEL_THRESHOLD * camera.width,
         flags=cv2.SOLVEPNP_P3P,
     )
-    if not found or inliers is None or len(inliers) < MIN_PIXELS:
+    if not found or inliers is None or len(inliers) < const.MIN_PIXELS:
         return None
     return ranked.keyframe.body_T_camera @ make_pose(cv2.Rodrigues(rotation)[0], translation.ravel())
 
@@ -136,7 +122,7 @@ def consistent_pixels(query: Keyframe, ranked: RankedCandidate, pose: Array) -> 
     camera = ranked.keyframe.camera
     pixels, depth = camera.project(transform(pose, ours.points[here].astype(float)), ranked.keyframe.body_T_camera)
     error = np.hypot(*(pixels - theirs.positions[there]).T)
-    obeys = (depth > 0) & (error < 2 * PIXEL_THRESHOLD * camera.width)
+    obeys = (depth > 0) & (error < 2 * const.PIXEL_THRESHOLD * camera.width)
     return np.hstack([ours.positions[here[obeys]], theirs.positions[there[obeys]]]).astype(np.float32)
 
 
@@ -152,7 +138,7 @@ class TemporalMemory:
     """Poses found for the last few keyframes, accepted or not; the same live and offline."""
 
     def __init__(self) -> None:
-        self._findings: deque[list[_Finding]] = deque(maxlen=MEMORY_KEYFRAMES)
+        self._findings: deque[list[_Finding]] = deque(maxlen=const.MEMORY_KEYFRAMES)
 
     def reset(self) -> None:
         """Forget everything."""
@@ -174,7 +160,7 @@ class TemporalMemory:
         """The candidate nearest to where earlier closures and odometry put the rover, if there is one within 4 m."""
         distances = [self.expected_distance(query, item.keyframe) for item in ranked]
         nearest = int(np.argmin(distances)) if distances else 0
-        return [ranked[nearest]] if distances and distances[nearest] < EXPECTED_M else []
+        return [ranked[nearest]] if distances and distances[nearest] < const.EXPECTED_M else []
 
     def support(self, query: Keyframe, match: Keyframe, match_T_query: Array) -> float:
         """How many of the remembered keyframes found a pose that odometry carries over to this one."""
@@ -190,28 +176,25 @@ def prior_sigmas(query: Keyframe, match: Keyframe, match_T_query: Array, drift: 
         return float("nan")
     predicted = relative(match.odom_T_body, query.odom_T_body)
     driven = abs(query.travelled_m - match.travelled_m)
-    return float(np.linalg.norm(predicted[:3, 3] - match_T_query[:3, 3]) / (PRIOR_M + drift * driven))
+    return float(np.linalg.norm(predicted[:3, 3] - match_T_query[:3, 3]) / (const.PRIOR_M + drift * driven))
 
 
 def _distinct(fits: list[MapFit]) -> list[MapFit]:
     kept: list[MapFit] = []
     for fit in fits:
-        if not any(_same(fit.pose, other.pose) for other in kept):
+        if not any(_near(fit.pose, other.pose, const.DISTINCT_M, const.DISTINCT_RAD) for other in kept):
             kept.append(fit)
     return kept
 
 
-def _same(a: Array, b: Array) -> bool:
+def _near(a: Array, b: Array, metres: float, radians: float) -> bool:
     gap = relative(a, b)
-    return bool((gap[:3, 3] ** 2).sum() < DISTINCT_M**2 and rotation_angle(gap) < DISTINCT_RAD)
+    return bool(np.linalg.norm(gap[:3, 3]) < metres and rotation_angle(gap) < radians)
 
 
 def _agrees(found: _Finding, query: Keyframe, match: Keyframe, match_T_query: Array) -> bool:
     carried = _carried(found, query, match)
-    if carried is None:
-        return False
-    gap = relative(carried, match_T_query)
-    return bool(np.linalg.norm(gap[:3, 3]) < AGREE_M and rotation_angle(gap) < AGREE_RAD)
+    return carried is not None and _near(carried, match_T_query, const.AGREE_M, const.AGREE_RAD)
 
 
 def _carried(found: _Finding, query: Keyframe, match: Keyframe) -> Array | None:
@@ -223,7 +206,7 @@ def _carried(found: _Finding, query: Keyframe, match: Keyframe) -> Array | None:
     if found.query.session != query.session or found.match.session != match.session:
         return None
     moved, shifted = relative(query_before, query_now), relative(match_before, match_now)
-    if float(np.linalg.norm(moved[:3, 3]) + np.linalg.norm(shifted[:3, 3])) > ODOMETRY_REACH_M:
+    if float(np.linalg.norm(moved[:3, 3]) + np.linalg.norm(shifted[:3, 3])) > const.ODOMETRY_REACH_M:
         return None
     carried: Array = relative(shifted, found.match_T_query @ moved)
     return carried

@@ -15,18 +15,7 @@ import numpy as np
 
 from umf_ros.frames import Keyframe, LocalFeatures
 from umf_ros.geometry import Array, transform
-from umf_ros.verification.constants import (
-    AGREEMENT_COMPARED,
-    AGREEMENT_M,
-    AGREEMENT_PEERS,
-    AGREEMENT_PIXELS,
-    AGREEMENT_RANGE,
-    AGREEMENT_RANGE_M,
-    AGREEMENT_ROWS,
-    INLIER_M,
-    MIN_SURFACE_NOISE_M,
-    NO_FIT_M,
-)
+from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, prior_sigmas
 from umf_ros.verification.registration import NOMINAL, Alignment, PreparedScan, covariance_of
@@ -171,12 +160,13 @@ def image_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
     ours, theirs = query.embedding.image, match.embedding.image
     if ours is None or theirs is None:
         return float("nan")
-    ours, theirs, camera = strongest(ours, AGREEMENT_COMPARED), strongest(theirs, AGREEMENT_COMPARED), match.camera
+    ours, theirs = strongest(ours, const.AGREEMENT_COMPARED), strongest(theirs, const.AGREEMENT_COMPARED)
+    camera = match.camera
     pixels, depth = camera.project(transform(pose, ours.points.astype(float)), match.body_T_camera)
     offset = pixels[:, None] - theirs.positions[None].astype(float)
     distance = np.hypot(offset[..., 0], offset[..., 1])
-    peers = (np.abs(offset[..., 1]) < AGREEMENT_ROWS * camera.height) & (depth > 0)[:, None]
-    return _rank_agreement(ours, theirs, distance, AGREEMENT_PIXELS * camera.width, peers)
+    peers = (np.abs(offset[..., 1]) < const.AGREEMENT_ROWS * camera.height) & (depth > 0)[:, None]
+    return _rank_agreement(ours, theirs, distance, const.AGREEMENT_PIXELS * camera.width, peers)
 
 
 def cloud_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
@@ -184,25 +174,25 @@ def cloud_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
     ours, theirs = query.embedding.cloud, match.embedding.cloud
     if ours is None or theirs is None:
         return float("nan")
-    ours, theirs = strongest(ours, AGREEMENT_COMPARED), strongest(theirs, AGREEMENT_COMPARED)
+    ours, theirs = strongest(ours, const.AGREEMENT_COMPARED), strongest(theirs, const.AGREEMENT_COMPARED)
     moved = transform(pose, ours.positions.astype(float))
     distance = np.linalg.norm(moved[:, None] - theirs.positions[None], axis=2)
     range_ours = np.linalg.norm(moved, axis=1)[:, None]
     range_theirs = np.linalg.norm(theirs.positions, axis=1)[None]
-    peers = np.abs(range_ours - range_theirs) < AGREEMENT_RANGE * range_theirs + AGREEMENT_RANGE_M
-    return _rank_agreement(ours, theirs, distance, AGREEMENT_M, peers)
+    peers = np.abs(range_ours - range_theirs) < const.AGREEMENT_RANGE * range_theirs + const.AGREEMENT_RANGE_M
+    return _rank_agreement(ours, theirs, distance, const.AGREEMENT_M, peers)
 
 
 def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan, query: PreparedScan) -> Measurement:
     """Tests of how two scans fit."""
     fit = evaluate(match.elevation, query.elevation, alignment.pose)
-    size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, NO_FIT_M)
+    size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     return replace(
         known,
         kind=SCAN,
         residual_m=float(np.median(size)),
         residual_p90_m=float(np.percentile(size, 90)),
-        noise_m=max(match.noise_m, MIN_SURFACE_NOISE_M),
+        noise_m=max(match.noise_m, const.MIN_SURFACE_NOISE_M),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),
         relief_m=shared_relief(match.elevation, query.elevation, alignment.pose),
@@ -217,7 +207,7 @@ def _measure_pairs(known: Measurement, alignment: Alignment) -> Measurement:
     return replace(
         known,
         kind=IMAGE,
-        residual_m=float(np.sqrt(np.mean(residuals**2))) if len(residuals) else INLIER_M,
+        residual_m=float(np.sqrt(np.mean(residuals**2))) if len(residuals) else const.INLIER_M,
         overlap=alignment.overlap,
         pose_inliers=float(len(alignment.points)),
         spread=_spread(alignment.points),
@@ -240,7 +230,7 @@ def _rank_agreement(ours: LocalFeatures, theirs: LocalFeatures, distance: Array,
     distance = np.where(np.isfinite(distance), distance, np.inf)
     nearest = distance.argmin(axis=1)
     rows = np.arange(len(distance))
-    usable = (distance[rows, nearest] < reach) & (peers.sum(axis=1) >= AGREEMENT_PEERS)
+    usable = (distance[rows, nearest] < reach) & (peers.sum(axis=1) >= const.AGREEMENT_PEERS)
     if not usable.any():
         return float("nan")
     similarity = similarities(ours.descriptors[rows[usable]], theirs.descriptors)

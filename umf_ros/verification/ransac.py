@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.geometry import Array, align
-from umf_ros.verification.constants import MAX_TILT_RAD, MIN_TRIANGLE
+from umf_ros.verification import constants as const
 
 Mask = NDArray[np.bool_]
 
@@ -69,7 +69,7 @@ def fit_rigid(a: Array, b: Array, threshold: float, iterations: int, seed: int) 
     """
     samples = _samples(len(a), 3, iterations, seed)
     rotations, translations = _triads(a[samples], b[samples], threshold)
-    upright = rotations[:, 2, 2] > np.cos(MAX_TILT_RAD)
+    upright = rotations[:, 2, 2] > np.cos(const.MAX_TILT_RAD)
     if not upright.any():
         return None
     rotations, translations = rotations[upright], translations[upright]
@@ -79,7 +79,7 @@ def fit_rigid(a: Array, b: Array, threshold: float, iterations: int, seed: int) 
     if best.sum() < 3:
         return None
     pose = kabsch(a[best], b[best])
-    if pose is None or pose[2, 2] < np.cos(MAX_TILT_RAD):
+    if pose is None or pose[2, 2] < np.cos(const.MAX_TILT_RAD):
         return None
     agrees = np.linalg.norm(a @ pose[:3, :3].T + pose[:3, 3] - b, axis=1) < threshold
     return Consensus(pose, agrees) if agrees.sum() >= 3 else None
@@ -123,7 +123,7 @@ def _homographies(a: Array, b: Array) -> Array:
     """
     quads = np.stack([a, b])
     turns = _turns(quads)
-    plausible = (turns[0] * turns[1] > 0).all(axis=1) & (np.abs(turns[0]).min(axis=1) > MIN_TRIANGLE)
+    plausible = (turns[0] * turns[1] > 0).all(axis=1) & (np.abs(turns[0]).min(axis=1) > const.MIN_TRIANGLE)
     (turns_a, turns_b), corners = turns[:, plausible], _homogeneous(quads[:, plausible, :3])
     # both quadrilaterals as images of the canonical one; the scale of a column follows from the fourth point
     to_b = corners[1].transpose(0, 2, 1) * (turns_b[:, :3] / turns_a[:, :3] / turns_a[:, 3:])[:, None]

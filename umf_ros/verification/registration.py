@@ -11,27 +11,8 @@ import small_gicp
 from numpy.typing import NDArray
 
 from umf_ros.frames import Keyframe, Points
-from umf_ros.geometry import Array, transform
-from umf_ros.verification.constants import (
-    COARSE_REACH_M,
-    COARSE_STEPS,
-    FINE_REACH_M,
-    FINE_STEPS,
-    INLIER_M,
-    MAX_RANGE_M,
-    MIN_RESIDUAL_NOISE_M,
-    MIN_SCAN_POINTS,
-    NOISE_NEIGHBOURS,
-    NOMINAL_FLOOR_DEG,
-    NOMINAL_FLOOR_M,
-    NOMINAL_INFLATION,
-    NORMAL_NEIGHBOURS,
-    SAMPLE,
-    SCANS_KEPT,
-    SEARCH_M,
-    SEARCH_RAD,
-    THIN_CELL_M,
-)
+from umf_ros.geometry import Array, skew, transform
+from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import ElevationMap
 from umf_ros.verification.ransac import kabsch
 
@@ -47,7 +28,7 @@ class PreparedScan:
     @property
     def usable(self) -> bool:
         """Whether there is anything to align."""
-        return len(self.points) >= MIN_SCAN_POINTS
+        return len(self.points) >= const.MIN_SCAN_POINTS
 
     @cached_property
     def elevation(self) -> ElevationMap:
@@ -58,20 +39,20 @@ class PreparedScan:
     def cloud(self) -> small_gicp.PointCloud:
         """Points, normals and covariances."""
         cloud = small_gicp.PointCloud(self.points)
-        small_gicp.estimate_normals_covariances(cloud, self.tree, NORMAL_NEIGHBOURS, 1)
+        small_gicp.estimate_normals_covariances(cloud, self.tree, const.NORMAL_NEIGHBOURS, 1)
         return cloud
 
     @cached_property
     def sample(self) -> Array:
         """(S, 3) at most 1500 points, evenly taken."""
-        picks = np.linspace(0, len(self.points) - 1, min(SAMPLE, len(self.points))).astype(int)
+        picks = np.linspace(0, len(self.points) - 1, min(const.SAMPLE, len(self.points))).astype(int)
         return self.points[picks]
 
     @cached_property
     def sample_cloud(self) -> small_gicp.PointCloud:
         """The sample with covariances of its own."""
         cloud = small_gicp.PointCloud(self.sample)
-        small_gicp.estimate_normals_covariances(cloud, None, NORMAL_NEIGHBOURS, 1)
+        small_gicp.estimate_normals_covariances(cloud, None, const.NORMAL_NEIGHBOURS, 1)
         return cloud
 
     @cached_property
@@ -87,7 +68,7 @@ class PreparedScan:
     @cached_property
     def noise_m(self) -> float:
         """How far the points scatter about their neighbours' planes, m: sensor noise and roughness together."""
-        index, _ = self.tree.batch_knn_search(self.sample, NOISE_NEIGHBOURS, 1)
+        index, _ = self.tree.batch_knn_search(self.sample, const.NOISE_NEIGHBOURS, 1)
         neighbours = np.asarray(index, np.intp)
         offsets = self.points[neighbours[:, 1:]] - self.sample[:, None]
         away = np.abs(np.einsum("nki,ni->nk", offsets, self.normals[neighbours[:, 0]]))
@@ -109,7 +90,7 @@ class ScanCache:
         key = (keyframe.session, keyframe.stamp_ns)
         scan = self._scans.pop(key, None) or PreparedScan(keyframe.points)
         self._scans[key] = scan
-        if len(self._scans) > SCANS_KEPT:
+        if len(self._scans) > const.SCANS_KEPT:
             self._scans.popitem(last=False)
         return scan
 
@@ -139,7 +120,7 @@ class CovarianceModel:
 
 
 # a fixed yardstick of what a pose is known to: refitting the covariance must not move the decision
-NOMINAL = CovarianceModel(NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG)
+NOMINAL = CovarianceModel(const.NOMINAL_INFLATION, const.NOMINAL_FLOOR_M, const.NOMINAL_FLOOR_DEG)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +147,7 @@ class Alignment:
         """Information (6, 6) of the residuals as if they were independent, with outliers weighed down."""
         if not len(self.residuals):
             return np.zeros((6, 6))
-        noise = max(1.4826 * float(np.median(np.abs(self.residuals))), MIN_RESIDUAL_NOISE_M)
+        noise = max(1.4826 * float(np.median(np.abs(self.residuals))), const.MIN_RESIDUAL_NOISE_M)
         weight = 1.0 / (1.0 + (self.residuals / (2 * noise)) ** 2)
         found: Array = (self.jacobian * weight[:, None]).T @ self.jacobian / noise**2
         return found
@@ -175,7 +156,7 @@ class Alignment:
 def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Alignment:
     """Generalised ICP (Segal, RSS 2009) from the pose `guess`, first far-sighted, then near-sighted."""
     pose = guess
-    for reach, steps in ((COARSE_REACH_M, COARSE_STEPS), (FINE_REACH_M, FINE_STEPS)):
+    for reach, steps in ((const.COARSE_REACH_M, const.COARSE_STEPS), (const.FINE_REACH_M, const.FINE_STEPS)):
         result = small_gicp.align(
             match.cloud,
             query.sample_cloud,
@@ -198,8 +179,8 @@ def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
     offset = moved - match.points[index]
     residual = np.einsum("ij,ij->i", offset, normals)
     solid = np.einsum("ij,ij->i", normals, normals) > 0.5
-    close = solid & (squared < FINE_REACH_M**2)
-    seen = solid & (squared < COARSE_REACH_M**2)
+    close = solid & (squared < const.FINE_REACH_M**2)
+    seen = solid & (squared < const.COARSE_REACH_M**2)
     arm = np.cross(moved[close] - pose[:3, 3], normals[close])
     overlap = float(close.sum()) / max(int(seen.sum()), 1)
     return Alignment(pose, residual[close], np.hstack([normals[close], arm]), overlap, moved[close])
@@ -207,12 +188,12 @@ def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
 
 def align_features(match_points: Array, query_points: Array, guess: Array) -> Alignment:
     """Refine the pose `guess` on the pairs (N, 3) of lifted features that agree with it, each in its body frame, m."""
-    near = np.linalg.norm(transform(guess, query_points) - match_points, axis=1) < INLIER_M
+    near = np.linalg.norm(transform(guess, query_points) - match_points, axis=1) < const.INLIER_M
     pose = kabsch(query_points[near], match_points[near])
     if pose is None:
         pose = guess
     moved = transform(pose, query_points[near])
-    arms = -_cross_matrices(moved - pose[:3, 3])
+    arms = -skew(moved - pose[:3, 3])
     jacobian = np.concatenate([np.broadcast_to(np.eye(3), arms.shape), arms], axis=2).reshape(-1, 6)
     residuals = (moved - match_points[near]).ravel()
     return Alignment(pose, residuals, jacobian, float(near.mean()) if len(near) else 0.0, moved)
@@ -223,28 +204,18 @@ def covariance_of(found: Array, model: CovarianceModel) -> Array:
 
     The information gives the shape: a plane leaves two shifts and a turn as wide as the search.
     """
-    known = np.diag([SEARCH_M**-2] * 3 + [SEARCH_RAD**-2] * 3)
+    known = np.diag([const.SEARCH_M**-2] * 3 + [const.SEARCH_RAD**-2] * 3)
     covariance = np.linalg.inv(known + found / model.inflation) + model.floor
     return (covariance + covariance.swapaxes(-1, -2)) / 2
 
 
-def thin_scan(points: Points | None, cell_m: float = THIN_CELL_M) -> Points:
+def thin_scan(points: Points | None, cell_m: float = const.THIN_CELL_M) -> Points:
     """One mean point per occupied cube of `cell_m`, nearer than 40 m: (M, 3) float32, body frame."""
-    if points is None or not len(points):
-        return np.empty((0, 3), np.float32)
-    near = points[np.einsum("ij,ij->i", points, points) < MAX_RANGE_M**2].astype(float)
-    if not len(near):
-        return np.empty((0, 3), np.float32)
-    cells = np.floor((near + MAX_RANGE_M) / cell_m).astype(np.int64)
-    side = int(2 * MAX_RANGE_M / cell_m) + 2
+    points = np.empty((0, 3), np.float32) if points is None else points
+    near = points[np.einsum("ij,ij->i", points, points) < const.MAX_RANGE_M**2].astype(float)
+    cells = np.floor((near + const.MAX_RANGE_M) / cell_m).astype(np.int64)
+    side = int(2 * const.MAX_RANGE_M / cell_m) + 2
     keys = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
     _, owner, count = np.unique(keys, return_inverse=True, return_counts=True)
     means = [np.bincount(owner, near[:, axis]) / count for axis in range(3)]
     return np.column_stack(means).astype(np.float32)
-
-
-def _cross_matrices(vectors: Array) -> Array:
-    """Matrices (N, 3, 3) with `m @ x == cross(v, x)`."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

@@ -7,8 +7,8 @@ they count beside the similarity, each modality's by its logarithm.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,17 +16,19 @@ from numpy.typing import NDArray
 
 from umf_ros.config import Verification
 from umf_ros.frames import Candidate, Keyframe, LocalFeatures, SuperFeatures
-from umf_ros.geometry import relative
-from umf_ros.verification.constants import (
-    CLOUD_THRESHOLD_M,
-    IMAGE_THRESHOLD,
-    SAME_PLACE_M,
-    SERIAL_PRODUCTS,
-    SUPERFEATURE_RATIO,
-)
+from umf_ros.geometry import Array, relative
+from umf_ros.verification import constants as const
 from umf_ros.verification.ransac import Consensus, fit_homography, fit_rigid
 
 Indices = NDArray[np.intp]
+Fit = Callable[[Array, Array, float, int, int], Consensus | None]
+NO_PAIRS: Indices = np.empty((0, 2), np.intp)
+WITHOUT: dict[str, Any] = {
+    "both": {},
+    "image": {"cloud": None, "super_cloud": None},
+    "cloud": {"image": None, "super_image": None},
+}
+"""What the choice of modalities takes out of an embedding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +49,8 @@ class RankedCandidate:
 
     candidate: Candidate
     keyframe: Keyframe
-    image_pairs: Indices = field(default_factory=lambda: np.empty((0, 2), np.intp))
-    cloud_pairs: Indices = field(default_factory=lambda: np.empty((0, 2), np.intp))
+    image_pairs: Indices = field(default_factory=lambda: NO_PAIRS)
+    cloud_pairs: Indices = field(default_factory=lambda: NO_PAIRS)
     image: Consensus | None = None
     cloud: Consensus | None = None
     superfeatures: int = 0
@@ -71,6 +73,7 @@ def rerank(
 ) -> list[RankedCandidate]:
     """The candidates, best first; equals are ordered by similarity, then by age."""
     count = _by_superfeatures if settings.rerank == "superfeatures" else _by_ransac
+    query = replace(query, embedding=replace(query.embedding, **WITHOUT[settings.modalities]))
     ranked = [count(query, candidate, keyframe, settings) for candidate, keyframe in candidates]
     return sorted(ranked, key=lambda item: (-item.order, -item.candidate.similarity, item.candidate.stamp_ns))
 
@@ -98,16 +101,13 @@ def strongest(features: LocalFeatures, count: int) -> LocalFeatures:
     """The first `count` features: a bound on what their comparison costs."""
     if len(features.positions) <= count:
         return features
-    first = slice(count)
-    return LocalFeatures(
-        features.positions[first], features.descriptors[first], features.saliency[first], features.points[first]
-    )
+    return LocalFeatures(*(getattr(features, one.name)[:count] for one in fields(features)))
 
 
 def similarities(query: NDArray[Any], match: NDArray[Any]) -> NDArray[np.float32]:
     """Cosine similarities (Q, M), float32, of unit descriptors (Q, D) and (M, D)."""
     ours, theirs = query.astype(np.float32), match.astype(np.float32).T
-    rows = max(SERIAL_PRODUCTS // max(theirs.size, 1), 1)
+    rows = max(const.SERIAL_PRODUCTS // max(theirs.size, 1), 1)
     found = np.empty((len(ours), theirs.shape[1]), np.float32)
     for start in range(0, len(ours), rows):
         np.matmul(ours[start : start + rows], theirs, out=found[start : start + rows])
@@ -121,14 +121,16 @@ def mutual_neighbours(similarity: NDArray[Any]) -> Indices:
         similarity: (Q, M); may be empty.
     """
     if 0 in similarity.shape:
-        return np.empty((0, 2), np.intp)
+        return NO_PAIRS
     best_column = similarity.argmax(axis=1)
     best_row = similarity.argmax(axis=0)
     rows = np.flatnonzero(best_row[best_column] == np.arange(len(similarity)))
     return np.column_stack([rows, best_column[rows]])
 
 
-def eligible_superfeatures(query: SuperFeatures, match: SuperFeatures, ratio: float = SUPERFEATURE_RATIO) -> Indices:
+def eligible_superfeatures(
+    query: SuperFeatures, match: SuperFeatures, ratio: float = const.SUPERFEATURE_RATIO
+) -> Indices:
     """IDs of the super-features that match (thesis 4.3, equation 4.1).
 
     A pair is eligible when both are each other's nearest neighbour, carry the same ID, and the
@@ -146,53 +148,37 @@ def eligible_superfeatures(query: SuperFeatures, match: SuperFeatures, ratio: fl
 
 
 def _by_superfeatures(
-    query: Keyframe, candidate: Candidate, keyframe: Keyframe, settings: Verification
+    query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification
 ) -> RankedCandidate:
-    ours, theirs = query.embedding, keyframe.embedding
-    pairs = []
-    if settings.modalities != "cloud":
-        pairs.append((ours.super_image, theirs.super_image))
-    if settings.modalities != "image":
-        pairs.append((ours.super_cloud, theirs.super_cloud))
-    counts = [
-        len(eligible_superfeatures(mine, other)) for mine, other in pairs if mine is not None and other is not None
-    ]
+    ours, theirs = query.embedding, match.embedding
+    pairs = (ours.super_image, theirs.super_image), (ours.super_cloud, theirs.super_cloud)
+    counts = [len(eligible_superfeatures(mine, other)) for mine, other in pairs if mine and other]
     order = weigh(candidate.similarity, counts, settings)
-    return RankedCandidate(candidate, keyframe, superfeatures=sum(counts), score=float(sum(counts)), order=order)
+    return RankedCandidate(candidate, match, superfeatures=sum(counts), score=float(sum(counts)), order=order)
 
 
-def _by_ransac(query: Keyframe, candidate: Candidate, keyframe: Keyframe, settings: Verification) -> RankedCandidate:
-    ours, theirs = query.embedding, keyframe.embedding
-    image_pairs, cloud_pairs = np.empty((2, 0, 2), np.intp)
-    image = cloud = None
-    if settings.modalities != "cloud" and ours.image is not None and theirs.image is not None:
-        image_pairs = _pairs(ours.image, theirs.image, settings)
-        image = fit_homography(
-            ours.image.positions[image_pairs[:, 0]].astype(float),
-            theirs.image.positions[image_pairs[:, 1]].astype(float),
-            IMAGE_THRESHOLD * query.camera.width,
-            settings.ransac_iterations,
-            settings.seed,
-        )
-    if settings.modalities != "image" and ours.cloud is not None and theirs.cloud is not None:
-        cloud_pairs = _pairs(ours.cloud, theirs.cloud, settings)
-        cloud = fit_rigid(
-            ours.cloud.positions[cloud_pairs[:, 0]].astype(float),
-            theirs.cloud.positions[cloud_pairs[:, 1]].astype(float),
-            CLOUD_THRESHOLD_M,
-            settings.ransac_iterations,
-            settings.seed,
-        )
+def _by_ransac(query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification) -> RankedCandidate:
+    ours, theirs = query.embedding, match.embedding
+    reach = const.IMAGE_THRESHOLD * query.camera.width
+    image_pairs, image = _explain(ours.image, theirs.image, fit_homography, reach, settings)
+    cloud_pairs, cloud = _explain(ours.cloud, theirs.cloud, fit_rigid, const.CLOUD_THRESHOLD_M, settings)
     counts = [consensus.count for consensus in (image, cloud) if consensus]
     order = weigh(candidate.similarity, counts, settings)
     return RankedCandidate(
-        candidate, keyframe, image_pairs, cloud_pairs, image, cloud, score=float(sum(counts)), order=order
+        candidate, match, image_pairs, cloud_pairs, image, cloud, score=float(sum(counts)), order=order
     )
 
 
-def _pairs(query: LocalFeatures, match: LocalFeatures, settings: Verification) -> Indices:
-    ours, theirs = strongest(query, settings.rerank_features), strongest(match, settings.rerank_features)
-    return mutual_neighbours(similarities(ours.descriptors, theirs.descriptors))
+def _explain(
+    query: LocalFeatures | None, match: LocalFeatures | None, fit: Fit, threshold: float, settings: Verification
+) -> tuple[Indices, Consensus | None]:
+    """Mutual neighbours among the strongest features of both, and the model that explains most of them."""
+    if query is None or match is None:
+        return NO_PAIRS, None
+    query, match = strongest(query, settings.rerank_features), strongest(match, settings.rerank_features)
+    pairs = mutual_neighbours(similarities(query.descriptors, match.descriptors))
+    here, there = query.positions[pairs[:, 0]].astype(float), match.positions[pairs[:, 1]].astype(float)
+    return pairs, fit(here, there, threshold, settings.ransac_iterations, settings.seed)
 
 
 def _same_place(a: Keyframe, b: Keyframe) -> bool:
@@ -200,4 +186,4 @@ def _same_place(a: Keyframe, b: Keyframe) -> bool:
         return True
     if a.odom_T_body is None or b.odom_T_body is None or a.session != b.session:
         return False
-    return bool(np.linalg.norm(relative(a.odom_T_body, b.odom_T_body)[:3, 3]) < SAME_PLACE_M)
+    return bool(np.linalg.norm(relative(a.odom_T_body, b.odom_T_body)[:3, 3]) < const.SAME_PLACE_M)

@@ -11,8 +11,8 @@ import numpy as np
 from umf_ros.config import Verification
 from umf_ros.frames import Candidate, Keyframe, LoopClosure, Points
 from umf_ros.geometry import heading
+from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance
-from umf_ros.verification.constants import MAX_REFINED
 from umf_ros.verification.elevation_map import TurnedMap
 from umf_ros.verification.hypotheses import (
     Hypothesis,
@@ -22,7 +22,7 @@ from umf_ros.verification.hypotheses import (
     paired_points,
 )
 from umf_ros.verification.measurement import AlignedHypothesis, Measurement, measure, measure_candidate
-from umf_ros.verification.registration import ScanCache, align_features, align_scans
+from umf_ros.verification.registration import ScanCache, align_features, align_scans, covariance_of
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
 
@@ -130,7 +130,7 @@ class Verifier:
         for group in (self._memory.expected(query, ranked), select(ranked, self._settings.refine_best)):
             fresh = [item for item in group if item.candidate.stamp_ns not in tested]
             tested |= {item.candidate.stamp_ns for item in fresh}
-            for hypothesis in self._hypotheses(query, fresh, turned)[:MAX_REFINED]:
+            for hypothesis in self._hypotheses(query, fresh, turned)[: const.MAX_REFINED]:
                 judged.append(self._judge(query, hypothesis))
                 accepted = {one.match_stamp_ns for one in judged if not self._objection(one)}
                 if len(accepted) >= self._settings.max_closures:
@@ -179,7 +179,7 @@ class Verifier:
         objection = self._objection(judged)
         if objection:
             return Verdict(ranked.candidate, objection, measurement, None, pixels, probability)
-        covariance = self._acceptance.covariance(aligned.alignment.information, measurement.kind)
+        covariance = covariance_of(aligned.alignment.information, self._acceptance.covariances[measurement.kind])
         closure = LoopClosure(aligned.query.stamp_ns, ranked.candidate.stamp_ns, aligned.pose, covariance, probability)
         return Verdict(ranked.candidate, "accepted", measurement, closure, pixels, probability)
 

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from umf_ros.config import dump_settings
 from umf_ros.errors import ConfigError, UmfError
 from umf_ros.lab.commands import evaluate, pretrain
+from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
-from umf_ros.networks.weights import save_weights
 
 app = typer.Typer()
 app.command("evaluate")(evaluate.command)

@@ -5,14 +5,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.distance import cdist
 from tiny_worlds import TINY
 
 from umf_ros.embedding.umf_embedder import UmfEmbedder
 from umf_ros.frames import Frame
 from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures, tsne
+from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
-from umf_ros.networks.weights import load_weights, save_weights
+from umf_ros.networks.weights import load_weights
 
 
 def is_picture(path: Path) -> bool:
@@ -61,6 +63,8 @@ def test_attention_and_key_points_are_drawn(tmp_path: Path, rng: np.random.Gener
 
     whole = look(network, embedder, frame(rng.integers(0, 255, (60, 80), np.uint8), 2000))
     dark = look(network, embedder, frame(np.zeros((60, 80), np.uint8), 2000))
+    tokens = TINY.image_size[0] // 16 * (TINY.image_size[1] // 16)
+    torch.testing.assert_close(whole.looked.sum(), torch.tensor(float(tokens)))  # one is the fair share
     plot_superfeatures(tmp_path / "super.png", [(whole, whole), (whole, dark)], TINY.image_size)
     plot_keypoints(tmp_path / "points.png", [whole, dark])
     assert is_picture(tmp_path / "super.png") and is_picture(tmp_path / "points.png")

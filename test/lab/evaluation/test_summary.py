@@ -27,8 +27,8 @@ from umf_ros.lab.evaluation.summary import (
     measure,
 )
 from umf_ros.lab.evaluation.worlds_run import ASKED
+from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF, count_parameters
-from umf_ros.networks.weights import save_weights
 
 CURVE = precision_recall(np.array([0.9, 0.5]), np.array([True, False]), np.ones(2, bool))
 NAMES = (*ASKED, "same light", *METHODS)

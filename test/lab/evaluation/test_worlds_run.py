@@ -13,8 +13,8 @@ from umf_ros.config import Verification
 from umf_ros.lab.evaluation import worlds_run
 from umf_ros.lab.evaluation.summary import WorldResult, cost_of_weights
 from umf_ros.lab.evaluation.worlds_run import PICTURES, WorldEvaluation, WorldsRun
+from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF, count_parameters
-from umf_ros.networks.weights import save_weights
 
 
 @pytest.fixture(scope="module")

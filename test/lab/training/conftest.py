@@ -6,7 +6,7 @@ import pytest
 from tiny_worlds import TINY, write_world
 
 from umf_ros.lab.datasets.simulated import SimulatedWorld
-from umf_ros.networks.presets import PRESETS
+from umf_ros.lab.training.networks import PRESETS
 
 
 @pytest.fixture(autouse=True)

@@ -29,7 +29,7 @@ def objective() -> MaskedImagesObjective:
     return MaskedImagesObjective(UMF(TINY), settings)
 
 
-@pytest.fixture(params=["resnet18", "resnet50", "mobile"])
+@pytest.fixture(params=["resnet18", "resnet50"])
 def backbone(request: pytest.FixtureRequest) -> Backbone:
     torch.manual_seed(0)
     return Backbone(request.param, 8).train()

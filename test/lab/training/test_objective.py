@@ -8,9 +8,9 @@ import pytest
 
 from umf_ros.errors import ConfigError
 from umf_ros.lab import training
+from umf_ros.lab.training.networks import read_card
 from umf_ros.lab.training.objective import find_methods, generator
 from umf_ros.lab.training.run import load_run, train
-from umf_ros.networks.weights import read_card
 
 NEW = """
 from dataclasses import dataclass

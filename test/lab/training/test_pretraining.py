@@ -14,12 +14,13 @@ from umf_ros.errors import ConfigError, WeightsError
 from umf_ros.lab.datasets.simulated import WorldFolder
 from umf_ros.lab.training.distributed import Team
 from umf_ros.lab.training.masked_images_objective import MaskedImagesObjective
+from umf_ros.lab.training.networks import read_card
 from umf_ros.lab.training.objective import find_objective
 from umf_ros.lab.training.progress import Progress
 from umf_ros.lab.training.run import load_run, train
 from umf_ros.lab.training.trainer import Trainer
 from umf_ros.networks.umf import UMF
-from umf_ros.networks.weights import load_weights, read_card
+from umf_ros.networks.weights import load_weights
 
 
 @pytest.fixture

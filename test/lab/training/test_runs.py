@@ -24,13 +24,13 @@ from umf_ros.lab.commands import train as train_command
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.lab.training.distributed import Team, choose_device, join_team
 from umf_ros.lab.training.metric_objective import MetricObjective
+from umf_ros.lab.training.networks import PRESETS, read_card, save_weights
 from umf_ros.lab.training.progress import Progress, append_row, learning_rate, resuming, save_checkpoint
 from umf_ros.lab.training.run import load_run, make_network
 from umf_ros.lab.training.trainer import Trainer
 from umf_ros.lab.training.validation import describe, figures, mean_of, validate
-from umf_ros.networks.presets import PRESETS
 from umf_ros.networks.umf import UMF
-from umf_ros.networks.weights import load_weights, read_card, save_weights
+from umf_ros.networks.weights import load_weights
 
 CPU = Team(0, 1, torch.device("cpu"))
 

@@ -21,12 +21,13 @@ from umf_ros.lab.datasets.views import Augmentation, ViewMaker
 from umf_ros.lab.training.batches import BatchMaker
 from umf_ros.lab.training.distributed import Team
 from umf_ros.lab.training.metric_objective import MetricObjective, rule_of
+from umf_ros.lab.training.networks import read_card
 from umf_ros.lab.training.run import load_run, train
 from umf_ros.lab.training.sampler import PairSampler, places_drawn
 from umf_ros.lab.training.trainer import Trainer
 from umf_ros.lab.training.validation import validate
 from umf_ros.networks.umf import UMF
-from umf_ros.networks.weights import load_weights, read_card
+from umf_ros.networks.weights import load_weights
 
 RULE = Rule(positive_m=5)
 
@@ -187,9 +188,8 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from tiny_worlds import TINY
-from umf_ros.networks.presets import PRESETS
-from umf_ros.lab.training.run import load_run
-from umf_ros.lab.training.run import train
+from umf_ros.lab.training.networks import PRESETS
+from umf_ros.lab.training.run import load_run, train
 PRESETS["tiny"] = TINY
 for workers in (0, 3):
     small = dict(preset="tiny", steps=4, epoch_steps=2, batch=8, local_pairs=2, bank_from_step=2, warmup_steps=1)
@@ -249,8 +249,8 @@ def test_weights_of_another_image_size_can_start_a_run(folder, tmp_path):
     first = train(settings_for(folder, steps=2), tmp_path / "a", False, silent)
     second = train(settings_for(folder, steps=2, start=str(first), image_size=(32, 64)), tmp_path / "b", False, silent)
     assert load_weights(second).config == replace(TINY, image_size=(32, 64))
-    with pytest.raises(ConfigError, match="is not a umf_mobile"):
-        train(settings_for(folder, preset="umf_mobile", start=str(first)), tmp_path / "c", False, silent)
+    with pytest.raises(ConfigError, match="is not a umf_light"):
+        train(settings_for(folder, preset="umf_light", start=str(first)), tmp_path / "c", False, silent)
 
 
 def test_validation_of_a_perfect_world(world):

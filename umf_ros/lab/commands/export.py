@@ -16,7 +16,7 @@ def command(
     """Export a network to OpenVINO."""
     from rich.console import Console
 
-    from umf_ros.embedding.export import convert, inputs_by_name, save
+    from umf_ros.embedding.export import convert, save
     from umf_ros.embedding.inputs import blank_input
     from umf_ros.embedding.runtimes import Flat
     from umf_ros.errors import ConfigError
@@ -25,7 +25,7 @@ def command(
     if out.suffix != ".xml":
         raise ConfigError(f"{out}: OpenVINO's files end in .xml")
     network = load_weights(locate_weights(weights))
-    model = convert(Flat(network, super_features), inputs_by_name(blank_input(network.config)))
+    model = convert(Flat(network, super_features), blank_input(network.config)._asdict())
     save(model, out)
     megabytes = out.with_suffix(".bin").stat().st_size / 1e6
     sizes = f"{len(model.inputs)} inputs, {len(model.outputs)} outputs, {megabytes:.1f} MB of weights"

@@ -16,7 +16,7 @@ from umf_ros.embedding.voxels import VoxelScan
 from umf_ros.frames import Image, Points
 from umf_ros.geometry import Array, invert, make_pose, transform
 from umf_ros.lab.datasets.sample import Sample
-from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.config import NetworkConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,12 +43,14 @@ class Seen:
         frame: the frame.
         embedding: its local and super-features.
         output: of the network.
+        looked: (1, T) how much the scan's tokens looked at each token of the image, in the last layer of fusion.
         centroids: (V, 3) places of the voxels, body frame, m.
     """
 
     frame: Frame
     embedding: Embedding
     output: NetworkOutput
+    looked: Tensor
     centroids: Points
 
 
@@ -63,9 +65,13 @@ def look(network: UMF, embedder: Embedder, frame: Frame) -> Seen:
     image = None if frame.left is None or is_blank(frame.left) else frame.left
     scan = prepare_scan(frame.points, frame.intensity, network.config)
     batch = pack([prepare_image(image, network.config)], [scan], network.config)
+    maps: list[Tensor] = []
+    last = network.get_submodule(f"fusion.layers.{network.config.layers - 1}.cloud_cross")
+    hook = last.register_forward_hook(lambda module, tokens, found: maps.append(found[1]))
     with torch.inference_mode():
-        output = network(batch, super_features=True, attention=True)
-    return Seen(frame, embedder.embed(frame), output, scan.centroids)
+        output = network(batch, super_features=True)
+    hook.remove()
+    return Seen(frame, embedder.embed(frame), output, received(maps[0]), scan.centroids)
 
 
 def plot_superfeatures(path: Path, pairs: Sequence[tuple[Seen, Seen]], size: tuple[int, int]) -> None:
@@ -183,7 +189,7 @@ def _draw_cloud_keypoints(axes: Axes, seen: Seen) -> None:
 
 def _draw_fusion(axes: Axes, seen: Seen) -> None:
     """Where the scan's tokens look in the image."""
-    looked = received(seen.output.attention[-1]["cloud_cross"])[0]
+    looked = seen.looked[0]
     if seen.frame.left is not None and len(looked) > 1:
         height, width = seen.frame.left.shape
         _overlay(axes, seen.frame.left, _grid(looked, width / height))

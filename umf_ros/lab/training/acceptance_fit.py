@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +13,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from umf_ros.geometry import Array
-from umf_ros.verification.acceptance import Logistic, criteria_of, scores
+from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, criteria_of, scores
 from umf_ros.verification.measurement import Measurement
 from umf_ros.verification.registration import CovarianceModel, covariance_of
 
@@ -58,6 +61,14 @@ def fit_logistic(examples: list[Example], kind: str, ridge: float = 0.003) -> Lo
 def inside_ellipsoid(errors: Array, covariances: Array, confidence: float = 0.95) -> float:
     """Share of the errors (N, 6) inside the confidence ellipsoid of their covariances (N, 6, 6)."""
     return float(np.mean(_squared_distances(errors, covariances) < chi2.ppf(confidence, 6)))
+
+
+def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: str, results: dict[str, float]) -> None:
+    """Write a fitted decision for `load_acceptance`, with the command that made it and what it reached."""
+    content: dict[str, Any] = {"fitted_with": fitted_with, "results": results}
+    content["models"] = {kind: asdict(model.models[kind]) for kind in KINDS}
+    content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in KINDS}
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def _loss(parameters: Array, design: Array, right: NDArray[np.bool_], ridge: float) -> tuple[float, Array]:

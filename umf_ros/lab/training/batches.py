@@ -16,8 +16,8 @@ from umf_ros.lab.datasets.labels import Places
 from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.datasets.views import View, ViewMaker
 from umf_ros.lab.training.sampler import Draw, places_drawn
-from umf_ros.networks.presets import NetworkConfig
-from umf_ros.networks.umf import NetworkInput, to_device
+from umf_ros.networks.config import NetworkConfig
+from umf_ros.networks.umf import NetworkInput
 
 CHILDREN = 8
 """Voxels folded into one cell of the grid."""
@@ -55,7 +55,7 @@ class TrainingBatch:
         """The batch on another device, its grid dense again."""
         names = ("image_kept", "cloud_kept", "local_rows", "cells", "voxels", "useful_cells")
         moved = {name: getattr(self, name).to(device) for name in names}
-        return replace(self, input=_thick(to_device(self.input, device)), **moved)
+        return replace(self, input=_thick(self.input.to(device)), **moved)
 
 
 def stack_views(views: Sequence[View], config: NetworkConfig) -> NetworkInput:
@@ -69,11 +69,11 @@ def _thin(batch: NetworkInput) -> NetworkInput:
     occupied = torch.nonzero(cells[:, :CHILDREN].sum(1)).squeeze(1)  # the first feature is occupancy
     places = torch.stack(torch.unravel_index(occupied, batch.grid.shape[:4]))
     grid = torch.sparse_coo_tensor(places, cells[occupied], batch.grid.shape, is_coalesced=True)
-    return replace(batch, grid=grid)
+    return batch._replace(grid=grid)
 
 
 def _thick(batch: NetworkInput) -> NetworkInput:
-    return replace(batch, grid=batch.grid.to_dense()) if batch.grid.is_sparse else batch
+    return batch._replace(grid=batch.grid.to_dense()) if batch.grid.is_sparse else batch
 
 
 class BatchMaker:

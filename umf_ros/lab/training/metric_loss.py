@@ -23,7 +23,7 @@ from umf_ros.lab.training.losses import (
     wasted_saliency,
 )
 from umf_ros.lab.training.settings import MetricSettings
-from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import UMF, Features
 
 

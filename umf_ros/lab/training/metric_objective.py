@@ -19,6 +19,7 @@ from umf_ros.lab.datasets.views import Augmentation, ViewMaker
 from umf_ros.lab.evaluation.protocol import ROBOTCAR_RULE, RULES
 from umf_ros.lab.training.batches import BatchMaker, TrainingBatch
 from umf_ros.lab.training.metric_loss import Bank, MetricLoss
+from umf_ros.lab.training.networks import branch_layers, fine_layers
 from umf_ros.lab.training.objective import Judgement, Objective, generator
 from umf_ros.lab.training.sampler import PairSampler
 from umf_ros.lab.training.settings import MetricSettings
@@ -183,18 +184,17 @@ def _choose_parameters(network: UMF, settings: MetricSettings) -> None:
     """Switch off what the losses do not reach, so that nothing is silently left at random."""
     if settings.branch != "both":
         network.requires_grad_(False)
-        for layer in network.branch_layers(settings.branch):
+        for layer in branch_layers(network, settings.branch):
             layer.requires_grad_(True)
     if settings.freeze_encoders:
-        for encoder in (network.image_encoder, network.voxel_encoder):
-            encoder.requires_grad_(False)
-            for layer in encoder.fine_layers():  # they belong to the local features
-                layer.requires_grad_(True)
+        network.image_encoder.requires_grad_(False)
+        network.voxel_encoder.requires_grad_(False)
+        for layer in fine_layers(network):  # they belong to the local features
+            layer.requires_grad_(True)
     frozen: list[nn.Module] = []
     if not settings.weight_super or not settings.local_pairs:
         frozen += [network.super_image, network.super_cloud]
     if not settings.local_pairs:
-        frozen += [network.image_local, network.cloud_local, *network.image_encoder.fine_layers()]
-        frozen += network.voxel_encoder.fine_layers()
+        frozen += [network.image_local, network.cloud_local, *fine_layers(network)]
     for module in frozen:
         module.requires_grad_(False)

@@ -18,15 +18,15 @@ from umf_ros.config import problems, read_values
 from umf_ros.errors import ConfigError
 from umf_ros.lab.datasets.listed import Source, open_source
 from umf_ros.lab.training.distributed import join_team
+from umf_ros.lab.training.networks import PRESETS, read_card, save_weights
 from umf_ros.lab.training.objective import find_objective
 from umf_ros.lab.training.progress import Progress
 from umf_ros.lab.training.settings import RunSettings, write_settings
 from umf_ros.lab.training.trainer import Trainer
 from umf_ros.networks.image_encoder import ResidualBlock
-from umf_ros.networks.presets import PRESETS
 from umf_ros.networks.umf import UMF, channels_last, count_parameters
 from umf_ros.networks.voxel_encoder import ResidualBlock3d
-from umf_ros.networks.weights import load_weights, read_card, save_weights
+from umf_ros.networks.weights import load_weights
 
 
 def load_run(path: Path | None, **overrides: object) -> Any:

@@ -10,8 +10,8 @@ from pydantic import Field, model_validator
 
 from umf_ros.config import Group
 from umf_ros.errors import OutputError
+from umf_ros.lab.training.networks import Precision
 from umf_ros.networks.umf import Branch
-from umf_ros.networks.weights import Precision
 
 
 class RunSettings(Group):

@@ -17,7 +17,7 @@ from umf_ros.lab.evaluation.results import percent
 from umf_ros.lab.evaluation.retrieval import rank
 from umf_ros.lab.evaluation.scores import Scores, score
 from umf_ros.lab.training.batches import stack_views
-from umf_ros.networks.umf import UMF, to_device
+from umf_ros.networks.umf import UMF
 
 MODES = ("fused", "image", "cloud")
 
@@ -38,7 +38,7 @@ def describe(
     for start in range(0, len(rows), batch):
         views = [maker.plain(sequence.sample(int(row))) for row in rows[start : start + batch]]
         with torch.inference_mode():
-            inputs = to_device(stack_views(views, network.config), device)
+            inputs = stack_views(views, network.config).to(device)
             present = inputs.coarse_mask.any(1)
             features = network.encode(inputs)
             nothing = torch.zeros_like(present)

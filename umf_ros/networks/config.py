@@ -1,4 +1,4 @@
-"""The sizes of a UMF network and the presets that are known by name."""
+"""The sizes of a UMF network."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 from umf_ros.errors import WeightsError
 
-Backbone = Literal["resnet18", "resnet34", "resnet50", "mobile"]
+Backbone = Literal["resnet18", "resnet34", "resnet50"]
 
 
 @dataclass(frozen=True)
@@ -75,28 +75,3 @@ class NetworkConfig:
             return cls(**fields)
         except (TypeError, ValueError, ArithmeticError) as error:
             raise WeightsError(f"weights of another architecture: {error}") from None
-
-
-PRESETS: dict[str, NetworkConfig] = {
-    # the horizon and the rocks under a moved sun need these pixels: at 128 x 96 the image alone finds a tenth less
-    "umf_light": NetworkConfig(backbone="resnet34", image_size=(160, 224), voxel_blocks=2),
-    "umf_mobile": NetworkConfig(backbone="mobile", width=24),
-    "umf_resnet50": NetworkConfig(
-        backbone="resnet50",
-        width=64,
-        image_size=(224, 224),
-        pyramid=256,
-        voxel_channels=(48, 128, 256),
-        tokens=256,
-        heads=8,
-        layers=3,
-        coarse_voxels=256,
-        feedforward=1024,
-        local=128,
-        image_local=128,
-        cloud_local=32,
-        super_iterations=6,
-        image_supers=(64, 128),
-        cloud_supers=(128, 32),
-    ),
-}

@@ -1,0 +1,110 @@
+"""Networks to train: their presets, what of them learns, and their weights on disk with a JSON card beside them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from umf_ros.errors import OutputError, WeightsError
+from umf_ros.networks.config import NetworkConfig
+from umf_ros.networks.umf import UMF
+from umf_ros.networks.weights import SCALE
+
+Precision = Literal["half", "int8"]
+SMALL = 4096
+"""Tensors with fewer values are kept in half precision."""
+
+PRESETS: dict[str, NetworkConfig] = {
+    # the horizon and the rocks under a moved sun need these pixels: at 128 x 96 the image alone finds a tenth less
+    "umf_light": NetworkConfig(backbone="resnet34", image_size=(160, 224), voxel_blocks=2),
+    "umf_resnet50": NetworkConfig(
+        backbone="resnet50",
+        width=64,
+        image_size=(224, 224),
+        pyramid=256,
+        voxel_channels=(48, 128, 256),
+        tokens=256,
+        heads=8,
+        layers=3,
+        coarse_voxels=256,
+        feedforward=1024,
+        local=128,
+        image_local=128,
+        cloud_local=32,
+        super_iterations=6,
+        image_supers=(64, 128),
+        cloud_supers=(128, 32),
+    ),
+}
+
+
+def branch_layers(network: UMF, branch: Literal["image", "cloud"]) -> list[nn.Module]:
+    """What belongs to one modality alone on the way to the descriptor."""
+    names = ["image_encoder" if branch == "image" else "voxel_encoder", f"{branch}_tokens"]
+    names += [f"fusion.layers.{layer}.{branch}_self" for layer in range(network.config.layers)]
+    names += [f"fusion.{branch}_{part}" for part in ("norm", "pool", "head")]
+    return [network.get_submodule(name) for name in names]
+
+
+def fine_layers(network: UMF) -> list[nn.Module]:
+    """What of both encoders only the fine maps need: without local features nothing teaches it."""
+    pyramid, voxels = network.image_encoder.pyramid, network.voxel_encoder
+    return [pyramid.fine, pyramid.laterals[0], pyramid.laterals[1], voxels.fine, voxels.up_fine]
+
+
+def save_weights(network: UMF, path: Path, card: dict[str, Any], precision: Precision = "half") -> None:
+    """Write the weights, rounded, and `<name>.json` with the card and the architecture.
+
+    Args:
+        network: whose weights.
+        path: the `.safetensors` to write.
+        card: what is to be said of them.
+        precision: "int8" keeps eight bits of the large tensors and a scale for every output channel,
+            half the size of half precision.
+
+    Raises:
+        OutputError: the files cannot be written.
+    """
+    architecture = network.config.as_dict()
+    tensors: dict[str, Tensor] = {}
+    for name, value in network.state_dict().items():
+        coarse = precision == "int8" and value.is_floating_point() and value.ndim > 1 and value.numel() >= SMALL
+        tensors |= _quantise(name, value) if coarse else {name: _halve(value)}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_file(tensors, path, metadata={"architecture": json.dumps(architecture)})
+        path.chmod(0o644)
+        text = json.dumps(card | {"precision": precision, "architecture": architecture}, indent=2, ensure_ascii=False)
+        path.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+    except (OSError, SafetensorError) as error:
+        raise OutputError(f"cannot write {path}: {error}") from None
+
+
+def read_card(path: Path) -> dict[str, Any]:
+    """The JSON card beside a weights file.
+
+    Raises:
+        WeightsError: the card is missing or not JSON.
+    """
+    card = path.with_suffix(".json")
+    try:
+        return dict(json.loads(card.read_text(encoding="utf-8")))
+    except (OSError, TypeError, ValueError) as error:
+        raise WeightsError(f"cannot read the card {card}: {' '.join(str(error).split())}") from None
+
+
+def _quantise(name: str, value: Tensor) -> dict[str, Tensor]:
+    value = value.detach().cpu().float()
+    largest = value.abs().amax(dim=tuple(range(1, value.ndim)), keepdim=True)
+    scale = (largest / 127).clamp(min=1e-12)
+    return {name: (value / scale).round().to(torch.int8).contiguous(), name + SCALE: scale.contiguous()}
+
+
+def _halve(value: Tensor) -> Tensor:
+    return value.detach().cpu().half().contiguous() if value.is_floating_point() else value.detach().cpu().contiguous()
