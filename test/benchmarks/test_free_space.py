@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from free_space import RangeImage, Sight, contradiction, counterparts
 from scipy.spatial import cKDTree
 
 from umf_ros.geometry import invert, make_pose, transform
-from umf_ros.verification.free_space import RangeImage, Sight, contradiction, counterparts
 
 RNG = np.random.default_rng(3)
 TURN = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [2.0, 1.0, 0.0])
