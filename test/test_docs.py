@@ -27,7 +27,8 @@ def classes() -> dict[str, set[str]]:
 @pytest.mark.parametrize("document", DOCUMENTS)
 def test_files_that_are_named_exist(document: str) -> None:
     named = re.findall(r"`((?:umf_ros|benchmarks|tools|config|docs|test|examples)/[\w/.]+)`", text_of(document))
-    assert [name for name in named if not (ROOT / name).exists()] == []
+    # NAME stands for what the reader calls it
+    assert [name for name in named if not (ROOT / name).exists() and not name.split("/")[-1].startswith("NAME")] == []
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)

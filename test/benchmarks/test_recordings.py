@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import make_keyframe
+from measurements import GOOD
 from recordings import RealPair, cropped, draw_pairs, read_pairs, read_scan, summary
 
-from umf_ros.frames import Candidate, LoopClosure, Verdict
+from umf_ros.frames import Candidate, LoopClosure
 from umf_ros.geometry import make_pose
+from umf_ros.verification import Verdict
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".bin"])
@@ -58,7 +60,7 @@ def test_true_false_and_misplaced_closures_are_told_apart():
 
     def verdict(estimate):
         closure = None if estimate is None else LoopClosure(2, 1, estimate, np.eye(6) * 0.01)
-        return Verdict(Candidate(0, 1, 0.5), "", closure=closure)
+        return Verdict(Candidate(0, 1, 0.5), "", GOOD, closure)
 
     true, false = RealPair("a", "b", True, pose), RealPair("a", "c", False)
     unknown = RealPair("a", "d", True)
