@@ -191,7 +191,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["{bag}", "--config", "{notes}"], "notes.txt: expected names and values, found a str"),
         (
             ["{bag}", "--dataset", "kitti"],
-            f"dataset: input should be {either([repr(name) for name in dataset_names()])}",
+            f"dataset: input should be {either(list(map(repr, dataset_names())))}",
         ),
         (["{bag}", "--embedder", "magic"], "magic"),
         (["{bag}", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
