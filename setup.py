@@ -47,7 +47,7 @@ setup(
             "umf = umf_ros.cli:main",
             "loop_closure_node = umf_ros.nodes.loop_closure_node:main",
             "pose_graph_node = umf_ros.nodes.pose_graph_node:main",
-            "bag_player_node = umf_ros.nodes.bag_player_node:main",
+            "bag_player_node = umf_ros.lab.live.bag_player_node:main",
         ],
     },
 )

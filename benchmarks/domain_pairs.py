@@ -129,9 +129,10 @@ def pairs_of(places: list[Place], domain: Domain, rng: np.random.Generator) -> I
             yield from (Pair(query, first[index], kind) for index in {nearest, int(rng.choice(near))})
         if query.scan.label == SAME_WAY:
             far = np.flatnonzero(away > ELSEWHERE_M)
-            alike = max((Pair(query, first[index], ELSEWHERE) for index in far), key=lambda pair: pair.similarity)
-            yield alike
-            yield Pair(query, first[int(rng.choice(far))], ELSEWHERE)
+            elsewhere = [Pair(query, first[index], ELSEWHERE) for index in far]
+            if elsewhere:  # one world of small rooms has no place that far
+                yield max(elsewhere, key=lambda pair: pair.similarity)
+                yield elsewhere[int(rng.integers(len(elsewhere)))]
 
 
 def _distance(query: Place, match: Place) -> float:

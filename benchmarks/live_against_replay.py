@@ -23,8 +23,8 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import Bag
 from umf_ros.commands.recordings import BagPath, ConfigPath, open_recording
 from umf_ros.config import Settings, dump_settings
+from umf_ros.lab.live.live_graph import LiveGraph
 from umf_ros.loop_detector import LoopDetector, make_detector_embedder
-from umf_ros.nodes.live_graph import LiveGraph
 from umf_ros.replay import Replay
 from umf_ros.runs.recorder import count_drops, read_summary
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from umf_ros.config import PoseGraphSettings
 from umf_ros.geometry import Array, invert
+from umf_ros.lab.datasets.g2o import PERIOD_NS, as_recording, read_g2o
 from umf_ros.lab.simulation.pose_graphs import (
     WORLDS,
     GraphWorld,
@@ -37,7 +38,6 @@ from umf_ros.lab.simulation.pose_graphs import (
 )
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.condensed import Edge, between
-from umf_ros.pose_graph.g2o import PERIOD_NS, as_recording, read_g2o
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
 FIRST_SEED = 20_000

@@ -1,8 +1,10 @@
-"""Frames and keyframes made of noise, for tests that need no world."""
+"""What tests share: frames and keyframes made of noise, a small recording, and a DDS domain of their own."""
 
 from __future__ import annotations
 
+import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +19,9 @@ if TYPE_CHECKING:
 
 # a shell that starts the tests in the background has them ignore Ctrl-C, which some of them press
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# real DDS, on this machine alone and in a domain of its own
+os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 CAMERA = StereoCamera(688, 512, 579.488, 579.488, 342.133, 255.806, 0.2003)
 
@@ -72,10 +77,19 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(7)
 
 
+@pytest.fixture
+def ros_context() -> Iterator[None]:
+    import rclpy
+
+    rclpy.init()
+    yield
+    rclpy.try_shutdown()
+
+
 @pytest.fixture(scope="session")
 def mini_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fast drive around a small loop, one and a half times, in a world no one trained or tuned on."""
-    from umf_ros.bags.writer import BagWriter
+    from umf_ros.lab.simulation.bag_writer import BagWriter
     from umf_ros.lab.simulation.presets import DEMO, Preset, gentle_loop
     from umf_ros.lab.simulation.recording import record, write_side_files
     from umf_ros.lab.simulation.route import Walker

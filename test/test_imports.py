@@ -32,6 +32,25 @@ def runtime() -> list[Path]:
     return sorted(path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "lab")
 
 
+LIGHT = ["commands/play.py", "commands/graph.py", "datasets/g2o.py", "evaluation/graph_plot.py", "live/*.py"]
+"""Files of the lab that `pip install .` serves too: recordings are played, graph files optimised and drawn."""
+
+
+def light() -> list[Path]:
+    return [path for pattern in LIGHT for path in sorted((PACKAGE / "lab").glob(pattern))]
+
+
+def without(missing: list[str]) -> str:
+    """A statement after which these modules are not there, as on a rover."""
+    return (
+        "class Missing:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if any((name + '.').startswith(gone + '.') for gone in {missing!r}):\n"
+        "            raise ModuleNotFoundError(name)\n"
+        "sys.meta_path.insert(0, Missing())\n"
+    )
+
+
 def lab_packages() -> list[str]:
     """What can be imported of the distributions that only the lab asks for."""
     wanted = required("requirements-lab.txt")
@@ -45,26 +64,26 @@ def test_the_contracts_hold() -> None:
 
 
 def test_the_runtime_imports_without_the_lab() -> None:
-    """With the lab and its packages not there, as on a rover."""
     missing = ["umf_ros.lab", *lab_packages()]
     assert "open3d" in missing and "sklearn" in missing
-    block = (
-        "class Missing:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        f"        if any((name + '.').startswith(gone + '.') for gone in {missing!r}):\n"
-        "            raise ModuleNotFoundError(name)\n"
-        "sys.meta_path.insert(0, Missing())\n"
-    )
     nodes = [name for name in modules(runtime()) if name.startswith("umf_ros.nodes.")]
     core = [name for name in modules(runtime()) if name not in nodes]
     no_ros = "assert 'rclpy' not in sys.modules, 'only nodes need ROS'"
-    statements = [block, *(f"import {name}" for name in core), no_ros, *(f"import {name}" for name in nodes)]
+    statements = [without(missing), *(f"import {name}" for name in core), no_ros, *(f"import {name}" for name in nodes)]
     assert imported_after("\n".join(statements), [*missing, nodes[-1]]) == [nodes[-1]]
 
 
-def test_the_runtime_asks_for_no_package_of_the_lab_later() -> None:
+def test_recordings_are_played_and_graph_files_read_without_the_packages_of_the_lab() -> None:
+    names = modules(light())
+    assert len(names) == 7
+    assert {name for path in light() for name in imports(path) if name.startswith("umf_ros.lab.")} <= set(names)
+    statements = [without(lab_packages()), *(f"import {name}" for name in names)]
+    assert imported_after("\n".join(statements), [*lab_packages(), *names]) == names
+
+
+def test_who_does_without_the_packages_of_the_lab_asks_for_none_later() -> None:
     unwanted = set(lab_packages())
-    for path in runtime():
+    for path in [*runtime(), *light()]:
         later = {module.split(".")[0] for module in imports(path)} & unwanted
         assert not later, f"{path} imports {later}"
 
@@ -81,9 +100,9 @@ def test_help_imports_nothing_heavy() -> None:
     assert imported_after(show_help, ["torch", "open3d", "gtsam", "cv2", "matplotlib", "rclpy", "scipy"]) == []
 
 
-def test_only_nodes_import_rclpy() -> None:
+def test_only_nodes_and_the_player_import_rclpy() -> None:
     for path in PACKAGE.rglob("*.py"):
-        if path.relative_to(PACKAGE).parts[0] != "nodes":
+        if path.parent != PACKAGE / "nodes" and path != PACKAGE / "lab" / "live" / "bag_player_node.py":
             assert not any(name.split(".")[0] == "rclpy" for name in imports(path)), path
 
 

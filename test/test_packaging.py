@@ -57,16 +57,27 @@ def test_everything_is_installed_to_share(install: Path) -> None:
     assert (install / "share" / "ament_index" / "resource_index" / "packages" / "umf_ros").is_file()
 
 
-@pytest.mark.parametrize("executable", ["loop_closure_node", "pose_graph_node"])
-def test_the_installed_executables_run(install: Path, executable: str, tmp_path: Path) -> None:
+def started(install: Path, executable: str) -> list[str]:
+    """A command that starts an installed executable as `ros2 run` does."""
     setup = f". {install}/share/umf_ros/package.sh && exec {install}/lib/umf_ros/{executable}"
     environment = f"PATH={Path(sys.executable).parent}:$PATH COLCON_CURRENT_PREFIX={install}"
-    process = Process("", tmp_path / "node.log", command=["bash", "-c", f"export {environment}; {setup}"])
+    return ["bash", "-c", f"export {environment}; {setup}"]
+
+
+@pytest.mark.parametrize("executable", ["loop_closure_node", "pose_graph_node"])
+def test_the_installed_executables_run(install: Path, executable: str, tmp_path: Path) -> None:
+    process = Process("", tmp_path / "node.log", command=started(install, executable))
     try:
         process.wait_for("ready")
         assert process.interrupt() == 0
     finally:
         process.kill()
+
+
+def test_the_installed_player_asks_for_its_recording(install: Path) -> None:
+    command = started(install, "bag_player_node nowhere.mcap")
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (1, "umf: there is no recording nowhere.mcap\n")
 
 
 def test_package_xml_names_what_is_imported() -> None:
@@ -76,7 +87,7 @@ def test_package_xml_names_what_is_imported() -> None:
     depends = {element.text for element in package.iter("exec_depend")}
     imported = {
         line.split()[1].split(".")[0]
-        for path in (PACKAGE / "nodes").glob("*.py")
+        for path in [*PACKAGE.glob("nodes/*.py"), *PACKAGE.glob("lab/live/*.py")]
         for line in path.read_text().splitlines()
         if line.startswith("from ") and (".msg import" in line or ".srv import" in line)
     }

@@ -19,7 +19,7 @@ COMMANDS = {
     "demo": "umf_ros.lab.commands.demo",
     "simulate": "umf_ros.lab.commands.simulate",
     "replay": "umf_ros.commands.replay",
-    "play": "umf_ros.commands.play",
+    "play": "umf_ros.lab.commands.play",
     "report": "umf_ros.commands.report",
     "evaluate": "umf_ros.lab.commands.evaluate",
     "explain": "umf_ros.commands.explain",
@@ -27,7 +27,7 @@ COMMANDS = {
     "export": "umf_ros.commands.export",
     "doctor": "umf_ros.commands.doctor",
     "pretrain": "umf_ros.lab.commands.pretrain",
-    "graph": "umf_ros.commands.graph",
+    "graph": "umf_ros.lab.commands.graph",
 }
 """The module of every subcommand, by name: those of the lab are known here by their names alone."""
 

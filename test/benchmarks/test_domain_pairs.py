@@ -57,6 +57,11 @@ def test_indoors_another_place_begins_sooner(places):
     assert all(abs(pair.match.position[0] - pair.query.position[0]) < 2 for pair in pairs if pair.kind == SAME)
 
 
+def test_a_world_too_small_for_another_place_still_gives_its_revisits():
+    pairs = list(pairs_of([place(0, "first"), place(1.0, "offset")], OPEN, np.random.default_rng(0)))
+    assert [pair.kind for pair in pairs] == [SAME]
+
+
 def closure(pose):
     return LoopClosure(2, 1, pose, np.diag([0.01] * 3 + [1e-4] * 3))
 

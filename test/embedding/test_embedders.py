@@ -13,13 +13,11 @@ from tiny_worlds import TINY, some_scan
 from umf_ros import embedding
 from umf_ros.config import EmbeddingSettings
 from umf_ros.embedding import make_embedder
-from umf_ros.embedding.ground_truth import GroundTruthEmbedder
 from umf_ros.embedding.scan_context_embedder import ScanContextEmbedder
 from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.embedding.umf_embedder import UmfEmbedder
-from umf_ros.errors import ConfigError, UmfError, WeightsError, either
+from umf_ros.errors import ConfigError, WeightsError, either
 from umf_ros.frames import Frame
-from umf_ros.geometry import make_pose
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import save_weights
 
@@ -192,46 +190,6 @@ def test_every_command_names_the_methods():
         assert f" {either(embedding.METHODS)}." in " ".join(said.stdout.replace("\u2502", " ").split())
     listed = "import sys, umf_ros.embedding; print([name for name in ('torch', 'cv2') if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", listed], capture_output=True, text=True).stdout.strip() == "[]"
-
-
-def ground_truth() -> GroundTruthEmbedder:
-    def pose(x: float, degrees: float) -> np.ndarray:
-        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-        return make_pose([[c, -s, 0], [s, c, 0], [0, 0, 1]], [x, 0, 0])
-
-    return GroundTruthEmbedder({0: pose(0, 0), 10**9: pose(3, 5), 2 * 10**9: pose(60, 0), 3 * 10**9: pose(0, 180)})
-
-
-def test_true_descriptors_fall_with_distance_and_turn():
-    embedder = ground_truth()
-    here, near, far, back = (embedder.embed(replace(some_frame(), stamp_ns=k * 10**9)).descriptor for k in range(4))
-    assert here @ near > 0.8
-    assert here @ far < 0.3
-    assert here @ back < 0.3
-    assert np.linalg.norm(here) == pytest.approx(1, abs=1e-5)
-
-
-def test_frames_without_a_true_pose_are_refused():
-    embedder = ground_truth()
-    assert (
-        embedder.embed(replace(some_frame(), stamp_ns=50_000_000)).descriptor @ embedder.embed(some_frame()).descriptor
-        > 0.999
-    )
-    with pytest.raises(UmfError, match=r"within 0\.1 s"):
-        embedder.embed(replace(some_frame(), stamp_ns=5 * 10**9))
-
-
-@pytest.mark.parametrize("metres", [2.0, 5.0, 9.0])
-def test_true_descriptors_fall_as_promised(metres):
-    here, there = make_pose(np.eye(3), [10, -4, 1]), make_pose(np.eye(3), [10 + metres, -4, 1])
-    embedder = GroundTruthEmbedder({0: here, 10**9: there}, scale_m=6.0, dimension=2048)
-    one, two = (embedder.embed(replace(some_frame(), stamp_ns=stamp)).descriptor for stamp in (0, 10**9))
-    assert one @ two == pytest.approx(np.exp(-(metres**2) / 72), abs=0.1)
-
-
-def test_without_any_pose_every_frame_is_refused():
-    with pytest.raises(UmfError, match="no true pose"):
-        GroundTruthEmbedder({}).embed(some_frame())
 
 
 def test_the_name_tells_weights_apart(weights, tmp_path):

@@ -46,7 +46,7 @@ def live(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFac
         for name in ("loop_closure_node", "pose_graph_node")
     ]
     subscriber = Process("", folder / "subscriber.log", command=[sys.executable, str(EXAMPLE)])
-    player_command = [sys.executable, "-m", "umf_ros.nodes.bag_player_node", str(mini_bag), "--rate", "0.5"]
+    player_command = [sys.executable, "-m", "umf_ros.lab.live.bag_player_node", str(mini_bag), "--rate", "0.5"]
     try:
         for node in nodes:
             node.wait_for("ready")

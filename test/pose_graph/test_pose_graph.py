@@ -13,9 +13,9 @@ from umf_ros.config import PoseGraphSettings
 from umf_ros.errors import GraphError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, expmap, invert, make_pose
+from umf_ros.lab.datasets.g2o import read_g2o
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops, with_wrong_closures
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.g2o import read_g2o
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.sessions import Sessions
 

@@ -1,1 +1,1 @@
-"""Recorded sensor data, read and written without a ROS environment."""
+"""Recorded sensor data, read without a ROS environment."""

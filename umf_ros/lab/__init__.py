@@ -1,1 +1,1 @@
-"""What makes and judges the runtime: simulation, data sets, training, evaluation."""
+"""What makes and judges the runtime: simulation, data sets, training, evaluation, playing to the live nodes."""

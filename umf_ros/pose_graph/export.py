@@ -1,6 +1,7 @@
 """What leaves the pose graph: graphs as g2o files, and verdicts as tables.
 
-An information matrix is written as GTSAM reads it, see `umf_ros.pose_graph.g2o`.
+An information matrix is written as GTSAM reads it: tangent space of the second vertex, translation first,
+rotation in radians.
 """
 
 from __future__ import annotations

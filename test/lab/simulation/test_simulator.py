@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from umf_ros.bags.writer import BagWriter
 from umf_ros.errors import ConfigError, OutputError
 from umf_ros.lab.commands.simulate import command
 from umf_ros.lab.datasets.simulated import SimulatedWorld
+from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.lidar import PERIOD_NS
 from umf_ros.lab.simulation.passes import SETTINGS, plan_passes

@@ -1,1 +1,1 @@
-"""Subcommands of `umf` that need the lab."""
+"""Subcommands of `umf` that make, play or judge; heavy imports stay inside the functions."""

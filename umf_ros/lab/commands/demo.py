@@ -26,7 +26,7 @@ def command(
     from umf_ros.bags.reader import open_bag
     from umf_ros.commands.progress import undisturbed
     from umf_ros.lab.commands import simulate
-    from umf_ros.nodes.live_graph import LiveGraph
+    from umf_ros.lab.live.live_graph import LiveGraph
     from umf_ros.runs.folder import check_writable, create_run_folder
     from umf_ros.runs.report import finish_run
 

@@ -70,7 +70,7 @@ def _write_bag(
     workers: int,
     console: Console,
 ) -> None:
-    from umf_ros.bags.writer import BagWriter
+    from umf_ros.lab.simulation.bag_writer import BagWriter
     from umf_ros.lab.simulation.presets import find_preset
     from umf_ros.lab.simulation.recording import record, write_side_files
     from umf_ros.lab.simulation.simulator import Simulator

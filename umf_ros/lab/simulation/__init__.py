@@ -1,1 +1,1 @@
-"""Planetary worlds and the S3LI sensors inside them."""
+"""Planetary worlds, the S3LI sensors inside them, and their recordings."""

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.bags.writer import BagWriter
 from umf_ros.errors import OutputError
 from umf_ros.lab.simulation import gnss, imu
+from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.camera import Rendering
 from umf_ros.lab.simulation.lidar import PERIOD_NS
 from umf_ros.lab.simulation.messages import (

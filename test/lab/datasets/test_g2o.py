@@ -1,4 +1,4 @@
-"""g2o in and out, and `umf graph` on files."""
+"""g2o in and out."""
 
 from __future__ import annotations
 
@@ -18,16 +18,13 @@ from graph_worlds import (
     rms,
     two_laps,
 )
-from typer.testing import CliRunner, Result
 
-from umf_ros.commands.graph import app
-from umf_ros.errors import GraphError, OutputError, UmfError
+from umf_ros.errors import GraphError, OutputError
 from umf_ros.geometry import adjoint, expmap, heading, invert, propagate
-from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops, with_wrong_closures
+from umf_ros.lab.datasets.g2o import G2oGraph, as_recording, drive, read_g2o
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.condensed import Edge
 from umf_ros.pose_graph.export import write_g2o
-from umf_ros.pose_graph.g2o import G2oGraph, as_recording, drive, read_g2o
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
 
@@ -41,17 +38,6 @@ def edges(count: int, planar: bool) -> list[Edge]:
         pose = expmap((keep * rng.normal(0, 0.8, 6))[None])[0]
         result.append(Edge(k, k + 1, pose, covariance))
     return result
-
-
-def write_world(path: Path, world: GraphWorld) -> None:
-    steps = invert(world.odometry[:-1]) @ world.odometry[1:]
-    odometry = [Edge(k, k + 1, step, world.step_covariances[k + 1]) for k, step in enumerate(steps)]
-    closures = [Edge(c.first, c.second, c.pose, c.covariance) for c in world.closures]
-    write_g2o(path, world.odometry, odometry + closures)
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def test_what_was_written_is_read(tmp_path: Path) -> None:
@@ -142,45 +128,6 @@ def test_chains_and_backward_edges_are_sorted_out(tmp_path: Path) -> None:
     recording = as_recording(read_g2o(path))
     assert recording.ids.tolist() == [10, 11, 12, 40, 41] and recording.chains == [0, 3]
     assert [(closure.first, closure.second) for closure in recording.closures] == [(0, 4)]
-
-
-def test_optimize_rejects_what_is_wrong_and_writes_what_is_right(tmp_path: Path) -> None:
-    world = with_wrong_closures(rover_loops(300, 12), 0.3, "groups", 1)
-    write_world(tmp_path / "in.g2o", world)
-    output, table = tmp_path / "out.g2o", tmp_path / "verdicts.csv"
-    result = run("optimize", tmp_path / "in.g2o", "-o", output, "--verdicts", table)
-    assert result.exit_code == 0, result.output
-    right = sum(closure.right for closure in world.closures)
-    assert f"{right} accepted" in result.output and "contradicts the map" in result.output
-    assert len(read_g2o(output).edges) == len(world.truth) - 1 + right
-    assert len(table.read_text().splitlines()) == 1 + len(world.closures)
-
-
-def test_optimize_without_guards_accepts_all(tmp_path: Path) -> None:
-    world = rover_loops(200, 12)
-    write_world(tmp_path / "in.g2o", world)
-    result = run("optimize", tmp_path / "in.g2o", "--reject", "none")
-    assert f"{len(world.closures)} accepted" in result.output and "rejected" not in result.output
-
-
-def test_optimize_says_which_line_it_skipped(tmp_path: Path) -> None:
-    (tmp_path / "bad.g2o").write_text(GOOD + "EDGE_SE2 1 2 oops\n")
-    result = run("optimize", tmp_path / "bad.g2o")
-    assert result.exit_code == 0 and "skipped line 2:" in result.output
-
-
-def test_wrong_arguments_are_one_clear_error(tmp_path: Path) -> None:
-    (tmp_path / "good.g2o").write_text(GOOD)
-    result = run("optimize", tmp_path / "good.g2o", "--reject", "magic")
-    assert isinstance(result.exception, UmfError) and "expected all or none" in str(result.exception)
-    assert isinstance(run("optimize", tmp_path / "none.g2o").exception, GraphError)
-
-
-def test_plot_draws_a_picture(tmp_path: Path) -> None:
-    write_world(tmp_path / "in.g2o", rover_loops(200, 12))
-    assert run("plot", tmp_path / "in.g2o", "-o", tmp_path / "graph.png").exit_code == 0
-    assert (tmp_path / "graph.png").stat().st_size > 10_000
-    assert isinstance(run("plot", tmp_path / "in.g2o", "-o", tmp_path / "no" / "a.png").exception, OutputError)
 
 
 WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))

@@ -28,7 +28,7 @@ from umf_ros.sensors.synchronizer import Synchronizer
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "umf_ros.nodes.bag_player_node", *arguments]
+    command = [sys.executable, "-m", "umf_ros.lab.live.bag_player_node", *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -29,7 +29,7 @@ from umf_ros.nodes.process import complain
 CLOCK_PERIOD_NS = 10_000_000
 SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
 SUBSCRIBER_TIMEOUT_S = 180.0
-SETTLING_S = 0.5
+SETTLING_S = 2.0
 """Discovery is over when nothing has changed for this long."""
 
 

@@ -20,23 +20,25 @@ from umf_ros.errors import UmfError
 START_TIMEOUT_S = 180.0
 STOP_TIMEOUT_S = 60.0
 READY = "ready"
+PLAYER = "umf_ros.lab.live.bag_player_node"
+NODES = ("umf_ros.nodes.loop_closure_node", "umf_ros.nodes.pose_graph_node")
 # a recording on this machine must arrive whole, however busy the machine is
 WHOLE = ("qos.reliability:=reliable", "qos.depth:=200")
 
 
 class NodeProcess:
-    """A node in a process of its own; its output goes to a log file and line by line to `on_line`.
+    """A node in a process of its own; its output goes to a file in the folder `logs` and line by line to `on_line`.
 
     It does not see the terminal's Ctrl-C: whoever started it decides the order in which nodes end.
     """
 
-    def __init__(self, name: str, arguments: list[str], log: Path, on_line: Callable[[str], None]) -> None:
-        self.name = name
+    def __init__(self, module: str, arguments: list[str], logs: Path, on_line: Callable[[str], None]) -> None:
+        self.name = module.rpartition(".")[2]
         self.ready = threading.Event()
-        self._log = log.open("w", encoding="utf-8")
+        self._log = (logs / f"{self.name}.log").open("w", encoding="utf-8")
         self._on_line = on_line
         self._process = subprocess.Popen(
-            [sys.executable, "-m", f"umf_ros.nodes.{name}", *arguments],
+            [sys.executable, "-m", module, *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -111,8 +113,8 @@ class LiveGraph:
         (self._folder / "logs").mkdir(exist_ok=True)
         try:
             with self._console.status("Starting loop_closure_node and pose_graph_node"):
-                for name in ("loop_closure_node", "pose_graph_node"):
-                    self._nodes.append(self._start(name, self._parameters()))
+                for module in NODES:
+                    self._nodes.append(self._start(module, self._parameters()))
                 for node in self._nodes:
                     node.wait_ready()
         except BaseException:
@@ -137,7 +139,7 @@ class LiveGraph:
             UmfError: the player failed or a node died.
         """
         arguments = [str(bag.resolve()), "--rate", str(rate), "--wait-for-subscribers", "--quiet"]
-        player = self._start("bag_player_node", arguments)
+        player = self._start(PLAYER, arguments)
         try:
             self._watch(player, duration_s / rate)
         finally:
@@ -162,8 +164,8 @@ class LiveGraph:
                     if node.exit_code is not None:
                         raise UmfError(f"{node.name} died with status {node.exit_code}; see {self._folder / 'logs'}")
 
-    def _start(self, name: str, arguments: list[str]) -> NodeProcess:
-        return NodeProcess(name, arguments, self._folder / "logs" / f"{name}.log", self._show)
+    def _start(self, module: str, arguments: list[str]) -> NodeProcess:
+        return NodeProcess(module, arguments, self._folder / "logs", self._show)
 
     def _show(self, line: str) -> None:
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -9,13 +9,13 @@ import pytest
 from graph_worlds import closing, lap_pairs, two_laps
 from typer.testing import CliRunner, Result
 
-from umf_ros.commands.graph import MOST_ROWS, app
-from umf_ros.errors import OutputError, UmfError
+from umf_ros.errors import GraphError, OutputError, UmfError
 from umf_ros.geometry import relative
-from umf_ros.lab.simulation.pose_graphs import GraphWorld
+from umf_ros.lab.commands.graph import MOST_ROWS, app
+from umf_ros.lab.datasets.g2o import read_g2o
+from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops, with_wrong_closures
 from umf_ros.pose_graph.condensed import Edge
 from umf_ros.pose_graph.export import write_g2o
-from umf_ros.pose_graph.g2o import read_g2o
 
 RIGHT = closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0)
 
@@ -109,6 +109,29 @@ def test_output_that_cannot_be_written_is_an_error(tmp_path: Path, option: str) 
     assert isinstance(result.exception, OutputError) and "cannot write" in str(result.exception)
 
 
+def test_groups_of_wrong_closures_are_told_from_right_ones(tmp_path: Path) -> None:
+    world = with_wrong_closures(rover_loops(300, 12), 0.3, "groups", 1)
+    output, table = tmp_path / "out.g2o", tmp_path / "verdicts.csv"
+    result = run("optimize", write_world(tmp_path / "in.g2o", world), "-o", output, "--verdicts", table)
+    assert result.exit_code == 0, result.output
+    right = sum(closure.right for closure in world.closures)
+    assert f"{right} accepted" in result.output and "contradicts the map" in result.output
+    assert len(read_g2o(output).edges) == len(world.truth) - 1 + right
+    assert len(table.read_text().splitlines()) == 1 + len(world.closures)
+
+
+def test_without_guards_all_are_accepted(tmp_path: Path) -> None:
+    world = with_wrong_closures(rover_loops(200, 12), 0.3, "groups", 1)
+    result = run("optimize", write_world(tmp_path / "in.g2o", world), "--reject", "none")
+    assert f"{len(world.closures)} accepted" in result.output and "rejected" not in result.output
+
+
+@pytest.mark.parametrize("command", ["optimize", "plot"])
+def test_a_file_that_is_not_there_is_an_error(tmp_path: Path, command: str) -> None:
+    result = run(command, tmp_path / "none.g2o")
+    assert isinstance(result.exception, GraphError) and "No such file" in str(result.exception)
+
+
 @pytest.mark.parametrize("guards", ["gate", "some", "ALL"])
 def test_an_unknown_guard_lists_the_known_ones(tmp_path: Path, guards: str) -> None:
     result = run("optimize", write_world(tmp_path / "a.g2o", RIGHT), "--reject", guards)
@@ -120,3 +143,4 @@ def test_the_picture_goes_where_it_should(tmp_path: Path) -> None:
     result = run("plot", write_world(tmp_path / "a.g2o", RIGHT), "-o", tmp_path / "b.png")
     assert result.exit_code == 0 and "b.png" in result.output
     assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
+    assert isinstance(run("plot", tmp_path / "a.g2o", "-o", tmp_path / "no" / "b.png").exception, OutputError)

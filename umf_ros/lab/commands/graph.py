@@ -12,8 +12,8 @@ from umf_ros.errors import ConfigError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from umf_ros.lab.datasets.g2o import GraphRecording
     from umf_ros.pose_graph.closures import ClosureVerdict
-    from umf_ros.pose_graph.g2o import GraphRecording
     from umf_ros.pose_graph.pose_graph import PoseGraph
 
 MOST_ROWS = 20
@@ -40,8 +40,8 @@ def optimize(
 
     from umf_ros.config import PoseGraphSettings
     from umf_ros.errors import OutputError
+    from umf_ros.lab.datasets.g2o import as_recording, drive, read_g2o
     from umf_ros.pose_graph.export import verdict_table
-    from umf_ros.pose_graph.g2o import as_recording, drive, read_g2o
     from umf_ros.pose_graph.pose_graph import PoseGraph
 
     console, content = Console(), read_g2o(file)
@@ -70,8 +70,8 @@ def plot(
     output: Annotated[Path, typer.Option("--output", "-o", help="Picture to write.")] = Path("graph.png"),
 ) -> None:
     """Draw a graph file: odometry dark, closures green, from above and from the side."""
-    from umf_ros.pose_graph.g2o import as_recording, read_g2o
-    from umf_ros.runs.plots import plot_graph
+    from umf_ros.lab.datasets.g2o import as_recording, read_g2o
+    from umf_ros.lab.evaluation.graph_plot import plot_graph
 
     content = read_g2o(file)
     plot_graph(as_recording(content), content.poses, output)

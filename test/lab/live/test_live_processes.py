@@ -17,16 +17,15 @@ from recordings import traverse, write_mcap
 from rich.console import Console
 
 from umf_ros.errors import UmfError
-from umf_ros.nodes.live_graph import LiveGraph, NodeProcess
+from umf_ros.lab.live.live_graph import PLAYER, LiveGraph, NodeProcess
 
 SCANS = 14
 RESULTS = ["summary.json", "closures.csv", "keyframes.csv", "config.yaml", "graph.g2o", "trajectory_odometry.tum"]
 
 
 @pytest.fixture(autouse=True)
-def own_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A DDS domain of our own; and no process is left when a test is over."""
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+def no_process_is_left() -> Iterator[None]:
+    """When a test is over."""
     before = set(nodes())
     yield
     assert set(nodes()) <= before
@@ -44,7 +43,7 @@ def nodes() -> dict[int, str]:
     for path in Path("/proc/self/task").glob("*/children"):
         for number in path.read_text().split():
             words = Path(f"/proc/{number}/cmdline").read_bytes().decode().split("\0")
-            names = [word.removeprefix("umf_ros.nodes.") for word in words if word.startswith("umf_ros.nodes.")]
+            names = [word.rpartition(".")[2] for word in words if word.startswith("umf_ros.")]
             found |= {int(number): name for name in names}
     return found
 
@@ -68,33 +67,33 @@ def once(condition: Callable[[], bool], action: Callable[[], object]) -> threadi
 
 def test_a_program_that_ends_before_it_is_ready_is_told_with_its_log(tmp_path: Path) -> None:
     lines: list[str] = []
-    process = NodeProcess("dds_check", [], tmp_path / "check.log", lines.append)
-    with pytest.raises(UmfError, match=rf"dds_check ended with status 0; see {tmp_path}/check\.log"):
+    process = NodeProcess("umf_ros.nodes.dds_check", [], tmp_path, lines.append)
+    with pytest.raises(UmfError, match=rf"dds_check ended with status 0; see {tmp_path}/dds_check\.log"):
         process.wait_ready()
     assert process.stop() and process.exit_code == 0
     assert len(lines) == 1 and lines[0].startswith("an image arrived after")
-    assert (tmp_path / "check.log").read_text() == lines[0] + "\n"
+    assert (tmp_path / "dds_check.log").read_text() == lines[0] + "\n"
 
 
 def test_what_a_program_complains_of_is_shown_and_logged(tmp_path: Path) -> None:
     lines: list[str] = []
-    process = NodeProcess("bag_player_node", ["nowhere.mcap"], tmp_path / "player.log", lines.append)
+    process = NodeProcess(PLAYER, ["nowhere.mcap"], tmp_path, lines.append)
     with pytest.raises(UmfError, match="bag_player_node ended with status 1"):
         process.wait_ready()
     process.stop()
     assert lines == ["umf: there is no recording nowhere.mcap"]
-    assert (tmp_path / "player.log").read_text() == "umf: there is no recording nowhere.mcap\n"
+    assert (tmp_path / "bag_player_node.log").read_text() == "umf: there is no recording nowhere.mcap\n"
 
 
 def test_a_node_runs_in_a_session_of_its_own_until_it_is_stopped(tmp_path: Path) -> None:
     """The Ctrl-C of a terminal goes to every process of its session: the nodes must not see it."""
     lines: list[str] = []
-    process = NodeProcess("pose_graph_node", [], tmp_path / "node.log", lines.append)
+    process = NodeProcess("umf_ros.nodes.pose_graph_node", [], tmp_path, lines.append)
     process.wait_ready()
     number = number_of("pose_graph_node")
     assert os.getsid(number) == number != os.getsid(0) and process.exit_code is None
     assert process.stop() and process.exit_code == 0
-    assert "ready\n" in (tmp_path / "node.log").read_text() and "ready" not in lines
+    assert "ready\n" in (tmp_path / "pose_graph_node.log").read_text() and "ready" not in lines
     assert process.stop()  # stopping what has ended is nothing
 
 
