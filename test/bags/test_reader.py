@@ -214,7 +214,7 @@ def test_a_data_set_is_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     (datasets / "my-rover.yaml").write_text("topics: {left: /nav/left}\n")
     with pytest.raises(ConfigError, match=r"my-rover\.yaml: calibration: .*required.*unknown parameter topics\.left"):
         topics_of(settings)
-    with pytest.raises(ConfigError, match="dataset: input should be 'simulated', 'my-rover', 's3li-etna' or"):
+    with pytest.raises(ConfigError, match=r"dataset: input should be 'simulated', .*'my-rover'"):
         load_settings(dataset="kitti")
 
 

@@ -11,6 +11,8 @@ from command_line import only_line, umf
 
 from umf_ros import __version__
 from umf_ros.commands import checks
+from umf_ros.errors import either
+from umf_ros.resources import dataset_names
 
 COMMANDS = ["demo", "simulate", "replay", "play", "report", "evaluate", "explain", "train", "export", "doctor"]
 GROUPS = {"pretrain": ["image", "lidar"], "graph": ["optimize", "plot"]}
@@ -39,7 +41,9 @@ def test_help_lists_every_command_with_one_line() -> None:
 
 @pytest.mark.parametrize("command", ["replay", "explain", "evaluate"])
 def test_help_names_the_data_sets(command: str) -> None:
-    assert "auto, simulated, s3li-etna or s3li-vulcano." in umf(command, "--help").text
+    names = dataset_names()
+    assert {"simulated", "s3li-etna", "s3li-vulcano"} <= set(names)
+    assert f"{either(['auto', *names])}." in umf(command, "--help").text
 
 
 @pytest.mark.parametrize("words", [[name] for name in COMMANDS] + [[g, c] for g, cs in GROUPS.items() for c in cs])

@@ -19,7 +19,9 @@ from recordings import ODOMETRY, TRUTH, traverse, write_mcap
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
+from umf_ros.errors import either
 from umf_ros.geometry import invert, relative, rotation_angle
+from umf_ros.resources import dataset_names
 from umf_ros.runs.tables import read_closures
 
 FILES = (
@@ -187,7 +189,10 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["{bag}", "--config", "nowhere.yaml"], "cannot read nowhere.yaml"),
         (["{bag}", "--config", "{wrong}"], "unknown parameter loop.topk"),
         (["{bag}", "--config", "{notes}"], "notes.txt: expected names and values, found a str"),
-        (["{bag}", "--dataset", "kitti"], "dataset: input should be 'simulated', 's3li-etna' or 's3li-vulcano'"),
+        (
+            ["{bag}", "--dataset", "kitti"],
+            f"dataset: input should be {either(list(map(repr, dataset_names())))}",
+        ),
         (["{bag}", "--embedder", "magic"], "magic"),
         (["{bag}", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
         (["{bag}", "--weights", "{notes}"], "notes.txt"),
