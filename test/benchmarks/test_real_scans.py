@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import make_keyframe
 from measurements import GOOD
-from recordings import RealPair, cropped, draw_pairs, read_pairs, read_scan, summary
+from real_scans import RealPair, cropped, draw_pairs, read_pairs, read_scan, summary
 
 from umf_ros.frames import Candidate, LoopClosure
 from umf_ros.geometry import make_pose

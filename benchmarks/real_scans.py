@@ -1,6 +1,6 @@
 """Verification on real scans in a plain folder, LiDAR alone: how many true and how many false pairs are accepted.
 
-python benchmarks/recordings.py FOLDER [--sample N] [--apart N] [--crop DEG] [--json FILE]
+python benchmarks/real_scans.py FOLDER [--sample N] [--apart N] [--crop DEG] [--json FILE]
 
 The folder holds scans, .npy or .bin, (N, 3) or (N, 4) float32 (x y z in metres and, fourth, intensity; .bin always
 has four), and `pairs.csv` with the columns match_scan, query_scan (paths relative to the folder) and same_place
