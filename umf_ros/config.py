@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import PydanticCustomError
 
 from umf_ros.errors import ConfigError, either
 from umf_ros.resources import DEFAULT_DATASET, dataset_names, find
@@ -27,7 +26,7 @@ def _known(name: str) -> str:
     names = dataset_names()
     if name not in names:
         find("config/datasets")  # a broken installation lacks them all
-        raise PydanticCustomError("dataset", "Input should be {names}", {"names": either([repr(one) for one in names])})
+        raise ValueError(f"Input should be {either([repr(one) for one in names])}")
     return name
 
 
@@ -329,10 +328,11 @@ def problems(error: ValidationError) -> str:
 
 def _explain(problem: Any) -> str:
     name = ".".join(str(part) for part in problem["loc"])
+    text = str(problem["msg"]).removeprefix("Value error, ")
     if not name:  # of several values together
-        return str(problem["msg"]).removeprefix("Value error, ")
+        return text
     if problem["type"] == "extra_forbidden":
         return f"unknown parameter {name}"
     if problem["type"] == "missing":
         return f"{name} is missing"
-    return f"{name}: {problem['msg'][0].lower()}{problem['msg'][1:]} (got {problem['input']!r})"
+    return f"{name}: {text[0].lower()}{text[1:]} (got {problem['input']!r})"
