@@ -240,18 +240,18 @@ class PoseGraph:
         chain = self._sessions.chains[-1]
         if not len(chain.stamps):
             return np.eye(4)
-        last = chain.log.stamps[-1:]
+        last = np.array([chain.newest_ns])
         return self._sessions.at(len(self._sessions.chains) - 1, last)[0] @ invert(chain.poses_at(last)[0])
 
     def covariance(self) -> Array:
         """(6, 6) marginal covariance of the newest pose in ROS order about the map's axes; zero without odometry."""
         self._refresh()
         session = len(self._sessions.chains) - 1
-        last = self._sessions.chains[session].log.stamps[-1:]
-        if not len(last):
+        last = self._sessions.chains[session].newest_ns
+        if last is None:
             return np.zeros((6, 6))
-        covariance = self._sessions.covariance(session, int(last[0]), self._rejection.scale)
-        return gtsam_to_ros_covariance(covariance, self._sessions.at(session, last)[0])
+        covariance = self._sessions.covariance(session, last, self._rejection.scale)
+        return gtsam_to_ros_covariance(covariance, self._sessions.at(session, np.array([last]))[0])
 
     def write_tum(self, path: str | Path, optimized: bool = True) -> None:
         """Write the trajectory, or the odometry, of all joined sessions in order of their stamps as a TUM file.
@@ -284,7 +284,7 @@ class PoseGraph:
         endpoints = [self._rejection.endpoints_in(session) for session in range(len(self._sessions.chains))]
         full = self._sessions.expand(self._rejection.accepted, endpoints, self._rejection.scale)
         ids = [row if vertex_of is None else vertex_of(stamp) for row, (_, stamp) in enumerate(full.vertices)]
-        write_g2o(path, full.poses, full.edges, planar, ids)
+        write_g2o(path, full.poses, [full.edges[row] for row in range(len(full.edges))], planar, ids)
         if vertex_of is None:
             write_vertex_table(Path(path).with_suffix(".csv"), full.vertices)
 
