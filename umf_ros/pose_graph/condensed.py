@@ -122,6 +122,8 @@ class Optimizer:
         Raises:
             GraphError: the system is indeterminate or does not converge to finite poses.
         """
+        if not graph.anchors:  # QR would not notice
+            raise GraphError("the pose graph cannot be solved: no vertex stays where it is")
         numbers = np.array([self._numbers.setdefault(key, len(self._numbers)) for key in graph.vertices])
         self._start_from(numbers, graph.poses)
         factors = self._factor_graph(graph, numbers)
@@ -180,12 +182,8 @@ def _descend(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam
     """Gauss-Newton; a step that is not small has to pay, else Levenberg and Marquardt take over."""
     error: float | None = None
     for _ in range(_MAX_STEPS):
-        try:
-            delta = factors.linearize(values).optimize()
-        except RuntimeError:  # Cholesky finds a long straight chain indeterminate
-            return _descend_carefully(factors, values)
-        trial = values.retract(delta)
-        steps = np.abs(delta.vector().reshape(-1, 6)).max(axis=0)
+        trial, delta = _step(factors, values)
+        steps = np.abs(delta).max(axis=0)
         if max(steps[:3]) < _SMALL_TURN_RAD and max(steps[3:]) < _SMALL_STEP_M:
             return trial
         error = factors.error(values) if error is None else error
@@ -196,6 +194,20 @@ def _descend(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam
             return trial
         values, error = trial, trial_error
     return values
+
+
+def _step(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[gtsam.Values, Array]:
+    """One step of Gauss-Newton, and (N, 6) by how much it moves each vertex."""
+    try:
+        delta = factors.linearize(values).optimize()
+        return values.retract(delta), delta.vector().reshape(-1, 6)
+    except RuntimeError:  # Cholesky finds a long straight chain indeterminate, which QR does not
+        parameters = gtsam.GaussNewtonParams()
+        parameters.setLinearSolverType("MULTIFRONTAL_QR")
+        optimizer = gtsam.GaussNewtonOptimizer(factors, values, parameters)
+        optimizer.iterate()
+        trial = optimizer.values()
+        return trial, values.localCoordinates(trial).vector().reshape(-1, 6)
 
 
 def _descend_carefully(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
