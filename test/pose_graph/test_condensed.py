@@ -100,12 +100,13 @@ def test_what_cannot_be_solved_says_so_and_breaks_nothing(breakage: str) -> None
 
 def test_the_marginal_grows_along_a_chain() -> None:
     optimizer = Optimizer()
-    np.testing.assert_array_equal(optimizer.marginal(0), np.zeros((6, 6)))
+    assert optimizer.marginal(0) is None
     optimizer.solve(problem(square(), CYCLE[:3]))
-    spreads = [np.trace(optimizer.marginal(vertex)) for vertex in range(4)]
-    assert spreads == sorted(spreads) and spreads[0] < 1e-9 < spreads[1]
-    np.testing.assert_allclose(optimizer.marginal(1), COVARIANCE, atol=1e-9)
-    np.testing.assert_array_equal(optimizer.marginal("unknown"), np.zeros((6, 6)))
+    marginals = [optimizer.marginal(vertex) for vertex in range(4)]
+    spreads = [np.trace(marginal) for marginal in marginals if marginal is not None]
+    assert len(spreads) == 4 and spreads == sorted(spreads) and spreads[0] < 1e-9 < spreads[1]
+    np.testing.assert_allclose(marginals[1], COVARIANCE, atol=1e-9)
+    assert optimizer.marginal("unknown") is None
 
 
 @pytest.mark.parametrize("scale", [1.0, 3.0])

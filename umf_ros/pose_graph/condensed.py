@@ -113,8 +113,8 @@ class Optimizer:
         self._numbers: dict[Hashable, int] = {}
         self._values = gtsam.Values()
         self._poses = np.empty((0, 4, 4))
-        self._solved: gtsam.NonlinearFactorGraph | None = None
-        self._marginals: dict[Hashable, Array] = {}
+        self._solved = gtsam.NonlinearFactorGraph()
+        self._marginals: dict[Hashable, Array | None] = {}
 
     def solve(self, graph: Graph) -> Array:
         """(N, 4, 4) poses of the vertices at the minimum near those to start from.
@@ -140,15 +140,13 @@ class Optimizer:
         self._values, self._poses, self._solved, self._marginals = values, poses, factors, {}
         return poses[numbers]
 
-    def marginal(self, vertex: Hashable) -> Array:
-        """(6, 6) covariance of a vertex of the last solved graph in its tangent space; zero before the first."""
-        if self._solved is None or vertex not in self._numbers:
-            return np.zeros((6, 6))
+    def marginal(self, vertex: Hashable) -> Array | None:
+        """(6, 6) covariance of a vertex of the last solved graph in its tangent space; None where it is unknown."""
         if vertex not in self._marginals:
             try:
-                found = gtsam.Marginals(self._solved, self._values).marginalCovariance(self._numbers[vertex])
-            except (RuntimeError, IndexError):
-                found = np.zeros((6, 6))
+                found = gtsam.Marginals(self._solved, self._values).marginalCovariance(self._numbers.get(vertex, -1))
+            except (RuntimeError, IndexError, TypeError):
+                found = None
             self._marginals[vertex] = found
         return self._marginals[vertex]
 

@@ -117,8 +117,8 @@ class OutlierRejection:
             self._decide_all()
         if self._revoke_outvoted():
             self._decide_all()
-        for _ in range(_MOST_ROUNDS):
-            self._solve(exactly=True)
+        self._solve()
+        self._sessions.refine(self.accepted, self.scale)
         return self._verdicts()
 
     def renew(self) -> list[ClosureVerdict]:
@@ -347,9 +347,9 @@ class OutlierRejection:
             self._solve()
         return bool(reasons)
 
-    def _solve(self, without: Sequence[int] = (), exactly: bool = False) -> None:
+    def _solve(self, without: Sequence[int] = ()) -> None:
         closures = [closure for row, closure in enumerate(self.closures) if closure.accepted and row not in without]
-        self._sessions.solve(closures, self.scale, exactly)
+        self._sessions.solve(closures, self.scale)
         self._map = RelativePoses(self._sessions, self.scale)
 
     def _worth_another_look(self) -> list[int]:

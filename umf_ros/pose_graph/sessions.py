@@ -19,6 +19,7 @@ from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Stamps
 
 # where every keyframe is a vertex, one so close to a closure's endpoint adds nothing but rounding errors
 _TOO_CLOSE_NS = 10_000_000
+_REFINEMENTS = 4
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,9 @@ class Sessions:
     def __init__(self, settings: PoseGraphSettings) -> None:
         self._settings = settings
         self._optimizer = Optimizer()
-        self._solved_for = (NoiseScale(), False)
+        self._refiner = Optimizer()
+        self._scale = NoiseScale()
+        self._refined: dict[int, CorrectedPath | None] = {}
         self.chains: list[OdometryChain] = []
         self.paths: list[CorrectedPath | None] = []
         self.components: list[int] = []
@@ -95,7 +98,7 @@ class Sessions:
             if len(chain.stamps) and (late or self.paths[session] is None):
                 self.paths[session] = self._uncorrected(session)
             if late:
-                self._optimizer = Optimizer()
+                self._optimizer, self._refined = Optimizer(), {}
         return changed
 
     @property
@@ -113,7 +116,7 @@ class Sessions:
 
     def reset(self) -> None:
         """Go back to the odometry alone."""
-        self._optimizer = Optimizer()
+        self._optimizer, self._refined = Optimizer(), {}
         self.solution = None
         self.components = list(range(len(self.chains)))
         self.paths = [self._uncorrected(s) if len(c.stamps) else None for s, c in enumerate(self.chains)]
@@ -139,31 +142,41 @@ class Sessions:
 
     def at(self, session: int, stamps: Stamps) -> Array:
         """(N, 4, 4) `map_T_body` of one session."""
-        return self.path(session).at(stamps)
+        return (self._refined.get(session) or self.path(session)).at(stamps)
 
-    def solve(self, closures: Sequence[TrackedClosure], scale: NoiseScale, exactly: bool = False) -> None:
-        """Move every path to the optimum of odometry and the given closures.
-
-        Args:
-            closures: to be met.
-            scale: of the stated noise.
-            exactly: solve for every keyframe, not only for the closures' endpoints.
+    def solve(self, closures: Sequence[TrackedClosure], scale: NoiseScale) -> None:
+        """Move every path to the optimum of odometry and the given closures, as far as condensed odometry tells.
 
         Raises:
             GraphError: the system cannot be solved; the paths stay as they were.
         """
-        if (scale, exactly) != self._solved_for:
-            self._optimizer, self._solved_for = Optimizer(), (scale, exactly)
-        stamps = [self._vertex_stamps(session, closures, exactly) for session in range(len(self.chains))]
+        if scale != self._scale:
+            self._optimizer, self._scale = Optimizer(), scale
+        stamps = [self._vertex_stamps(session, closures) for session in range(len(self.chains))]
         components, moves = self._join(closures)
-        starts, graph = self._graph(stamps, closures, scale, moves)
-        anchors = [int(starts[session]) for session, _ in self._active if components[session] == session]
-        self.solution = replace(graph, poses=self._optimizer.solve(replace(graph, anchors=anchors)))
-        self.components, self.starts = components, starts
-        for session, path in self._active:
-            own = self.solution.poses[starts[session] : starts[session + 1]]
-            points = path.chain.at(stamps[session])
-            self.paths[session] = CorrectedPath(path.chain, stamps[session], points, own)
+        starts, graph = self._graph(stamps, closures, scale, components, moves)
+        self.solution = replace(graph, poses=self._optimizer.solve(graph))
+        self.components, self.starts, self._refined = components, starts, {}
+        self.paths = self._through(stamps, starts, self.solution.poses)
+
+    def refine(self, closures: Sequence[TrackedClosure], scale: NoiseScale) -> None:
+        """Move every path to the exact optimum, of every keyframe, after these closures have been solved for.
+
+        Raises:
+            GraphError: the system cannot be solved; the paths stay as they were.
+        """
+        self._refiner, unmoved = Optimizer(), [np.eye(4)] * len(self.chains)
+        stamps = [self._keyframes_and(self._vertex_stamps(s, closures), s) for s in range(len(self.chains))]
+        for _ in range(_REFINEMENTS):
+            starts, graph = self._graph(stamps, closures, scale, self.components, unmoved)
+            self._refined = dict(enumerate(self._through(stamps, starts, self._refiner.solve(graph))))
+
+    def _through(self, stamps: list[Stamps], starts: NDArray[np.int64], poses: Array) -> list[CorrectedPath | None]:
+        """The paths through solved poses."""
+        return [
+            path and CorrectedPath(path.chain, own, path.chain.at(own), poses[start : start + len(own)])
+            for path, own, start in zip(self.paths, stamps, starts, strict=False)
+        ]
 
     @property
     def _active(self) -> list[tuple[int, CorrectedPath]]:
@@ -171,53 +184,61 @@ class Sessions:
 
     def covariance(self, session: int, stamp_ns: int, scale: NoiseScale) -> Array:
         """(6, 6) marginal covariance of the pose at a stamp after the last solved one, in its tangent space."""
-        path = self.path(session)
+        path, last = self._refined.get(session), None
+        if path is not None:
+            last = self._refiner.marginal((session, int(path.stamps[-1])))
+        if path is None or last is None:
+            path = self.path(session)
+            last = self._optimizer.marginal((session, int(path.stamps[-1])))
         at = np.array([stamp_ns], np.int64)
         back = invert(path.at(at)) @ path.poses[-1:]
-        last = self._optimizer.marginal((session, int(path.stamps[-1])))
         points = path.chain.at(at)
         walked = scale.odometry**2 * (points.noise - path.points.noise[-1])
-        return (propagate(adjoint(back), last) + propagate(adjoint(invert(points.poses)), walked))[0]
+        return (
+            propagate(adjoint(back), np.zeros((6, 6)) if last is None else last)
+            + propagate(adjoint(invert(points.poses)), walked)
+        )[0]
 
     def expand(self, closures: Sequence[TrackedClosure], extra: Sequence[Stamps], scale: NoiseScale) -> Graph:
         """Every keyframe and the `extra` stamps of each session, joined by odometry and by the given closures."""
         stamps = [np.union1d(chain.stamps, more) for chain, more in zip(self.chains, extra, strict=True)]
-        return self._graph(stamps, closures, scale, [np.eye(4)] * len(stamps))[1]
+        return self._graph(stamps, closures, scale, self.components, [np.eye(4)] * len(stamps))[1]
 
     def _graph(
-        self, stamps: list[Stamps], closures: Sequence[TrackedClosure], scale: NoiseScale, moves: list[Array]
+        self,
+        stamps: list[Stamps],
+        closures: Sequence[TrackedClosure],
+        scale: NoiseScale,
+        components: list[int],
+        moves: Sequence[Array],
     ) -> tuple[NDArray[np.int64], Graph]:
-        """The graph of poses at stamps of each session, moved, and each session's first vertex."""
+        """The first vertex of each session, and the graph of moved poses at stamps of each."""
         starts = np.cumsum([0] + [len(own) for own in stamps])
         edges = [odometry_edges(path.chain.at(stamps[s]), int(starts[s]), scale.odometry) for s, path in self._active]
         edges.append(_closure_edges(closures, stamps, starts, scale.closures))
         vertices = [(session, stamp) for session, own in enumerate(stamps) for stamp in own.tolist()]
-        parts = [moves[session] @ path.at(stamps[session]) for session, path in self._active]
-        poses = np.concatenate([np.empty((0, 4, 4)), *parts])
-        return starts, Graph(
-            vertices,
-            poses,
-            [],
-            _edge_keys(vertices, closures),
-            Edges.join(edges),
-        )
+        poses = [np.empty((0, 4, 4)), *(moves[s] @ self.at(s, stamps[s]) for s, _ in self._active)]
+        anchors = [int(starts[session]) for session, _ in self._active if components[session] == session]
+        keys = _edge_keys(vertices, closures)
+        return starts, Graph(vertices, np.concatenate(poses), anchors, keys, Edges.join(edges))
 
     def _uncorrected(self, session: int) -> CorrectedPath:
         chain = self.chains[session]
         first = chain.stamps[:1].copy()
         return CorrectedPath(chain, first, chain.at(first), chain.poses_at(first))
 
-    def _vertex_stamps(self, session: int, closures: Sequence[TrackedClosure], every_keyframe: bool) -> Stamps:
+    def _vertex_stamps(self, session: int, closures: Sequence[TrackedClosure]) -> Stamps:
         """The first stamp of a session and those of its closures' endpoints; none without odometry."""
         endpoints = [c.closure.match_stamp_ns for c in closures if c.match == session]
         endpoints += [c.closure.query_stamp_ns for c in closures if c.query == session]
-        known = self.chains[session].stamps
-        least = np.unique(np.concatenate([known[:1], np.array(endpoints, np.int64)]))
-        if not every_keyframe:
-            return least
-        after = np.searchsorted(least, known)
-        gaps = [np.abs(known - least[np.clip(row, 0, len(least) - 1)]) for row in (after - 1, after)]
-        return np.union1d(least, known[np.min(gaps, axis=0) > _TOO_CLOSE_NS])
+        return np.unique(np.concatenate([self.chains[session].stamps[:1], np.array(endpoints, np.int64)]))
+
+    def _keyframes_and(self, stamps: Stamps, session: int) -> Stamps:
+        """Stamps of a session with those of all keyframes, except very close ones."""
+        keyframes = self.chains[session].stamps
+        after = np.searchsorted(stamps, keyframes)
+        gaps = [np.abs(keyframes - stamps[np.clip(row, 0, len(stamps) - 1)]) for row in (after - 1, after)]
+        return np.union1d(stamps, keyframes[np.min(gaps, axis=0) > _TOO_CLOSE_NS])
 
     def _join(self, closures: Sequence[TrackedClosure]) -> tuple[list[int], list[Array]]:
         """The component of each session, and how each moves to its component's gauge, newly joined ones included."""
