@@ -155,9 +155,8 @@ class OutlierRejection:
 
     def endpoint_positions(self) -> Array:
         """(N, 2, 3) map positions of the match and query endpoints of all closures."""
-        rows = np.arange(len(self.closures))
         both = (self._arrays.match, self._arrays.query)
-        return np.stack([self._poses(endpoints, rows)[:, :3, 3] for endpoints in both], axis=1)
+        return np.stack([self._poses(endpoints)[:, :3, 3] for endpoints in both], axis=1)
 
     def _decide_all(self) -> None:
         rows: Iterable[int] = range(len(self.closures))
@@ -354,19 +353,16 @@ class OutlierRejection:
 
     def _worth_another_look(self) -> list[int]:
         """Closures not accepted that the moved map now comes close to."""
-        rows = np.flatnonzero(~self._in_state(State.ACCEPTED))
-        return rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
+        ways = invert(self._poses(self._arrays.match)) @ self._poses(self._arrays.query)
+        misfits = np.linalg.norm((invert(self._arrays["pose"]) @ ways)[:, :3, 3], axis=1)
+        return np.flatnonzero(~self._in_state(State.ACCEPTED) & (misfits < _CLOSE_M)).tolist()
 
-    def _misfits(self, rows: NDArray[np.int64]) -> Array:
-        """(N, 4, 4) from what closures say to what the map says."""
-        ways = invert(self._poses(self._arrays.match, rows)) @ self._poses(self._arrays.query, rows)
-        return invert(self._arrays["pose"][rows]) @ ways
-
-    def _poses(self, endpoints: Endpoints, rows: NDArray[np.int64]) -> Array:
-        poses = np.zeros((len(rows), 4, 4))
-        for session in np.unique(endpoints["session"][rows]):
-            mine = endpoints["session"][rows] == session
-            poses[mine] = self._sessions.at(int(session), endpoints["stamp"][rows][mine])
+    def _poses(self, endpoints: Endpoints) -> Array:
+        """(N, 4, 4) `map_T_body` at one endpoint of every closure."""
+        poses = np.zeros((len(endpoints), 4, 4))
+        for session in np.unique(endpoints["session"]):
+            mine = endpoints["session"] == session
+            poses[mine] = self._sessions.at(int(session), endpoints["stamp"][mine])
         return poses
 
     def _note(
