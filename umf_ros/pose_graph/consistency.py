@@ -270,13 +270,13 @@ class _Place:
     def noise_to_vertex(self, vertex: int, back: Array) -> Array:
         """Noise of the odometry between here and a vertex beside it, in the tangent space `back` leads to."""
         row = vertex - self.start
-        sign = 1.0 if self.stamp >= self.path.stamps[row] else -1.0
-        return propagate(adjoint(back @ self.turn), sign * (self.noise - self.path.points.noise[row]))
+        walked = self.path.points.noise[row] - self.noise
+        return propagate(adjoint(back @ self.turn), walked if self.stamp < self.path.stamps[row] else -walked)
 
     def noise_to(self, other: _Place, back: Array) -> Array:
         """Noise of the odometry from here to another place of the session."""
-        sign = 1.0 if other.stamp >= self.stamp else -1.0
-        return propagate(adjoint(back @ other.turn), sign * (other.noise - self.noise))
+        walked = other.noise - self.noise
+        return propagate(adjoint(back @ other.turn), walked if self.stamp <= other.stamp else -walked)
 
 
 def _length(covariances: Array) -> Array:
