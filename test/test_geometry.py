@@ -17,7 +17,6 @@ from umf_ros.geometry import (
     logmap,
     make_pose,
     propagate,
-    right_jacobian,
     ros_to_gtsam_covariance,
     transform,
 )
@@ -103,13 +102,6 @@ def test_log_near_half_a_turn(angle: float) -> None:
     axis = np.array([0.6, -0.48, 0.64])
     pose = expmap(np.array([[*(angle * axis), 1.0, 2.0, 3.0]]))
     np.testing.assert_allclose(expmap(logmap(pose)), pose, atol=1e-7)
-
-
-def test_right_jacobian_is_the_derivative_of_exp() -> None:
-    twist, step = twists(1, 0.05)[:1], 1e-6
-    pose = expmap(twist)
-    columns = [logmap(invert(pose) @ expmap(twist + step * axis))[0] / step for axis in np.eye(6)]
-    np.testing.assert_allclose(right_jacobian(twist)[0], np.stack(columns, axis=1), atol=1e-5)
 
 
 def test_inverting_a_stack_inverts_each() -> None:

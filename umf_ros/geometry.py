@@ -139,15 +139,6 @@ def adjoint(poses: Array) -> Array:
     return result
 
 
-def right_jacobian(twists: Array) -> Array:
-    """(N, 6, 6) right Jacobians of `expmap` for small (N, 6) twists, to third order."""
-    turned, moved = skew(twists[..., :3]), skew(twists[..., 3:])
-    ad = np.zeros((*twists.shape[:-1], 6, 6))
-    ad[..., :3, :3] = ad[..., 3:, 3:] = turned
-    ad[..., 3:, :3] = moved
-    return np.eye(6) - ad / 2 + ad @ ad / 6 - ad @ ad @ ad / 24
-
-
 def propagate(matrices: Array, covariances: Array) -> Array:
     """`A S A'` for stacks of matrices and covariances."""
     return matrices @ covariances @ np.swapaxes(matrices, -1, -2)

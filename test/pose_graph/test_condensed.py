@@ -11,7 +11,7 @@ from graph_worlds import chain_of, two_laps
 from umf_ros.errors import GraphError
 from umf_ros.geometry import Array, adjoint, expmap, invert, make_pose, propagate, relative
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS
-from umf_ros.pose_graph.condensed import CondensedGraph, Edges, Linearisation, Optimizer, odometry_edges
+from umf_ros.pose_graph.condensed import Edges, Graph, Optimizer, odometry_edges
 
 COVARIANCE = np.diag([*np.deg2rad([0.5] * 3), 0.05, 0.05, 0.05]) ** 2
 
@@ -31,10 +31,10 @@ def edges(poses: Array, pairs: list[tuple[int, int]], wrong: dict[int, Array] | 
     return Edges(first, second, np.stack(measured), np.tile(COVARIANCE, (len(pairs), 1, 1)))
 
 
-def problem(poses: Array, pairs: list[tuple[int, int]], initial: Array | None = None, **wrong: Array) -> CondensedGraph:
+def problem(poses: Array, pairs: list[tuple[int, int]], initial: Array | None = None, **wrong: Array) -> Graph:
     offsets = {int(name[1:]): offset for name, offset in wrong.items()}
     found = edges(poses, pairs, offsets)
-    return CondensedGraph(range(len(poses)), poses if initial is None else initial, [0], pairs, found)
+    return Graph(range(len(poses)), poses if initial is None else initial, [0], pairs, found)
 
 
 CYCLE = [(0, 1), (1, 2), (2, 3), (0, 3)]
@@ -74,13 +74,13 @@ def test_a_growing_problem_is_solved_as_if_it_were_new() -> None:
     np.testing.assert_allclose(optimizer.solve(grown), Optimizer().solve(grown), atol=1e-4)
 
 
-def test_new_measurements_under_old_keys_need_forgetting() -> None:
-    optimizer, poses = Optimizer(), square()[:2]
-    optimizer.solve(problem(poses, [(0, 1)]))
-    longer = problem(poses, [(0, 1)], e0=make_pose(np.eye(3), [0, -1.0, 0]))
-    optimizer.forget_factors()
-    found = optimizer.solve(longer)
-    assert np.linalg.norm(found[1, :3, 3]) == pytest.approx(11.0, abs=1e-3)
+def test_a_long_straight_chain_is_solved() -> None:
+    """Elimination by Cholesky finds such a chain indeterminate, though it is not."""
+    poses = np.tile(np.eye(4), (3000, 1, 1))
+    poses[:, 0, 3] = np.arange(3000)
+    chain = [(k, k + 1) for k in range(2999)]
+    found = Optimizer().solve(problem(poses, chain))
+    np.testing.assert_allclose(found, poses, atol=1e-3)
 
 
 @pytest.mark.parametrize("breakage", ["no anchor", "not finite", "no covariance"])
@@ -100,18 +100,19 @@ def test_what_cannot_be_solved_says_so_and_breaks_nothing(breakage: str) -> None
 
 def test_the_marginal_grows_along_a_chain() -> None:
     optimizer = Optimizer()
-    np.testing.assert_array_equal(optimizer.marginal(0), np.zeros((6, 6)))
+    assert optimizer.marginal(0) is None
     optimizer.solve(problem(square(), CYCLE[:3]))
-    spreads = [np.trace(optimizer.marginal(vertex)) for vertex in range(4)]
-    assert spreads == sorted(spreads) and spreads[0] < 1e-9 < spreads[1]
-    np.testing.assert_allclose(optimizer.marginal(1), COVARIANCE, atol=1e-9)
-    np.testing.assert_array_equal(optimizer.marginal("unknown"), np.zeros((6, 6)))
+    marginals = [optimizer.marginal(vertex) for vertex in range(4)]
+    spreads = [np.trace(marginal) for marginal in marginals if marginal is not None]
+    assert len(spreads) == 4 and spreads == sorted(spreads) and spreads[0] < 1e-9 < spreads[1]
+    np.testing.assert_allclose(marginals[1], COVARIANCE, atol=1e-9)
+    assert optimizer.marginal("unknown") is None
 
 
 @pytest.mark.parametrize("scale", [1.0, 3.0])
 def test_an_edge_between_far_stamps_is_the_way_between(scale: float) -> None:
     world = two_laps(3)
-    points = Linearisation(chain_of(world)).at(np.array([20, 90]) * PERIOD_NS)
+    points = chain_of(world).at(np.array([20, 90]) * PERIOD_NS)
     edges = odometry_edges(points, first_vertex=7, scale=scale)
     assert len(edges) == 1 and (edges[0].first, edges[0].second) == (7, 8)
     np.testing.assert_allclose(edges[0].pose, invert(world.odometry[20]) @ world.odometry[90], atol=1e-9)

@@ -10,7 +10,7 @@ from graph_worlds import SETTINGS
 from umf_ros.config import PoseGraphSettings
 from umf_ros.geometry import Array, adjoint, expmap, invert, propagate, relative
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
-from umf_ros.pose_graph.odometry import OdometryChain, OdometryLog
+from umf_ros.pose_graph.odometry import OdometryChain
 
 WORLD = rover_loops(300, 12)
 
@@ -19,26 +19,27 @@ def line(count: int) -> Array:
     return expmap(np.stack([np.array([0, 0, 0, 0.1 * k, 0, 0]) for k in range(count)]))
 
 
-def test_a_log_sorts_drops_duplicates_and_keeps_the_first() -> None:
-    log, poses = OdometryLog(), line(6)
+def test_a_chain_sorts_drops_duplicates_and_keeps_the_first() -> None:
+    chain, poses = OdometryChain(SETTINGS), line(6)
     for k in (3, 1, 5):
-        log.add(k, poses[k])
-    assert log.sort() == 1
-    log.add(3, poses[0])
-    log.add(2, poses[2])
-    assert log.sort() == 2 and log.sort() is None
-    assert log.stamps.tolist() == [1, 2, 3, 5] and log.duplicates == 1
-    np.testing.assert_array_equal(log.poses_at(np.array([3]))[0], poses[3])
-    np.testing.assert_allclose(log.poses_at(np.array([4]))[0, 0, 3], 0.4)
+        chain.add(k, poses[k])
+    assert not chain.update() and chain.newest_ns == 5
+    chain.add(3, poses[0])
+    assert not chain.update()
+    chain.add(2, poses[2])
+    assert chain.update() and not chain.update()
+    np.testing.assert_array_equal(chain.poses_at(np.array([1, 2, 3, 5])), poses[[1, 2, 3, 5]])
+    np.testing.assert_allclose(chain.poses_at(np.array([4]))[0, 0, 3], 0.4)
 
 
-def test_a_log_knows_where_it_can_be_trusted() -> None:
-    log, poses = OdometryLog(), line(6)
+def test_a_chain_knows_where_it_can_be_trusted() -> None:
+    chain, poses = OdometryChain(SETTINGS.model_copy(update={"max_gap_s": 10e-9})), line(6)
+    assert not chain.covers(0)
     for k in (0, 10, 40):
-        log.add(k, poses[0])
-    log.sort()
-    known = log.known(np.array([-1, 0, 5, 10, 25, 40, 41]), max_gap_ns=10)
-    assert known.tolist() == [False, True, True, True, False, True, False]
+        chain.add(k, poses[0])
+    chain.update()
+    known = [chain.covers(stamp) for stamp in (-1, 0, 5, 10, 25, 40, 41)]
+    assert known == [False, True, True, True, False, True, False]
 
 
 def test_noise_between_two_stamps_is_that_of_the_steps_between() -> None:
@@ -46,9 +47,8 @@ def test_noise_between_two_stamps_is_that_of_the_steps_between() -> None:
     for k in range(60):
         chain.add(k * PERIOD_NS, WORLD.odometry[k], WORLD.step_covariance(k))
     chain.update()
-    stamps = np.array([20, 50]) * PERIOD_NS
-    noise = np.diff(chain.noise_at(stamps, chain.poses_at(stamps)), axis=0)
-    back = adjoint(invert(chain.at_origin(chain.poses_at(stamps[1:]))))
+    points = chain.at(np.array([20, 50]) * PERIOD_NS)
+    noise, back = np.diff(points.noise, axis=0), adjoint(invert(points.poses[1:]))
     expected = np.zeros((6, 6))
     for k in range(21, 51):
         carry = gtsam.Pose3(relative(WORLD.odometry[50], WORLD.odometry[k])).AdjointMap()
@@ -64,7 +64,7 @@ def test_the_model_grows_with_the_way_not_with_the_messages() -> None:
             chain.add(stamp, expmap(np.array([[0, 0, 0, 0.5 * stamp / 1e9, 0, 0]]))[0])
         chain.update()
         end = np.array([60_000_000_000])
-        ends.append(chain.noise_at(end, chain.poses_at(end))[0])
+        ends.append(chain.at(end).noise[0])
         assert len(chain.stamps) == pytest.approx(30 / 0.25, abs=2)
     np.testing.assert_allclose(ends[0], ends[1], rtol=0.02, atol=1e-12)
     assert np.sqrt(ends[0][3, 3]) == pytest.approx(PoseGraphSettings().odometry_sigma_m * np.sqrt(30), rel=0.05)

@@ -19,7 +19,7 @@ from umf_ros.runs.tables import (
     CANDIDATES,
     CLOSURES,
     INLIERS,
-    Table,
+    CsvTable,
     candidate_row,
     closure_row,
     inlier_rows,
@@ -39,7 +39,7 @@ def closure(seed: int = 0, probability: float = 0.97) -> LoopClosure:
 
 
 def written(path: Path, rows: list[list[object]], columns: list[str] = CLOSURES) -> Path:
-    table = Table(path, columns)
+    table = CsvTable(path, columns)
     table.append(rows)
     table.close()
     return path
@@ -96,7 +96,7 @@ def test_inliers_are_pixels_to_a_tenth(tmp_path: Path) -> None:
 
 
 def test_rows_are_there_before_the_table_is_closed(tmp_path: Path) -> None:
-    table = Table(tmp_path / "a.csv", ["a", "b"])
+    table = CsvTable(tmp_path / "a.csv", ["a", "b"])
     assert (tmp_path / "a.csv").read_bytes() == b"a,b\r\n"
     for count in range(1, 4):
         table.append([[count, count]] * 2)
@@ -114,7 +114,7 @@ class FullDisk(io.StringIO):
 def test_a_full_disk_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "open", lambda *_, **__: FullDisk())
     with pytest.raises(OutputError, match=r"cannot write .*a\.csv: No space left on device$"):
-        Table(tmp_path / "a.csv", ["a"])
+        CsvTable(tmp_path / "a.csv", ["a"])
 
 
 @pytest.mark.parametrize(

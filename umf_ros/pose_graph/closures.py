@@ -11,7 +11,7 @@ import numpy as np
 from umf_ros.errors import GraphError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, ros_to_gtsam_covariance
-from umf_ros.pose_graph.odometry import GrowingArray, OdometryChain
+from umf_ros.pose_graph.odometry import OdometryChain, Table
 
 _SKEWED = 1e-3
 
@@ -76,60 +76,46 @@ class TrackedClosure:
         self.verdict = ClosureVerdict(self.closure, state, reason, residual, residual_m)
 
 
-class Endpoints:
-    """One endpoint of N closures: its session, stamp, and the odometry there."""
+class Endpoints(Table):
+    """One endpoint of N closures: its session and stamp, with the travel, pose and noise of the odometry there."""
 
     def __init__(self) -> None:
-        self.session = GrowingArray(dtype=np.int64)
-        self.stamp = GrowingArray(dtype=np.int64)
-        self.travel = GrowingArray()
-        self.pose = GrowingArray((4, 4))
-        self.noise = GrowingArray((6, 6))
+        whole, poses = np.empty(0, np.int64), np.empty((0, 4, 4))
+        super().__init__(session=whole, stamp=whole, travel=np.empty(0), pose=poses, noise=np.empty((0, 6, 6)))
 
     def append(self, chain: OdometryChain, session: int, stamp: int) -> None:
         """Append an endpoint by session and stamp."""
         at = np.array([stamp], np.int64)
-        pose = chain.poses_at(at)
-        self.session.extend([session])
-        self.stamp.extend(at)
-        self.travel.extend(chain.travel_at(at))
-        self.pose.extend(chain.at_origin(pose))
-        self.noise.extend(chain.noise_at(at, pose))
+        poses, noise = chain.at(at)
+        self.extend(session=[session], stamp=at, travel=chain.travel_at(at), pose=poses, noise=noise)
 
     def renew(self, chains: Sequence[OdometryChain]) -> None:
         """Look the odometry up again after its past changed."""
-        for session in np.unique(self.session.view):
-            mine, chain = self.session.view == session, chains[session]
-            stamps = self.stamp.view[mine]
-            poses = chain.poses_at(stamps)
-            self.travel.view[mine] = chain.travel_at(stamps)
-            self.pose.view[mine] = chain.at_origin(poses)
-            self.noise.view[mine] = chain.noise_at(stamps, poses)
+        for session in np.unique(self["session"]):
+            mine, chain = self["session"] == session, chains[session]
+            stamps = self["stamp"][mine]
+            self["travel"][mine] = chain.travel_at(stamps)
+            self["pose"][mine], self["noise"][mine] = chain.at(stamps)
 
     def distances(self, row: int) -> Array:
         """(N,) metres along the path from endpoint `row` to every other; infinite between sessions."""
-        same = self.session.view == self.session.view[row]
-        return np.where(same, np.abs(self.travel.view - self.travel.view[row]), np.inf)
+        same = self["session"] == self["session"][row]
+        return np.where(same, np.abs(self["travel"] - self["travel"][row]), np.inf)
 
 
-class ClosureArrays:
-    """Both endpoints of N closures and their measurements."""
+class ClosureArrays(Table):
+    """Poses and covariances of N closures, and both their endpoints."""
 
     def __init__(self) -> None:
+        super().__init__(pose=np.empty((0, 4, 4)), covariance=np.empty((0, 6, 6)))
         self.match = Endpoints()
         self.query = Endpoints()
-        self.pose = GrowingArray((4, 4))
-        self.covariance = GrowingArray((6, 6))
-
-    def __len__(self) -> int:
-        return len(self.pose)
 
     def append(self, chains: Sequence[OdometryChain], tracked: TrackedClosure) -> None:
         """Append one closure."""
         self.match.append(chains[tracked.match], tracked.match, tracked.closure.match_stamp_ns)
         self.query.append(chains[tracked.query], tracked.query, tracked.closure.query_stamp_ns)
-        self.pose.extend(tracked.closure.match_T_query[None])
-        self.covariance.extend(tracked.covariance[None])
+        self.extend(pose=[tracked.closure.match_T_query], covariance=[tracked.covariance])
 
     def renew(self, chains: Sequence[OdometryChain]) -> None:
         """Look the odometry up again after its past changed."""
@@ -163,16 +149,11 @@ def check_pose(pose: Array) -> None:
         raise GraphError(f"a pose is a 4x4 matrix, not {np.shape(pose)}")
     if not np.isfinite(pose).all():
         raise GraphError("pose is not finite")
-    x, y, z = pose[0, :3], pose[1, :3], pose[2, :3]
-    # three products say that x and y are orthonormal and that z is their cross product
-    if max(abs(x @ x - 1), abs(y @ y - 1), abs(x @ y)) > _SKEWED or np.abs(_cross(x, y) - z).max() > _SKEWED:
+    rotation = pose[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > _SKEWED or np.linalg.det(rotation) < 0:
         raise GraphError("rotation is not orthonormal")
     if np.abs(pose[:3, 3]).max() > 1e7:
         raise GraphError("absurd position")
-
-
-def _cross(a: Array, b: Array) -> Array:
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def check_covariance(covariance: Array) -> None:

@@ -1,9 +1,7 @@
 """Odometry condensed to one edge between any two stamps, and the small graph that remains to be solved.
 
 Between two chosen stamps the many odometry steps act like one: their noise adds up, carried along
-the path. Around the odometry itself that is exact only to first order in the correction; around
-the corrected path (`Linearisation.around`) it is the exact Gauss-Newton elimination of all poses
-between, so repeating to solve and to linearise converges to the optimum of the full graph.
+the path. That is exact to first order in the correction.
 """
 
 from __future__ import annotations
@@ -17,106 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.errors import GraphError
-from umf_ros.geometry import Array, adjoint, expmap, invert, logmap, orthonormal, propagate, right_jacobian
-from umf_ros.pose_graph.odometry import OdometryChain, Stamps
+from umf_ros.geometry import Array, adjoint, invert, propagate
+from umf_ros.pose_graph.odometry import PathPoints
 
 _ANCHOR = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
 _MAX_STEPS = 30
 # a step this small leaves an error of about the product of both, which the next solution removes
 _SMALL_TURN_RAD = 0.02
 _SMALL_STEP_M = 0.2
-
-
-@dataclass(frozen=True)
-class PathPoints:
-    """A linearised path at N stamps.
-
-    Attributes:
-        poses: (N, 4, 4) around which is linearised, seen from `Linearisation`'s origin.
-        noise: (N, 6, 6) noise of all steps so far, at the origin.
-        offset: (N, 6) corrections that the steps already carry, summed at the origin.
-    """
-
-    poses: Array
-    noise: Array
-    offset: Array
-
-    def __getitem__(self, rows: NDArray[Any]) -> PathPoints:
-        """The chosen rows."""
-        return PathPoints(self.poses[rows], self.noise[rows], self.offset[rows])
-
-
-@dataclass(frozen=True)
-class _Correction:
-    """How far a corrected path is from its odometry: `turns` take odometry poses to corrected ones at each stamp."""
-
-    stamps: Stamps
-    turns: Array
-    odometry_noise: Array
-    points: PathPoints
-
-
-class Linearisation:
-    """The path around which a session's odometry is condensed: the odometry itself, or a corrected path."""
-
-    def __init__(self, chain: OdometryChain, correction: _Correction | None = None) -> None:
-        self._chain = chain
-        self._correction = correction
-
-    def at(self, stamps: Stamps) -> PathPoints:
-        """The path at stamps the odometry covers."""
-        poses = self._chain.poses_at(stamps)
-        odometry, noise = self._chain.at_origin(poses), self._chain.noise_at(stamps, poses)
-        if self._correction is None:
-            return PathPoints(odometry, noise, np.zeros((len(stamps), 6)))
-        return _corrected(self._correction, stamps, odometry, noise)
-
-    def around(self, stamps: Stamps, poses: Array) -> Linearisation:
-        """The same odometry linearised around (N, 4, 4) corrected poses at sorted stamps."""
-        # this is repeated, and inverting by transposing would multiply what is not quite orthonormal
-        poses = orthonormal(poses)
-        odometry = self._chain.poses_at(stamps)
-        noise = self._chain.noise_at(stamps, odometry)
-        odometry = self._chain.at_origin(odometry)
-        inverse = invert(odometry)
-        measured = inverse[:-1] @ odometry[1:]
-        offsets = logmap(invert(measured) @ invert(poses[:-1]) @ poses[1:])
-        own = propagate(adjoint(inverse[1:]), np.diff(noise, axis=0))
-        shifted = poses.copy()
-        shifted[:, :3, 3] -= poses[0, :3, 3]
-        carry = adjoint(shifted[1:]) @ right_jacobian(offsets)
-        points = PathPoints(
-            shifted,
-            _sum_from_zero(propagate(carry, own)),
-            _sum_from_zero((carry @ offsets[..., None])[..., 0]),
-        )
-        return Linearisation(self._chain, _Correction(stamps, shifted @ inverse, noise[-1], points))
-
-
-def _corrected(correction: _Correction, stamps: Stamps, odometry: Array, noise: Array) -> PathPoints:
-    """The corrected path at stamps with the given odometry; beyond its last stamp it follows the odometry."""
-    last = len(correction.stamps) - 1
-    upper = np.clip(np.searchsorted(correction.stamps, stamps), 0, last)
-    at_node = (correction.stamps[upper] == stamps) | (stamps > correction.stamps[last])
-    lower = np.where(at_node, upper, np.maximum(upper - 1, 0))
-    span = np.maximum(correction.stamps[upper] - correction.stamps[lower], 1)
-    share = np.clip((stamps - correction.stamps[lower]) / span, 0.0, 1.0)[:, None]
-    twists = share * logmap(invert(correction.turns[lower]) @ correction.turns[upper])
-    before, after = correction.points[lower], correction.points[upper]
-    result = PathPoints(
-        correction.turns[lower] @ expmap(twists) @ odometry,
-        before.noise + share[..., None] * (after.noise - before.noise),
-        before.offset + share * (after.offset - before.offset),
-    )
-    beyond = stamps > correction.stamps[last]
-    if beyond.any():
-        carry = adjoint(correction.turns[last])
-        result.noise[beyond] += propagate(carry, noise[beyond] - correction.odometry_noise)
-    return result
-
-
-def _sum_from_zero(values: Array) -> Array:
-    return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
 
 
 @dataclass(frozen=True)
@@ -164,15 +70,8 @@ class Edges:
 
 def odometry_edges(points: PathPoints, first_vertex: int, scale: float = 1.0) -> Edges:
     """Edges between the successive N points of one session, its noise multiplied by `scale` squared."""
-    back = invert(points.poses[1:])
-    carry = adjoint(back)
-    offsets = (carry @ np.diff(points.offset, axis=0)[..., None])[..., 0]
-    covariances = scale**2 * propagate(carry, np.diff(points.noise, axis=0))
-    measured = invert(points.poses[:-1]) @ points.poses[1:] @ expmap(-offsets)
-    # keeps the gradient of the condensed edge that of the chain where the offset is not small
-    for row in np.flatnonzero(np.abs(offsets).max(axis=1, initial=0.0) > 1e-6):
-        jacobian = gtsam.Pose3.LogmapDerivative(gtsam.Pose3.Expmap(offsets[row]))
-        covariances[row] = propagate(jacobian, covariances[row])
+    measured = invert(points.poses[:-1]) @ points.poses[1:]
+    covariances = scale**2 * propagate(adjoint(invert(points.poses[1:])), np.diff(points.noise, axis=0))
     first = np.arange(first_vertex, first_vertex + len(measured))
     return Edges(first, first + 1, measured, covariances)
 
@@ -184,18 +83,18 @@ def between(edge: Edge) -> gtsam.BetweenFactorPose3:
 
 
 @dataclass(frozen=True)
-class CondensedGraph:
+class Graph:
     """A graph of N vertices and M edges.
 
     Attributes:
-        vertices: N lasting keys.
-        poses: (N, 4, 4) to start from.
+        vertices: N lasting keys, each hashable.
+        poses: (N, 4, 4) to start from, or solved.
         anchors: the vertices 0..N-1 that stay where they are, one per connected part.
         keys: M lasting keys of the edges.
         edges: the M measurements between vertices 0..N-1.
     """
 
-    vertices: Sequence[Hashable]
+    vertices: Sequence[Any]
     poses: Array
     anchors: Sequence[int]
     keys: Sequence[Hashable]
@@ -203,9 +102,10 @@ class CondensedGraph:
 
 
 class Optimizer:
-    """Solves condensed graphs that differ little from one to the next.
+    """Solves graphs that differ little from one to the next.
 
-    Vertices and edges go by lasting keys, so that values and factors are made once.
+    Vertices and edges go by lasting keys, so that values and factors are made once: an edge whose
+    measurement or covariance changes needs a new optimiser.
     """
 
     def __init__(self) -> None:
@@ -213,18 +113,17 @@ class Optimizer:
         self._numbers: dict[Hashable, int] = {}
         self._values = gtsam.Values()
         self._poses = np.empty((0, 4, 4))
-        self._solved: gtsam.NonlinearFactorGraph | None = None
+        self._solved = gtsam.NonlinearFactorGraph()
+        self._marginals: dict[Hashable, Array | None] = {}
 
-    def forget_factors(self) -> None:
-        """Edges have new measurements or covariances under their old keys."""
-        self._factors = {}
-
-    def solve(self, graph: CondensedGraph) -> Array:
+    def solve(self, graph: Graph) -> Array:
         """(N, 4, 4) poses of the vertices at the minimum near those to start from.
 
         Raises:
             GraphError: the system is indeterminate or does not converge to finite poses.
         """
+        if not graph.anchors:  # QR would not notice
+            raise GraphError("the pose graph cannot be solved: no vertex stays where it is")
         numbers = np.array([self._numbers.setdefault(key, len(self._numbers)) for key in graph.vertices])
         self._start_from(numbers, graph.poses)
         factors = self._factor_graph(graph, numbers)
@@ -238,17 +137,18 @@ class Optimizer:
         poses[:, :3, 3] = rows[:, 9:]
         if not np.isfinite(poses).all():
             raise GraphError("the pose graph cannot be solved: the result is not finite")
-        self._values, self._poses, self._solved = values, poses, factors
+        self._values, self._poses, self._solved, self._marginals = values, poses, factors, {}
         return poses[numbers]
 
-    def marginal(self, vertex: Hashable) -> Array:
-        """(6, 6) covariance of a vertex of the last solved graph in its tangent space; zero before the first."""
-        if self._solved is None or vertex not in self._numbers:
-            return np.zeros((6, 6))
-        try:
-            return gtsam.Marginals(self._solved, self._values).marginalCovariance(self._numbers[vertex])
-        except (RuntimeError, IndexError):
-            return np.zeros((6, 6))
+    def marginal(self, vertex: Hashable) -> Array | None:
+        """(6, 6) covariance of a vertex of the last solved graph in its tangent space; None where it is unknown."""
+        if vertex not in self._marginals:
+            try:
+                found = gtsam.Marginals(self._solved, self._values).marginalCovariance(self._numbers.get(vertex, -1))
+            except (RuntimeError, IndexError, TypeError):
+                found = None
+            self._marginals[vertex] = found
+        return self._marginals[vertex]
 
     def _start_from(self, numbers: NDArray[np.int64], initial: Array) -> None:
         known = len(self._poses)
@@ -262,7 +162,7 @@ class Optimizer:
         self._poses = np.concatenate([self._poses, np.tile(np.eye(4), (len(self._numbers) - known, 1, 1))])
         self._poses[numbers] = initial
 
-    def _factor_graph(self, graph: CondensedGraph, numbers: NDArray[np.int64]) -> gtsam.NonlinearFactorGraph:
+    def _factor_graph(self, graph: Graph, numbers: NDArray[np.int64]) -> gtsam.NonlinearFactorGraph:
         factors = gtsam.NonlinearFactorGraph()
         for vertex in graph.anchors:
             factors.add(gtsam.PriorFactorPose3(int(numbers[vertex]), gtsam.Pose3(graph.poses[vertex]), _ANCHOR))
@@ -280,9 +180,8 @@ def _descend(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam
     """Gauss-Newton; a step that is not small has to pay, else Levenberg and Marquardt take over."""
     error: float | None = None
     for _ in range(_MAX_STEPS):
-        delta = factors.linearize(values).optimize()
-        trial = values.retract(delta)
-        steps = np.abs(delta.vector().reshape(-1, 6)).max(axis=0)
+        trial, delta = _step(factors, values)
+        steps = np.abs(delta).max(axis=0)
         if max(steps[:3]) < _SMALL_TURN_RAD and max(steps[3:]) < _SMALL_STEP_M:
             return trial
         error = factors.error(values) if error is None else error
@@ -293,6 +192,20 @@ def _descend(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam
             return trial
         values, error = trial, trial_error
     return values
+
+
+def _step(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[gtsam.Values, Array]:
+    """One step of Gauss-Newton, and (N, 6) by how much it moves each vertex."""
+    try:
+        delta = factors.linearize(values).optimize()
+        return values.retract(delta), delta.vector().reshape(-1, 6)
+    except RuntimeError:  # Cholesky finds a long straight chain indeterminate, which QR does not
+        parameters = gtsam.GaussNewtonParams()
+        parameters.setLinearSolverType("MULTIFRONTAL_QR")
+        optimizer = gtsam.GaussNewtonOptimizer(factors, values, parameters)
+        optimizer.iterate()
+        trial = optimizer.values()
+        return trial, values.localCoordinates(trial).vector().reshape(-1, 6)
 
 
 def _descend_carefully(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:

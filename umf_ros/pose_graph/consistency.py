@@ -8,6 +8,7 @@ Closures of one place count once.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -76,8 +77,9 @@ class ConsistencyGraph:
         self._consistent.append({})
         self._inconsistent.append(set())
         near = self._near(row)
-        known = sorted({self.place_of[other] for other in near})
-        self.place_of.append(next((first for first in known if self._same_place(row, [first])), row))
+        known = np.unique(np.array(self.place_of, np.int64)[near])
+        same = known[self._same_place(known, row)]
+        self.place_of.append(int(same[0]) if len(same) else row)
         loops = loop_residuals(self._closures, np.full(len(near), row), near)
         self._compare(row, near, loops, scale)
         return loops
@@ -107,7 +109,7 @@ class ConsistencyGraph:
         wrong one is consistent with right ones too where little would have shown it.
         """
         linked, others, evidence = [self._best_linked(found)], found, 0.0
-        while others := [other for other in others if not self._same_place(other, linked[-1:])]:
+        while others := self._elsewhere(others, linked[-1]):
             ratio, nearest = min(
                 (min((self._consistent[other][k] for k in linked if k in self._consistent[other]), default=1.0), other)
                 for other in others
@@ -127,11 +129,12 @@ class ConsistencyGraph:
             for other, ratio in self._consistent[one].items()
             if one < other and other in inside and self.place_of[one] != self.place_of[other]
         ]
-        return next((one for _, one, other in sorted(pairs) if not self._same_place(one, [other])), found[0])
+        return next((one for _, one, other in sorted(pairs) if self._elsewhere([one], other)), found[0])
 
     def companions(self, row: int, members: NDArray[np.bool_]) -> list[int]:
         """Closures out of `members` of the same place that are consistent with this one."""
-        return [other for other in self._consistent[row] if members[other] and self._same_place(other, [row])]
+        consistent = np.array([other for other in self._consistent[row] if members[other]], np.int64)
+        return consistent[self._same_place(consistent, row)].tolist()
 
     def opponents(self, row: int, members: NDArray[np.bool_]) -> list[int]:
         """Closures out of `members` that are inconsistent with this one."""
@@ -139,11 +142,10 @@ class ConsistencyGraph:
 
     def count_places(self, rows: list[int]) -> int:
         """How many different places closures are of."""
-        counted: list[int] = []
-        for row in rows:
-            if not self._same_place(row, counted):
-                counted.append(row)
-        return len(counted)
+        count = 0
+        while rows:
+            rows, count = self._elsewhere(rows, rows[0]), count + 1
+        return count
 
     def _near(self, row: int) -> NDArray[np.int64]:
         apart = np.maximum(self._closures.match.distances(row), self._closures.query.distances(row))
@@ -163,18 +165,18 @@ class ConsistencyGraph:
                 self._inconsistent[row].add(other)
                 self._inconsistent[other].add(row)
 
-    def _same_place(self, row: int, others: list[int]) -> bool:
-        match, query = self._closures.match, self._closures.query
-        for other in others:
-            same = match.session.view[row] == match.session.view[other]
-            same &= query.session.view[row] == query.session.view[other]
-            apart = min(
-                abs(match.travel.view[row] - match.travel.view[other]),
-                abs(query.travel.view[row] - query.travel.view[other]),
-            )
-            if same and apart < self._settings.place_m:
-                return True
-        return False
+    def _same_place(self, rows: Sequence[int] | NDArray[np.int64], other: int) -> NDArray[np.bool_]:
+        """(N,) which closures are of the place of another one."""
+        rows = np.asarray(rows, np.int64)
+        same, apart = np.ones(len(rows), bool), np.full(len(rows), np.inf)
+        for ends in (self._closures.match, self._closures.query):
+            same &= ends["session"][rows] == ends["session"][other]
+            apart = np.minimum(apart, np.abs(ends["travel"][rows] - ends["travel"][other]))
+        return same & (apart < self._settings.place_m)
+
+    def _elsewhere(self, rows: list[int], other: int) -> list[int]:
+        """Those of other places than one closure."""
+        return [row for row, same in zip(rows, self._same_place(rows, other), strict=True) if not same]
 
 
 class Prediction(NamedTuple):
@@ -202,17 +204,15 @@ class RelativePoses:
         self._variance_scale = scale.odometry**2
         solution = sessions.solution
         assert solution is not None
-        self._starts, self._edges, self._poses = solution.starts, solution.edges, solution.poses
+        self._starts, self._edges, self._poses = sessions.starts, solution.edges, solution.poses
         first, second, size = self._edges.first, self._edges.second, len(self._poses)
-        lengths = _length(self._edges.covariances)
+        low, high, lengths = np.minimum(first, second), np.maximum(first, second), _length(self._edges.covariances)
         # of parallel edges the shortest counts: a sparse matrix would add them up
-        order = np.lexsort((lengths, np.maximum(first, second), np.minimum(first, second)))
-        low, high = np.minimum(first, second)[order], np.maximum(first, second)[order]
-        best = np.ones(len(order), bool)
-        best[1:] = (np.diff(low) != 0) | (np.diff(high) != 0)
-        self._rows, low, high = order[best], low[best], high[best]
-        self._keys = low * size + high
-        self._ways = csr_matrix((lengths[self._rows], (low, high)), shape=(size, size))
+        order = np.argsort(lengths, kind="stable")
+        self._keys, best = np.unique((low * size + high)[order], return_index=True)
+        self._rows = order[best]
+        ends = (low[self._rows], high[self._rows])
+        self._ways = csr_matrix((lengths[self._rows], ends), shape=(size, size))
 
     def predict(self, match: int, match_stamp: int, query: int, query_stamp: int) -> Prediction:
         """The map's relative pose from stamp `match_stamp` of session `match` to the query's."""
@@ -259,7 +259,7 @@ class _Place:
 
     def __post_init__(self) -> None:
         at = np.array([self.stamp], np.int64)
-        points = self.path.linearisation.at(at)
+        points = self.path.chain.at(at)
         self.noise = points.noise[0]
         self.pose = self.path.at(at)[0]
         self.turn = self.pose @ invert(points.poses[0])
@@ -270,13 +270,13 @@ class _Place:
     def noise_to_vertex(self, vertex: int, back: Array) -> Array:
         """Noise of the odometry between here and a vertex beside it, in the tangent space `back` leads to."""
         row = vertex - self.start
-        sign = 1.0 if self.stamp >= self.path.stamps[row] else -1.0
-        return propagate(adjoint(back @ self.turn), sign * (self.noise - self.path.points.noise[row]))
+        walked = self.path.points.noise[row] - self.noise
+        return propagate(adjoint(back @ self.turn), walked if self.stamp < self.path.stamps[row] else -walked)
 
     def noise_to(self, other: _Place, back: Array) -> Array:
         """Noise of the odometry from here to another place of the session."""
-        sign = 1.0 if other.stamp >= self.stamp else -1.0
-        return propagate(adjoint(back @ other.turn), sign * (other.noise - self.noise))
+        walked = other.noise - self.noise
+        return propagate(adjoint(back @ other.turn), walked if self.stamp <= other.stamp else -walked)
 
 
 def _length(covariances: Array) -> Array:

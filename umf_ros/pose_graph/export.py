@@ -42,7 +42,7 @@ def verdict_table(verdicts: list[ClosureVerdict], vertex_of: Callable[[int], int
 
 def write_g2o(
     path: str | Path,
-    poses: Sequence[Array],
+    poses: Iterable[Array],
     edges: Sequence[Edge],
     planar: bool = False,
     ids: Sequence[int] | None = None,
@@ -59,6 +59,7 @@ def write_g2o(
     Raises:
         OutputError: the file cannot be written.
     """
+    poses = list(poses)
     names = range(len(poses)) if ids is None else ids
     vertex, edge = (_planar_vertex, _planar_edge) if planar else (_spatial_vertex, _spatial_edge)
     lines = [vertex(pose, name) for pose, name in zip(poses, names, strict=True)]

@@ -69,16 +69,16 @@ def loop_residuals(closures: ClosureArrays, one: Rows, other: Rows) -> LoopResid
 
     The way is: match of one, query of one, query of other, match of other, match of one.
     """
-    odometry_query = invert(closures.query.pose.view[one]) @ closures.query.pose.view[other]
-    odometry_match = invert(closures.match.pose.view[other]) @ closures.match.pose.view[one]
-    back = invert(closures.pose.view[other])
+    odometry_query = invert(closures.query["pose"][one]) @ closures.query["pose"][other]
+    odometry_match = invert(closures.match["pose"][other]) @ closures.match["pose"][one]
+    back = invert(closures["pose"][other])
     after_back = odometry_match
     after_query = back @ after_back
     after_one = odometry_query @ after_query
-    closed = closures.pose.view[one] @ after_one
-    noise_one = propagate(adjoint(invert(after_one)), closures.covariance.view[one])
+    closed = closures["pose"][one] @ after_one
+    noise_one = propagate(adjoint(invert(after_one)), closures["covariance"][one])
     # the covariance of an inverse lives in the tangent space of the match
-    noise_other = propagate(adjoint(closures.pose.view[other]), closures.covariance.view[other])
+    noise_other = propagate(adjoint(closures["pose"][other]), closures["covariance"][other])
     noise_other = propagate(adjoint(invert(after_back)), noise_other)
     walk_query = _walk(closures.query, one, other, other)
     walk_match = _walk(closures.match, one, other, one)
@@ -88,9 +88,9 @@ def loop_residuals(closures: ClosureArrays, one: Rows, other: Rows) -> LoopResid
 
 def _walk(endpoints: Endpoints, a: Rows, b: Rows, at: Rows) -> Array:
     """Odometry noise between the endpoints of closures a and b, in the tangent space of the endpoint of `at`."""
-    forward = (endpoints.stamp.view[a] <= endpoints.stamp.view[b])[:, None, None]
-    noise = np.where(forward, 1.0, -1.0) * (endpoints.noise.view[b] - endpoints.noise.view[a])
-    return propagate(adjoint(invert(endpoints.pose.view[at])), noise)
+    forward = (endpoints["stamp"][a] <= endpoints["stamp"][b])[:, None, None]
+    noise = np.where(forward, 1.0, -1.0) * (endpoints["noise"][b] - endpoints["noise"][a])
+    return propagate(adjoint(invert(endpoints["pose"][at])), noise)
 
 
 class NoiseScaleEstimator:

@@ -2,127 +2,66 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from umf_ros.config import PoseGraphSettings
 from umf_ros.geometry import Array, adjoint, interpolate, orthonormal, propagate, relative, ros_to_gtsam_covariance
 
 Stamps = NDArray[np.int64]
+Rows = NDArray[np.int64]
 _TURN_M_PER_RAD = 0.5
 _DRIFT_M_PER_S = 1e-4
 
 
-class GrowingArray:
-    """An array that grows at its end in amortised constant time, and can be cut back."""
+class Table:
+    """Named columns that grow at their end in amortised constant time, and can be cut back.
 
-    def __init__(self, shape: tuple[int, ...] = (), dtype: DTypeLike = float) -> None:
-        self._data: NDArray[Any] = np.empty((64, *shape), dtype)
+    Args:
+        columns: (0, ...) arrays that say what each column holds.
+    """
+
+    def __init__(self, **columns: NDArray[Any]) -> None:
+        self._columns = columns
         self._size = 0
 
     def __len__(self) -> int:
         return self._size
 
-    @property
-    def view(self) -> NDArray[Any]:
-        """The rows so far; valid until the next change."""
-        return self._data[: self._size]
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """(N, ...) rows of a column; valid until the next change."""
+        return self._columns[name][: self._size]
 
-    def extend(self, rows: ArrayLike) -> None:
-        """Append (N, ...) rows."""
-        added = np.asarray(rows)
-        size = self._size + len(added)
-        if size > len(self._data):
-            grown = np.empty((max(size, 2 * len(self._data)), *self._data.shape[1:]), self._data.dtype)
-            grown[: self._size] = self.view
-            self._data = grown
-        self._data[self._size : size] = added
-        self._size = size
+    def extend(self, **rows: ArrayLike) -> None:
+        """Append (N, ...) rows of every column."""
+        start, self._size = self._size, self._size + len(np.asarray(next(iter(rows.values()))))
+        for name, column in self._columns.items():
+            if self._size > len(column):
+                column = self._columns[name] = np.resize(column, (2 * self._size, *column.shape[1:]))
+            column[start : self._size] = rows[name]
 
     def truncate(self, size: int) -> None:
         """Keep the first `size` rows."""
-        self._size = min(size, self._size)
+        self._size = size
 
 
-class OdometryLog:
-    """Odometry messages sorted by stamp; a second message of the same stamp is dropped."""
+class PathPoints(NamedTuple):
+    """Odometry at N stamps, seen from the position of the session's first pose: that keeps sums well conditioned.
 
-    def __init__(self) -> None:
-        self._stamps = GrowingArray(dtype=np.int64)
-        self._poses = GrowingArray((3, 4))
-        self._arrived: list[tuple[int, Array]] = []
-        self.duplicates = 0
+    Attributes:
+        poses: (N, 4, 4).
+        noise: (N, 6, 6) noise of all steps so far, at the origin.
+    """
 
-    @property
-    def stamps(self) -> Stamps:
-        """(N,) stamps of the sorted messages."""
-        return self._stamps.view
-
-    def add(self, stamp_ns: int, pose: Array) -> None:
-        """Remember one (4, 4) pose; it is sorted in by the next `sort`."""
-        self._arrived.append((stamp_ns, pose))
-
-    def sort(self) -> int | None:
-        """Sort the new messages in; returns the earliest stamp that is new, None without one."""
-        if not self._arrived:
-            return None
-        stamps = np.array([stamp for stamp, _ in self._arrived], np.int64)
-        poses = orthonormal(np.stack([pose for _, pose in self._arrived]))
-        self._arrived = []
-        return self._merge(stamps, poses[:, :3])
-
-    def _merge(self, stamps: Stamps, rows: Array) -> int | None:
-        start = int(np.searchsorted(self.stamps, stamps.min()))
-        old = len(self.stamps) - start
-        stamps = np.concatenate([self.stamps[start:], stamps])
-        rows = np.concatenate([self._poses.view[start:], rows])
-        # the first index of a stamp is the one that arrived first: unique is stable and old ones lead
-        sorted_stamps, first = np.unique(stamps, return_index=True)
-        self.duplicates += len(stamps) - len(first)
-        new = sorted_stamps[first >= old]
-        self._stamps.truncate(start)
-        self._poses.truncate(start)
-        self._stamps.extend(sorted_stamps)
-        self._poses.extend(rows[first])
-        return int(new[0]) if len(new) else None
-
-    def poses(self, rows: NDArray[np.int64] | slice) -> Array:
-        """(N, 4, 4) poses of the given rows."""
-        values = self._poses.view[rows]
-        poses = np.zeros((len(values), 4, 4))
-        poses[:, :3] = values
-        poses[:, 3, 3] = 1.0
-        return poses
-
-    def known(self, stamps: Stamps, max_gap_ns: int) -> NDArray[np.bool_]:
-        """Which stamps are a message's own or lie in a gap of at most `max_gap_ns` between two."""
-        if not len(self.stamps):
-            return np.zeros(len(stamps), bool)
-        after = np.searchsorted(self.stamps, stamps)
-        upper = np.minimum(after, len(self.stamps) - 1)
-        lower = np.maximum(upper - 1, 0)
-        exact = self.stamps[upper] == stamps
-        between = (after > 0) & (after < len(self.stamps))
-        return exact | (between & (self.stamps[upper] - self.stamps[lower] <= max_gap_ns))
-
-    def poses_at(self, stamps: Stamps) -> Array:
-        """(N, 4, 4) poses interpolated at the stamps, held constant outside the log."""
-        upper = np.clip(np.searchsorted(self.stamps, stamps), 0, len(self.stamps) - 1)
-        exact = self.stamps[upper] == stamps
-        lower = np.where(exact, upper, np.maximum(upper - 1, 0))
-        span = np.maximum(self.stamps[upper] - self.stamps[lower], 1)
-        fractions = np.clip((stamps - self.stamps[lower]) / span, 0.0, 1.0)
-        poses, between = self.poses(lower), np.flatnonzero(fractions)
-        if len(between):
-            poses[between] = interpolate(poses[between], self.poses(upper[between]), fractions[between])
-        return poses
+    poses: Array
+    noise: Array
 
 
 class OdometryChain:
-    """Keyframes of one session's odometry with the noise collected along the way.
+    """All messages of one session, and keyframes among them with the noise collected along the way.
 
     The noise of the way from a to b is a difference of prefix sums: with `W` the covariance of a
     step carried to the origin by the adjoint, `cov(a_T_b) = Ad(b)^-1 (sum_b W - sum_a W) Ad(b)^-T`
@@ -131,144 +70,143 @@ class OdometryChain:
 
     def __init__(self, settings: PoseGraphSettings) -> None:
         self._settings = settings
-        self.log = OdometryLog()
+        self._arrived: list[tuple[int, Array]] = []
         self._covariances: dict[int, Array] = {}
-        self._samples = GrowingArray(dtype=np.int64)
-        self._sample_travel = GrowingArray()
-        self._stamps = GrowingArray(dtype=np.int64)
-        self._poses = GrowingArray((4, 4))
-        self._travel = GrowingArray()
-        self._noise = GrowingArray((6, 6))
-        self._origin: Array = np.zeros(3)
+        stamps, poses = np.empty(0, np.int64), np.empty((0, 4, 4))
+        self._messages = Table(stamp=stamps, pose=poses)
+        self._keyframes = Table(stamp=stamps, pose=poses, travel=np.empty(0), noise=np.empty((0, 6, 6)))
 
     @property
     def stamps(self) -> Stamps:
         """(N,) stamps of the keyframes."""
-        return self._stamps.view
+        return self._keyframes["stamp"]
 
     @property
     def poses(self) -> Array:
         """(N, 4, 4) odometry poses of the keyframes."""
-        return self._poses.view
+        return self._keyframes["pose"]
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the last message, None without one."""
+        return int(self._messages["stamp"][-1]) if len(self._messages) else None
 
     def add(self, stamp_ns: int, pose: Array, covariance: Array | None = None) -> None:
         """Remember a message; see `PoseGraph.add_odometry`."""
-        self.log.add(stamp_ns, pose)
+        self._arrived.append((stamp_ns, pose))
         if covariance is not None:
             self._covariances.setdefault(stamp_ns, covariance)
 
     def update(self) -> bool:
         """Take the new messages in; True when the past changed, not only the end grew."""
-        last = int(self.log.stamps[-1]) if len(self.log.stamps) else None
-        changed = self.log.sort()
+        newest, changed = self.newest_ns, self._sort_in()
         if changed is None:
             return False
-        self._rebuild_from(changed)
-        return last is not None and changed < last
+        self._choose_keyframes(changed)
+        return newest is not None and changed < newest
 
-    def covers(self, stamps: Stamps) -> NDArray[np.bool_]:
-        """Which stamps have a trustworthy odometry pose."""
-        return self.log.known(stamps, int(self._settings.max_gap_s * 1e9))
+    def covers(self, stamp_ns: int) -> bool:
+        """Whether a stamp is a message's own or lies in a gap between two that is short enough to trust."""
+        known = self._messages["stamp"]
+        if not len(known) or not known[0] <= stamp_ns <= known[-1]:
+            return False
+        lower, upper, _ = _neighbours(known, np.array([stamp_ns]))
+        return bool(known[upper] - known[lower] <= self._settings.max_gap_s * 1e9)
 
     def poses_at(self, stamps: Stamps) -> Array:
-        """(N, 4, 4) odometry poses."""
-        return self.log.poses_at(stamps)
+        """(N, 4, 4) odometry poses interpolated at the stamps, held constant outside the messages."""
+        lower, upper, share = _neighbours(self._messages["stamp"], stamps)
+        poses, between = self._messages["pose"][lower], np.flatnonzero(share)
+        if len(between):
+            poses[between] = interpolate(poses[between], self._messages["pose"][upper[between]], share[between])
+        return poses
 
     def travel_at(self, stamps: Stamps) -> Array:
         """(N,) metres driven since the start of the session, turns on the spot included."""
-        return np.interp(stamps.astype(float), self.stamps.astype(float), self._travel.view)
+        return np.interp(stamps.astype(float), self.stamps.astype(float), self._keyframes["travel"])
 
-    def noise_at(self, stamps: Stamps, poses: Array) -> Array:
-        """(N, 6, 6) noise collected from the start to the stamps, whose odometry poses are given, at the origin."""
-        upper = np.clip(np.searchsorted(self.stamps, stamps), 0, len(self.stamps) - 1)
-        exact = self.stamps[upper] == stamps
-        lower = np.where(exact, upper, np.maximum(upper - 1, 0))
-        span = np.maximum(self.stamps[upper] - self.stamps[lower], 1)
-        fractions = np.clip((stamps - self.stamps[lower]) / span, 0.0, 1.0)[:, None, None]
-        noise = (1 - fractions) * self._noise.view[lower] + fractions * self._noise.view[upper]
+    def at(self, stamps: Stamps) -> PathPoints:
+        """The path at stamps the odometry covers."""
+        poses, collected = self.poses_at(stamps), self._keyframes["noise"]
+        lower, upper, share = _neighbours(self.stamps, stamps)
+        shares = share[:, None, None]
+        noise = (1 - shares) * collected[lower] + shares * collected[upper]
         beyond = stamps > self.stamps[-1]
         if beyond.any():
-            noise[beyond] += self._steps_beyond(stamps[beyond], poses[beyond])
-        return noise
+            last = np.broadcast_to(self.poses[-1], poses[beyond].shape)
+            steps = self._model(_path_steps(last, poses[beyond], stamps[beyond] - self.stamps[-1]))
+            noise[beyond] += propagate(adjoint(self._from_origin(poses[beyond])), steps)
+        return PathPoints(self._from_origin(poses), noise)
 
-    def at_origin(self, poses: Array) -> Array:
-        """Odometry poses seen from the chain's first pose's position: keeps the prefix sums well conditioned."""
+    def _from_origin(self, poses: Array) -> Array:
         shifted = poses.copy()
-        shifted[..., :3, 3] -= self._origin
+        shifted[:, :3, 3] -= self._messages["pose"][0, :3, 3]
         return shifted
-
-    def _steps_beyond(self, stamps: Stamps, poses: Array) -> Array:
-        last = np.broadcast_to(self.poses[-1], poses.shape)
-        steps = _path_steps(last, poses, stamps - self.stamps[-1])
-        return propagate(adjoint(self.at_origin(poses)), self._model(steps))
 
     def _model(self, travel: Array) -> Array:
         turn = np.deg2rad(self._settings.odometry_sigma_deg) ** 2
         shift = self._settings.odometry_sigma_m**2
         return travel[:, None, None] * np.diag([turn] * 3 + [shift] * 3)
 
-    def _rebuild_from(self, changed: int) -> None:
-        """Sample the log once per period, then keep a sample wherever enough way has been made."""
+    def _sort_in(self) -> int | None:
+        """Sort the new messages in, the first of each stamp; returns the earliest stamp that is new."""
+        if not self._arrived:
+            return None
+        stamps = np.array([stamp for stamp, _ in self._arrived], np.int64)
+        poses = orthonormal(np.stack([pose for _, pose in self._arrived]))
+        poses[:, 3] = 0, 0, 0, 1
+        self._arrived = []
+        known = self._messages["stamp"]
+        start = int(np.searchsorted(known, stamps.min()))
+        stamps = np.concatenate([known[start:], stamps])
+        poses = np.concatenate([self._messages["pose"][start:], poses])
+        # the first index of a stamp is the one that arrived first: unique is stable and old ones lead
+        ordered, first = np.unique(stamps, return_index=True)
+        new = ordered[first >= len(known) - start]
+        self._messages.truncate(start)
+        self._messages.extend(stamp=ordered, pose=poses[first])
+        return int(new[0]) if len(new) else None
+
+    def _choose_keyframes(self, changed_ns: int) -> None:
+        """Sample the messages once per period, and keep a sample wherever enough way has been made."""
         period = int(self._settings.keyframe_period_s * 1e9)
-        start = int(np.searchsorted(self.log.stamps, changed - changed % period))
-        kept = int(np.searchsorted(self._samples.view, changed - changed % period))
-        self._samples.truncate(kept)
-        self._sample_travel.truncate(kept)
-        keyframes = int(np.searchsorted(self.stamps, changed - changed % period))
-        for rows in (self._stamps, self._poses, self._travel, self._noise):
-            rows.truncate(keyframes)
-        tail = self.log.stamps[start:]
-        first_of_cell = np.ones(len(tail), bool)
-        first_of_cell[1:] = np.diff(tail // period) > 0
-        if self._covariances:
-            first_of_cell |= np.fromiter((int(stamp) in self._covariances for stamp in tail), bool, len(tail))
-        self._extend(start + np.flatnonzero(first_of_cell))
+        self._keyframes.truncate(int(np.searchsorted(self.stamps, changed_ns - changed_ns % period)))
+        known = len(self._keyframes)
+        start = int(np.searchsorted(self._messages["stamp"], self.stamps[-1])) if known else 0
+        messages = self._messages["stamp"][start:]
+        given, cells = self._has_covariance(messages), messages // period
+        # what is known ends with the first row: it begins the way
+        rows = np.flatnonzero(given | (np.diff(cells, prepend=cells[0] - 1) > 0))
+        stamps, poses = messages[rows], self._messages["pose"][start + rows]
+        steps = _path_steps(poses[:-1], poses[1:], np.diff(stamps))
+        travel = np.cumsum([0.0, *steps]) + (self._keyframes["travel"][-1] if known else 0.0)
+        keep = given[rows] | (np.diff(np.floor(travel / self._settings.keyframe_spacing_m), prepend=-1) > 0)
+        keep[0] = not known
+        if keep.any():
+            self._add_keyframes(stamps[keep], np.concatenate([poses[:1], poses[keep]]), travel[keep], travel[0])
 
-    def _extend(self, rows: NDArray[np.int64]) -> None:
-        stamps, poses = self.log.stamps[rows], self.log.poses(rows)
-        previous = len(self._samples)
-        if previous:
-            before = self._samples.view[-1:]
-            steps = _path_steps(
-                np.concatenate([self.log.poses_at(before), poses[:-1]]), poses, np.diff(stamps, prepend=before)
-            )
-            travel: Array = self._sample_travel.view[-1] + np.cumsum(steps)
-            previous_travel: Array = np.concatenate([self._sample_travel.view[-1:], travel[:-1]])
-        else:
-            self._origin = poses[0, :3, 3].copy()
-            steps = _path_steps(poses[:-1], poses[1:], np.diff(stamps))
-            travel = np.concatenate([[0.0], np.cumsum(steps)])
-            previous_travel = np.concatenate([[-1.0], travel[:-1]])
-        self._samples.extend(stamps)
-        self._sample_travel.extend(travel)
-        spacing = self._settings.keyframe_spacing_m
-        keep = np.floor(travel / spacing) > np.floor(previous_travel / spacing)
-        if self._covariances:
-            keep |= np.fromiter((int(stamp) in self._covariances for stamp in stamps), bool, len(stamps))
-        self._add_keyframes(stamps[keep], poses[keep], travel[keep])
+    def _add_keyframes(self, stamps: Stamps, poses: Array, travel: Array, start: float) -> None:
+        """Add N keyframes; poses begins with the one before the first, `start` is the way up to that."""
+        steps = self._model(np.diff(travel, prepend=start))
+        for row in np.flatnonzero(self._has_covariance(stamps)):
+            step = relative(poses[row], poses[row + 1])
+            steps[row] = ros_to_gtsam_covariance(self._covariances[int(stamps[row])], step)
+        collected = self._keyframes["noise"][-1] if len(self._keyframes) else np.zeros((6, 6))
+        noise = collected + np.cumsum(propagate(adjoint(self._from_origin(poses[1:])), steps), axis=0)
+        self._keyframes.extend(stamp=stamps, pose=poses[1:], travel=travel, noise=noise)
 
-    def _add_keyframes(self, stamps: Stamps, poses: Array, travel: Array) -> None:
-        if not len(stamps):
-            return
-        steps = np.diff(travel, prepend=self._travel.view[-1] if len(self._travel) else travel[0])
-        model = self._model(np.maximum(steps, 0.0))
-        if self._covariances:
-            self._take_given(model, stamps, poses)
-        carried = propagate(adjoint(self.at_origin(poses)), model)
-        start = self._noise.view[-1] if len(self._noise) else np.zeros((6, 6))
-        self._stamps.extend(stamps)
-        self._poses.extend(poses)
-        self._travel.extend(travel)
-        self._noise.extend(start + np.cumsum(carried, axis=0))
+    def _has_covariance(self, stamps: Stamps) -> NDArray[np.bool_]:
+        if not self._covariances:
+            return np.zeros(len(stamps), bool)
+        return np.fromiter((stamp in self._covariances for stamp in stamps.tolist()), bool, len(stamps))
 
-    def _take_given(self, model: Array, stamps: Stamps, poses: Array) -> None:
-        """Replace the model by the covariances that came with the messages."""
-        before = self.poses[-1] if len(self.poses) else None
-        for row, stamp in enumerate(stamps):
-            given = self._covariances.get(int(stamp))
-            if given is not None and before is not None:
-                model[row] = ros_to_gtsam_covariance(given, relative(before, poses[row]))
-            before = poses[row]
+
+def _neighbours(known: Stamps, stamps: Stamps) -> tuple[Rows, Rows, Array]:
+    """(N,) rows before and after each stamp among sorted known ones, and where between them it lies, 0 to 1."""
+    upper = np.clip(np.searchsorted(known, stamps), 0, len(known) - 1)
+    lower = np.where(known[upper] == stamps, upper, np.maximum(upper - 1, 0))
+    span = np.maximum(known[upper] - known[lower], 1)
+    return lower, upper, np.clip((stamps - known[lower]) / span, 0.0, 1.0)
 
 
 def _path_steps(a: Array, b: Array, elapsed_ns: Stamps) -> Array:

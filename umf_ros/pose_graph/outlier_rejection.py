@@ -27,7 +27,7 @@ from umf_ros.pose_graph.consistency import (
     squared_mahalanobis,
 )
 from umf_ros.pose_graph.noise_scale import NoiseScale, NoiseScaleEstimator
-from umf_ros.pose_graph.odometry import GrowingArray, Stamps
+from umf_ros.pose_graph.odometry import Stamps, Table
 from umf_ros.pose_graph.sessions import Sessions
 
 _LOOPS_PER_CLOSURE = 3
@@ -82,7 +82,7 @@ class OutlierRejection:
         self._consistency = ConsistencyGraph(self._arrays, settings)
         self._estimator = NoiseScaleEstimator()
         self._map: RelativePoses | None = None
-        self._states = GrowingArray(dtype="U16")
+        self._table = Table(state=np.empty(0, "U16"))
         self._changed: set[int] = set()
         self._revoked: set[int] = set()
         self._too_far: set[int] = set()
@@ -117,9 +117,8 @@ class OutlierRejection:
             self._decide_all()
         if self._revoke_outvoted():
             self._decide_all()
-        for _ in range(_MOST_ROUNDS):
-            self._sessions.relinearise()
-            self._solve()
+        self._solve()
+        self._sessions.refine(self.accepted, self.scale)
         return self._verdicts()
 
     def renew(self) -> list[ClosureVerdict]:
@@ -152,13 +151,12 @@ class OutlierRejection:
     def endpoints_in(self, session: int) -> Stamps:
         """Stamps of all endpoints of closures in a session."""
         both = (self._arrays.match, self._arrays.query)
-        return np.concatenate([endpoints.stamp.view[endpoints.session.view == session] for endpoints in both])
+        return np.concatenate([endpoints["stamp"][endpoints["session"] == session] for endpoints in both])
 
     def endpoint_positions(self) -> Array:
         """(N, 2, 3) map positions of the match and query endpoints of all closures."""
-        rows = np.arange(len(self.closures))
         both = (self._arrays.match, self._arrays.query)
-        return np.stack([self._poses(endpoints, rows)[:, :3, 3] for endpoints in both], axis=1)
+        return np.stack([self._poses(endpoints)[:, :3, 3] for endpoints in both], axis=1)
 
     def _decide_all(self) -> None:
         rows: Iterable[int] = range(len(self.closures))
@@ -183,7 +181,7 @@ class OutlierRejection:
     def _take(self, tracked: TrackedClosure) -> int:
         row = len(self.closures)
         self.closures.append(tracked)
-        self._states.extend([tracked.verdict.state])
+        self._table.extend(state=[tracked.verdict.state])
         self._arrays.append(self._sessions.chains, tracked)
         loops = self._consistency.add(row, self.scale)
         self._estimator.add(loops[-_LOOPS_PER_CLOSURE:], self._consistency.place_of[row])
@@ -316,7 +314,7 @@ class OutlierRejection:
         odds = np.array([self._ratios[row] for row in place])
         if not last_word:
             return odds
-        rejected, accepted = (int((self._states.view == state).sum()) for state in (State.REJECTED, State.ACCEPTED))
+        rejected, accepted = (int((self._table["state"] == state).sum()) for state in (State.REJECTED, State.ACCEPTED))
         prior = (_WRONG_BEFORE + rejected) / (_RIGHT_BEFORE + accepted)
         _, evidence = self._consistency.consistency_set(place[0], self._in_state(State.UNDECIDED))
         return odds * prior * np.exp(-evidence) * (_WRONG_ALONE if len(place) == 1 else 1.0)
@@ -329,13 +327,13 @@ class OutlierRejection:
 
     def _in_state(self, state: State) -> NDArray[np.bool_]:
         """Which closures have a verdict, except those revoked for good."""
-        members = self._states.view == state
+        members = self._table["state"] == state
         members[list(self._revoked)] = False
         return members
 
     def _waited(self, row: int) -> float:
         """Metres driven since a closure's query; infinite when that was in another session than the newest one's."""
-        travel = self._arrays.query.travel.view
+        travel = self._arrays.query["travel"]
         if self.closures[row].query != self.closures[-1].query:
             return float("inf")
         return float(travel[-1] - travel[row])
@@ -355,26 +353,23 @@ class OutlierRejection:
 
     def _worth_another_look(self) -> list[int]:
         """Closures not accepted that the moved map now comes close to."""
-        rows = np.flatnonzero(~self._in_state(State.ACCEPTED))
-        return rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
+        ways = invert(self._poses(self._arrays.match)) @ self._poses(self._arrays.query)
+        misfits = np.linalg.norm((invert(self._arrays["pose"]) @ ways)[:, :3, 3], axis=1)
+        return np.flatnonzero(~self._in_state(State.ACCEPTED) & (misfits < _CLOSE_M)).tolist()
 
-    def _misfits(self, rows: NDArray[np.int64]) -> Array:
-        """(N, 4, 4) from what closures say to what the map says."""
-        ways = invert(self._poses(self._arrays.match, rows)) @ self._poses(self._arrays.query, rows)
-        return invert(self._arrays.pose.view[rows]) @ ways
-
-    def _poses(self, endpoints: Endpoints, rows: NDArray[np.int64]) -> Array:
-        poses = np.zeros((len(rows), 4, 4))
-        for session in np.unique(endpoints.session.view[rows]):
-            mine = endpoints.session.view[rows] == session
-            poses[mine] = self._sessions.at(int(session), endpoints.stamp.view[rows][mine])
+    def _poses(self, endpoints: Endpoints) -> Array:
+        """(N, 4, 4) `map_T_body` at one endpoint of every closure."""
+        poses = np.zeros((len(endpoints), 4, 4))
+        for session in np.unique(endpoints["session"]):
+            mine = endpoints["session"] == session
+            poses[mine] = self._sessions.at(int(session), endpoints["stamp"][mine])
         return poses
 
     def _note(
         self, row: int, state: State, reason: str, squared: float = float("nan"), metres: float = float("nan")
     ) -> None:
         before = self.closures[row].verdict.state
-        self._states.view[row] = state
+        self._table["state"][row] = state
         self.closures[row].decide(state, reason, float(np.sqrt(squared)), metres)
         if before is not state:
             self._changed.add(row)

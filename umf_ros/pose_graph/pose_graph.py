@@ -24,7 +24,7 @@ from umf_ros.pose_graph.closures import (
 )
 from umf_ros.pose_graph.export import verdict_table, write_g2o, write_vertex_table
 from umf_ros.pose_graph.noise_scale import NoiseScale
-from umf_ros.pose_graph.odometry import Stamps
+from umf_ros.pose_graph.odometry import OdometryChain, Stamps
 from umf_ros.pose_graph.outlier_rejection import OutlierRejection
 from umf_ros.pose_graph.sessions import Sessions
 from umf_ros.trajectory import Trajectory, write_tum
@@ -35,9 +35,10 @@ _NO_ODOMETRY_YET = "its odometry has not arrived"
 
 @dataclass
 class _Waiting:
-    """A closure without odometry, the newest stamp when it came (None: there was none), and whether that was said."""
+    """A closure without odometry, its covariance in GTSAM's order, and the newest stamp when it came, None without."""
 
     closure: LoopClosure
+    covariance: Array
     since_ns: int | None
     announced: bool = False
 
@@ -146,7 +147,7 @@ class PoseGraph:
 
     def _receive(self, closure: LoopClosure) -> ClosureVerdict | None:
         try:
-            check_closure(closure, self._settings.max_closure_m)
+            covariance = check_closure(closure, self._settings.max_closure_m)
         except GraphError as error:
             return self._refuse(closure, str(error))
         # two measurements of one pair are two closures; the same one again is a message sent twice
@@ -155,7 +156,7 @@ class PoseGraph:
             self.counts["closure twice"] += 1
             return None
         self._seen.add(message)
-        self._waiting.append(_Waiting(closure, self._sessions.newest_ns))
+        self._waiting.append(_Waiting(closure, covariance, self._sessions.newest_ns))
         return None
 
     def _refuse(self, closure: LoopClosure, reason: str) -> ClosureVerdict:
@@ -168,7 +169,7 @@ class PoseGraph:
         verdicts, arrived, waiting = [], [], []
         newest_ns = self._sessions.newest_ns
         for entry in self._waiting:
-            tracked = self._locate(entry.closure)
+            tracked = self._locate(entry)
             waited_ns = entry.waited_ns(newest_ns)
             if tracked is not None:
                 arrived.append(tracked)
@@ -182,13 +183,12 @@ class PoseGraph:
         self._waiting = waiting
         return verdicts, arrived
 
-    def _locate(self, closure: LoopClosure) -> TrackedClosure | None:
-        query = self._sessions.find(closure.query_stamp_ns)
-        match = self._sessions.find(closure.match_stamp_ns, before=query)
+    def _locate(self, entry: _Waiting) -> TrackedClosure | None:
+        query = self._sessions.find(entry.closure.query_stamp_ns)
+        match = self._sessions.find(entry.closure.match_stamp_ns, before=query)
         if query is None or match is None:
             return None
-        covariance = check_closure(closure, self._settings.max_closure_m)
-        return TrackedClosure(match, query, ClosureVerdict(closure, State.UNDECIDED, "new"), covariance)
+        return TrackedClosure(match, query, ClosureVerdict(entry.closure, State.UNDECIDED, "new"), entry.covariance)
 
     def _replay(self) -> list[ClosureVerdict]:
         before = {id(c.closure): c.verdict.state for c in self._rejection.closures}
@@ -219,20 +219,17 @@ class PoseGraph:
 
     def trajectory(self) -> tuple[Stamps, Array]:
         """Stamps (N,) in ns and `map_T_body` (N, 4, 4) of every keyframe that is joined to the map."""
-        self._refresh()
-        stamps: list[Stamps] = [np.empty(0, np.int64)]
-        poses: list[Array] = [np.empty((0, 4, 4))]
-        for session in self._sessions.joined:
-            stamps.append(self._sessions.chains[session].stamps)
-            poses.append(self._sessions.at(session, stamps[-1]))
-        return np.concatenate(stamps), np.concatenate(poses)
+        return self._keyframes(lambda session, chain: self._sessions.at(session, chain.stamps))
 
     def odometry(self) -> tuple[Stamps, Array]:
         """Stamps (N,) in ns and `odom_T_body` (N, 4, 4) of the same keyframes as `trajectory`."""
+        return self._keyframes(lambda _, chain: chain.poses)
+
+    def _keyframes(self, poses_of: Callable[[int, OdometryChain], Array]) -> tuple[Stamps, Array]:
         self._refresh()
-        chains = [self._sessions.chains[session] for session in self._sessions.joined]
-        stamps = [np.empty(0, np.int64), *(chain.stamps for chain in chains)]
-        return np.concatenate(stamps), np.concatenate([np.empty((0, 4, 4)), *(chain.poses for chain in chains)])
+        chains = [(session, self._sessions.chains[session]) for session in self._sessions.joined]
+        stamps = [np.empty(0, np.int64), *(chain.stamps for _, chain in chains)]
+        return np.concatenate(stamps), np.concatenate([np.empty((0, 4, 4)), *(poses_of(*one) for one in chains)])
 
     def map_T_odom(self) -> Array:
         """(4, 4) pose of the newest session's odometry frame in the map: where its newest pose went."""
@@ -240,18 +237,18 @@ class PoseGraph:
         chain = self._sessions.chains[-1]
         if not len(chain.stamps):
             return np.eye(4)
-        last = chain.log.stamps[-1:]
+        last = np.array([chain.newest_ns])
         return self._sessions.at(len(self._sessions.chains) - 1, last)[0] @ invert(chain.poses_at(last)[0])
 
     def covariance(self) -> Array:
         """(6, 6) marginal covariance of the newest pose in ROS order about the map's axes; zero without odometry."""
         self._refresh()
         session = len(self._sessions.chains) - 1
-        last = self._sessions.chains[session].log.stamps[-1:]
-        if not len(last):
+        last = self._sessions.chains[session].newest_ns
+        if last is None:
             return np.zeros((6, 6))
-        covariance = self._sessions.covariance(session, int(last[0]), self._rejection.scale)
-        return gtsam_to_ros_covariance(covariance, self._sessions.at(session, last)[0])
+        covariance = self._sessions.covariance(session, last, self._rejection.scale)
+        return gtsam_to_ros_covariance(covariance, self._sessions.at(session, np.array([last]))[0])
 
     def write_tum(self, path: str | Path, optimized: bool = True) -> None:
         """Write the trajectory, or the odometry, of all joined sessions in order of their stamps as a TUM file.
@@ -284,7 +281,7 @@ class PoseGraph:
         endpoints = [self._rejection.endpoints_in(session) for session in range(len(self._sessions.chains))]
         full = self._sessions.expand(self._rejection.accepted, endpoints, self._rejection.scale)
         ids = [row if vertex_of is None else vertex_of(stamp) for row, (_, stamp) in enumerate(full.vertices)]
-        write_g2o(path, full.poses, full.edges, planar, ids)
+        write_g2o(path, full.poses, [full.edges[row] for row in range(len(full.edges))], planar, ids)
         if vertex_of is None:
             write_vertex_table(Path(path).with_suffix(".csv"), full.vertices)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -13,17 +13,13 @@ from numpy.typing import NDArray
 from umf_ros.config import PoseGraphSettings
 from umf_ros.geometry import Array, adjoint, expmap, invert, logmap, propagate
 from umf_ros.pose_graph.closures import TrackedClosure
-from umf_ros.pose_graph.condensed import (
-    CondensedGraph,
-    Edge,
-    Edges,
-    Linearisation,
-    Optimizer,
-    PathPoints,
-    odometry_edges,
-)
+from umf_ros.pose_graph.condensed import Edges, Graph, Optimizer, odometry_edges
 from umf_ros.pose_graph.noise_scale import NoiseScale
-from umf_ros.pose_graph.odometry import OdometryChain, Stamps
+from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Stamps
+
+# where every keyframe is a vertex, one so close to a closure's endpoint adds nothing but rounding errors
+_TOO_CLOSE_NS = 10_000_000
+_REFINEMENTS = 4
 
 
 @dataclass(frozen=True)
@@ -34,68 +30,37 @@ class CorrectedPath:
     which is its least-squares optimum; beyond the last one the path follows the odometry.
 
     Attributes:
-        linearisation: the path the correction is relative to.
+        chain: the odometry.
         stamps: (N,) sorted stamps of the solved poses.
-        points: the linearised path at `stamps`.
+        points: the odometry at `stamps`.
         poses: (N, 4, 4) solved `map_T_body` at `stamps`.
     """
 
-    linearisation: Linearisation
+    chain: OdometryChain
     stamps: Stamps
     points: PathPoints
     poses: Array
 
     def at(self, stamps: Stamps) -> Array:
         """(M, 4, 4) `map_T_body` at stamps the odometry covers."""
-        points = self.linearisation.at(stamps)
+        points = self.chain.at(stamps)
         after = np.searchsorted(self.stamps, stamps, side="right")
         lower = np.maximum(after - 1, 0)
-        twists = self.points.offset[lower] - points.offset
+        twists = np.zeros((len(stamps), 6))
         inside = (after > 0) & (after < len(self.stamps))
         if inside.any():
             walked = points.noise[inside] - self.points.noise[lower[inside]]
-            twists[inside] += (walked @ self._multipliers[lower[inside]][..., None])[..., 0]
+            twists[inside] = (walked @ self._multipliers[lower[inside]][..., None])[..., 0]
         start = self.poses[lower] @ invert(self.points.poses[lower])
         return start @ expmap(twists) @ points.poses
 
     @cached_property
     def _multipliers(self) -> Array:
         """(N-1, 6) correction between two solved poses per noise: Lagrange multipliers of the solved poses."""
-        linearised_steps = invert(self.points.poses[:-1]) @ self.points.poses[1:]
-        solved_steps = invert(self.poses[:-1]) @ self.poses[1:]
-        misfits = logmap(invert(linearised_steps) @ solved_steps)
-        twists = (adjoint(self.points.poses[1:]) @ misfits[..., None])[..., 0] + np.diff(self.points.offset, axis=0)
-        return np.linalg.solve(np.diff(self.points.noise, axis=0), twists[..., None])[..., 0]
-
-
-@dataclass(frozen=True)
-class Solution:
-    """The condensed graph as it was last solved.
-
-    Attributes:
-        starts: (S + 1,) first vertex of each session.
-        edges: odometry and closures.
-        poses: (V, 4, 4) solved poses of the vertices.
-    """
-
-    starts: NDArray[np.int64]
-    edges: Edges
-    poses: Array
-
-
-@dataclass(frozen=True)
-class FullGraph:
-    """Every pose of the map with the measurements between them.
-
-    Attributes:
-        vertices: session and stamp of each.
-        poses: (4, 4) `map_T_body` of each.
-        edges: measurements between vertices by their place in `vertices`, with the covariances the solution used.
-    """
-
-    vertices: list[tuple[int, int]]
-    poses: list[Array]
-    edges: list[Edge]
+        steps = invert(self.points.poses[:-1]) @ self.points.poses[1:]
+        misfits = logmap(invert(steps) @ invert(self.poses[:-1]) @ self.poses[1:])
+        twists = adjoint(self.points.poses[1:]) @ misfits[..., None]
+        return np.linalg.solve(np.diff(self.points.noise, axis=0), twists)[..., 0]
 
 
 class Sessions:
@@ -108,11 +73,14 @@ class Sessions:
     def __init__(self, settings: PoseGraphSettings) -> None:
         self._settings = settings
         self._optimizer = Optimizer()
+        self._refiner = Optimizer()
         self._scale = NoiseScale()
+        self._refined: dict[int, CorrectedPath | None] = {}
         self.chains: list[OdometryChain] = []
         self.paths: list[CorrectedPath | None] = []
         self.components: list[int] = []
-        self.solution: Solution | None = None
+        self.starts = np.zeros(1, np.int64)
+        self.solution: Graph | None = None
         self.begin()
 
     def begin(self) -> None:
@@ -129,25 +97,26 @@ class Sessions:
             changed |= late
             if len(chain.stamps) and (late or self.paths[session] is None):
                 self.paths[session] = self._uncorrected(session)
-                self._optimizer.forget_factors()
+            if late:
+                self._optimizer, self._refined = Optimizer(), {}
         return changed
 
     @property
     def newest_ns(self) -> int | None:
         """Stamp of the newest odometry of all sessions; None without."""
-        return max((int(chain.log.stamps[-1]) for chain in self.chains if len(chain.log.stamps)), default=None)
+        return max((chain.newest_ns for chain in self.chains if chain.newest_ns is not None), default=None)
 
     @property
     def outgrown(self) -> bool:
         """Whether a session has odometry but no pose in the last solution."""
         if self.solution is None:
             return True
-        vertices = np.diff(self.solution.starts, append=np.full(len(self.chains), self.solution.starts[-1]))
-        return any(path is not None and not vertices[s] for s, path in enumerate(self.paths))
+        solved = {session for session, _ in self.solution.vertices}
+        return any(path is not None and session not in solved for session, path in enumerate(self.paths))
 
     def reset(self) -> None:
         """Go back to the odometry alone."""
-        self._optimizer = Optimizer()
+        self._optimizer, self._refined = Optimizer(), {}
         self.solution = None
         self.components = list(range(len(self.chains)))
         self.paths = [self._uncorrected(s) if len(c.stamps) else None for s, c in enumerate(self.chains)]
@@ -156,7 +125,7 @@ class Sessions:
         """The newest session (not newer than `before`) whose odometry covers the stamp, or None."""
         newest = len(self.chains) - 1 if before is None else before
         for session in range(newest, -1, -1):
-            if self.chains[session].covers(np.array([stamp_ns]))[0]:
+            if self.chains[session].covers(stamp_ns):
                 return session
         return None
 
@@ -173,86 +142,103 @@ class Sessions:
 
     def at(self, session: int, stamps: Stamps) -> Array:
         """(N, 4, 4) `map_T_body` of one session."""
-        return self.path(session).at(stamps)
+        return (self._refined.get(session) or self.path(session)).at(stamps)
 
     def solve(self, closures: Sequence[TrackedClosure], scale: NoiseScale) -> None:
-        """Move every path to the optimum of odometry and the given closures.
+        """Move every path to the optimum of odometry and the given closures, as far as condensed odometry tells.
 
         Raises:
             GraphError: the system cannot be solved; the paths stay as they were.
         """
         if scale != self._scale:
-            self._optimizer.forget_factors()
-            self._scale = scale
+            self._optimizer, self._scale = Optimizer(), scale
         stamps = [self._vertex_stamps(session, closures) for session in range(len(self.chains))]
-        starts = np.cumsum([0] + [len(own) for own in stamps])
-        active = [session for session, path in enumerate(self.paths) if path is not None]
-        points = {session: self.path(session).linearisation.at(stamps[session]) for session in active}
-        edges = [odometry_edges(points[session], int(starts[session]), scale.odometry) for session in active]
-        edges.append(_closure_edges(closures, stamps, starts, scale.closures))
         components, moves = self._join(closures)
-        vertices = [(session, stamp) for session in active for stamp in stamps[session].tolist()]
-        graph = CondensedGraph(
-            vertices=vertices,
-            poses=np.concatenate([moves[session] @ self.at(session, stamps[session]) for session in active]),
-            anchors=[int(starts[session]) for session in active if components[session] == session],
-            keys=_edge_keys(vertices, closures),
-            edges=Edges.join(edges),
-        )
-        poses = self._optimizer.solve(graph)
-        self.components = components
-        self.solution = Solution(starts, graph.edges, poses)
-        for session in active:
-            own = poses[starts[session] : starts[session + 1]]
-            linearisation = self.path(session).linearisation
-            self.paths[session] = CorrectedPath(linearisation, stamps[session], points[session], own)
+        starts, graph = self._graph(stamps, closures, scale, components, moves)
+        self.solution = replace(graph, poses=self._optimizer.solve(graph))
+        self.components, self.starts, self._refined = components, starts, {}
+        self.paths = self._through(stamps, starts, self.solution.poses)
 
-    def relinearise(self) -> None:
-        """Condense the odometry around the corrected paths from now on."""
-        self._optimizer.forget_factors()
-        for session, path in enumerate(self.paths):
-            if path is not None and len(path.stamps) > 1:
-                nodes = np.union1d(self.chains[session].stamps, path.stamps)
-                linearisation = path.linearisation.around(nodes, path.at(nodes))
-                points = linearisation.at(path.stamps)
-                self.paths[session] = CorrectedPath(linearisation, path.stamps, points, path.poses)
+    def refine(self, closures: Sequence[TrackedClosure], scale: NoiseScale) -> None:
+        """Move every path to the exact optimum, of every keyframe, after these closures have been solved for.
+
+        Raises:
+            GraphError: the system cannot be solved; the paths stay as they were.
+        """
+        self._refiner, unmoved = Optimizer(), [np.eye(4)] * len(self.chains)
+        stamps = [self._keyframes_and(self._vertex_stamps(s, closures), s) for s in range(len(self.chains))]
+        for _ in range(_REFINEMENTS):
+            starts, graph = self._graph(stamps, closures, scale, self.components, unmoved)
+            self._refined = dict(enumerate(self._through(stamps, starts, self._refiner.solve(graph))))
+
+    def _through(self, stamps: list[Stamps], starts: NDArray[np.int64], poses: Array) -> list[CorrectedPath | None]:
+        """The paths through solved poses."""
+        return [
+            path and CorrectedPath(path.chain, own, path.chain.at(own), poses[start : start + len(own)])
+            for path, own, start in zip(self.paths, stamps, starts, strict=False)
+        ]
+
+    @property
+    def _active(self) -> list[tuple[int, CorrectedPath]]:
+        return [(session, path) for session, path in enumerate(self.paths) if path is not None]
 
     def covariance(self, session: int, stamp_ns: int, scale: NoiseScale) -> Array:
         """(6, 6) marginal covariance of the pose at a stamp after the last solved one, in its tangent space."""
-        path = self.path(session)
+        path, last = self._refined.get(session), None
+        if path is not None:
+            last = self._refiner.marginal((session, int(path.stamps[-1])))
+        if path is None or last is None:
+            path = self.path(session)
+            last = self._optimizer.marginal((session, int(path.stamps[-1])))
         at = np.array([stamp_ns], np.int64)
         back = invert(path.at(at)) @ path.poses[-1:]
-        last = self._optimizer.marginal((session, int(path.stamps[-1])))
-        points = path.linearisation.at(at)
+        points = path.chain.at(at)
         walked = scale.odometry**2 * (points.noise - path.points.noise[-1])
-        return (propagate(adjoint(back), last) + propagate(adjoint(invert(points.poses)), walked))[0]
+        return (
+            propagate(adjoint(back), np.zeros((6, 6)) if last is None else last)
+            + propagate(adjoint(invert(points.poses)), walked)
+        )[0]
 
-    def expand(self, closures: Sequence[TrackedClosure], extra: Sequence[Stamps], scale: NoiseScale) -> FullGraph:
+    def expand(self, closures: Sequence[TrackedClosure], extra: Sequence[Stamps], scale: NoiseScale) -> Graph:
         """Every keyframe and the `extra` stamps of each session, joined by odometry and by the given closures."""
         stamps = [np.union1d(chain.stamps, more) for chain, more in zip(self.chains, extra, strict=True)]
+        return self._graph(stamps, closures, scale, self.components, [np.eye(4)] * len(stamps))[1]
+
+    def _graph(
+        self,
+        stamps: list[Stamps],
+        closures: Sequence[TrackedClosure],
+        scale: NoiseScale,
+        components: list[int],
+        moves: Sequence[Array],
+    ) -> tuple[NDArray[np.int64], Graph]:
+        """The first vertex of each session, and the graph of moved poses at stamps of each."""
         starts = np.cumsum([0] + [len(own) for own in stamps])
-        active = [session for session, own in enumerate(stamps) if len(own)]
-        edges = [
-            odometry_edges(Linearisation(self.chains[s]).at(stamps[s]), int(starts[s]), scale.odometry) for s in active
-        ]
-        joined = Edges.join([*edges, _closure_edges(closures, stamps, starts, scale.closures)])
-        return FullGraph(
-            vertices=[(session, stamp) for session in active for stamp in stamps[session].tolist()],
-            poses=[pose for session in active for pose in self.at(session, stamps[session])],
-            edges=[joined[row] for row in range(len(joined))],
-        )
+        edges = [odometry_edges(path.chain.at(stamps[s]), int(starts[s]), scale.odometry) for s, path in self._active]
+        edges.append(_closure_edges(closures, stamps, starts, scale.closures))
+        vertices = [(session, stamp) for session, own in enumerate(stamps) for stamp in own.tolist()]
+        poses = [np.empty((0, 4, 4)), *(moves[s] @ self.at(s, stamps[s]) for s, _ in self._active)]
+        anchors = [int(starts[session]) for session, _ in self._active if components[session] == session]
+        keys = _edge_keys(vertices, closures)
+        return starts, Graph(vertices, np.concatenate(poses), anchors, keys, Edges.join(edges))
 
     def _uncorrected(self, session: int) -> CorrectedPath:
         chain = self.chains[session]
         first = chain.stamps[:1].copy()
-        linearisation = Linearisation(chain)
-        return CorrectedPath(linearisation, first, linearisation.at(first), chain.poses_at(first))
+        return CorrectedPath(chain, first, chain.at(first), chain.poses_at(first))
 
     def _vertex_stamps(self, session: int, closures: Sequence[TrackedClosure]) -> Stamps:
         """The first stamp of a session and those of its closures' endpoints; none without odometry."""
         endpoints = [c.closure.match_stamp_ns for c in closures if c.match == session]
         endpoints += [c.closure.query_stamp_ns for c in closures if c.query == session]
         return np.unique(np.concatenate([self.chains[session].stamps[:1], np.array(endpoints, np.int64)]))
+
+    def _keyframes_and(self, stamps: Stamps, session: int) -> Stamps:
+        """Stamps of a session with those of all keyframes, except very close ones."""
+        keyframes = self.chains[session].stamps
+        after = np.searchsorted(stamps, keyframes)
+        gaps = [np.abs(keyframes - stamps[np.clip(row, 0, len(stamps) - 1)]) for row in (after - 1, after)]
+        return np.union1d(stamps, keyframes[np.min(gaps, axis=0) > _TOO_CLOSE_NS])
 
     def _join(self, closures: Sequence[TrackedClosure]) -> tuple[list[int], list[Array]]:
         """The component of each session, and how each moves to its component's gauge, newly joined ones included."""

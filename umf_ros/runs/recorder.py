@@ -43,10 +43,10 @@ class RunRecorder:
         self._settings = settings
         self._weights = weights
         write_atomically(folder / "config.yaml", dump_settings(settings))
-        self._closures = tables.Table(folder / "closures.csv", tables.CLOSURES)
-        self._candidates = tables.Table(folder / "candidates.csv", tables.CANDIDATES)
-        self._keyframes = tables.Table(folder / "keyframes.csv", tables.KEYFRAMES)
-        self._inliers = tables.Table(folder / "inliers.csv", tables.INLIERS)
+        self._closures = tables.CsvTable(folder / "closures.csv", tables.CLOSURES)
+        self._candidates = tables.CsvTable(folder / "candidates.csv", tables.CANDIDATES)
+        self._keyframes = tables.CsvTable(folder / "keyframes.csv", tables.KEYFRAMES)
+        self._inliers = tables.CsvTable(folder / "inliers.csv", tables.INLIERS)
         self._latency = {stage: array("f") for stage in STAGES}
         self._counts = dict.fromkeys(COUNTS, 0)
         self._started = time.monotonic()

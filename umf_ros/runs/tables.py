@@ -26,7 +26,7 @@ INLIERS = ["query_stamp_ns", "match_stamp_ns", "query_u", "query_v", "match_u", 
 Row = TypeVar("Row")
 
 
-class Table:
+class CsvTable:
     """A CSV file with a header, flushed after every block of rows."""
 
     def __init__(self, path: Path, columns: list[str]) -> None:

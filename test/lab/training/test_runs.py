@@ -97,7 +97,7 @@ def test_wrong_settings_are_one_clear_line(tmp_path, content, word):
 def test_settings_that_are_not_there(tmp_path):
     with pytest.raises(ConfigError, match="No such file"):
         load_run(tmp_path / "none.yaml", train="worlds")
-    with pytest.raises(ConfigError, match="train: "):
+    with pytest.raises(ConfigError, match="train is missing"):
         load_run(None)
 
 
