@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from umf_ros.config import Loop
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, make_pose, relative, transform
-from umf_ros.runs.tables import KEYFRAMES, Table
+from umf_ros.runs.tables import KEYFRAMES, CsvTable
 from umf_ros.runs.truth import (
     JudgedRun,
     absolute_trajectory_error,
@@ -47,7 +47,7 @@ def truth(first: int = 0, last: int = 80, has_orientation: bool = True) -> Traje
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A run with a keyframe every two seconds."""
-    table = Table(tmp_path / "keyframes.csv", KEYFRAMES)
+    table = CsvTable(tmp_path / "keyframes.csv", KEYFRAMES)
     table.append([[stamp(second), 0, f"{second:.4f}"] for second in range(0, 80, 2)])
     table.close()
     return tmp_path
@@ -137,7 +137,7 @@ def test_the_summary_has_its_keys_and_plain_numbers() -> None:
 
 
 def test_a_run_without_keyframes(tmp_path: Path) -> None:
-    Table(tmp_path / "keyframes.csv", KEYFRAMES).close()
+    CsvTable(tmp_path / "keyframes.csv", KEYFRAMES).close()
     assert judged(tmp_path, truth(), []).revisits == 0
 
 
