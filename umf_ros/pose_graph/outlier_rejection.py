@@ -156,7 +156,7 @@ class OutlierRejection:
     def endpoint_positions(self) -> Array:
         """(N, 2, 3) map positions of the match and query endpoints of all closures."""
         both = (self._arrays.match, self._arrays.query)
-        return np.stack([self._poses(endpoints)[:, :3, 3] for endpoints in both], axis=1)
+        return np.stack([self._poses(endpoints, slice(None))[:, :3, 3] for endpoints in both], axis=1)
 
     def _decide_all(self) -> None:
         rows: Iterable[int] = range(len(self.closures))
@@ -353,16 +353,17 @@ class OutlierRejection:
 
     def _worth_another_look(self) -> list[int]:
         """Closures not accepted that the moved map now comes close to."""
-        ways = invert(self._poses(self._arrays.match)) @ self._poses(self._arrays.query)
-        misfits = np.linalg.norm((invert(self._arrays["pose"]) @ ways)[:, :3, 3], axis=1)
-        return np.flatnonzero(~self._in_state(State.ACCEPTED) & (misfits < _CLOSE_M)).tolist()
+        rows = np.flatnonzero(~self._in_state(State.ACCEPTED))
+        ways = invert(self._poses(self._arrays.match, rows)) @ self._poses(self._arrays.query, rows)
+        misfits = invert(self._arrays["pose"][rows]) @ ways
+        return rows[np.linalg.norm(misfits[:, :3, 3], axis=1) < _CLOSE_M].tolist()
 
-    def _poses(self, endpoints: Endpoints) -> Array:
-        """(N, 4, 4) `map_T_body` at one endpoint of every closure."""
-        poses = np.zeros((len(endpoints), 4, 4))
-        for session in np.unique(endpoints["session"]):
-            mine = endpoints["session"] == session
-            poses[mine] = self._sessions.at(int(session), endpoints["stamp"][mine])
+    def _poses(self, endpoints: Endpoints, rows: slice | NDArray[np.int64]) -> Array:
+        """(N, 4, 4) `map_T_body` at one endpoint of closures."""
+        sessions, stamps = endpoints["session"][rows], endpoints["stamp"][rows]
+        poses = np.zeros((len(sessions), 4, 4))
+        for session in np.unique(sessions):
+            poses[sessions == session] = self._sessions.at(int(session), stamps[sessions == session])
         return poses
 
     def _note(
