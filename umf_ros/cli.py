@@ -20,7 +20,7 @@ COMMANDS = {
     "simulate": "umf_ros.lab.commands.simulate",
     "replay": "umf_ros.commands.replay",
     "play": "umf_ros.lab.commands.play",
-    "report": "umf_ros.commands.report",
+    "report": "umf_ros.lab.commands.report",
     "evaluate": "umf_ros.lab.commands.evaluate",
     "explain": "umf_ros.lab.commands.explain",
     "train": "umf_ros.lab.commands.train",

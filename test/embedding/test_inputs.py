@@ -8,8 +8,7 @@ import pytest
 import torch
 from tiny_worlds import TINY, some_scan
 
-from umf_ros.embedding.images import is_blank, shrink, standardise
-from umf_ros.embedding.inputs import blank_input, pack, prepare_image, prepare_scan
+from umf_ros.embedding.inputs import blank_input, is_blank, pack, prepare_image, prepare_scan, shrink, standardise
 from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_salient
 from umf_ros.embedding.voxels import CELLS, MIN_POINTS, ORIGIN_M, VOXEL_M, voxelise
 

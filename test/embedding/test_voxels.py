@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tiny_worlds import some_scan
 
-from umf_ros.embedding.images import is_blank, shrink, standardise
+from umf_ros.embedding.inputs import is_blank, shrink, standardise
 from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_salient
 from umf_ros.embedding.voxels import voxelise
 

@@ -20,7 +20,7 @@ from umf_ros.loop_detector import Detection
 from umf_ros.runs import recorder as recorder_module
 from umf_ros.runs.recorder import RunRecorder, count_drops, read_summary
 from umf_ros.runs.tables import read_closures
-from umf_ros.sensors.counters import SURPLUS, InputCounter
+from umf_ros.sensors.buffers import SURPLUS, InputCounter
 from umf_ros.sensors.synchronizer import INPUTS
 from umf_ros.verification import Measurement, Verdict
 

@@ -7,8 +7,8 @@ from recordings import drive
 from scipy.spatial.transform import Rotation
 
 from umf_ros.geometry import Array, invert, make_pose, transform
+from umf_ros.sensors.assembly import deskew
 from umf_ros.sensors.buffers import OdometryBuffer
-from umf_ros.sensors.motion import deskew
 
 START_NS = 1_625_680_800_000_000_000
 S = 10**9

@@ -12,7 +12,7 @@ from umf_ros.bags.records import RawMessage
 from umf_ros.config import Settings, Topics
 from umf_ros.errors import BagError, MessageError
 from umf_ros.frames import Frame, Image
-from umf_ros.sensors.counters import InputCounter
+from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.intake import Intake, wanted_inputs
 from umf_ros.sensors.messages import OdometrySample, stamp_ns
 from umf_ros.sensors.sessions import Input

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from umf_ros.embedding.images import shrink, standardise
 from umf_ros.embedding.voxels import VoxelScan, voxelise
 from umf_ros.frames import Image, Points
 from umf_ros.networks.config import NetworkConfig
@@ -58,3 +58,24 @@ def prepare_scan(points: Points | None, intensity: Points | None, config: Networ
 def blank_input(config: NetworkConfig) -> NetworkInput:
     """A batch of one frame without image and scan, for its shapes."""
     return pack([None], [prepare_scan(None, None, config)], config)
+
+
+DARK_STD = 2.0
+
+
+def is_blank(image: Image) -> bool:
+    """Whether an image shows nothing: a rover in the dark, or a covered lens."""
+    return float(image.std()) < DARK_STD
+
+
+def shrink(image: Image, size: tuple[int, int]) -> Image:
+    """The whole view at (height, width) = `size`, whatever the aspect."""
+    if image.shape[:2] == size:
+        return image
+    return cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA).astype(np.uint8)
+
+
+def standardise(image: NDArray[np.floating] | Image) -> NDArray[np.float32]:
+    """Zero mean and unit contrast, so that exposure does not matter."""
+    values = image.astype(np.float32) / 255
+    return (values - values.mean()) / (values.std() + np.float32(0.05))

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.images import is_blank
-from umf_ros.embedding.inputs import pack, prepare_image, prepare_scan
+from umf_ros.embedding.inputs import is_blank, pack, prepare_image, prepare_scan
 from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_salient
 from umf_ros.embedding.runtimes import Outputs, make_runtime
 from umf_ros.embedding.voxels import VoxelScan

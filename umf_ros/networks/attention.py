@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+import torch
 from torch import Tensor, nn
 
 MASKED = -1e4
@@ -78,3 +81,27 @@ def received(weights: Tensor, query_mask: Tensor | None = None, key_mask: Tensor
     share = query_mask.to(weights.dtype) / query_mask.sum(1, keepdim=True).clamp(min=1)
     looked = (share[:, None, None] @ weights).squeeze(2).float().mean(1)
     return looked * key_mask.float().sum(1, keepdim=True).clamp(min=1)
+
+
+def sine_encoding(positions: Tensor, channels: int) -> Tensor:
+    """Encode positions in [0, 1] by sines and cosines of rising wavelength.
+
+    Args:
+        positions: (..., A), one column per axis.
+        channels: length of the encoding; what A axes of whole sine-cosine pairs leave over is zero.
+
+    Returns:
+        (..., channels).
+    """
+    axes = positions.shape[-1]
+    pairs = channels // (2 * axes)
+    wavelengths = 100.0 ** (torch.arange(pairs, device=positions.device, dtype=positions.dtype) / max(pairs, 1))
+    phase = (positions * 2 * math.pi).unsqueeze(-1) * (4.0 / wavelengths)
+    code = torch.stack([phase.sin(), phase.cos()], dim=-1).flatten(-3)
+    return torch.nn.functional.pad(code, (0, channels - code.shape[-1]))
+
+
+def cell_positions(*shape: int) -> Tensor:
+    """(N, A) centres of the cells of a map or grid of A axes, the last of them fastest, in [0, 1]."""
+    axes = [(torch.arange(size) + 0.5) / size for size in shape]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, len(shape))

@@ -19,7 +19,7 @@ from umf_ros.frames import Frame
 from umf_ros.loop_detector import Detection
 from umf_ros.runs import tables
 from umf_ros.runs.folder import write_atomically
-from umf_ros.sensors.counters import InputCounter
+from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
 COUNTS = ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected")

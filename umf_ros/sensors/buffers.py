@@ -3,15 +3,42 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections import deque
-from dataclasses import dataclass
+from collections import Counter, deque
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.frames import Image
 from umf_ros.geometry import Array, interpolate
-from umf_ros.sensors.counters import SURPLUS, InputCounter
+
+SURPLUS = "surplus"
+"""Reason of the images that lie nearest to no scan: cameras are faster than LiDARs, nothing is wrong."""
+
+
+@dataclass(slots=True)
+class InputCounter:
+    """Messages of one input: `received == used + sum(dropped) + waiting` at any time.
+
+    Attributes:
+        received: messages that arrived.
+        used: messages that became part of a frame, or of the odometry.
+        dropped: the others, by reason.
+    """
+
+    received: int = 0
+    used: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def waiting(self) -> int:
+        """Messages whose fate is open."""
+        return self.received - self.used - self.dropped.total()
+
+    @property
+    def lost(self) -> int:
+        """Messages dropped for a reason that should not happen."""
+        return self.dropped.total() - self.dropped[SURPLUS]
 
 
 @dataclass(slots=True)

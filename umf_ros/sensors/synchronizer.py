@@ -10,9 +10,8 @@ from umf_ros.config import Sync
 from umf_ros.errors import MessageError
 from umf_ros.frames import Frame, Image, StereoCamera
 from umf_ros.sensors.assembly import Anchor, assemble, filter_cloud
-from umf_ros.sensors.buffers import ImageBuffer, OdometryBuffer, StampedImage
+from umf_ros.sensors.buffers import ImageBuffer, InputCounter, OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
-from umf_ros.sensors.counters import InputCounter
 from umf_ros.sensors.messages import Cloud
 from umf_ros.sensors.sessions import ODOMETRY, Arrival, Input, Reset, SessionClock
 

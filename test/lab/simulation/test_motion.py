@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.bags.rtklib import east_north_up, read_rtklib
+from umf_ros.bags.trajectories import east_north_up, read_rtklib
 from umf_ros.geometry import heading, make_pose, relative
 from umf_ros.lab.simulation import gnss, imu
 from umf_ros.lab.simulation.motion import Motion

@@ -21,8 +21,7 @@ from umf_ros.lab.training.losses import (
     super_contrastive,
     wasted_saliency,
 )
-from umf_ros.networks.local_features import LocalMap
-from umf_ros.networks.superfeatures import SuperMap
+from umf_ros.networks.local_features import LocalMap, SuperMap
 
 
 def test_labels_follow_distance_and_heading():

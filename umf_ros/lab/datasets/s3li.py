@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.rtklib import east_north_up
-from umf_ros.bags.trajectories import read_ground_truth, read_odometry
+from umf_ros.bags.trajectories import east_north_up, read_ground_truth, read_odometry
 from umf_ros.config import Settings
-from umf_ros.embedding.images import shrink
+from umf_ros.embedding.inputs import shrink
 from umf_ros.errors import BagError, UmfError
 from umf_ros.frames import Frame, Image
 from umf_ros.geometry import Array, align, transform

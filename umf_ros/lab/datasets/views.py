@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.embedding.images import is_blank, shrink, standardise
-from umf_ros.embedding.inputs import prepare_scan
+from umf_ros.embedding.inputs import is_blank, prepare_scan, shrink, standardise
 from umf_ros.embedding.voxels import VoxelScan
 from umf_ros.frames import Image, Points
 from umf_ros.geometry import Array, invert, make_pose, transform

@@ -19,8 +19,7 @@ from sklearn.manifold import TSNE
 from torch import Tensor
 
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.embedding.images import is_blank
-from umf_ros.embedding.inputs import pack, prepare_image, prepare_scan
+from umf_ros.embedding.inputs import is_blank, pack, prepare_image, prepare_scan
 from umf_ros.frames import Embedding, Frame, Image, Points
 from umf_ros.geometry import Array
 from umf_ros.lab.evaluation.retrieval import Indices

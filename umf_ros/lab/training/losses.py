@@ -6,8 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from umf_ros.networks.local_features import LocalMap
-from umf_ros.networks.superfeatures import SuperMap
+from umf_ros.networks.local_features import LocalMap, SuperMap
 
 
 def multi_similarity(
