@@ -116,7 +116,7 @@ class Verification(Group):
         0.02,
         ge=0,
         le=1000,
-        description="what e times as many inliers weigh against cosine similarity; 1000: inliers alone (thesis)",
+        description="what e times as many inliers weigh against cosine similarity; 1000: inliers alone [UMF 4.5]",
     )
     modalities: Literal["both", "image", "cloud"] = Field("both", description="local features that reranking uses")
     rerank_features: int = Field(

@@ -81,7 +81,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class LocalFeatures:
-    """K salient local features of one modality (thesis 4.4), strongest first.
+    """K salient local features of one modality [UMF 4.4], strongest first.
 
     Attributes:
         positions: (K, 2) float32 pixels of the left image, or (K, 3) float32 metres in the body frame.
@@ -98,7 +98,7 @@ class LocalFeatures:
 
 @dataclass(frozen=True, slots=True)
 class SuperFeatures:
-    """The ordered super-features of one modality (thesis 4.3); the row is the feature's ID.
+    """The ordered super-features of one modality [UMF 4.3]; the row is the feature's ID.
 
     Attributes:
         descriptors: (N, D) float16, L2-normalised.

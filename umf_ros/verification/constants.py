@@ -15,7 +15,7 @@ import numpy as np
 IMAGE_THRESHOLD = 0.03  # of the image's width; geometry: a cell of the feature map is 1.8 %
 CLOUD_THRESHOLD_M = 0.75  # geometry: the cells of the voxel features are about a metre wide
 SERIAL_PRODUCTS = 2**18  # multiplications up to which OpenBLAS stays on one thread; its others would spin for nothing
-SUPERFEATURE_RATIO = 0.9  # thesis 4.3, equation 4.1
+SUPERFEATURE_RATIO = 0.9  # [UMF eq. 4.1]
 SAME_PLACE_M = 3.0  # by hand: candidates nearer than this to a chosen one show the same place
 
 # ransac

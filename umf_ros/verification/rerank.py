@@ -1,6 +1,6 @@
-"""Reranking of the candidates by what their local features share with the query (thesis 4.5).
+"""Reranking of the candidates by what their local features share with the query [UMF 4.5].
 
-The thesis orders by the number of inliers and looks at the global similarity among equals only. On ground
+[UMF] orders by the number of inliers and looks at the global similarity among equals only. On ground
 that looks alike everywhere a few inliers more are found by chance, and a good ranking was made worse: here
 they count beside the similarity, each modality's by its logarithm.
 """
@@ -131,7 +131,7 @@ def mutual_neighbours(similarity: NDArray[Any]) -> Indices:
 def eligible_superfeatures(
     query: SuperFeatures, match: SuperFeatures, ratio: float = const.SUPERFEATURE_RATIO
 ) -> Indices:
-    """IDs of the super-features that match (thesis 4.3, equation 4.1).
+    """IDs of the super-features that match [UMF eq. 4.1].
 
     A pair is eligible when both are each other's nearest neighbour, carry the same ID, and the
     nearest neighbour is closer than `ratio` times the second nearest.

@@ -189,7 +189,7 @@ class Verifier:
             return f"probability {judged.probability:.2f} is below {self._threshold:g}"
         pose = judged.aligned.pose
         turn_deg, shift_m = abs(np.degrees(heading(pose))), float(np.linalg.norm(pose[:3, 3]))
-        # a place is a position and a view (thesis 5.1.2): whoever looks elsewhere is somewhere else
+        # a place is a position and a view [UMF 5.1.2]: whoever looks elsewhere is somewhere else
         if turn_deg > self._settings.max_turn_deg:
             return f"turned by {turn_deg:.0f} deg, more than {self._settings.max_turn_deg:g}"
         if shift_m > self._settings.max_shift_m:

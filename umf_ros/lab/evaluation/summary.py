@@ -134,7 +134,7 @@ class WorldsSummary:
         """The tables by their titles."""
         return {
             "Modalities": self._recalls(["fused", "image", "lidar"]),
-            "Reranking (as thesis table 5.7; its Etna recall@1 beside)": self._reranking(),
+            "Reranking (as UMF table 5.7; its Etna recall@1 beside)": self._reranking(),
             "Lost modalities and unchanged light": self._recalls(["fused", "image black", "cloud empty", "same light"]),
             "Recall@1 by difference of heading": self._yaw(),
             "Other methods": self._baselines(),
@@ -149,7 +149,7 @@ class WorldsSummary:
     def _reranking(self) -> TextTable:
         names = ["fused", *METHODS]
         table = self._recalls(names)
-        return _with_column(table, len(table[0]), "thesis, Etna", [f"{ETNA_RECALL1[name]:.1f}" for name in names])
+        return _with_column(table, len(table[0]), "UMF, Etna", [f"{ETNA_RECALL1[name]:.1f}" for name in names])
 
     def _yaw(self) -> TextTable:
         rows = []
