@@ -28,6 +28,7 @@ from umf_ros.loop_detector import LoopDetector, make_detector_embedder
 from umf_ros.replay import Replay
 from umf_ros.runs.recorder import count_drops, read_summary
 
+OUT = Path("results/live_against_replay")
 TABLES = ("closures.csv", "graph_verdicts.csv")
 SHOWN = 3
 
@@ -38,7 +39,7 @@ def main(
     bag: BagPath,
     rate: Annotated[float, typer.Option(min=0.01, max=100, help="Speed of the live run.")] = 1.0,
     config: ConfigPath = None,
-    out: Annotated[Path, typer.Option(help="Where the folders live/ and replay/ go.")] = Path("live_against_replay"),
+    out: Annotated[Path, typer.Option(help="Where the folders live/ and replay/ go.")] = OUT,
 ) -> None:
     """Compare the live graph with the replay."""
     console = Console()
