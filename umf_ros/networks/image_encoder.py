@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from umf_ros.networks.efficientnet import EfficientNetLite0
 from umf_ros.networks.presets import NetworkConfig
 
 RESNET_DEPTHS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3), "resnet50": (3, 4, 6, 3)}
@@ -128,7 +129,8 @@ class ImageEncoder(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.backbone = Backbone(config.backbone, config.width)
+        lite = config.backbone == "efficientnet_lite0"
+        self.backbone = EfficientNetLite0() if lite else Backbone(config.backbone, config.width)
         self.pyramid = FeaturePyramid(self.backbone.channels, config.pyramid, config.tokens, config.local)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ from umf_ros.networks.image_encoder import ImageEncoder
 from umf_ros.networks.local_features import CloudLocal, ImageLocal, LocalMap
 from umf_ros.networks.positions import image_positions, sine_encoding, voxel_positions
 from umf_ros.networks.presets import NetworkConfig
+from umf_ros.networks.scene import SceneDescriptor
 from umf_ros.networks.superfeatures import IterativeAttention, SuperMap
 from umf_ros.networks.voxel_encoder import CELLS, VoxelEncoder
 
@@ -55,12 +56,14 @@ class Features:
         image, cloud: tokens for fusion, positions included.
         fine_image: (B, C, H/4, W/4).
         fine_cloud: (B, V, C).
+        scene: (B, S) L2-normalised, or None where the network has no such part.
     """
 
     image: Tokens
     cloud: Tokens
     fine_image: Tensor
     fine_cloud: Tensor
+    scene: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +93,7 @@ class UMF(nn.Module):
         self.config = config
         self.image_encoder = ImageEncoder(config)
         self.voxel_encoder = VoxelEncoder(config)
+        self.scene = SceneDescriptor(config.scene) if config.scene else None
         # content and position on one scale, or one of them drowns
         self.image_tokens, self.cloud_tokens = nn.LayerNorm(config.tokens), nn.LayerNorm(config.tokens)
         self.fusion = Fusion(config)
@@ -114,14 +118,17 @@ class UMF(nn.Module):
 
     def encode(self, batch: NetworkInput, branch: Branch = "both") -> Features:
         """Run the encoders and add the positions to the tokens; of the branch left out all is zero."""
+        scene = None
         if branch == "cloud":
             size = batch.image.shape[0]
+            scene = None if self.scene is None else batch.image.new_zeros(size, self.config.scene)
             image = batch.image.new_zeros(size, *self.cells.shape)
             fine_image = batch.image.new_zeros(size, self.config.local, *self.image_local.positions.shape[:2])
         else:
             coarse, fine_image = self.image_encoder(batch.image)
             image = self.image_tokens(coarse.flatten(2).transpose(1, 2))
             image = image + self.cells.to(image.dtype)
+            scene = None if self.scene is None else self.scene(batch.image)
         everywhere = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device)
         if branch == "image":
             cloud = batch.image.new_zeros(*batch.coarse_index.shape, self.config.tokens)
@@ -130,13 +137,13 @@ class UMF(nn.Module):
             cloud, fine_cloud = self.voxel_encoder(batch.grid, batch.coarse_index, batch.fine_index)
             cloud = self.cloud_tokens(cloud)
             cloud = cloud + self.coarse_voxels[batch.coarse_index].to(cloud.dtype)
-        return Features(Tokens(image, everywhere), Tokens(cloud, batch.coarse_mask), fine_image, fine_cloud)
+        return Features(Tokens(image, everywhere), Tokens(cloud, batch.coarse_mask), fine_image, fine_cloud, scene)
 
     def fuse(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> Fused:
         """Descriptors and attention maps, with the modalities that are present (B,) bool."""
         image = self.absent_image(features.image, image_present)
         cloud = self.absent_cloud(features.cloud, cloud_present)
-        return self.fusion(image, cloud, image_present, cloud_present)
+        return self.fusion(image, cloud, image_present, cloud_present, features.scene)
 
     def branch_layers(self, branch: Literal["image", "cloud"]) -> list[nn.Module]:
         """What belongs to one modality alone on the way to the descriptor."""
@@ -144,7 +151,8 @@ class UMF(nn.Module):
         if branch == "image":
             encoder: list[nn.Module] = [self.image_encoder, self.image_tokens]
             own = [layer.get_submodule("image_self") for layer in fusion.layers]
-            return encoder + own + [fusion.image_norm, fusion.image_pool, fusion.image_head]
+            scene: list[nn.Module] = [] if self.scene is None else [self.scene.projection]
+            return encoder + own + scene + [fusion.image_norm, fusion.image_pool, fusion.image_head]
         encoder = [self.voxel_encoder, self.cloud_tokens]
         own = [layer.get_submodule("cloud_self") for layer in fusion.layers]
         return encoder + own + [fusion.cloud_norm, fusion.cloud_pool, fusion.cloud_head]

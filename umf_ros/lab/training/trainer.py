@@ -79,7 +79,7 @@ class Trainer:
         self._network = network.to(team.device)
         self._whole = settings.loss == "neighbourhood"
         self._rule = _rule(settings)
-        self._bank = Bank(settings.bank, network.config.descriptor)
+        self._bank = Bank(settings.bank, network.config.length)
         self._sampler: tuple[int, PairSampler] | None = None
         objective: nn.Module = Objective(self._network, settings, self._rule).to(team.device)
         self._trained = _choose_parameters(network, settings)
@@ -179,7 +179,7 @@ class Trainer:
         return {name: float(value.detach()) for name, value in losses.items()}
 
     def _bank_width(self) -> int:
-        return self._network.config.descriptor
+        return self._network.config.length
 
     def _learning_rate(self) -> float:
         settings = self._settings
