@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from umf_ros.embedding.embedder import Embedder
 
 METHODS = ("umf", "thumbnail", "scan_context")
+PUBLISHED = ("lite0-cells", "lite0-mean")
+"""Methods that need published weights (`embedding.weights`)."""
 
 
 def make_embedder(settings: Embedding, super_features: bool = False) -> Embedder:
@@ -35,4 +37,18 @@ def make_embedder(settings: Embedding, super_features: bool = False) -> Embedder
         from umf_ros.embedding.baselines import ScanContextEmbedder, ThumbnailEmbedder
 
         return ThumbnailEmbedder() if settings.method == "thumbnail" else ScanContextEmbedder()
-    raise ConfigError(f"embedding.method: unknown method {settings.method!r}; known: {', '.join(METHODS)}")
+    if settings.method in PUBLISHED:
+        return _published(settings)
+    raise ConfigError(
+        f"embedding.method: unknown method {settings.method!r}; known: {', '.join((*METHODS, *PUBLISHED))}"
+    )
+
+
+def _published(settings: Embedding) -> Embedder:
+    from pathlib import Path
+
+    from umf_ros.embedding.lite0 import Lite0Embedder
+
+    if not settings.weights:
+        raise ConfigError(f"embedding.method {settings.method}: embedding.weights must name the published weights")
+    return Lite0Embedder(Path(settings.weights), "mean" if settings.method == "lite0-mean" else "cells")

@@ -107,7 +107,6 @@ class Fusion(nn.Module):
         half = config.descriptor // 2
         self.image_head, self.cloud_head = nn.Linear(config.tokens, half), nn.Linear(config.tokens, half)
         self.weigh = nn.Linear(2 * config.tokens, 2)
-        self.scene_weight = nn.Parameter(torch.ones(())) if config.scene else None
 
     def forward(
         self, image: Tokens, cloud: Tokens, image_present: Tensor, cloud_present: Tensor, scene: Tensor | None = None
@@ -115,9 +114,11 @@ class Fusion(nn.Module):
         """Fuse tokens of which the absent rows (present: (B,) bool) hold the learned token alone.
 
         Args:
-            image, cloud: tokens.
-            image_present, cloud_present: (B,) bool.
-            scene: (B, S) L2-normalised, of a network that has such a part.
+            image: its tokens.
+            cloud: its tokens.
+            image_present: (B,) bool.
+            cloud_present: (B,) bool.
+            scene: (B, S), of a network that has such a part; its length is its weight beside the image's half.
         """
         maps = []
         for layer in self.layers:
@@ -127,9 +128,8 @@ class Fusion(nn.Module):
         felt = self.cloud_pool(Tokens(self.cloud_norm(cloud.values), cloud.mask))
         with torch.autocast(seen.device.type, enabled=False):
             image_half = nn.functional.normalize(self.image_head(seen.float()), dim=-1)
-            if self.scene_weight is not None and scene is not None:
-                both = torch.cat([image_half, self.scene_weight * scene.float()], dim=-1)
-                image_half = nn.functional.normalize(both, dim=-1)
+            if scene is not None:
+                image_half = nn.functional.normalize(torch.cat([image_half, scene.float()], dim=-1), dim=-1)
             cloud_half = nn.functional.normalize(self.cloud_head(felt.float()), dim=-1)
             scores = self.weigh(torch.cat([seen, felt], dim=-1).float())
             present = torch.stack([image_present, cloud_present], dim=-1)

@@ -89,7 +89,7 @@ PRESETS: dict[str, NetworkConfig] = {
     "umf_light": NetworkConfig(backbone="resnet34", image_size=(160, 224), voxel_blocks=2),
     "umf_mobile": NetworkConfig(backbone="mobile", width=24),
     # what it says of the scene comes from a trunk trained on photographs (`umf_ros.networks.scene`)
-    "umf_scene": NetworkConfig(backbone="resnet34", image_size=(160, 224), voxel_blocks=2, scene=384),
+    "umf_scene": NetworkConfig(backbone="resnet34", image_size=(160, 224), voxel_blocks=2, scene=512),
     # its trunk begins with what it learned on photographs (`umf_ros.networks.efficientnet`)
     "umf_lite0": NetworkConfig(backbone="efficientnet_lite0", image_size=(160, 224), voxel_blocks=2),
     "umf_resnet50": NetworkConfig(

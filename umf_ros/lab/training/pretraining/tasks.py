@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from umf_ros.errors import ConfigError
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.training.pretraining.cloud import OccupancyReconstruction, occupancy
 from umf_ros.lab.training.pretraining.image import ImageReconstruction, normalised, patches, repainted, unpatch
@@ -19,6 +20,7 @@ from umf_ros.lab.training.pretraining.pictures import save_images, save_occupanc
 from umf_ros.lab.training.pretraining.settings import PretrainingSettings
 from umf_ros.lab.training.pretraining.sparse import hide
 from umf_ros.lab.training.views import View
+from umf_ros.networks.image_encoder import Backbone
 from umf_ros.networks.umf import UMF
 
 Inputs = tuple[Tensor, Tensor]
@@ -54,7 +56,10 @@ class PaintImages:
     """Hidden patches of images."""
 
     def __init__(self, network: UMF, settings: PretrainingSettings) -> None:
-        self.model = ImageReconstruction(network.image_encoder.backbone, settings.decoder_width)
+        backbone = network.image_encoder.backbone
+        if not isinstance(backbone, Backbone):
+            raise ConfigError(f"preset: the image trunk of {settings.preset} comes pretrained")
+        self.model = ImageReconstruction(backbone, settings.decoder_width)
         self._size, self._ratio = network.config.image_size, settings.mask_ratio
 
     def part(self, sample: Sample) -> Sample | None:
