@@ -13,6 +13,8 @@ import pytest
 from processes import Process
 from sources import PACKAGE, ROOT, distributions, imports, required
 
+from umf_ros.resources import LAB_PACKAGES
+
 PARTS = ["package.xml", "setup.py", "setup.cfg", "umf_ros", "resource", "config", "launch", "models"]
 PARTS += [path.name for path in ROOT.glob("requirements*.txt")]
 TEMPLATE = Path("runs", "templates", "planted.html.j2")
@@ -130,8 +132,16 @@ def test_what_is_imported_is_required(wing: str, lists: list[str]) -> None:
         )
 
 
-def test_a_package_that_only_the_lab_has_is_asked_for_in_one_line(tmp_path: Path) -> None:
-    missing = "import sys; sys.modules['open3d'] = None; from umf_ros import cli; cli.main()"
+@pytest.mark.parametrize(
+    ("module", "advice"),
+    [
+        ("open3d", "the lab needs it: pip install 'umf_ros[lab]'"),
+        # it is the lab that asks, but its extra would not bring this one
+        ("cv2", "umf doctor says what helps"),
+    ],
+)
+def test_a_package_that_is_missing_is_asked_for_in_one_line(module: str, advice: str, tmp_path: Path) -> None:
+    missing = f"import sys; sys.modules[{module!r}] = None; from umf_ros import cli; cli.main()"
     done = subprocess.run(
         [sys.executable, "-c", missing, "simulate", str(tmp_path / "a.mcap")],
         capture_output=True,
@@ -140,8 +150,12 @@ def test_a_package_that_only_the_lab_has_is_asked_for_in_one_line(tmp_path: Path
         timeout=60,
     )
     assert done.returncode == 1
-    assert done.stderr == "umf: open3d is not installed; the lab needs it: pip install 'umf_ros[lab]'\n"
+    assert done.stderr == f"umf: {module} is not installed; {advice}\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_packages_of_the_lab_are_those_of_its_extra() -> None:
+    assert {distribution for distribution, _ in LAB_PACKAGES.values()} == required("requirements-lab.txt")
 
 
 def test_the_parameter_documentation_is_up_to_date() -> None:

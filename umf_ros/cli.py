@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import traceback
 from functools import cache
 from importlib import import_module
 from typing import Annotated, NoReturn
@@ -14,6 +13,7 @@ import typer
 
 from umf_ros import __version__
 from umf_ros.errors import UmfError
+from umf_ros.resources import LAB_PACKAGES
 
 COMMANDS = {
     "demo": "umf_ros.lab.commands.demo",
@@ -67,11 +67,9 @@ def _options(version: Version = False) -> None:
     """Options of `umf` itself."""
 
 
-def _what_helps(error: ModuleNotFoundError) -> str:
-    """Where a missing package comes from: the lab has its own, and the innermost module of ours tells who asked."""
-    names = [frame.f_globals["__name__"] for frame, _ in traceback.walk_tb(error.__traceback__)]
-    ours = [name for name in names if name.startswith("umf_ros.")]
-    if ours and ours[-1].startswith("umf_ros.lab."):
+def _what_helps(package: str) -> str:
+    """Where a missing package comes from."""
+    if package in LAB_PACKAGES:
         return "the lab needs it: pip install 'umf_ros[lab]'"
     return "umf doctor says what helps"
 
@@ -88,7 +86,7 @@ def main() -> NoReturn:
         typer.echo(f"umf: {error}", err=True)
         sys.exit(1)
     except ModuleNotFoundError as error:
-        typer.echo(f"umf: {error.name} is not installed; {_what_helps(error)}", err=True)
+        typer.echo(f"umf: {error.name} is not installed; {_what_helps(str(error.name).split('.')[0])}", err=True)
         sys.exit(1)
     except BrokenPipeError:
         # the reader of our output went away, as with `umf ... | head`

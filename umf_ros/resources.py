@@ -1,4 +1,4 @@
-"""Files that come with the package, in a checkout or an installed share folder: cheap, for `umf --help` asks too."""
+"""What comes with the package, in a checkout or an installed share folder, and what does not: cheap, for help asks."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from pathlib import Path
 from umf_ros.errors import UmfError
 
 DEFAULT_DATASET = "simulated"
+LAB_PACKAGES = {"open3d": ("open3d", "0.19"), "sklearn": ("scikit-learn", "1.4")}
+"""What a rover does without: distribution and first version known to work, by module."""
 
 
 def share_folders() -> list[Path]:

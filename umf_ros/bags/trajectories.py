@@ -16,6 +16,16 @@ from umf_ros.geometry import Array, make_pose
 from umf_ros.sensors.messages import decode_pose, stamp_ns
 from umf_ros.trajectory import Trajectory
 
+GPS_EPOCH_S = 315_964_800
+"""1980-01-06 in POSIX seconds."""
+LEAP_SECONDS = 18
+"""GPS time is ahead of UTC by this much since 2017."""
+WORST_QUALITY = 2
+"""1 is a fixed, 2 a floating ambiguity; the rest is off by metres."""
+
+_EQUATOR_M = 6_378_137.0
+_ECCENTRICITY_SQUARED = 6.694379990141e-3  # WGS 84
+
 
 def read_tum(path: str | Path) -> Trajectory:
     """Trajectory from a TUM file: `seconds x y z qx qy qz qw` per line, # for comments.
@@ -107,17 +117,6 @@ def _to_ns(seconds: str) -> int:
         return round(float(seconds) * 1e9)
     whole, _, fraction = seconds.partition(".")
     return int(whole or 0) * 10**9 + int(fraction[:9].ljust(9, "0"))
-
-
-GPS_EPOCH_S = 315_964_800
-"""1980-01-06 in POSIX seconds."""
-LEAP_SECONDS = 18
-"""GPS time is ahead of UTC by this much since 2017."""
-WORST_QUALITY = 2
-"""1 is a fixed, 2 a floating ambiguity; the rest is off by metres."""
-
-_EQUATOR_M = 6_378_137.0
-_ECCENTRICITY_SQUARED = 6.694379990141e-3  # WGS 84
 
 
 def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> tuple[NDArray[np.int64], Array]:

@@ -14,6 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 from umf_ros.config import EmbeddingSettings
 from umf_ros.errors import UmfError
+from umf_ros.resources import LAB_PACKAGES
 
 TIMEOUT_S = 60
 
@@ -33,7 +34,6 @@ _PACKAGES = (
     ("matplotlib", "matplotlib", "3.8"),
     ("jinja2", "Jinja2", "3.1"),
 )
-_LAB_PACKAGES = (("open3d", "open3d", "0.19"), ("sklearn", "scikit-learn", "1.4"))
 _MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "visualization_msgs", "std_srvs")
 
 
@@ -59,7 +59,7 @@ def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
     yield "Python", check_python
     for module, distribution, minimum in _PACKAGES:
         yield distribution, partial(check_package, module, distribution, minimum)
-    for module, distribution, minimum in _LAB_PACKAGES:
+    for module, (distribution, minimum) in LAB_PACKAGES.items():
         yield distribution, partial(check_lab_package, module, distribution, minimum)
     yield "ROS 2 Python", check_rclpy
     yield "ROS 2 messages", check_messages

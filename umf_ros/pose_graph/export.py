@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.errors import OutputError
+from umf_ros.errors import writing
 from umf_ros.geometry import Array, heading, to_quaternion
 from umf_ros.pose_graph.closures import ClosureVerdict
 from umf_ros.pose_graph.condensed import Edge
@@ -81,10 +81,8 @@ def write_vertex_table(path: str | Path, vertices: Iterable[tuple[int, int]]) ->
 
 
 def _write(path: str | Path, lines: Iterable[str]) -> None:
-    try:
+    with writing(path):
         Path(path).write_text("".join(line + "\n" for line in lines), encoding="ascii")
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from None
 
 
 def _spatial_vertex(pose: Array, name: int) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from umf_ros.config import PoseGraphSettings
-from umf_ros.errors import GraphError, OutputError
+from umf_ros.errors import GraphError, writing
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, gtsam_to_ros_covariance, invert
 from umf_ros.pose_graph.closures import (
@@ -293,11 +293,9 @@ class PoseGraph:
         """
         folder = Path(folder)
         self.settle()
-        try:
+        with writing(f"to {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "graph_verdicts.csv").write_text(verdict_table(self.closures()), encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"cannot write to {folder}: {error.strerror}") from None
         self.write_tum(folder / "trajectory_odometry.tum", optimized=False)
         self.write_tum(folder / "trajectory_optimized.tum")
         self.write_g2o(folder / "graph.g2o")

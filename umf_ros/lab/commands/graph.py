@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.errors import ConfigError
+from umf_ros.errors import ConfigError, writing
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -39,7 +39,6 @@ def optimize(
     from rich.progress import track
 
     from umf_ros.config import PoseGraphSettings
-    from umf_ros.errors import OutputError
     from umf_ros.lab.datasets.g2o import as_recording, drive, read_g2o
     from umf_ros.pose_graph.export import verdict_table
     from umf_ros.pose_graph.pose_graph import PoseGraph
@@ -58,10 +57,8 @@ def optimize(
         graph.write_g2o(output, planar=content.planar, vertex_of=recording.vertex_of)
         console.print(f"optimised graph: {output}")
     if verdicts is not None:
-        try:
+        with writing(verdicts):
             verdicts.write_text(verdict_table(graph.closures(), recording.vertex_of), encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"cannot write {verdicts}: {error.strerror}") from None
 
 
 @app.command()

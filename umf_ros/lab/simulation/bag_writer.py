@@ -11,7 +11,7 @@ from typing import IO, Any
 from mcap.writer import CompressionType, Writer
 
 from umf_ros.bags.records import message_types
-from umf_ros.errors import OutputError
+from umf_ros.errors import OutputError, writing
 
 
 class BagWriter:
@@ -34,11 +34,9 @@ class BagWriter:
         self._counts: dict[str, int] = {}
         if self.path.is_dir():
             raise OutputError(f"cannot write {self.path}: it is a folder")
-        try:
+        with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._stream: IO[bytes] = self._unfinished.open("wb")
-        except OSError as error:
-            raise OutputError(f"cannot write {self.path}: {error.strerror}") from None
         self._writer = Writer(self._stream, compression=CompressionType.LZ4)
         try:
             self._guarded(self._writer.start, "ros2", library)
@@ -90,10 +88,8 @@ class BagWriter:
         return channel, kind
 
     def _guarded(self, action: Any, *arguments: Any) -> None:
-        try:
+        with writing(self.path):
             action(*arguments)
-        except OSError as error:
-            raise OutputError(f"cannot write {self.path}: {error.strerror}") from None
 
     def _discard(self) -> None:
         """Remove what is unfinished; does nothing after a good end."""

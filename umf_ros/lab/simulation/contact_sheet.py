@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from umf_ros.errors import OutputError
+from umf_ros.errors import writing
 from umf_ros.frames import Image
 from umf_ros.geometry import transform
 from umf_ros.lab.simulation.camera import Camera
@@ -31,11 +31,9 @@ def contact_sheet(survey: Survey, path: Path) -> None:
     scans = [_scan(survey, index) for index in range(SCANS)]
     rows = [np.hstack(tiles[row : row + COLUMNS]) for row in range(0, FRAMES, COLUMNS)]
     sheet = np.vstack([*(cv2.cvtColor(row, cv2.COLOR_GRAY2BGR) for row in rows), np.hstack(scans)])
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from None
 
 
 def _frame(survey: Survey, camera: Camera, index: int) -> Image:

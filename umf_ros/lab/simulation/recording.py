@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.errors import OutputError
+from umf_ros.errors import writing
 from umf_ros.lab.simulation import gnss, imu
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.camera import Rendering
@@ -76,10 +76,8 @@ def write_side_files(simulator: Simulator, bag: Path) -> None:
     stamps = np.array([stamp_ns(time_s) for time_s in run.times_s], np.int64)
     write_tum(bag.with_suffix(".odometry.tum"), Trajectory(stamps, run.poses))
     text = gnss.rtklib_text(gnss.measure(simulator.motion, simulator.duration_s, simulator.seed), START_NS)
-    try:
+    with writing(bag.with_suffix(".pos")):
         bag.with_suffix(".pos").write_text(text, encoding="ascii")
-    except OSError as error:
-        raise OutputError(f"cannot write {bag.with_suffix('.pos')}: {error.strerror}") from None
 
 
 def describe(simulator: Simulator) -> dict[str, str]:

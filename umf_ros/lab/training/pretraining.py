@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from umf_ros.errors import ConfigError, OutputError
+from umf_ros.errors import ConfigError, writing
 from umf_ros.geometry import Array
 from umf_ros.lab.datasets.sample import Sample, SampleSequence
 from umf_ros.lab.datasets.views import Augmentation, View, ViewMaker
@@ -122,11 +122,9 @@ def _save(path: Path, columns: Sequence[Column]) -> None:
     """Columns of pictures side by side, one row per example [UMF figures 4.6, 4.8]."""
     drawn = [_column(name, np.clip(values * 255, 0, 255).astype(np.uint8)) for name, values in columns]
     encoded, content = cv2.imencode(".png", np.concatenate(drawn, axis=1))
-    try:
+    with writing(path):
         if encoded:
             path.write_bytes(content.tobytes())
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from None
 
 
 def _column(name: str, images: NDArray[np.uint8]) -> NDArray[np.uint8]:

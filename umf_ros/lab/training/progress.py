@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from umf_ros.errors import OutputError, WeightsError
+from umf_ros.errors import OutputError, WeightsError, writing
 
 
 @dataclass
@@ -46,14 +46,11 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    try:
-        with path.open("a", newline="", encoding="utf-8") as stream:
-            writer = csv.DictWriter(stream, list(row))
-            if stream.tell() == 0:
-                writer.writeheader()
-            writer.writerow(row)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from None
+    with writing(path), path.open("a", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, list(row))
+        if stream.tell() == 0:
+            writer.writeheader()
+        writer.writerow(row)
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
