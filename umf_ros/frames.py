@@ -6,7 +6,7 @@ z up), the camera frame is optical (x right, y down, z forward). Poses follow `g
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,6 +141,7 @@ class Keyframe:
         odom_T_body: odometry at the stamp, or None.
         travelled_m: metres driven since the start of the session, NaN without odometry.
         session: session of the frame.
+        body_T_lidar: pose of the LiDAR in the body frame: where the scan was seen from.
     """
 
     stamp_ns: int
@@ -151,6 +152,7 @@ class Keyframe:
     odom_T_body: Array | None = None
     travelled_m: float = float("nan")
     session: int = 0
+    body_T_lidar: Array = field(default_factory=lambda: np.eye(4))
 
 
 @dataclass(frozen=True, slots=True)

@@ -151,6 +151,7 @@ def make_keyframe(
         odom_T_body=frame.odom_T_body,
         travelled_m=travelled_m,
         session=first_session + frame.session,
+        body_T_lidar=frame.body_T_lidar,
     )
 
 

@@ -51,11 +51,13 @@ def test_features_of_an_empty_view_are_empty_and_not_missing() -> None:
 def test_stamps_and_poses_keep_every_bit() -> None:
     rng = np.random.default_rng(2)
     pose = rng.standard_normal((4, 4))
-    keyframe = replace(make_keyframe(0), stamp_ns=2**62 + 1, session=2**40, odom_T_body=pose, body_T_camera=pose.T)
+    poses = {"odom_T_body": pose, "body_T_camera": pose.T, "body_T_lidar": pose}
+    keyframe = replace(make_keyframe(0), stamp_ns=2**62 + 1, session=2**40, **poses)
     found = unpack(pack(keyframe))
     assert (found.stamp_ns, found.session) == (2**62 + 1, 2**40)
     np.testing.assert_array_equal(found.odom_T_body, pose)
     np.testing.assert_array_equal(found.body_T_camera, pose.T)  # not contiguous when it was packed
+    np.testing.assert_array_equal(found.body_T_lidar, pose)
     assert astuple(found.camera) == astuple(keyframe.camera) and isinstance(found.camera.width, int)
 
 

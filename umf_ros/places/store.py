@@ -20,7 +20,7 @@ from umf_ros.errors import UmfError, writing
 from umf_ros.frames import Keyframe
 from umf_ros.places.packing import pack, unpack
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 _TABLES = (
     "CREATE TABLE about (content TEXT NOT NULL)",
     # the blob comes last: whoever wants the columns before it does not read it
