@@ -2,8 +2,9 @@
 
 python benchmarks/real_scans.py FOLDER [--sample N] [--apart N] [--crop DEG] [--json FILE]
 
-The folder holds scans as `umf compare` reads them, and `pairs.csv` with the columns match_scan, query_scan (paths relative to the folder) and same_place
-(1 or 0), and where it is known the true pose of the query in the match: x, y, z, qx, qy, qz, qw.
+The folder holds scans as `umf compare` reads them, and `pairs.csv` with the columns match_scan, query_scan (paths
+relative to the folder) and same_place (1 or 0), and where it is known the true pose of the query in the match: x, y,
+z, qx, qy, qz, qw.
 
 Without `pairs.csv` the scans in `scans/`, in the order of their names, are taken for a drive that sees no place
 twice: of pairs further apart in that order, half are drawn at random, the other half are those most alike.
@@ -77,7 +78,10 @@ def main(
     listed = (folder / "pairs.csv").is_file()
     pairs = list(read_pairs(folder / "pairs.csv") if listed else draw_pairs(folder, keyframe, sample, apart))
     verifier = Verifier(Verification())
-    verdicts = [(pair, judge(verifier, keyframe(pair.match), keyframe(pair.query))) for pair in track(pairs, folder.name, transient=True)]
+    verdicts = [
+        (pair, judge(verifier, keyframe(pair.match), keyframe(pair.query)))
+        for pair in track(pairs, folder.name, transient=True)
+    ]
     figures = summary(verdicts)
     for name, value in figures.items():
         console.print(f"{name:24} {value:.4g}")

@@ -58,9 +58,7 @@ def command(
     images = match_left, match_right, query_left, query_right
     if pairs is not None:
         if match is not None or any(images) or as_json or out is None:
-            raise ConfigError(
-                "--list PAIRS.csv needs --out VERDICTS.csv, and neither MATCH, QUERY, images nor --json"
-            )
+            raise ConfigError("--list PAIRS.csv needs --out VERDICTS.csv, and neither MATCH, QUERY, images nor --json")
         asked = read_pairs(pairs)
     else:
         asked = [_named_pair(match, query, images, out)]
@@ -108,7 +106,9 @@ def _compare_list(comparer: Comparer, asked: list[Pair], base: Path, out: Path, 
 
     columns = [*VIEW_COLUMNS, *RESULT_COLUMNS]
     table, accepted, failures = CsvTable(out, columns), 0, []
-    for number, pair in enumerate(track(asked, "Comparing", console=errors, transient=True), 1):
+    for number, pair in enumerate(
+        track(asked, "Comparing", console=errors, transient=True, disable=not errors.is_terminal), 1
+    ):
         row, fault = _verdict(comparer, pair)
         accepted += row["accepted"]
         failures += [f"pair {number}: {fault}"] if fault else []
