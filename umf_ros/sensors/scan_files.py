@@ -86,7 +86,7 @@ def _parse_bin(content: bytes, columns: int) -> Columns:
 def _columns_of(numbers: Points) -> int:
     """4 or 3 numbers per point; 0 where neither can be."""
     fits = [columns for columns in (4, 3) if len(numbers) % columns == 0]
-    if fits == [4, 3]:
+    if len(numbers) and fits == [4, 3]:
         return 3 if np.mean(numbers[3::4] < 0) > _MOST_NEGATIVE else 4
     return fits[0] if fits else 0
 
