@@ -79,5 +79,5 @@ def test_what_is_no_image_is_one_line(tmp_path: Path) -> None:
     for name in ("text.png", "empty.png"):
         with pytest.raises(SensorFileError, match=f"{name} is no image"):
             read_image(tmp_path / name)
-    with pytest.raises(SensorFileError, match="cannot read .*nowhere.png"):
+    with pytest.raises(SensorFileError, match=r"cannot read .*nowhere\.png"):
         read_image(tmp_path / "nowhere.png")
