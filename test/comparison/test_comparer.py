@@ -12,7 +12,7 @@ from recordings import CALIBRATION
 from scenes import landscape, pose_at, take, without_image
 
 from umf_ros.comparison.comparer import NO_CALIBRATION, NO_DEPTH, Comparer, judge, similarity_of
-from umf_ros.comparison.views import KeyframeSource, ReadingRules, View
+from umf_ros.comparison.views import KeyframeSource, PlaceView, ReadingRules
 from umf_ros.config import Verification
 from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.errors import SensorFileError
@@ -51,14 +51,14 @@ def test_a_pair_does_not_depend_on_where_and_when_it_was_taken() -> None:
 
 
 def test_scans_are_verified_and_timed(here: Path) -> None:
-    found = comparer().compare(View(str(here / "match.npy")), View(str(here / "query.npy")))
+    found = comparer().compare(PlaceView(str(here / "match.npy")), PlaceView(str(here / "query.npy")))
     assert found.reason not in ("", NO_DEPTH, NO_CALIBRATION)
     assert (found.closure is not None) == (found.reason == "accepted")
     assert found.milliseconds > 0
 
 
 def test_images_without_a_calibration_say_why_they_have_no_pose(here: Path) -> None:
-    image, scan = View("", str(here / "left.png")), View(str(here / "match.npy"))
+    image, scan = PlaceView("", str(here / "left.png")), PlaceView(str(here / "match.npy"))
     for pair in ((image, image), (scan, image), (image, scan)):
         found = comparer().compare(*pair)
         assert (found.reason, found.closure, found.probability) == (NO_CALIBRATION, None, None)
@@ -66,12 +66,12 @@ def test_images_without_a_calibration_say_why_they_have_no_pose(here: Path) -> N
 
 
 def test_one_image_says_that_its_depth_is_missing(here: Path) -> None:
-    image = View("", str(here / "left.png"))
+    image = PlaceView("", str(here / "left.png"))
     assert comparer(here / "calibration.yaml").compare(image, image).reason == NO_DEPTH
 
 
 def test_it_says_which_of_the_two_cannot_be_read(here: Path) -> None:
-    good, bad = View(str(here / "match.npy")), View(str(here / "nowhere.npy"))
+    good, bad = PlaceView(str(here / "match.npy")), PlaceView(str(here / "nowhere.npy"))
     with pytest.raises(SensorFileError, match=r"^match: cannot read"):
         comparer().compare(bad, good)
     with pytest.raises(SensorFileError, match=r"^query: cannot read"):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.comparison.comparer import Comparison
 from umf_ros.comparison.tables import POSE, RESULT_COLUMNS, SIGMA, failed_row, read_pairs, result_row, view_row
-from umf_ros.comparison.views import View
+from umf_ros.comparison.views import PlaceView
 from umf_ros.errors import ConfigError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import from_quaternion, make_pose
@@ -31,9 +31,9 @@ def test_columns_may_be_absent_empty_or_unknown_and_paths_are_relative(tmp_path:
     pairs = read_pairs(path)
     there = str(tmp_path)
     assert pairs == [
-        (View(f"{there}/sub/a.npy", f"{there}/a.png"), View(f"{there}/b.npy")),
-        (View(f"{there}/drive.mcap@12.5"), View("/abs/b.npy", f"{there}/c.png")),
-        (View(), View()),
+        (PlaceView(f"{there}/sub/a.npy", f"{there}/a.png"), PlaceView(f"{there}/b.npy")),
+        (PlaceView(f"{there}/drive.mcap@12.5"), PlaceView("/abs/b.npy", f"{there}/c.png")),
+        (PlaceView(), PlaceView()),
     ]
     assert view_row(*pairs[1], tmp_path) == {
         "match_scan": "drive.mcap@12.5",

@@ -10,7 +10,7 @@ import pytest
 from recordings import CALIBRATION, traverse, write_mcap
 
 from umf_ros.comparison import views
-from umf_ros.comparison.views import KeyframeSource, ReadingRules, View
+from umf_ros.comparison.views import KeyframeSource, PlaceView, ReadingRules
 from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.errors import CalibrationError, UmfError
 from umf_ros.frames import Embedding, Frame
@@ -44,7 +44,7 @@ def calibrated(here: Path) -> ReadingRules:
 
 def test_a_scan_alone_is_in_the_body_frame(here: Path) -> None:
     embedder = CountingEmbedder()
-    keyframe = KeyframeSource(embedder).keyframe(View(str(here / "scan.npy")))
+    keyframe = KeyframeSource(embedder).keyframe(PlaceView(str(here / "scan.npy")))
     (frame,) = embedder.frames
     np.testing.assert_array_equal(frame.points, np.load(here / "scan.npy")[:, :3])
     np.testing.assert_array_equal(keyframe.body_T_lidar, np.eye(4))
@@ -54,7 +54,7 @@ def test_with_a_calibration_images_belong_to_it(here: Path) -> None:
     embedder = CountingEmbedder()
     source = KeyframeSource(embedder, calibrated(here))
     image = str(here / "left.png")
-    source.keyframe(View(str(here / "scan.npy"), image, image))
+    source.keyframe(PlaceView(str(here / "scan.npy"), image, image))
     (frame,) = embedder.frames
     assert frame.left is not None and frame.right is not None and frame.points is not None
     assert frame.camera.fx == 60 and source.calibrated
@@ -65,7 +65,7 @@ def test_without_one_they_are_left_aside_and_it_says_so_once(here: Path) -> None
     embedder = CountingEmbedder()
     source = KeyframeSource(embedder, warn=told.append)
     for right in ("", "other.png"):
-        source.keyframe(View(str(here / "scan.npy"), str(here / "left.png"), right))
+        source.keyframe(PlaceView(str(here / "scan.npy"), str(here / "left.png"), right))
     assert [frame.left for frame in embedder.frames] == [None, None]
     assert told == ["images beside a scan are not used without a calibration"]
 
@@ -74,7 +74,7 @@ def test_a_view_in_many_pairs_is_embedded_once(here: Path, monkeypatch: pytest.M
     monkeypatch.setattr(views, "KEPT", 2)
     embedder = CountingEmbedder()
     source = KeyframeSource(embedder, calibrated(here))
-    one, two, three = View(str(here / "scan.npy")), View("", str(here / "left.png")), View(str(here / "drive.mcap@1"))
+    one, two, three = PlaceView(str(here / "scan.npy")), PlaceView("", str(here / "left.png")), PlaceView(str(here / "drive.mcap@1"))
     for view in (one, two, one, one, two):
         source.keyframe(view)
     assert len(embedder.frames) == 2
@@ -95,7 +95,7 @@ def test_a_recording_is_read_once_for_all_that_is_expected_of_it(here: Path, mon
 
     monkeypatch.setattr(views, "open_bag", count)
     source = KeyframeSource(ThumbnailEmbedder(), calibrated(here))
-    asked = [View(f"{here}/drive.mcap@{second}") for second in (2, 0.5, 1, 0.5, 99)]
+    asked = [PlaceView(f"{here}/drive.mcap@{second}") for second in (2, 0.5, 1, 0.5, 99)]
     source.expect(asked)
     stamps = [source.keyframe(view).stamp_ns for view in asked[:4]]
     assert len(opened) == 1
@@ -103,26 +103,26 @@ def test_a_recording_is_read_once_for_all_that_is_expected_of_it(here: Path, mon
     with pytest.raises(UmfError, match="no frame within a second of 99"):
         source.keyframe(asked[4])
     assert len(opened) == 1
-    source.keyframe(View(f"{here}/drive.mcap@1.2"))  # nobody expected it
+    source.keyframe(PlaceView(f"{here}/drive.mcap@1.2"))  # nobody expected it
     assert len(opened) == 2
 
 
 @pytest.mark.parametrize(
     ("view", "text"),
     [
-        (View(), "neither a scan nor a left image"),
-        (View("", "", "left.png"), "neither a scan nor a left image"),
-        (View("nowhere.pcd"), "cannot read .*nowhere.pcd"),
-        (View("", "nowhere.png"), "cannot read .*nowhere.png"),
-        (View("nowhere.mcap@1"), "there is no recording .*nowhere.mcap"),
-        (View("drive.mcap@soon"), "drive.mcap@soon: 'soon' is neither"),
-        (View("drive.mcap@1", "left.png"), "drive.mcap@1 brings its own images"),
-        (View("calibration.yaml@1"), "calibration.yaml"),
+        (PlaceView(), "neither a scan nor a left image"),
+        (PlaceView("", "", "left.png"), "neither a scan nor a left image"),
+        (PlaceView("nowhere.pcd"), "cannot read .*nowhere.pcd"),
+        (PlaceView("", "nowhere.png"), "cannot read .*nowhere.png"),
+        (PlaceView("nowhere.mcap@1"), "there is no recording .*nowhere.mcap"),
+        (PlaceView("drive.mcap@soon"), "drive.mcap@soon: 'soon' is neither"),
+        (PlaceView("drive.mcap@1", "left.png"), "drive.mcap@1 brings its own images"),
+        (PlaceView("calibration.yaml@1"), "calibration.yaml"),
     ],
 )
-def test_what_cannot_be_read_is_said_every_time(here: Path, view: View, text: str) -> None:
+def test_what_cannot_be_read_is_said_every_time(here: Path, view: PlaceView, text: str) -> None:
     source = KeyframeSource(ThumbnailEmbedder(), calibrated(here))
-    there = View(*(str(here / name) if name else "" for name in (view.scan, view.left, view.right)))
+    there = PlaceView(*(str(here / name) if name else "" for name in (view.scan, view.left, view.right)))
     for _ in range(2):
         with pytest.raises(UmfError, match=text):
             source.keyframe(there)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from umf_ros.comparison.comparer import Comparer, Comparison
     from umf_ros.comparison.tables import Pair, Row
-    from umf_ros.comparison.views import View
+    from umf_ros.comparison.views import PlaceView
 
 Image = Annotated[Path | None, typer.Option(help="Image file; needs --calibration.", show_default=False)]
 ViewName = Annotated[
@@ -85,8 +85,8 @@ def _named_pair(match: str | None, query: str | None, images: tuple[Path | None,
     return views
 
 
-def _view(name: str | None, left: Path | None, right: Path | None) -> View:
-    from umf_ros.comparison.views import View
+def _view(name: str | None, left: Path | None, right: Path | None) -> PlaceView:
+    from umf_ros.comparison.views import PlaceView
     from umf_ros.sensors.snapshots import IMAGE_SUFFIXES
 
     scan, images = name or "", [str(path) if path else "" for path in (left, right)]
@@ -94,7 +94,7 @@ def _view(name: str | None, left: Path | None, right: Path | None) -> View:
         if images[0]:
             raise ConfigError(f"{scan} and {images[0]} are both the left image")
         scan, images[0] = "", scan
-    return View(scan, *images)
+    return PlaceView(scan, *images)
 
 
 def _compare_list(comparer: Comparer, asked: list[Pair], base: Path, out: Path, errors: Console) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from umf_ros.comparison.views import KeyframeSource, View
+from umf_ros.comparison.views import KeyframeSource, PlaceView
 from umf_ros.config import Verification
 from umf_ros.errors import SensorFileError, UmfError
 from umf_ros.frames import Candidate, Keyframe, LoopClosure
@@ -50,7 +50,7 @@ class Comparer:
         self._source = source
         self._verifier = Verifier(settings)
 
-    def compare(self, match: View, query: View) -> Comparison:
+    def compare(self, match: PlaceView, query: PlaceView) -> Comparison:
         """Compare two views.
 
         Raises:
@@ -70,7 +70,7 @@ class Comparer:
             milliseconds=sum(self._verifier.latency_ms.values()),
         )
 
-    def _read(self, role: str, view: View) -> Keyframe:
+    def _read(self, role: str, view: PlaceView) -> Keyframe:
         try:
             return self._source.keyframe(view)
         except UmfError as error:

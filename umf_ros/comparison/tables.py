@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from umf_ros.comparison.comparer import Comparison
-from umf_ros.comparison.views import View
+from umf_ros.comparison.views import PlaceView
 from umf_ros.errors import ConfigError
 from umf_ros.geometry import to_quaternion
 
-Pair = tuple[View, View]
+Pair = tuple[PlaceView, PlaceView]
 Row = dict[str, Any]
 
 VIEW_COLUMNS = ("match_scan", "query_scan", "match_left", "match_right", "query_left", "query_right")
@@ -46,7 +46,7 @@ def read_pairs(path: Path) -> list[Pair]:
     return pairs
 
 
-def view_row(match: View, query: View, base: Path) -> dict[str, str]:
+def view_row(match: PlaceView, query: PlaceView, base: Path) -> dict[str, str]:
     """The columns of a list that name two views; paths relative to the list where they lie beside or below it."""
     names = {
         f"{role}_{part}": name for role, view in (("match", match), ("query", query)) for part, name in _parts(view)
@@ -73,13 +73,13 @@ def failed_row(reason: str) -> Row:
     return dict.fromkeys(RESULT_COLUMNS) | {"accepted": 0, "reason": reason}
 
 
-def _parts(view: View) -> Iterable[tuple[str, str]]:
+def _parts(view: PlaceView) -> Iterable[tuple[str, str]]:
     return ("scan", view.scan), ("left", view.left), ("right", view.right)
 
 
-def _view(role: str, row: dict[str, str | None], base: Path) -> View:
-    names = ((row.get(f"{role}_{part}") or "").strip() for part, _ in _parts(View()))
-    return View(*(str(base / name) if name else "" for name in names))
+def _view(role: str, row: dict[str, str | None], base: Path) -> PlaceView:
+    names = ((row.get(f"{role}_{part}") or "").strip() for part, _ in _parts(PlaceView()))
+    return PlaceView(*(str(base / name) if name else "" for name in names))
 
 
 def _relative(name: str, base: Path) -> str:

@@ -26,7 +26,7 @@ FRAMES_AT_ONCE = 100
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class PlaceView:
     """What was seen at one place and time.
 
     Attributes:
@@ -76,22 +76,22 @@ class KeyframeSource:
         self._rules = rules
         self._warn = _once(warn)
         self._calibration = UNCALIBRATED if rules.calibration is None else load_calibration(rules.calibration)
-        self._kept: OrderedDict[View, Keyframe | UmfError] = OrderedDict()
-        self._expected: dict[Path, list[View]] = {}
+        self._kept: OrderedDict[PlaceView, Keyframe | UmfError] = OrderedDict()
+        self._expected: dict[Path, list[PlaceView]] = {}
 
     @property
     def calibrated(self) -> bool:
         """Whether the files have a calibration."""
         return self._calibration is not UNCALIBRATED
 
-    def expect(self, views: Iterable[View]) -> None:
+    def expect(self, views: Iterable[PlaceView]) -> None:
         """Say which views will be asked for, in which order: a recording is read once for many of them."""
         for view in dict.fromkeys(views):
             reference = split_reference(view.scan)
             if reference is not None:
                 self._expected.setdefault(reference[0], []).append(view)
 
-    def keyframe(self, view: View) -> Keyframe:
+    def keyframe(self, view: PlaceView) -> Keyframe:
         """The keyframe of a view.
 
         Raises:
@@ -105,7 +105,7 @@ class KeyframeSource:
             raise found
         return found
 
-    def _read(self, view: View) -> None:
+    def _read(self, view: PlaceView) -> None:
         reference = split_reference(view.scan)
         try:
             if reference is None:
@@ -115,7 +115,7 @@ class KeyframeSource:
         except UmfError as error:
             self._keep(view, error)
 
-    def _snapshot(self, view: View) -> Frame:
+    def _snapshot(self, view: PlaceView) -> Frame:
         if not view.scan and not view.left:
             raise SensorFileError("neither a scan nor a left image")
         cloud = read_scan(Path(view.scan), self._rules.bin_columns) if view.scan else None
@@ -126,11 +126,11 @@ class KeyframeSource:
         left, right = (fit_image(read_image(Path(name)), self._calibration) if name else None for name in names)
         return make_snapshot(cloud, left, right, self._calibration, warn=self._warn)
 
-    def _read_recording(self, path: Path, view: View) -> None:
+    def _read_recording(self, path: Path, view: PlaceView) -> None:
         """Keep the keyframe of a frame, and of those of its recording that will be asked for next."""
         expected = self._expected.get(path, [view])
         start = expected.index(view) if view in expected else 0
-        moments: dict[View, Moment] = {}
+        moments: dict[PlaceView, Moment] = {}
         for one in {view: None} | dict.fromkeys(expected[start : start + FRAMES_AT_ONCE]):
             try:
                 moments[one] = _moment_of(one)
@@ -148,13 +148,13 @@ class KeyframeSource:
             except UmfError as error:
                 self._keep(one, error)
 
-    def _keep(self, view: View, found: Keyframe | UmfError) -> None:
+    def _keep(self, view: PlaceView, found: Keyframe | UmfError) -> None:
         self._kept[view] = found
         while len(self._kept) > KEPT:
             self._kept.popitem(last=False)
 
 
-def _moment_of(view: View) -> Moment:
+def _moment_of(view: PlaceView) -> Moment:
     if view.left or view.right:
         raise SensorFileError(f"{view.scan} brings its own images")
     try:
