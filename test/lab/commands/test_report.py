@@ -196,8 +196,8 @@ def test_without_a_truth_nothing_is_judged(bag: Path, tmp_path: Path) -> None:
     ended = report(tmp_path / "run", blind)
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["ground_truth"] is None
     assert "3 loop closures; there is no ground truth to judge them by." in ended.text
-    rows = [row for row in page_of(tmp_path / "run").rows if len(row) == 8]
-    assert [row[5:] for row in rows] == [["", "", ""]] * 3
+    rows = [row for row in page_of(tmp_path / "run").rows if len(row) == 9]
+    assert [row[5:] for row in rows] == [["", "", "", ""]] * 3
 
 
 def test_a_truth_file_goes_before_that_of_the_recording(run: Path, bag: Path, tmp_path: Path) -> None:
