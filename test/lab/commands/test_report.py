@@ -217,7 +217,7 @@ def test_closures_outside_of_the_truth_are_not_judged(run: Path, bag: Path, tmp_
     report(run, bag, "--ground-truth", tmp_path / "short.tum")
     found = json.loads((run / "summary.json").read_text())["ground_truth"]
     assert (found["closures_true"], found["closures_false"]) == (2, 0)
-    assert [row[7] for row in page_of(run).rows if len(row) == 9] == ["yes", "yes", ""]
+    assert [row[8] for row in page_of(run).rows if len(row) == 9] == ["yes", "yes", ""]
 
 
 def test_without_images_there_are_no_match_pictures(bag: Path, tmp_path: Path) -> None:
