@@ -1,8 +1,8 @@
 """Where one scan could lie on another, whatever the heading: an exhaustive search over heading and position.
 
-The query's surroundings are turned to every heading that lets the two see the same things and are correlated with the
-match's over all shifts at once (FFT). Relief alone is asked, and relief with structure: in the open the one is right, among
-walls the other. Every peak is settled in height and tilt, drawn to the match by some steps of ICP on
+The query's surroundings are turned to every heading that lets the two see the same things and are correlated with
+the match's over all shifts at once (FFT). Relief alone is asked, and relief with structure: in the open the one is
+right, among walls the other. Every peak is settled in height and tilt, drawn to the match by some steps of ICP on
 a few points, and ranked by how many of these then have a counterpart. It needs no training and does not
 know about the sun.
 """
@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.geometry import Array, make_pose, transform
 from umf_ros.verification import constants as const
+from umf_ros.verification.elevation_map import evaluate
 from umf_ros.verification.registration import PreparedScan
 from umf_ros.verification.surroundings import SIDE, Spectra, Surroundings
 
@@ -30,12 +31,17 @@ class Fit:
     Attributes:
         pose: (4, 4) `match_T_query`.
         share: of some of the query's points, how many have a counterpart.
-        correlation: of the surroundings at that place, -1 to 1, before the pose was refined.
+        terrain: how well the elevation maps fit there, in standard deviations of chance.
     """
 
     pose: Array
     share: float
-    correlation: float
+    terrain: float
+
+    @property
+    def score(self) -> float:
+        """What fits are ranked by: counterparts, and terrain where they say little."""
+        return self.share + const.TERRAIN_WEIGHT * self.terrain
 
 
 class TurnedSurroundings:
@@ -53,27 +59,28 @@ class TurnedSurroundings:
         fresh = wanted[~self._ready[wanted]]
         self._ready[fresh] = True
         if len(fresh):
-            self._spectra[fresh] = scipy.fft.rfft2(_turned(self.around, const.ALL_HEADINGS[fresh])).conj()
+            maps = np.stack([self.around.turned(heading) for heading in const.ALL_HEADINGS[fresh]])
+            self._spectra[fresh] = scipy.fft.rfft2(maps.transpose(0, 3, 1, 2)).conj()
         return self._spectra[wanted]
 
 
 def search(match: PreparedScan, turned: TurnedSurroundings) -> list[Fit]:
-    """The best fits, most counterparts first, each in a basin of its own."""
+    """The best fits, best first, each from a peak of its own."""
     overlap = match.view.overlap(turned.scan.view, const.ALL_HEADINGS)
     wanted = np.flatnonzero(overlap >= const.SEARCHED_OVERLAP)
     around = match.around(turned.cell_m)
     if not len(wanted) or min(len(around.rows), len(turned.around.rows)) < const.MIN_CELLS:
         return []
     fits = []
-    for heading, row, column, correlation in _peaks(_correlate(around, turned.spectra(wanted)), wanted):
+    for heading, row, column in _peaks(_correlate(around, turned.spectra(wanted)), wanted):
         shift = (np.array([row, column]) - const.AROUND_SHIFT) * turned.cell_m
         level = _settle(around, turned.around, float(const.ALL_HEADINGS[heading]), shift)
         to_match = make_pose(match.up.T, np.zeros(3))
-        fits.append(scout(match, turned.scan, to_match @ level @ make_pose(turned.scan.up, np.zeros(3)), correlation))
-    return sorted(fits, key=lambda fit: -fit.share)
+        fits.append(scout(match, turned.scan, to_match @ level @ make_pose(turned.scan.up, np.zeros(3))))
+    return sorted(fits, key=lambda fit: -fit.score)
 
 
-def scout(match: PreparedScan, query: PreparedScan, guess: Array, correlation: float = 0.0) -> Fit:
+def scout(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
     """Draw a pose to the match by a few points, and see how many of them find a counterpart."""
     result = small_gicp.align(
         match.cloud,
@@ -87,26 +94,14 @@ def scout(match: PreparedScan, query: PreparedScan, guess: Array, correlation: f
     )
     pose = np.asarray(result.T_target_source)
     squared = match.nearest(transform(pose, query.scouts))[1]
-    return Fit(pose, float((squared < (const.SCOUT_NEAR * _cell_for(query)) ** 2).mean()), correlation)
+    near = squared < (const.SCOUT_NEAR * _cell_for(query)) ** 2
+    return Fit(pose, float(near.mean()), evaluate(match.elevation, query.elevation, pose).score)
 
 
 def _cell_for(scan: PreparedScan) -> float:
     """Side of a cell, m, as the place around a scan asks for it."""
     steps = np.round(np.log2(scan.reach_m / const.REACH_CELLS) * 2) / 2
     return float(np.clip(2.0**steps, *const.AROUND_CELL_M))
-
-
-def _turned(around: Surroundings, headings: Array) -> NDArray[np.float32]:
-    """Maps (H, 2, SIDE, SIDE) of the surroundings turned by the headings (H,), rad."""
-    x, y = around.centres.T
-    cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
-    rows = np.floor((cos * x - sin * y) / around.cell_m).astype(int) + SIDE // 2
-    columns = np.floor((sin * x + cos * y) / around.cell_m).astype(int) + SIDE // 2
-    keys = ((np.arange(len(headings))[:, None] * SIDE + rows) * SIDE + columns).ravel()
-    size = len(headings) * SIDE * SIDE
-    count = np.maximum(np.bincount(keys, minlength=size), 1)
-    maps = [np.bincount(keys, np.broadcast_to(one, rows.shape).ravel(), size) / count for one in around.values]
-    return np.stack(maps).astype(np.float32).reshape(2, len(headings), SIDE, SIDE).swapaxes(0, 1)
 
 
 def _correlate(around: Surroundings, turned: Spectra) -> NDArray[np.float32]:
@@ -119,9 +114,9 @@ def _correlate(around: Surroundings, turned: Spectra) -> NDArray[np.float32]:
     return found
 
 
-def _peaks(volumes: NDArray[np.float32], headings: NDArray[np.intp]) -> list[tuple[int, int, int, float]]:
-    """Heading, row and column of the highest peaks, and the correlation there, no two of them neighbours."""
-    peaks: list[tuple[int, int, int, float]] = []
+def _peaks(volumes: NDArray[np.float32], headings: NDArray[np.intp]) -> list[tuple[int, int, int]]:
+    """Heading, row and column of the highest peaks, no two of them neighbours."""
+    peaks: list[tuple[int, int, int]] = []
     around = len(const.ALL_HEADINGS)
     blocked = np.zeros((around, *volumes.shape[2:]), bool)
     for volume, count in zip(volumes, const.PEAKS, strict=True):
@@ -132,7 +127,7 @@ def _peaks(volumes: NDArray[np.float32], headings: NDArray[np.intp]) -> list[tup
             heading, row, column = (int(i) for i in np.unravel_index(int(score.argmax()), score.shape))
             if not score[heading, row, column] > 0:
                 break
-            peaks.append((heading, row, column, float(score[heading, row, column])))
+            peaks.append((heading, row, column))
             beside = (heading + np.array([-1, 0, 1])) % around
             for part in (score, blocked):
                 part[beside, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = (
@@ -144,12 +139,10 @@ def _peaks(volumes: NDArray[np.float32], headings: NDArray[np.intp]) -> list[tup
 def _settle(match: Surroundings, query: Surroundings, heading: float, shift: Array) -> Array:
     """Full pose of a planar fit: height and tilt from the height differences of the shared cells."""
     planar = make_pose(Rotation.from_rotvec([0, 0, heading]).as_matrix(), [*shift, 0.0])
-    heights = query.lowest[query.rows, query.columns].astype(float)
+    heights = query.lowest[query.rows, query.columns]
     moved = transform(planar, np.column_stack([query.centres, heights]))
-    row, column = (np.floor(moved[:, :2] / match.cell_m).astype(int) + SIDE // 2).T
-    inside = (row >= 0) & (row < SIDE) & (column >= 0) & (column < SIDE)
-    below = np.full(len(moved), np.nan)
-    below[inside] = match.lowest[row[inside], column[inside]]
+    row, column = (np.floor(moved[:, :2] / match.cell_m).astype(int) + SIDE // 2).T.clip(0, SIDE - 1)
+    below = match.lowest[row, column]
     known = np.isfinite(below)
     place, offset = moved[known, :2], (below - moved[:, 2])[known]
     if len(offset) < 3:

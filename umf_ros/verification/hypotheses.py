@@ -61,8 +61,8 @@ def find_hypotheses(
     if turned is None or not match.usable:
         return [Hypothesis(ranked, pose, ranked.score) for pose in found[:1]]
     fits = [scout(match, turned.scan, pose) for pose in found] + search(match, turned)
-    fits.sort(key=lambda fit: -fit.share)
-    return [Hypothesis(ranked, fit.pose, fit.share) for fit in _distinct(fits)]
+    fits.sort(key=lambda fit: -fit.score)
+    return [Hypothesis(ranked, fit.pose, fit.score) for fit in _distinct(fits)]
 
 
 def pose_from_points(query: Keyframe, ranked: RankedCandidate, iterations: int, seed: int) -> Array | None:

@@ -8,6 +8,10 @@ metres wide, a field some ten.
 
 from __future__ import annotations
 
+import math
+from functools import cached_property
+
+import cv2
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
@@ -36,34 +40,48 @@ class Surroundings:
         self.cell_m = cell_m
         points = points[np.hypot(points[:, 0], points[:, 1]) < const.AROUND_RADIUS * cell_m]
         row, column = (np.floor(points[:, :2] / cell_m).astype(int) + SIDE // 2).T
-        keys, owner, count = np.unique(row * SIDE + column, return_inverse=True, return_counts=True)
-        self.rows, self.columns = keys // SIDE, keys % SIDE
+        cell = row * SIDE + column
+        count = np.bincount(cell, minlength=SIDE * SIDE)
+        occupied = np.flatnonzero(count)
+        self.rows, self.columns = occupied // SIDE, occupied % SIDE
         self.centres: Array = (np.column_stack([self.rows, self.columns]) - SIDE // 2 + 0.5) * cell_m
-        self.lowest: Grid = np.full((SIDE, SIDE), np.nan, np.float32)
-        bottom = np.full(len(keys), np.inf)
-        np.minimum.at(bottom, owner, points[:, 2])
-        self.lowest[self.rows, self.columns] = bottom
-        height = np.zeros((SIDE, SIDE), np.float32)
-        height[self.rows, self.columns] = np.bincount(owner, points[:, 2], len(keys)) / np.maximum(count, 1)
-        relief = relief_of(height, np.isfinite(self.lowest), cell_m)[self.rows, self.columns]
-        structure = np.sqrt(_layers(owner, points[:, 2], len(keys)))
+        bottom = np.full(SIDE * SIDE, np.inf)
+        np.minimum.at(bottom, cell, points[:, 2])
+        self.lowest: Array = np.where(count > 0, bottom, np.nan).reshape(SIDE, SIDE)
+        mean = np.bincount(cell, points[:, 2], SIDE * SIDE) / np.maximum(count, 1)
+        relief = relief_of(mean.reshape(SIDE, SIDE), np.isfinite(self.lowest), cell_m)[self.rows, self.columns]
+        structure = np.sqrt(_layers(cell, points[:, 2])[occupied])
         self.values = np.stack([_unit(np.nan_to_num(relief)), _unit(structure - structure.mean())])
 
-    @property
+    @cached_property
+    def maps(self) -> Grid:
+        """Relief and structure (SIDE, SIDE, 2), 0 where there are no points."""
+        maps = np.zeros((SIDE, SIDE, 2), np.float32)
+        maps[self.rows, self.columns] = self.values.T
+        return maps
+
+    @cached_property
     def spectra(self) -> Spectra:
         """Spectra (2, ...) of relief and structure."""
-        maps = np.zeros((2, SIDE, SIDE), np.float32)
-        maps[:, self.rows, self.columns] = self.values
-        spectra: Spectra = scipy.fft.rfft2(maps)
+        spectra: Spectra = scipy.fft.rfft2(self.maps.transpose(2, 0, 1))
         return spectra
 
+    def turned(self, heading: float) -> Grid:
+        """The maps (SIDE, SIDE, 2) turned about the sensor by a heading, rad."""
+        cos, sin, middle = math.cos(heading), math.sin(heading), (SIDE - 1) / 2
+        back = np.array([[cos, -sin, 0], [sin, cos, 0]])
+        back[:, 2] = middle - back[:, :2].sum(axis=1) * middle
+        turned = cv2.warpAffine(self.maps, back, (SIDE, SIDE), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        return np.asarray(turned, np.float32)
 
-def _layers(owner: NDArray[np.intp], height: Array, cells: int) -> Array:
-    """In how many layers every cell has points."""
+
+def _layers(cell: NDArray[np.intp], height: Array) -> Array:
+    """In how many layers every cell (SIDE^2,) has points."""
     layer = np.floor(height / const.LAYER_M).astype(int)
-    lowest, span = layer.min(initial=0), int(np.ptp(layer)) + 1 if len(layer) else 1
-    occupied = np.unique(owner * span + layer - lowest)
-    return np.bincount(occupied // span, minlength=cells).astype(float)
+    layer -= layer.min(initial=0)
+    occupied = np.zeros((SIDE * SIDE, layer.max(initial=0) + 1), bool)
+    occupied[cell, layer] = True
+    return occupied.sum(axis=1).astype(float)
 
 
 def _unit(values: Array) -> Grid:

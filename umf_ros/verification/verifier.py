@@ -140,7 +140,9 @@ class Verifier:
     def _turned(self, query: Keyframe) -> TurnedSurroundings | None:
         return TurnedSurroundings(self._scans[query]) if self._scans[query].usable else None
 
-    def _hypotheses(self, query: Keyframe, ranked: list[RankedCandidate], turned: TurnedSurroundings | None) -> list[Hypothesis]:
+    def _hypotheses(
+        self, query: Keyframe, ranked: list[RankedCandidate], turned: TurnedSurroundings | None
+    ) -> list[Hypothesis]:
         """Hypotheses about the given candidates, the most promising first."""
         found: list[Hypothesis] = []
         for item in ranked:
