@@ -92,3 +92,21 @@ MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of ke
 ODOMETRY_REACH_M = 15.0  # by hand: odometry is trusted over this distance
 PRIOR_M = 1.0  # by hand: standard deviation of what odometry predicts before any way is driven
 AGREE_M, AGREE_RAD = 0.5, 0.05  # by hand: two findings this near are one
+
+# submaps: what a narrow sensor saw along some metres of way
+SUBMAP_CELL_M = 0.3  # by hand: coarser than a scan, for odometry drifts inside
+SUBMAP_STEP_M = 1.5  # by hand: between the scans that are merged; 1 and 2 m were as good
+SUBMAP_AFTER_M = 15.0  # measured: way behind a stored submap's keyframe that belongs to it
+SUBMAP_SPACING_M = 2.0  # by hand: way between stored submaps
+MIN_SUBMAP_M = 6.0  # by hand: way below which a submap is hardly more than a scan
+NARROW_DEG = 300.0  # geometry: a sensor that sees more needs no submaps
+EXPECTED_REACH_M = 15.0  # by hand: odometry carries a closure over this way
+ODOMETRY_GAP_M = 80.0  # by hand: way after which odometry alone tells next to nothing
+SUBMAP_NEAR_M = 8.0  # geometry: further apart, two submaps share too little
+KEYPOINTS, KEYPOINT_CONTRAST = 120, 0.01  # measured
+MIN_KEYPOINTS = 4
+KEYPOINT_M, KEYPOINT_SCALE = 1.0, 0.1  # geometry: two cells; odometry is off by less than a tenth
+KEYPOINT_VOTES = 15  # measured: stored keypoints that each of the query votes for
+SUBMAPS_COMPARED = 10  # measured: the right one is among the ten best in four of five
+SUBMAP_BEFORE_M = 20.0  # measured: way before a submap's keyframe that belongs to it
+SUBMAPS_KEPT = 12

@@ -21,7 +21,7 @@ from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, prior_si
 from umf_ros.verification.registration import NOMINAL, Alignment, PreparedScan, covariance_of
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
 
-SCAN, IMAGE = "scan", "image"
+SCAN, IMAGE, SUBMAP = "scan", "image", "submap"
 
 
 def measured(*kinds: str) -> Any:
