@@ -2,179 +2,163 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 
 from umf_ros.config import Loop, Verification
 from umf_ros.frames import Candidate, Keyframe, LoopClosure
-from umf_ros.geometry import Array, heading, make_pose, relative
-from umf_ros.keyframes import is_past
+from umf_ros.geometry import Array, heading, make_pose
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.submaps.index import KeypointIndex
-from umf_ros.submaps.keypoints import find_keypoints
+from umf_ros.submaps.judgement import load_submap_acceptance, measure_submaps
+from umf_ros.submaps.proposals import Expectation, Found, Lookalikes, Proposal
 from umf_ros.submaps.submap import Submap
-from umf_ros.submaps.trail import Stop, Trail
+from umf_ros.submaps.trail import Trail
+from umf_ros.verification import Measurement, Verdict
 from umf_ros.verification import constants as const
 from umf_ros.verification.all_round import settle
-from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory
-from umf_ros.verification.measurement import SUBMAP, AlignedHypothesis, Measurement, measure
-from umf_ros.verification.registration import align_scans
-from umf_ros.verification.rerank import RankedCandidate
+from umf_ros.verification.field_of_view import FieldOfView
+from umf_ros.verification.hypotheses import TemporalMemory
+from umf_ros.verification.registration import Alignment, align_scans
 
 
 @dataclass(frozen=True, slots=True)
-class Proposal:
-    """A stop that may show the query's place.
+class Tested:
+    """A proposal after its test: the submaps of match and query, how they were aligned, and what was measured."""
 
-    Attributes:
-        row: of the stop.
-        pose: (4, 4) `match_T_query`.
-        planar: whether height and tilt are still to be found.
-    """
+    match: Submap
+    query: Submap
+    alignment: Alignment
+    measurement: Measurement
 
-    row: int
-    pose: Array
-    planar: bool = False
+    @property
+    def way_m(self) -> float:
+        """Metres of way that odometry joined inside both submaps."""
+        return self.match.way_m + self.query.way_m
 
 
 class SubmapFinder:
-    """Recognises places from any side, by what was seen along the way before them.
+    """Recognises a place from any side, by all that was seen on the last metres of way.
 
-    Where the rover should be is told by odometry since the last closure; where nothing is expected, by keypoints of
-    the relief. Keyframes must come in order.
+    A narrow sensor that comes back the other way shares nothing with its earlier scans; merged over some metres by
+    odometry, they do share the ground between them. Where the rover should be again is told by odometry since the
+    latest closure; where nothing is expected, keypoints of the relief are searched now and then. Submaps are
+    aligned and judged as scans are, and the closure ties the two keyframes they were merged around.
+
+    Keyframes must come in order. Whoever has no odometry, or sees all around, needs none of this.
+
+    Args:
+        settings: the verification group of the settings.
+        rules: which earlier keyframes are admissible.
+        database: the places; every keyframe is added there before it is remembered here.
+
+    Raises:
+        ConfigError: the acceptance model cannot be read.
     """
 
     def __init__(self, settings: Verification, rules: Loop, database: PlaceDatabase) -> None:
-        self._settings, self._rules, self._database = settings, rules, database
-        self._trail = Trail(lambda stop: database.find(stop.stamp_ns, stop.session))
-        self._keypoints = KeypointIndex()
-        self._described: list[int] = []
+        self._settings, self._rules = settings, rules
+        self._acceptance = load_submap_acceptance()
+        self._trail = Trail(database)
+        self._lookalikes = Lookalikes(self._trail, rules)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was found lately, and every place that the database has forgotten."""
+        self._lookalikes.forget(self._trail.forget())
+        self._expectation = Expectation(self._trail, self._rules)
         self._memory = TemporalMemory()
-        self._anchor: tuple[Keyframe, Keyframe, Array] | None = None
         self._asked_m = -np.inf
 
-    def examine(self, query: Keyframe) -> list[tuple[AlignedHypothesis, Measurement, Proposal]]:
-        if query.odom_T_body is None:
-            return []
-        found = []
-        for proposal in self.proposals(query):
-            one = self._test(query, proposal)
-            if one is not None:
-                found.append(one)
-        return found
+    def find(self, query: Keyframe, closures: Sequence[tuple[Keyframe, Array]]) -> list[Verdict]:
+        """One verdict for every submap that was tested; none where the scan alone has found the place.
 
-    def proposals(self, query: Keyframe) -> list[Proposal]:
-        expected = self._expected(query)
-        if expected:
-            return expected[:1]
-        if query.travelled_m - self._asked_m < const.SUBMAP_SPACING_M:
+        Args:
+            query: the newest keyframe, not yet remembered.
+            closures: matched keyframes and `match_T_query` that were accepted for it already.
+        """
+        if closures:
+            for match, pose in closures:
+                self._expectation.latest = Found(query, match, pose)
+            return []
+        verdicts = []
+        for tested in self.examine(query):
+            verdicts.append(self._judge(tested))
+            closure = verdicts[-1].closure
+            if closure is not None:
+                self._expectation.latest = Found(query, tested.match.keyframe, closure.match_T_query)
+                break
+        return verdicts
+
+    def examine(self, query: Keyframe) -> list[Tested]:
+        """Every test of a keyframe, without a decision."""
+        if query.odom_T_body is None or not _narrow(query):
+            return []
+        tested = [one for proposal in self._propose(query) if (one := self._test(query, proposal)) is not None]
+        self._memory.remember(query, [(one.match.keyframe, one.alignment.pose, False) for one in tested])
+        return tested
+
+    def remember(self, keyframe: Keyframe) -> None:
+        """Take up a keyframe that was added to the database."""
+        if self._trail.add(keyframe):
+            self._lookalikes.describe()
+
+    def _propose(self, query: Keyframe) -> list[Proposal]:
+        expected = self._expectation.propose(query)
+        if expected is not None:
+            return [expected]
+        if query.travelled_m - self._asked_m < const.ASKED_EVERY_M:
             return []
         self._asked_m = query.travelled_m
-        return self._similar(query)
+        return self._lookalikes.propose(self._trail.behind(query, const.SUBMAP_BEFORE_M))
 
-    def remember(self, query: Keyframe, closures: Sequence[tuple[Keyframe, Array]]) -> None:
-        for match, pose in closures:
-            self._anchor = (query, match, pose)
-        if self._trail.add(query):
-            self._describe()
-
-    def _describe(self) -> None:
-        """Describe the stops whose submaps are complete."""
-        newest = self._trail.stops[-1]
-        first = self._described[-1] + 2 if self._described else 0
-        for row in range(first, len(self._trail), 2):
-            stop = self._trail.stops[row]
-            if stop.session == newest.session and newest.travelled_m - stop.travelled_m < const.SUBMAP_AFTER_M:
-                break
-            submap = self._trail.around(row, const.SUBMAP_BEFORE_M, stop.travelled_m + const.SUBMAP_AFTER_M)
-            self._keypoints.add(find_keypoints(submap.scan.elevation.relief))
-            self._described.append(row)
-
-    def _past(self, query: Keyframe, rows: Sequence[int]) -> Array:
-        stops = [self._trail.stops[row] for row in rows]
-        age = query.stamp_ns - np.array([stop.stamp_ns for stop in stops], np.int64)
-        way = query.travelled_m - np.array([stop.travelled_m for stop in stops])
-        same = np.array([stop.session for stop in stops]) == query.session
-        return is_past(age, way, self._rules, same)
-
-    def _expected(self, query: Keyframe) -> list[Proposal]:
-        """Stops near which odometry, since the last closure or alone, puts the rover, nearest first."""
-        found = []
-        for session, where, low, high in self._predictions(query):
-            rows = [row for row in self._trail.rows_of(session) if low <= self._trail.stops[row].travelled_m <= high]
-            if not rows:
-                continue
-            poses = [relative(self._trail.stops[row].odom_T_body, where) for row in rows]
-            away = np.array([np.linalg.norm(pose[:3, 3]) for pose in poses])
-            away[~self._past(query, rows)] = np.inf
-            best = int(np.argmin(away))
-            if away[best] < const.SUBMAP_NEAR_M:
-                found.append(Proposal(rows[best], poses[best]))
-        return found
-
-    def _predictions(self, query: Keyframe) -> Iterator[tuple[int, Array, float, float]]:
-        """Session, pose of the query in its odometry, and the part of the way where that is believed."""
-        now = query.odom_T_body
-        if self._anchor is not None:
-            before, match, pose = self._anchor
-            near = query.travelled_m - before.travelled_m < const.EXPECTED_REACH_M and before.session == query.session
-            if near:
-                where = match.odom_T_body @ pose @ relative(before.odom_T_body, now)
-                reach = const.EXPECTED_REACH_M
-                yield match.session, where, match.travelled_m - reach, match.travelled_m + reach
-        yield query.session, now, query.travelled_m - const.ODOMETRY_GAP_M, np.inf
-
-    def _query_submap(self, query: Keyframe, stop: Stop | None) -> Submap:
-        way = const.SUBMAP_BEFORE_M
-        if stop is not None and stop.session == query.session:
-            way = min(way, (query.travelled_m - stop.travelled_m) / 2)
-        key = (query.stamp_ns, query.session, round(way, 1))
-        if getattr(self, "_latest", (None, None))[0] != key:
-            self._latest = key, self._trail.behind(query, way)
-        return self._latest[1]
-
-    def _similar(self, query: Keyframe) -> list[Proposal]:
-        """Stops whose submaps have the same keypoints."""
-        if not self._described:
-            return []
-        admissible = self._past(query, self._described)
-        # submaps that share scans with the query's resemble it for no other reason
-        stops = [self._trail.stops[row] for row in self._described]
-        admissible &= np.array(
-            [
-                stop.session != query.session
-                or query.travelled_m - stop.travelled_m > const.SUBMAP_BEFORE_M + const.SUBMAP_AFTER_M
-                for stop in stops
-            ]
-        )
-        submap = self._query_submap(query, None)
-        guesses = self._keypoints.search(find_keypoints(submap.scan.elevation.relief), admissible)
-        found = []
-        for guess in guesses[:2]:
-            c, s = np.cos(guess.heading), np.sin(guess.heading)
-            pose = make_pose([[c, -s, 0], [s, c, 0], [0, 0, 1]], [*guess.shift, 0])
-            found.append(Proposal(self._described[guess.row], pose, planar=True))
-        return found
-
-    def _test(self, query: Keyframe, proposal: Proposal):
+    def _test(self, query: Keyframe, proposal: Proposal) -> Tested | None:
+        """Align the submaps of a proposal; None where there is too little way for two that share no scan."""
         stop = self._trail.stops[proposal.row]
-        ours = self._query_submap(query, stop)
-        last = stop.travelled_m + const.SUBMAP_AFTER_M
+        way_m, last_m = const.SUBMAP_BEFORE_M, stop.travelled_m + const.SUBMAP_AFTER_M
         if stop.session == query.session:
-            last = min(last, ours.first_m - 0.1)
-        theirs = self._trail.around(proposal.row, const.SUBMAP_BEFORE_M, last)
-        pose = proposal.pose
-        if proposal.planar:
-            cell = const.CELL_M
-            pose = settle(theirs.scan.around(cell), ours.scan.around(cell), float(heading(pose)), pose[:2, 3])
-            u, v = np.eye(4), np.eye(4)
-            u[:3, :3] = theirs.scan.up.T
-            v[:3, :3] = ours.scan.up
-            pose = u @ pose @ v
-        candidate = Candidate(proposal.row, stop.stamp_ns, float("nan"))
-        hypothesis = Hypothesis(RankedCandidate(candidate, theirs.keyframe), pose, 0.0)
-        aligned = AlignedHypothesis(query, hypothesis, align_scans(theirs.scan, ours.scan, pose), (theirs.scan, ours.scan))
-        return aligned, measure(aligned, self._memory, self._settings.odometry_drift), proposal
+            way_m = min(way_m, (query.travelled_m - stop.travelled_m) / 2)
+            last_m = min(last_m, query.travelled_m - way_m)
+        if way_m < const.MIN_SUBMAP_M:
+            return None
+        ours, theirs = self._trail.behind(query, way_m), self._trail.around(proposal.row, last_m)
+        if not (ours.scan.usable and theirs.scan.usable):
+            return None
+        guess = _settled(theirs, ours, proposal.pose) if proposal.planar else proposal.pose
+        alignment = align_scans(theirs.scan, ours.scan, guess)
+        measurement = measure_submaps(theirs, ours, alignment, self._memory, self._settings.odometry_drift)
+        return Tested(theirs, ours, alignment, measurement)
+
+    def _judge(self, tested: Tested) -> Verdict:
+        query, match, pose = tested.query.keyframe, tested.match.keyframe, tested.alignment.pose
+        index = self._trail.database.index_of(match.stamp_ns, match.session)
+        candidate = Candidate(-1 if index is None else index, match.stamp_ns, tested.measurement.similarity)
+        probability = self._acceptance.probability(tested.measurement)
+        objection = self._objection(probability, pose)
+        if objection:
+            return Verdict(candidate, objection, tested.measurement, probability=probability)
+        covariance = self._acceptance.covariance(tested.alignment.information, tested.way_m)
+        closure = LoopClosure(query.stamp_ns, match.stamp_ns, pose, covariance, probability)
+        return Verdict(candidate, "accepted", tested.measurement, closure, probability=probability)
+
+    def _objection(self, probability: float, pose: Array) -> str:
+        """Why a hypothesis is no closure; empty when it is one."""
+        shift_m = float(np.linalg.norm(pose[:3, 3]))
+        if probability < self._settings.min_probability:
+            return f"probability {probability:.2f} is below {self._settings.min_probability:g}"
+        if shift_m > self._settings.max_shift_m:
+            return f"{shift_m:.1f} m apart, more than {self._settings.max_shift_m:g}"
+        return ""
+
+
+def _narrow(keyframe: Keyframe) -> bool:
+    """Whether the sensor sees so little around it that a turned visit shows it something else."""
+    return FieldOfView(keyframe.points - keyframe.body_T_lidar[:3, 3]).width_deg < const.NARROW_DEG
+
+
+def _settled(match: Submap, query: Submap, planar: Array) -> Array:
+    """Full pose of a planar one: height and tilt from the heights of both submaps."""
+    around = (one.scan.around(const.CELL_M) for one in (match, query))
+    level = settle(*around, float(heading(planar)), planar[:2, 3])
+    return make_pose(match.scan.up.T, np.zeros(3)) @ level @ make_pose(query.scan.up, np.zeros(3))

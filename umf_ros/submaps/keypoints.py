@@ -1,6 +1,6 @@
-"""Keypoints of the relief seen from above: what is found again whatever the heading [LOWE].
+"""Keypoints of the relief seen from above: what is found again whatever the heading [Lowe 2004].
 
-As density maps with keypoints do [GUPTA], but of relief, which keeps rocks and ripples where density keeps walls.
+As density maps with keypoints do [Gupta 2024], but of relief, which keeps rocks and ripples where density keeps walls.
 """
 
 from __future__ import annotations

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from umf_ros.frames import Keyframe
-from umf_ros.geometry import relative, transform
+from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.registration import PreparedScan, thin_scan
 
 
 @dataclass(frozen=True, slots=True)
 class Submap:
-    """What was seen around a keyframe.
+    """What was seen around a keyframe, from both sides of it.
 
     Attributes:
         keyframe: the one whose body frame it is in.
@@ -29,19 +29,27 @@ class Submap:
     first_m: float
     last_m: float
 
+    @property
+    def way_m(self) -> float:
+        """Metres of way over which odometry joined the scans."""
+        return self.last_m - self.first_m
 
-def merge(centre: Keyframe, keyframes: Iterable[Keyframe]) -> Submap:
+
+def merge(centre: Keyframe, keyframes: Sequence[Keyframe]) -> Submap:
     """The submap around a keyframe.
 
     Args:
         centre: with odometry.
-        keyframes: of the same session, with odometry; at least one.
+        keyframes: at least one, of the same session, with odometry.
     """
-    parts, metres = [], []
-    for one in keyframes:
-        if one.odom_T_body is None or centre.odom_T_body is None:
-            raise ValueError("a submap needs odometry")
-        parts.append(transform(relative(centre.odom_T_body, one.odom_T_body), one.points))
-        metres.append(one.travelled_m)
-    points = thin_scan(np.concatenate(parts), const.SUBMAP_CELL_M)
-    return Submap(centre, PreparedScan(points, centre.body_T_lidar), min(metres), max(metres))
+    body_T_odom = np.linalg.inv(_odometry(centre))
+    points = [transform(body_T_odom @ _odometry(one), one.points) for one in keyframes]
+    thinned = thin_scan(np.concatenate(points), const.SUBMAP_CELL_M)
+    metres = [one.travelled_m for one in keyframes]
+    return Submap(centre, PreparedScan(thinned, centre.body_T_lidar), min(metres), max(metres))
+
+
+def _odometry(keyframe: Keyframe) -> Array:
+    if keyframe.odom_T_body is None:
+        raise ValueError("a submap needs odometry")
+    return keyframe.odom_T_body
