@@ -106,7 +106,7 @@ def measure_submaps(
     nominal = covariance_of(alignment.information, NOMINAL)
     return Measurement(
         kind=SUBMAP,
-        similarity=math.nan,
+        similarity=float(query.keyframe.embedding.descriptor @ match.keyframe.embedding.descriptor),
         residual_m=float(np.median(size)),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),

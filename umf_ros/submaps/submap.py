@@ -46,7 +46,7 @@ def merge(centre: Keyframe, keyframes: Sequence[Keyframe]) -> Submap:
     points = [transform(body_T_odom @ _odometry(one), one.points) for one in keyframes]
     thinned = thin_scan(np.concatenate(points), const.SUBMAP_CELL_M)
     metres = [one.travelled_m for one in keyframes]
-    return Submap(centre, PreparedScan(thinned, centre.body_T_lidar), min(metres), max(metres))
+    return Submap(centre, PreparedScan(thinned), min(metres), max(metres))
 
 
 def _odometry(keyframe: Keyframe) -> Array:
