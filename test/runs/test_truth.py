@@ -16,8 +16,8 @@ from umf_ros.runs.tables import KEYFRAMES, CsvTable
 from umf_ros.runs.truth import (
     JudgedRun,
     absolute_trajectory_error,
-    find_revisits,
     endpoints,
+    find_revisits,
     judge_closure,
     judge_run,
     positions_in_truth,
@@ -140,6 +140,8 @@ def test_the_summary_has_its_keys_and_plain_numbers() -> None:
         "closures_true": 0,
         "closures_false": 0,
         "revisits": 7,
+        "revisits_any_heading": 0,
+        "closed_any_heading": 0,
         "ate_odometry_m": 1.2346,
         "ate_optimized_m": None,
         "nees_median": None,

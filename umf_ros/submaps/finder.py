@@ -60,14 +60,14 @@ class SubmapFinder:
     def __init__(self, settings: Verification, rules: Loop, database: PlaceDatabase) -> None:
         self._settings, self._rules = settings, rules
         self._acceptance = load_submap_acceptance()
-        self._trail = Trail(database)
-        self._lookalikes = Lookalikes(self._trail, rules)
+        self.trail = Trail(database)
+        self._lookalikes = Lookalikes(self.trail, rules)
         self.reset()
 
     def reset(self) -> None:
         """Forget what was found lately, and every place that the database has forgotten."""
-        self._lookalikes.forget(self._trail.forget())
-        self._expectation = Expectation(self._trail, self._rules)
+        self._lookalikes.forget(self.trail.forget())
+        self._expectation = Expectation(self.trail, self._rules)
         self._memory = TemporalMemory()
         self._asked_m = -np.inf
 
@@ -95,13 +95,34 @@ class SubmapFinder:
         """Every test of a keyframe, without a decision."""
         if query.odom_T_body is None or not _narrow(query):
             return []
-        tested = [one for proposal in self._propose(query) if (one := self._test(query, proposal)) is not None]
+        tested = [one for proposal in self._propose(query) if (one := self.test(query, proposal)) is not None]
         self._memory.remember(query, [(one.match.keyframe, one.alignment.pose, False) for one in tested])
         return tested
 
+    def lookalikes(self, query: Keyframe) -> list[Proposal]:
+        """Stops whose ground looks like the last metres before a keyframe, best first."""
+        return self._lookalikes.propose(self.trail.behind(query, const.SUBMAP_BEFORE_M))
+
+    def test(self, query: Keyframe, proposal: Proposal) -> Tested | None:
+        """Align the submaps of a proposal; None where there is too little way for two that share no scan."""
+        stop = self.trail.stops[proposal.row]
+        way_m, last_m = const.SUBMAP_BEFORE_M, stop.travelled_m + const.SUBMAP_AFTER_M
+        if stop.session == query.session:
+            way_m = min(way_m, (query.travelled_m - stop.travelled_m) / 2)
+            last_m = min(last_m, query.travelled_m - way_m)
+        if way_m < const.MIN_SUBMAP_M:
+            return None
+        ours, theirs = self.trail.behind(query, way_m), self.trail.around(proposal.row, last_m)
+        if not (ours.scan.usable and theirs.scan.usable):
+            return None
+        guess = _settled(theirs, ours, proposal.pose) if proposal.planar else proposal.pose
+        alignment = align_scans(theirs.scan, ours.scan, guess)
+        measurement = measure_submaps(theirs, ours, alignment, self._memory, self._settings.odometry_drift)
+        return Tested(theirs, ours, alignment, measurement)
+
     def remember(self, keyframe: Keyframe) -> None:
         """Take up a keyframe that was added to the database."""
-        if self._trail.add(keyframe):
+        if self.trail.add(keyframe):
             self._lookalikes.describe()
 
     def _propose(self, query: Keyframe) -> list[Proposal]:
@@ -111,28 +132,11 @@ class SubmapFinder:
         if query.travelled_m - self._asked_m < const.ASKED_EVERY_M:
             return []
         self._asked_m = query.travelled_m
-        return self._lookalikes.propose(self._trail.behind(query, const.SUBMAP_BEFORE_M))
-
-    def _test(self, query: Keyframe, proposal: Proposal) -> Tested | None:
-        """Align the submaps of a proposal; None where there is too little way for two that share no scan."""
-        stop = self._trail.stops[proposal.row]
-        way_m, last_m = const.SUBMAP_BEFORE_M, stop.travelled_m + const.SUBMAP_AFTER_M
-        if stop.session == query.session:
-            way_m = min(way_m, (query.travelled_m - stop.travelled_m) / 2)
-            last_m = min(last_m, query.travelled_m - way_m)
-        if way_m < const.MIN_SUBMAP_M:
-            return None
-        ours, theirs = self._trail.behind(query, way_m), self._trail.around(proposal.row, last_m)
-        if not (ours.scan.usable and theirs.scan.usable):
-            return None
-        guess = _settled(theirs, ours, proposal.pose) if proposal.planar else proposal.pose
-        alignment = align_scans(theirs.scan, ours.scan, guess)
-        measurement = measure_submaps(theirs, ours, alignment, self._memory, self._settings.odometry_drift)
-        return Tested(theirs, ours, alignment, measurement)
+        return self.lookalikes(query)[: const.LOOKALIKES]
 
     def _judge(self, tested: Tested) -> Verdict:
         query, match, pose = tested.query.keyframe, tested.match.keyframe, tested.alignment.pose
-        index = self._trail.database.index_of(match.stamp_ns, match.session)
+        index = self.trail.database.index_of(match.stamp_ns, match.session)
         candidate = Candidate(-1 if index is None else index, match.stamp_ns, tested.measurement.similarity)
         probability = self._acceptance.probability(tested.measurement)
         objection = self._objection(probability, pose)

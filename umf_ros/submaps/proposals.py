@@ -113,8 +113,7 @@ class Lookalikes:
         ]
         guesses = self._index.search(find_keypoints(query.scan.elevation.relief), admissible & np.array(apart, bool))
         return [
-            Proposal(int(self._rows[guess.row]), _planar(guess.heading, guess.shift), planar=True)
-            for guess in guesses[: const.LOOKALIKES]
+            Proposal(int(self._rows[guess.row]), _planar(guess.heading, guess.shift), planar=True) for guess in guesses
         ]
 
 

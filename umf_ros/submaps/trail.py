@@ -81,7 +81,7 @@ class Trail:
 
     def rows(self, session: int, first_m: float, last_m: float) -> NDArray[np.intp]:
         """Rows of a session's stops between two places of the way."""
-        key = (lambda stop: (stop.session, stop.travelled_m))
+        key = lambda stop: (stop.session, stop.travelled_m)
         return np.arange(
             bisect_left(self.stops, (session, first_m), key=key), bisect_right(self.stops, (session, last_m), key=key)
         )
