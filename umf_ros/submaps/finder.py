@@ -163,6 +163,6 @@ def _narrow(keyframe: Keyframe) -> bool:
 
 def _settled(match: Submap, query: Submap, planar: Array) -> Array:
     """Full pose of a planar one: height and tilt from the heights of both submaps."""
-    around = (one.scan.around(const.CELL_M) for one in (match, query))
-    level = settle(*around, float(heading(planar)), planar[:2, 3])
+    theirs, ours = match.scan.around(const.CELL_M), query.scan.around(const.CELL_M)
+    level = settle(theirs, ours, float(heading(planar)), planar[:2, 3])
     return make_pose(match.scan.up.T, np.zeros(3)) @ level @ make_pose(query.scan.up, np.zeros(3))

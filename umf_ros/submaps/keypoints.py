@@ -42,7 +42,7 @@ def find_keypoints(relief: Grid) -> Keypoints:
     picture = np.clip(128 + 127 / highest * np.nan_to_num(relief), 0, 255).astype(np.uint8)
     # the border of the known ground is an edge that depends on where the rover looked
     inner = cv2.erode(np.isfinite(relief).astype(np.uint8), np.ones((3, 3), np.uint8))
-    detector = cv2.SIFT_create(const.KEYPOINTS, 3, const.KEYPOINT_CONTRAST, 20, 1.0)
+    detector = cv2.SIFT.create(const.KEYPOINTS, 3, const.KEYPOINT_CONTRAST, 20, 1.0)
     found, descriptors = detector.detectAndCompute(picture, inner)
     if descriptors is None:
         return Keypoints(np.empty((0, 2), np.float32), np.empty((0, 128), np.float32))
@@ -66,4 +66,4 @@ def planar_motion(query: Keypoints, match: Keypoints) -> tuple[Array, int] | Non
     )
     if motion is None or abs(float(np.hypot(motion[0, 0], motion[1, 0])) - 1) > const.KEYPOINT_SCALE:
         return None
-    return motion, int(inliers.sum())
+    return np.asarray(motion, float), int(inliers.sum())

@@ -35,6 +35,10 @@ class Stop:
     odom_T_body: Array
 
 
+def _way(stop: Stop) -> tuple[int, float]:
+    return stop.session, stop.travelled_m
+
+
 class Trail:
     """Stops in the order they were driven, and submaps of the scans taken there.
 
@@ -55,9 +59,9 @@ class Trail:
         if keyframe.odom_T_body is None:
             return False
         last = self.stops[-1] if self.stops else None
-        if last is not None and last.session == keyframe.session:
-            if keyframe.travelled_m - last.travelled_m < const.SUBMAP_STEP_M:
-                return False
+        same_way = last is not None and last.session == keyframe.session
+        if last is not None and same_way and keyframe.travelled_m - last.travelled_m < const.SUBMAP_STEP_M:
+            return False
         self.stops.append(Stop(keyframe.stamp_ns, keyframe.session, keyframe.travelled_m, keyframe.odom_T_body))
         return True
 
@@ -81,10 +85,8 @@ class Trail:
 
     def rows(self, session: int, first_m: float, last_m: float) -> NDArray[np.intp]:
         """Rows of a session's stops between two places of the way."""
-        key = lambda stop: (stop.session, stop.travelled_m)
-        return np.arange(
-            bisect_left(self.stops, (session, first_m), key=key), bisect_right(self.stops, (session, last_m), key=key)
-        )
+        first = bisect_left(self.stops, (session, first_m), key=_way)
+        return np.arange(first, bisect_right(self.stops, (session, last_m), key=_way))
 
     def around(self, row: int, last_m: float) -> Submap:
         """The submap of a stop: what was seen before it, and behind it up to a place of the way.
