@@ -37,6 +37,11 @@ class Tested:
         """Metres of way that odometry joined inside both submaps."""
         return self.match.way_m + self.query.way_m
 
+    @property
+    def common(self) -> float:
+        """Share of the query's submap that has a counterpart in the match's."""
+        return len(self.alignment.points) / max(len(self.query.scan.sample), 1)
+
 
 class SubmapFinder:
     """Recognises a place from any side, by all that was seen on the last metres of way.
@@ -113,7 +118,7 @@ class SubmapFinder:
         if way_m < const.MIN_SUBMAP_M:
             return None
         ours, theirs = self.trail.behind(query, way_m), self.trail.around(proposal.row, last_m)
-        if not (ours.scan.usable and theirs.scan.usable):
+        if theirs.way_m < const.MIN_SUBMAP_M or not (ours.scan.usable and theirs.scan.usable):
             return None
         guess = _settled(theirs, ours, proposal.pose) if proposal.planar else proposal.pose
         alignment = align_scans(theirs.scan, ours.scan, guess)
@@ -139,18 +144,20 @@ class SubmapFinder:
         index = self.trail.database.index_of(match.stamp_ns, match.session)
         candidate = Candidate(-1 if index is None else index, match.stamp_ns, tested.measurement.similarity)
         probability = self._acceptance.probability(tested.measurement)
-        objection = self._objection(probability, pose)
+        objection = self._objection(tested, probability)
         if objection:
             return Verdict(candidate, objection, tested.measurement, probability=probability)
         covariance = self._acceptance.covariance(tested.alignment.information, tested.way_m)
         closure = LoopClosure(query.stamp_ns, match.stamp_ns, pose, covariance, probability)
         return Verdict(candidate, "accepted", tested.measurement, closure, probability=probability)
 
-    def _objection(self, probability: float, pose: Array) -> str:
+    def _objection(self, tested: Tested, probability: float) -> str:
         """Why a hypothesis is no closure; empty when it is one."""
-        shift_m = float(np.linalg.norm(pose[:3, 3]))
+        shift_m = float(np.linalg.norm(tested.alignment.pose[:3, 3]))
         if probability < self._settings.min_probability:
             return f"probability {probability:.2f} is below {self._settings.min_probability:g}"
+        if tested.common < const.MIN_COMMON:
+            return f"only {tested.common:.0%} of the submap in common"
         if shift_m > self._settings.max_shift_m:
             return f"{shift_m:.1f} m apart, more than {self._settings.max_shift_m:g}"
         return ""

@@ -31,6 +31,7 @@ CRITERIA: dict[str, Criterion] = {
     "terrain_score": Criterion(lambda m: m.terrain_score, 5.0, 30.0),
     "terrain_unique": Criterion(lambda m: m.terrain_correlation - m.terrain_rival, 0.0, 0.6),
     "overlap": Criterion(lambda m: m.overlap, 0.6, 0.95),
+    "position_known": Criterion(lambda m: math.log(m.position_std_m), math.log(1.0), math.log(0.1)),
     "relief_explained": Criterion(lambda m: _log_ratio(m.relief_m, m.residual_m), math.log(1.5), math.log(6)),
     "odometry_prior": Criterion(lambda m: m.prior_sigmas, 4.0, 1.0, missing=0.7),
     "support": Criterion(lambda m: m.support, 0.0, 2.0),
