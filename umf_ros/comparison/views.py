@@ -109,11 +109,17 @@ class KeyframeSource:
         reference = split_reference(view.scan)
         try:
             if reference is None:
-                self._keep(view, make_keyframe(self._snapshot(view), self._embedder))
+                self._keep(view, self._from_files(view))
             else:
                 self._read_recording(reference[0], view)
         except UmfError as error:
             self._keep(view, error)
+
+    def _from_files(self, view: PlaceView) -> Keyframe:
+        keyframe = make_keyframe(self._snapshot(view), self._embedder)
+        if not view.left and not len(keyframe.points):
+            raise SensorFileError(f"{view.scan} has no return within reach: expected metres, from the sensor")
+        return keyframe
 
     def _snapshot(self, view: PlaceView) -> Frame:
         if not view.scan and not view.left:
