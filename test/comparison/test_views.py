@@ -74,7 +74,11 @@ def test_a_view_in_many_pairs_is_embedded_once(here: Path, monkeypatch: pytest.M
     monkeypatch.setattr(views, "KEPT", 2)
     embedder = CountingEmbedder()
     source = KeyframeSource(embedder, calibrated(here))
-    one, two, three = PlaceView(str(here / "scan.npy")), PlaceView("", str(here / "left.png")), PlaceView(str(here / "drive.mcap@1"))
+    one, two, three = (
+        PlaceView(str(here / "scan.npy")),
+        PlaceView("", str(here / "left.png")),
+        PlaceView(str(here / "drive.mcap@1")),
+    )
     for view in (one, two, one, one, two):
         source.keyframe(view)
     assert len(embedder.frames) == 2
