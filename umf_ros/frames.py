@@ -61,6 +61,11 @@ class ScanMotion:
     rates: Array
     noise: Array
 
+    @classmethod
+    def none(cls, count: int) -> ScanMotion:
+        """Of a scan of so many points that was taken from one place, or whose motion is known exactly."""
+        return cls(np.zeros(count, np.float32), np.zeros(6), np.zeros(6))
+
 
 @dataclass(frozen=True, slots=True)
 class Frame:
