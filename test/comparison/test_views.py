@@ -140,3 +140,7 @@ def test_a_scan_in_another_unit_or_frame_is_none(here: Path, change: Callable[[n
 def test_a_calibration_that_cannot_be_read_is_said_at_once(here: Path) -> None:
     with pytest.raises(CalibrationError, match="cannot read"):
         KeyframeSource(ThumbnailEmbedder(), ReadingRules(here / "nowhere.yaml"))
+
+
+def test_a_data_set_names_its_calibration() -> None:
+    assert KeyframeSource(ThumbnailEmbedder(), ReadingRules(Path("simulated"))).calibrated

@@ -75,7 +75,7 @@ class KeyframeSource:
         self._embedder = embedder
         self._rules = rules
         self._warn = _once(warn)
-        self._calibration = UNCALIBRATED if rules.calibration is None else load_calibration(rules.calibration)
+        self._calibration = UNCALIBRATED if rules.calibration is None else load_calibration(str(rules.calibration))
         self._kept: OrderedDict[PlaceView, Keyframe | UmfError] = OrderedDict()
         self._expected: dict[Path, list[PlaceView]] = {}
 
