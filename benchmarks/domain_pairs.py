@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.frames import Keyframe
+from umf_ros.frames import Keyframe, ScanMotion
 from umf_ros.geometry import Array, relative, rotation_angle
 from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
 from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, SAME_WAY
@@ -89,10 +89,15 @@ def surveyed(domain: Domain, seed: int, extent: Extent, folder: Path | None) -> 
     return scans
 
 
-def keyframe_of(points: Array, intensity: Array | None, embedder: Embedder, stamp_ns: int) -> Keyframe:
-    """A keyframe of a robot with a LiDAR and nothing else."""
+def keyframe_of(
+    points: Array, intensity: Array | None, embedder: Embedder, stamp_ns: int, steady: bool = False
+) -> Keyframe:
+    """A keyframe of a robot with a LiDAR and nothing else; steady: the motion was removed from the scan."""
     cloud = Cloud(points.astype(np.float32), intensity)
-    return make_keyframe(make_snapshot(cloud, stamp_ns=stamp_ns), embedder)
+    frame = make_snapshot(cloud, stamp_ns=stamp_ns)
+    if steady and frame.points is not None:
+        frame = replace(frame, motion=ScanMotion.none(len(frame.points)))
+    return make_keyframe(frame, embedder)
 
 
 def places_of(domain: Domain, seeds: range, extent: Extent, folder: Path | None, embedder: Embedder) -> list[Place]:
@@ -101,7 +106,8 @@ def places_of(domain: Domain, seeds: range, extent: Extent, folder: Path | None,
     for seed in seeds:
         for scan in surveyed(domain, seed, extent, folder):
             stamp_ns = (len(places) + 1) * 10**9
-            keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, stamp_ns)
+            steady = scan.sweep.offset_s is not None
+            keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, stamp_ns, steady)
             places.append(Place(keyframe, scan, seed))
     return places
 

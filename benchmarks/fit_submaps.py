@@ -38,7 +38,7 @@ from umf_ros.submaps.judgement import SubmapAcceptance, scores
 from umf_ros.verification import Measurement
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import Logistic
-from umf_ros.verification.registration import thin_scan
+from umf_ros.verification.thinning import thin_scan
 
 Truth = dict[int, Array]
 NO_CAMERA = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from umf_ros.errors import ConfigError
-from umf_ros.frames import Frame, Image
+from umf_ros.frames import Frame, Image, ScanMotion
 from umf_ros.geometry import Array, relative, transform
 from umf_ros.lab.simulation.camera import Rendering
 from umf_ros.lab.simulation.lidar import PERIOD_NS, Lidar, Scan
@@ -155,6 +155,7 @@ class Simulator:
             points=transform(kept.body_T_lidar, points[usable]),
             intensity=scan.intensity[usable].astype(np.float32),
             odom_T_body=self.odometry_at(stamp),
+            motion=ScanMotion.none(int(usable.sum())),
         )
 
     def _rectified(self, exposure: Exposure) -> tuple[Image, Image | None]:

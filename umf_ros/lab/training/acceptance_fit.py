@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +122,12 @@ def scale_covariance(model: CovarianceModel, errors: Array, covariances: Array) 
     """
     variance = float(np.quantile(normalised_errors(errors, covariances), 0.95)) / float(chi2.ppf(0.95, 6))
     deviation = variance**0.5
-    return CovarianceModel(model.inflation * variance, model.floor_m * deviation, model.floor_deg * deviation)
+    return replace(
+        model,
+        inflation=model.inflation * variance,
+        floor_m=model.floor_m * deviation,
+        floor_deg=model.floor_deg * deviation,
+    )
 
 
 def _model_of(logarithms: Array) -> CovarianceModel:
