@@ -57,16 +57,16 @@ class JudgedRun:
     Attributes:
         closures: one per closure whose endpoints the truth covers.
         revisits: keyframes that saw an earlier place again, in about the same direction.
-        any_heading: keyframes that were near an earlier place again, and those of them with a true closure.
         ate_odometry_m: error of the odometry, or None without odometry.
         ate_optimized_m: error of the optimised trajectory, or None.
+        any_heading: keyframes that were near an earlier place again, and those of them with a true closure.
     """
 
     closures: list[JudgedClosure] = field(default_factory=list)
     revisits: int = 0
-    any_heading: tuple[int, int] = (0, 0)
     ate_odometry_m: float | None = None
     ate_optimized_m: float | None = None
+    any_heading: tuple[int, int] = (0, 0)
 
     def summary(self) -> dict[str, Any]:
         """The `ground_truth` entry of `summary.json`."""
