@@ -20,11 +20,12 @@ import typer
 from rich.console import Console
 from rich.progress import track
 from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from umf_ros.config import Database, KeyframePolicy, Loop, Verification
 from umf_ros.frames import Embedding, Frame, Keyframe, StereoCamera
-from umf_ros.geometry import Array, relative
+from umf_ros.geometry import Array, make_pose, relative
 from umf_ros.keyframes import KeyframeSelector, is_past
 from umf_ros.lab.simulation.presets import find_preset
 from umf_ros.lab.simulation.simulator import Simulator
@@ -35,6 +36,7 @@ from umf_ros.runs.truth import POSE_TOLERANCE_DEG, POSE_TOLERANCE_M, find_revisi
 from umf_ros.submaps import SubmapFinder
 from umf_ros.submaps.finder import Tested
 from umf_ros.submaps.judgement import OdometryError, SubmapAcceptance, scores
+from umf_ros.submaps.proposals import Proposal
 from umf_ros.verification import Measurement
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import Logistic
@@ -55,7 +57,7 @@ DRIVES = [
     ("mapping", 10117, "mesa", 1.0),
     ("traverse_2", 10118, "mounds", 1.0),
 ]
-WRONG_FROM_M = 15.0  # stops further away than this from the truth are what a wrong answer may be drawn from
+ANYWHERE, BESIDE_M = 3, 4.0  # wrong answers per keyframe at any stop, and how far beside the right ones
 EVERY = 10  # keyframes, for wrong answers
 DEFAULT_OUT = Path(__file__).parent.parent / "config" / "verification" / "submaps.json"
 
@@ -141,16 +143,30 @@ def _found_by_scan(drive: Drive) -> dict[int, list[tuple[Keyframe, Array]]]:
 
 
 def _wrong_answers(number: int, truth: Truth, finder: SubmapFinder, query: Keyframe) -> Iterator[Example]:
-    """What looks alike and is another place."""
+    """What looks alike and is another place, poses beside the right ones, and poses anywhere."""
     if query.travelled_m < const.SUBMAP_BEFORE_M:
         return
-    for proposal in finder.lookalikes(query):
-        stop = finder.trail.stops[proposal.row]
-        if np.linalg.norm(relative(truth[stop.stamp_ns], truth[query.stamp_ns])[:3, 3]) < WRONG_FROM_M:
-            continue
+    rng = np.random.default_rng([number, query.stamp_ns % 2**32])
+    rows = rng.permutation(len(finder.trail.stops))[:ANYWHERE].tolist()
+    proposals = finder.lookalikes(query) + [Proposal(row, _anywhere(rng), planar=True) for row in rows]
+    here = truth[query.stamp_ns]
+    for row, stop in enumerate(finder.trail.stops):
+        pose = relative(truth[stop.stamp_ns], here)
+        if np.linalg.norm(pose[:3, 3]) < BESIDE_M and stop.travelled_m < query.travelled_m - const.SUBMAP_BEFORE_M:
+            proposals.append(Proposal(row, _beside(rng) @ pose))
+    for proposal in proposals:
         tested = finder.test(query, proposal)
         if tested is not None:
             yield _example(number, truth, tested)
+
+
+def _anywhere(rng: np.random.Generator) -> Array:
+    return make_pose(Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)]).as_matrix(), [*rng.uniform(-5, 5, 2), 0])
+
+
+def _beside(rng: np.random.Generator) -> Array:
+    turn = Rotation.from_rotvec([0, 0, rng.normal(0, 0.15)]).as_matrix()
+    return make_pose(turn, [*rng.normal(0, BESIDE_M / 2, 2), 0])
 
 
 def _example(number: int, truth: Truth, tested: Tested) -> Example:
