@@ -60,7 +60,7 @@ def find_hypotheses(
     found = [pose for pose in poses if pose is not None and np.isfinite(pose).all()]
     if turned is None or not match.usable:
         return [Hypothesis(ranked, pose, ranked.score) for pose in found[:1]]
-    fits = [scout(match, turned.scan, pose) for pose in found] + search(match, turned)
+    fits = [fit for pose in found if (fit := scout(match, turned.scan, pose)).telling] + search(match, turned)
     fits.sort(key=lambda fit: -fit.score)
     return [Hypothesis(ranked, fit.pose, fit.score) for fit in _distinct(fits)]
 

@@ -192,8 +192,19 @@ class Verifier:
         pose = judged.aligned.pose
         turn_deg, shift_m = abs(np.degrees(heading(pose))), float(np.linalg.norm(pose[:3, 3]))
         # a place is a position and a view [UMF 5.1.2]: whoever looks elsewhere is somewhere else
-        if turn_deg > self._settings.max_turn_deg:
+        if 0 < self._settings.max_turn_deg < turn_deg:
             return f"turned by {turn_deg:.0f} deg, more than {self._settings.max_turn_deg:g}"
+        if (shared := _shared_view(judged.aligned)) < const.MIN_SHARED_VIEW:
+            return f"turned by {turn_deg:.0f} deg: the views share only {max(shared, 0):.0%}"
         if shift_m > self._settings.max_shift_m:
             return f"{shift_m:.1f} m apart, more than {self._settings.max_shift_m:g}"
         return ""
+
+
+def _shared_view(aligned: AlignedHypothesis) -> float:
+    """Share of the narrower view that both sensors see at the pose that was found."""
+    if aligned.scans is None:
+        return 1.0 - abs(heading(aligned.pose)) / min(one.camera.width_rad for one in (aligned.query, aligned.match))
+    match, query = aligned.scans
+    turn = heading(match.up @ aligned.pose[:3, :3] @ query.up.T)
+    return float(match.view.overlap(query.view, np.array([turn]))[0])
