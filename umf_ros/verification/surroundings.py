@@ -88,5 +88,9 @@ def _layers(cell: NDArray[np.intp], rise: Array) -> Array:
     return occupied.sum(axis=1).astype(float)
 
 
+def _centred(values: Array) -> Array:
+    return values - values.mean() if len(values) else values
+
+
 def _unit(values: Array) -> Grid:
     return (values / max(float(np.linalg.norm(values)), 1e-9)).astype(np.float32)
