@@ -77,6 +77,8 @@ SCANS_KEPT = 60  # prepared scans in memory: bounds it, changes no result
 # covariance
 SEARCH_M, SEARCH_RAD = 3.0, 0.35  # what the search itself knows, standard deviation: nothing is wider than this
 NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG = 20.0, 0.01, 0.05  # by hand: a yardstick of nobody's data
+MOMENTS = 6  # parts of a scan whose errors of motion are told apart; by hand: errors change little within a sixth
+MOTION_SHARE = 0.03  # by hand: of the motion during a scan that odometry gets wrong all along, as by its scale
 MIN_RESIDUAL_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanner is better
 
 # measurement: every test of a hypothesis

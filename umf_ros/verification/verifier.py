@@ -22,8 +22,9 @@ from umf_ros.verification.hypotheses import (
     paired_points,
 )
 from umf_ros.verification.measurement import AlignedHypothesis, Measurement, measure, measure_candidate
-from umf_ros.verification.registration import ScanCache, align_features, align_scans, covariance_of
+from umf_ros.verification.registration import ScanCache, align_features, align_scans
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
+from umf_ros.verification.scan_motion import closure_covariance
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +182,8 @@ class Verifier:
         objection = self._objection(judged)
         if objection:
             return Verdict(ranked.candidate, objection, measurement, None, pixels, probability)
-        covariance = covariance_of(aligned.alignment.information, self._acceptance.covariances[measurement.kind])
+        model = self._acceptance.covariances[measurement.kind]
+        covariance = closure_covariance(aligned.match, aligned.query, aligned.alignment, model)
         closure = LoopClosure(aligned.query.stamp_ns, ranked.candidate.stamp_ns, aligned.pose, covariance, probability)
         return Verdict(ranked.candidate, "accepted", measurement, closure, pixels, probability)
 
