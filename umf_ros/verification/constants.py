@@ -32,6 +32,19 @@ MIN_MAP_SCORE = 5.0  # by hand, in standard deviations of chance: below, two ele
 MAX_REFINED = 3  # hypotheses per group of candidates that are aligned: bounds the time
 EXPECTED_M = 4.0  # by hand: a candidate this near to where odometry carries an accepted closure is tested first
 
+# views: what two images say about a pose
+VIEW_NOISE = 0.0015  # of the image's width, a pixel in 688: measured on right pairs under another sun
+DISPARITY_NOISE = 0.0005  # of the image's width, a third of a pixel; measured likewise
+VIEW_REACH = 0.006  # of the image's width: as four standard deviations
+VIEW_SAMPLES = 300  # measured: three times as many find 3 % more, a third of them 3 % less
+VIEW_STEPS, VIEW_TOLERANCE = 8, 1e-4  # of Gauss-Newton; m and rad, far below what is known
+VIEW_KERNEL = 9.0  # squared standard deviations: three of them halve the pull of a feature
+VIEW_GATE, VIEW_NEAR = 11.3, 100.0  # likewise; 99 % of a chi-square of three, and what the refinement may draw in
+MIN_VIEW_SIGMAS = 0.5  # no pair of images is better than half the noise assumed
+UNMEASURED = 1e6  # pixels^2: the variance of a disparity nobody measured
+NEAREST_SEEN_M = 0.3  # nothing nearer than this is in front of a camera
+NOMINAL_BASELINE_M = 0.2  # S3LI's: how well depths of a camera without a right one are taken to be known
+
 # elevation maps
 CELL_M = 0.5  # by hand: rocks and ripples are seen, and ten thousand returns leave few holes
 ROWS, COLUMNS = 72, 96  # geometry: 36 m along, 48 m across, the reach of the scan with its shifts
