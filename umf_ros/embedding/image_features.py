@@ -1,77 +1,127 @@
-"""Local features of an image that survive light and view: XFeat's, to a fraction of a pixel."""
+"""Local features of images that survive light and view: XFeat's [Potje 2024], to a fraction of a pixel."""
 
 from __future__ import annotations
 
 import hashlib
-import os
-from importlib.util import find_spec
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from umf_ros.config import EmbeddingSettings
+from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.inputs import is_blank
-from umf_ros.frames import Image, LocalFeatures, Points
-from umf_ros.networks.xfeat import CELL, COARSEST, DESCRIPTOR, XFeat, load_xfeat
+from umf_ros.embedding.runtimes import XFeatRuntime, make_xfeat_runtime
+from umf_ros.frames import Embedding, Frame, Image, LocalFeatures, Points
+from umf_ros.geometry import Array
+from umf_ros.networks.xfeat import CELL, COARSEST
+from umf_ros.resources import find
 
+WEIGHTS = "models/xfeat.safetensors"
 LIMIT = 500
+LONGEST = 512  # pixels of the longer side of what the network sees: at 672 it finds no more and takes twice as long
 MIN_PROBABILITY = 0.05  # of a key point [Potje 2024]
-APART = 5  # pixels of the network's image: side of the square in which a key point is the best one
-LONGEST = 512  # pixels: the longer side of the network's image
+APART = 5  # side of the square in which a key point is the likeliest pixel, likewise
+FLAT = 1e-3  # added to probabilities before their logarithm
 
 
-class ImageFeatures:
-    """XFeat's key points of an image with their descriptors."""
+class XFeatExtractor:
+    """Key points of an image and their descriptors.
 
-    def __init__(self, weights: Path, runtime: Any) -> None:
-        self.name = f"xfeat-{hashlib.sha256(weights.read_bytes()).hexdigest()[:8]}"
-        self._run = runtime
+    Args:
+        weights: safetensors file.
+        runtime: what runs the network.
+    """
 
-    def extract(self, image: Image, longest=LONGEST, limit=LIMIT) -> LocalFeatures:
-        """The strongest features of an image (H, W), their positions in its pixels; their depths are unknown."""
-        size = network_size(image.shape[1], image.shape[0], longest)
-        shrunk = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if size != image.shape[::-1] else image
-        descriptors, corners, reliability = self._run(shrunk.astype(np.float32)[None, None])
-        pixels, score = key_points(corners, reliability, limit)
+    def __init__(self, weights: Path, runtime: XFeatRuntime) -> None:
+        self.name = f"{weights.stem}-{hashlib.sha256(weights.read_bytes()).hexdigest()[:8]}"
+        self._runtime = runtime
+
+    def extract(self, image: Image) -> LocalFeatures:
+        """The strongest features of an image (H, W), in its pixels; their depths are unknown."""
+        height, width = image.shape
+        size = network_size(width, height)
+        shrunk = image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        descriptors, corners, reliability = self._runtime.run(shrunk.astype(np.float32))
+        pixels, score = key_points(corners, reliability)
         found = sample(descriptors, (pixels + 0.5) / CELL - 0.5)
-        found /= np.linalg.norm(found, axis=1, keepdims=True)
-        ratio = np.array(image.shape[::-1]) / size
-        positions = ((pixels + 0.5) * ratio - 0.5).astype(np.float32)
-        return LocalFeatures(positions, found.astype(np.float16), score, np.full((len(pixels), 3), np.nan, np.float32))
+        found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
+        positions = (pixels + 0.5) * (np.array([width, height]) / size) - 0.5
+        unknown = np.full((len(pixels), 3), np.nan, np.float32)
+        return LocalFeatures(positions.astype(np.float32), found.astype(np.float16), score, unknown)
 
 
-def network_size(width, height, longest):
-    scale = min(1.0, longest / max(width, height))
-    return tuple(max(1, round(side * scale / COARSEST)) * COARSEST for side in (width, height))
+class WithXFeat:
+    """An embedder whose image features are XFeat's.
+
+    Args:
+        embedder: gives everything else.
+        extractor: gives the features.
+    """
+
+    def __init__(self, embedder: Embedder, extractor: XFeatExtractor) -> None:
+        # other features are another language, as other weights are
+        self.name = f"{embedder.name}+{extractor.name}"
+        self.dimension = embedder.dimension
+        self._embedder, self._extractor = embedder, extractor
+
+    def embed(self, frame: Frame) -> Embedding:
+        """As the embedder, with other features of the image."""
+        embedding = self._embedder.embed(frame)
+        if frame.left is None or is_blank(frame.left):
+            return embedding
+        return replace(embedding, image=self._extractor.extract(frame.left))
 
 
-def key_points(corners, reliability, limit):
-    peak = (corners == cv2.dilate(corners, np.ones((APART, APART), np.uint8))) & (corners > MIN_PROBABILITY)
+def with_xfeat(embedder: Embedder, settings: EmbeddingSettings) -> WithXFeat:
+    """The embedder with the shipped XFeat, run as the settings say."""
+    weights = find(WEIGHTS)
+    return WithXFeat(embedder, XFeatExtractor(weights, make_xfeat_runtime(weights, settings)))
+
+
+def network_size(width: int, height: int) -> tuple[int, int]:
+    """Width and height of what the network sees of an image: multiples of 32 pixels, at most 512."""
+    scale = min(1.0, LONGEST / max(width, height))
+    across, down = (max(1, round(side * scale / COARSEST)) * COARSEST for side in (width, height))
+    return across, down
+
+
+def key_points(corners: Points, reliability: Points) -> tuple[Array, Points]:
+    """Places (K, 2) of the strongest key points, column and row, and their scores (K,), best first.
+
+    Args:
+        corners: (H, W) probability of a key point.
+        reliability: (H / 8, W / 8) of the descriptors.
+    """
+    likeliest = corners == cv2.dilate(corners, np.ones((APART, APART), np.uint8))
+    peak = likeliest & (corners > MIN_PROBABILITY)
     peak[[0, -1]] = peak[:, [0, -1]] = False
     rows, columns = np.nonzero(peak)
-    where = np.column_stack([columns, rows]).astype(float)
-    score = corners[rows, columns] * sample(reliability[None], (where + 0.5) / CELL - 0.5)[:, 0]
-    best = np.argsort(-score, kind="stable")[:limit]
+    pixels = np.column_stack([columns, rows]).astype(float)
+    score = corners[rows, columns] * sample(reliability[None], (pixels + 0.5) / CELL - 0.5)[:, 0]
+    best = np.argsort(-score, kind="stable")[:LIMIT]
     rows, columns = rows[best], columns[best]
-    shift = [vertex(corners, rows, columns, *step) for step in ((0, 1), (1, 0))]
-    return where[best] + np.column_stack(shift), score[best].astype(np.float32)
+    shifts = [_vertex(corners, rows, columns, *step) for step in ((0, 1), (1, 0))]
+    return pixels[best] + np.column_stack(shifts), score[best].astype(np.float32)
 
 
-def vertex(values, rows, columns, down, across):
-    before, top, after = (np.log(values[rows + k * down, columns + k * across] + 1e-3) for k in (-1, 0, 1))
-    return 0.5 * (before - after) / np.minimum(before - 2 * top + after, -1e-6)
-
-
-def sample(maps, where):
-    """(K, C) values of maps (C, H, W) at (K, 2) places x, y, bilinear, held at the edge."""
+def sample(maps: Points, places: Array) -> Array:
+    """Values (K, C) of maps (C, H, W) at places (K, 2), column and row, bilinear; the edge holds beyond it."""
     height, width = maps.shape[1:]
-    x = np.clip(where[:, 0], 0, width - 1)
-    y = np.clip(where[:, 1], 0, height - 1)
-    left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
-    x, y = x - left, y - top
-    return sum(
-        maps[:, top + j, left + i] * ((x if i else 1 - x) * (y if j else 1 - y)) for j in (0, 1) for i in (0, 1)
-    ).T
+    column, row = np.clip(places, 0, np.array([width - 1, height - 1])).T
+    left, top = np.minimum(column.astype(int), max(width - 2, 0)), np.minimum(row.astype(int), max(height - 2, 0))
+    across, down = column - left, row - top
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    upper = maps[:, top, left] * (1 - across) + maps[:, top, right] * across
+    lower = maps[:, bottom, left] * (1 - across) + maps[:, bottom, right] * across
+    values: Array = (upper * (1 - down) + lower * down).T
+    return values
+
+
+def _vertex(corners: Points, rows: NDArray[np.intp], columns: NDArray[np.intp], down: int, across: int) -> Array:
+    """Shift (K,) to the vertex of the parabola through a maximum and its neighbours in one direction, in pixels."""
+    before, top, after = (np.log(corners[rows + step * down, columns + step * across] + FLAT) for step in (-1, 0, 1))
+    shift: Array = 0.5 * (before - after) / np.minimum(before - 2 * top + after, -1e-6)
+    return shift

@@ -62,7 +62,11 @@ class XFeat(nn.Module):
         features = self.fusion(eighth + raised[0] + raised[1])
         # the last of the 65 says that there is no key point in the square
         corners = self.corners(functional.pixel_unshuffle(image, CELL)).softmax(1)[:, : CELL**2]
-        return functional.normalize(features, dim=1), functional.pixel_shuffle(corners, CELL), self.reliability(features)
+        return (
+            functional.normalize(features, dim=1),
+            functional.pixel_shuffle(corners, CELL),
+            self.reliability(features),
+        )
 
 
 def load_xfeat(path: Path) -> XFeat:
@@ -76,7 +80,7 @@ def load_xfeat(path: Path) -> XFeat:
         network.load_state_dict({name: value.float() for name, value in load_file(path).items()})
     except (OSError, SafetensorError, RuntimeError, ValueError) as error:
         raise WeightsError(f"{path} does not hold weights of XFeat: {' '.join(str(error).split())[:200]}") from None
-    return network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload, no-any-return]
+    return network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 
 def _conv(inputs: int, outputs: int, side: int = 3, stride: int = 1) -> tuple[nn.Module, nn.Module]:

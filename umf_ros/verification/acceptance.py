@@ -71,8 +71,11 @@ CRITERIA: dict[str, Criterion] = {
     "similarity": Criterion(lambda m: m.similarity, 0.3, 0.9, KINDS),
     "odometry_prior": Criterion(lambda m: m.prior_sigmas, 4.0, 1.0, KINDS, missing=0.7),
     "support": Criterion(lambda m: m.support, 0.0, 3.0, KINDS),
-    "pose_inliers": Criterion(lambda m: math.log1p(m.pose_inliers), math.log(8), math.log(60), (IMAGE,)),
-    "spread": Criterion(lambda m: m.spread, 0.05, 0.3, (IMAGE,)),
+    "pose_inliers": Criterion(lambda m: math.log1p(m.pose_inliers), math.log(10), math.log(60), (IMAGE,)),
+    "share": Criterion(lambda m: m.overlap, 0.05, 0.35, (IMAGE,)),
+    "spread": Criterion(lambda m: m.spread, 0.03, 0.15, (IMAGE,)),
+    "residual_like_pixels": Criterion(lambda m: m.residual_sigmas, 1.5, 0.6, (IMAGE,)),
+    "two_way": Criterion(lambda m: -math.log(max(m.two_way_m, 1e-3)), -math.log(2.0), -math.log(0.1), (IMAGE,)),
 }
 
 

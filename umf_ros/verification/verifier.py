@@ -17,12 +17,10 @@ from umf_ros.verification.elevation_map import TurnedMap
 from umf_ros.verification.hypotheses import (
     Hypothesis,
     TemporalMemory,
-    consistent_pixels,
     find_hypotheses,
-    paired_points,
 )
 from umf_ros.verification.measurement import AlignedHypothesis, Measurement, measure, measure_candidate
-from umf_ros.verification.registration import ScanCache, align_features, align_scans, covariance_of
+from umf_ros.verification.registration import ScanCache, align_scans, covariance_of
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
 
@@ -149,11 +147,10 @@ class Verifier:
 
     def _judge(self, query: Keyframe, hypothesis: Hypothesis) -> JudgedHypothesis:
         scans = self._scans[hypothesis.ranked.keyframe], self._scans[query]
-        if all(scan.usable for scan in scans):
-            aligned = AlignedHypothesis(query, hypothesis, align_scans(*scans, hypothesis.pose), scans)
+        if hypothesis.views is not None and not all(scan.usable for scan in scans):
+            aligned = AlignedHypothesis(query, hypothesis, hypothesis.views.align(hypothesis.pose), None)
         else:
-            ours, theirs = paired_points(query, hypothesis.ranked)
-            aligned = AlignedHypothesis(query, hypothesis, align_features(theirs, ours, hypothesis.pose), None)
+            aligned = AlignedHypothesis(query, hypothesis, align_scans(*scans, hypothesis.pose), scans)
         measurement = measure(aligned, self._memory, self._settings.odometry_drift)
         return JudgedHypothesis(aligned, measurement, self._acceptance.probability(measurement))
 
@@ -175,7 +172,7 @@ class Verifier:
 
     def _verdict(self, ranked: RankedCandidate, judged: JudgedHypothesis) -> Verdict:
         aligned, measurement, probability = judged.aligned, judged.measurement, judged.probability
-        pixels = consistent_pixels(aligned.query, ranked, aligned.pose)
+        pixels = aligned.consistent_pixels
         objection = self._objection(judged)
         if objection:
             return Verdict(ranked.candidate, objection, measurement, None, pixels, probability)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import Keyframe, LocalFeatures, StereoCamera
+from umf_ros.frames import Keyframe, LocalFeatures, Points, StereoCamera
 from umf_ros.geometry import Array, invert, make_pose, rotation_angle, skew, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.rerank import mutual_neighbours, similarities
@@ -24,45 +24,41 @@ from umf_ros.verification.rerank import mutual_neighbours, similarities
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class View:
     """Features of one image, row by row those of the other view.
 
     Attributes:
         camera: intrinsics.
+        noise: (3,) standard deviations of a measurement, pixels.
         body_T_camera: pose of the camera.
         points: (N, 3) m, body frame, NaN where the depth is unknown.
         measured: (N, 3) column, row and disparity in pixels; likewise.
     """
 
     camera: StereoCamera
+    noise: Array
     body_T_camera: Array
     points: Array
     measured: Array
 
     @classmethod
-    def of(cls, keyframe: Keyframe, features: LocalFeatures, rows: NDArray[np.intp]) -> View:
-        """The view of a keyframe, with some of its features."""
+    def of(cls, keyframe: Keyframe, features: LocalFeatures, rows: NDArray[np.intp], noise: float) -> View:
+        """The view of a keyframe with some of its features, whose places are known to `noise` of the width."""
         points = features.points[rows].astype(float)
         disparity = _disparity(keyframe.camera, keyframe.camera.project(points, keyframe.body_T_camera)[1])
         measured = np.column_stack([features.positions[rows].astype(float), disparity])
-        return cls(keyframe.camera, keyframe.body_T_camera, points, measured)
+        sides = keyframe.camera.width * np.array([noise, noise, max(const.DISPARITY_NOISE, noise / 3)])
+        return cls(keyframe.camera, sides, keyframe.body_T_camera, points, measured)
 
-    @property
+    @cached_property
     def lifted(self) -> Mask:
         """(N,) whose depths are known."""
-        return np.isfinite(self.points).all(axis=1)
-
-    @property
-    def noise(self) -> Array:
-        """(3, 3) covariance of a measurement, pixels."""
-        sides = self.camera.width * np.array([const.VIEW_NOISE, const.VIEW_NOISE, const.DISPARITY_NOISE])
-        found: Array = np.diag(sides**2)
-        return found
+        return np.asarray(np.isfinite(self.points).all(axis=1))
 
     def only(self, rows: Mask) -> View:
         """The same with fewer features."""
-        return View(self.camera, self.body_T_camera, self.points[rows], self.measured[rows])
+        return View(self.camera, self.noise, self.body_T_camera, self.points[rows], self.measured[rows])
 
     def predict(self, points: Array) -> tuple[Array, Array, Mask]:
         """Where this view should measure points (N, 3) of its body frame.
@@ -82,12 +78,14 @@ class View:
         deep = np.stack([zero, zero, -disparity / z], axis=1)
         return predicted, np.stack([across, down, deep], axis=1) @ rotation, front
 
-    def covariances(self) -> Array:
-        """(N, 3, 3) m^2: of the points, body frame, as the noise of their measurements makes them."""
-        _, derivative, _ = self.predict(self.points)
-        back = np.linalg.inv(derivative)
-        found: Array = back @ self.noise @ back.transpose(0, 2, 1)
-        return found
+    @cached_property
+    def scatter(self) -> Array:
+        """(N, 3, 3) m: roots of the covariances of the points, body frame, that the noise of their measurements makes.
+
+        Zero where the depth is unknown.
+        """
+        _, derivative, front = self.predict(self.points)
+        return np.where(front[:, None, None], np.linalg.inv(derivative) * self.noise, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +96,9 @@ class ViewAlignment:
         pose: (4, 4) `match_T_query`.
         residuals: (P, 3) of the features that agree: column, row and disparity in standard deviations of their noise.
         jacobian: (P, 3, 6) of the residuals by (x y z rx ry rz) about the match axes at the query's origin.
-        pixels: (P, 2) of those features in the match's image, as shares of its width and height.
+        pixels: (P, 4) of those features: column and row in the query's image and in the match's.
+        size: (2,) width and height of the match's image.
+        distance_m: median distance of the two points of a pair, where both depths are known; NaN without any.
         share: of the pairs with a depth, how many agree.
         two_way_m: distance of the poses that the query's depths and the match's give, each by themselves; inf without.
         two_way_rad: angle between them.
@@ -108,6 +108,8 @@ class ViewAlignment:
     residuals: Array
     jacobian: Array
     pixels: Array
+    size: Array
+    distance_m: float
     share: float
     two_way_m: float
     two_way_rad: float
@@ -129,7 +131,7 @@ class ViewAlignment:
     @property
     def spread(self) -> float:
         """How wide the features lie across the image: the smaller deviation of both directions, of its sides."""
-        return float(self.pixels.std(axis=0).min()) if len(self.pixels) > 1 else 0.0
+        return float((self.pixels[:, 2:].std(axis=0) / self.size).min()) if len(self.pixels) > 1 else 0.0
 
 
 @dataclass(frozen=True)
@@ -140,15 +142,21 @@ class PairedViews:
     match: View
 
     @classmethod
-    def of(cls, query: Keyframe, match: Keyframe) -> PairedViews | None:
-        """Mutual neighbours among all image features of both; None without images or with next to no pairs."""
+    def of(cls, query: Keyframe, match: Keyframe, noise: float) -> PairedViews | None:
+        """Mutual neighbours among all image features of both; None without images or with next to no pairs.
+
+        Args:
+            query: one keyframe.
+            match: the other.
+            noise: standard deviation of a feature's place, of the image's width.
+        """
         ours, theirs = query.embedding.image, match.embedding.image
         if ours is None or theirs is None:
             return None
         pairs = mutual_neighbours(similarities(ours.descriptors, theirs.descriptors))
         if len(pairs) < const.MIN_PIXELS:
             return None
-        return cls(View.of(query, ours, pairs[:, 0]), View.of(match, theirs, pairs[:, 1]))
+        return cls(View.of(query, ours, pairs[:, 0], noise), View.of(match, theirs, pairs[:, 1], noise))
 
     @cached_property
     def poses(self) -> tuple[Array | None, Array | None]:
@@ -172,16 +180,33 @@ class PairedViews:
             if moved < const.VIEW_TOLERANCE:
                 break
         fit = nearby._compare(pose)
-        size = np.array([self.match.camera.width, self.match.camera.height])
+        agreeing = PairedViews(nearby.query.only(fit.agreeing), nearby.match.only(fit.agreeing))
         known = int((self.query.lifted | self.match.lifted).sum())
         return ViewAlignment(
             pose,
             fit.residuals[fit.agreeing],
             fit.jacobian[fit.agreeing],
-            nearby.match.measured[fit.agreeing, :2] / size,
+            agreeing.pixels,
+            np.array([self.match.camera.width, self.match.camera.height]),
+            agreeing.distance(pose),
             float(fit.agreeing.sum()) / max(known, 1),
             *self._two_way(),
         )
+
+    @property
+    def pixels(self) -> Array:
+        """(N, 4) column and row in the query's image and in the match's."""
+        return np.hstack([self.query.measured[:, :2], self.match.measured[:, :2]])
+
+    def consistent_pixels(self, pose: Array) -> Points:
+        """Those (K, 4) float32 of the pairs that agree with a pose."""
+        return self.pixels[self._compare(pose).agreeing].astype(np.float32)
+
+    def distance(self, pose: Array) -> float:
+        """Median distance (m) of the two points of a pair at a pose, where both depths are known; NaN without any."""
+        both = self.query.lifted & self.match.lifted
+        gaps = transform(pose, self.query.points[both]) - self.match.points[both]
+        return float(np.median(np.linalg.norm(gaps, axis=1))) if len(gaps) else float("nan")
 
     def _two_way(self) -> tuple[float, float]:
         forward, backward = self.poses
@@ -210,7 +235,7 @@ class PairedViews:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """All pairs at a pose: residuals (N, 3) in standard deviations, Jacobian (N, 3, 6), which are usable at all (N,)."""
+    """All pairs at a pose: residuals (N, 3) in standard deviations, Jacobian (N, 3, 6), and which can be used (N,)."""
 
     residuals: Array
     jacobian: Array
@@ -239,9 +264,8 @@ def _carry(source: View, target: View, pose: Array, arms: Array, inverse: bool =
     """
     predicted, derivative, front = target.predict(transform(pose, source.points))
     usable = front & source.lifted
-    open_ = derivative @ pose[:3, :3]
-    covariance = open_ @ np.where(usable[:, None, None], source.covariances(), np.eye(3)) @ open_.transpose(0, 2, 1)
-    covariance = covariance + target.noise
+    scatter = derivative @ pose[:3, :3] @ source.scatter
+    covariance = scatter @ scatter.transpose(0, 2, 1) + np.diag(target.noise**2)
     residual = predicted - target.measured
     unmeasured = ~np.isfinite(residual[:, 2])
     residual[unmeasured, 2] = 0.0
@@ -262,7 +286,7 @@ def _locate(source: View, target: View) -> Array | None:
         return None
     camera = target.camera
     options = cv2.UsacParams()
-    options.threshold = const.VIEW_REACH * camera.width
+    options.threshold = const.VIEW_REACH * float(target.noise[0])
     options.maxIterations = const.VIEW_SAMPLES
     options.confidence = 0.999
     options.isParallel = False  # the same on every machine
