@@ -15,7 +15,7 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.frames import Frame, Image, Keyframe, StereoCamera
+from umf_ros.frames import Frame, Image, Keyframe, ScanMotion, StereoCamera
 from umf_ros.geometry import Array, make_pose, relative, rotation_angle, transform
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, resized
 from umf_ros.lab.simulation.families import FAMILIES
@@ -142,6 +142,7 @@ def _frames(
                 points=returns[:, :3],
                 intensity=returns[:, 3],
                 odom_T_body=odom,
+                motion=ScanMotion.none(len(returns)),
             )
         )
     return frames

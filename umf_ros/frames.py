@@ -48,6 +48,26 @@ class StereoCamera:
 
 
 @dataclass(frozen=True, slots=True)
+class ScanMotion:
+    """When the points of a scan were measured, and how far the motion meanwhile, which was removed, is known.
+
+    Attributes:
+        moments_s: (N,) float32, s after the frame's stamp, one for every point.
+        rates: (6,) x y z rx ry rz, m/s and rad/s about the body's axes: the motion over the scan.
+        noise: (6,) m^2/s and rad^2/s: the variance that the odometry's error gains in a second.
+    """
+
+    moments_s: Points
+    rates: Array
+    noise: Array
+
+    @classmethod
+    def none(cls, count: int) -> ScanMotion:
+        """Of a scan of so many points that was taken from one place, or whose motion is known exactly."""
+        return cls(np.zeros(count, np.float32), np.zeros(6), np.zeros(6))
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
     """One synchronised set of measurements; either modality may be missing, never both.
 
@@ -64,6 +84,7 @@ class Frame:
         odom_T_body: odometry at `stamp_ns`, or None.
         image_stamp_ns: exposure of the left image, or None.
         session: counts the resets of the clock or the odometry.
+        motion: during the scan; None where it was not removed, for want of odometry or of times per point.
     """
 
     stamp_ns: int
@@ -77,6 +98,7 @@ class Frame:
     odom_T_body: Array | None = None
     image_stamp_ns: int | None = None
     session: int = 0
+    motion: ScanMotion | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +164,7 @@ class Keyframe:
         travelled_m: metres driven since the start of the session, NaN without odometry.
         session: session of the frame.
         body_T_lidar: pose of the LiDAR in the body frame: where the scan was seen from.
+        motion: during the scan, one moment for every thinned point; None where it was not removed.
     """
 
     stamp_ns: int
@@ -153,6 +176,7 @@ class Keyframe:
     travelled_m: float = float("nan")
     session: int = 0
     body_T_lidar: Array = field(default_factory=lambda: np.eye(4))
+    motion: ScanMotion | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from umf_ros.errors import OutputError
 from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure
 from umf_ros.keyframes import KeyframeSelector
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.verification import Verdict, Verifier, thin_scan
+from umf_ros.verification import Verdict, Verifier, thin_frame
 
 logger = logging.getLogger(__name__)
 
@@ -142,16 +142,18 @@ def make_keyframe(
         travelled_m: metres driven since the start of the session, NaN when unknown.
         first_session: number of the session that the frame counts as 0.
     """
+    points, motion = thin_frame(frame)
     return Keyframe(
         stamp_ns=frame.stamp_ns,
         embedding=lift(frame, embedder.embed(frame)),
         camera=frame.camera,
         body_T_camera=frame.body_T_camera,
-        points=thin_scan(frame.points),
+        points=points,
         odom_T_body=frame.odom_T_body,
         travelled_m=travelled_m,
         session=first_session + frame.session,
         body_T_lidar=frame.body_T_lidar,
+        motion=motion,
     )
 
 

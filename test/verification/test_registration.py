@@ -16,8 +16,8 @@ from umf_ros.verification.registration import (
     align_scans,
     covariance_of,
     inspect,
-    thin_scan,
 )
+from umf_ros.verification.thinning import thin_scan
 
 GROUND = landscape(8)
 PLANE = replace(GROUND, bumps=np.empty((0, 4)))

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import load, save
 
-from umf_ros.frames import Embedding, Keyframe, LocalFeatures, StereoCamera, SuperFeatures
+from umf_ros.frames import Embedding, Keyframe, LocalFeatures, ScanMotion, StereoCamera, SuperFeatures
 
+MOTION = "motion"
 FEATURES: dict[str, type[LocalFeatures] | type[SuperFeatures]] = {
     "image": LocalFeatures,
     "cloud": LocalFeatures,
@@ -32,10 +33,10 @@ def pack(keyframe: Keyframe) -> bytes:
     }
     if keyframe.odom_T_body is not None:
         arrays["odom_T_body"] = keyframe.odom_T_body
-    for group, kind in FEATURES.items():
-        features = getattr(embedding, group)
-        if features is not None:
-            arrays |= {f"{group}.{item.name}": getattr(features, item.name) for item in fields(kind)}
+    groups = {group: getattr(embedding, group) for group in FEATURES} | {MOTION: keyframe.motion}
+    for group, found in groups.items():
+        if found is not None:
+            arrays |= {f"{group}.{item.name}": getattr(found, item.name) for item in fields(found)}
     return save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
@@ -44,7 +45,7 @@ def unpack(blob: bytes) -> Keyframe:
     arrays = load(blob)
     stamp_ns, session = (int(number) for number in arrays["stamp_session"])
     width, height, *rest = (float(number) for number in arrays["camera"])
-    features = {group: _features(arrays, group, kind) for group, kind in FEATURES.items()}
+    features = {group: _group(arrays, group, kind) for group, kind in FEATURES.items()}
     return Keyframe(
         stamp_ns=stamp_ns,
         embedding=Embedding(arrays["descriptor"], **features),
@@ -55,10 +56,11 @@ def unpack(blob: bytes) -> Keyframe:
         odom_T_body=arrays.get("odom_T_body"),
         travelled_m=float(arrays["travelled_m"][0]),
         session=session,
+        motion=_group(arrays, MOTION, ScanMotion),
     )
 
 
-def _features(arrays: dict[str, Any], group: str, kind: Any) -> Any:
+def _group(arrays: dict[str, Any], group: str, kind: Any) -> Any:
     names = [item.name for item in fields(kind)]
     if f"{group}.{names[0]}" not in arrays:
         return None

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import Frame, Image, Points
+from umf_ros.frames import Frame, Image, Points, ScanMotion
 from umf_ros.geometry import Array, invert, relative, transform
 from umf_ros.sensors.buffers import OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.scan_motion import scan_motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,18 +39,6 @@ class Anchor:
         return self.measured_ns + int(offsets.min()), self.measured_ns + int(offsets.max())
 
 
-def filter_cloud(cloud: Cloud, calibration: Calibration) -> Cloud:
-    """Drop weak returns and those far above or below the LiDAR."""
-    keep = np.abs(cloud.points[:, 2]) <= calibration.max_height_m
-    if cloud.intensity is not None:
-        keep &= cloud.intensity > calibration.min_intensity
-    return Cloud(
-        cloud.points[keep],
-        None if cloud.intensity is None else cloud.intensity[keep],
-        None if cloud.time_offset_ns is None else cloud.time_offset_ns[keep],
-    )
-
-
 def assemble(
     anchor: Anchor,
     left: StampedImage | None,
@@ -60,7 +49,7 @@ def assemble(
 ) -> Frame:
     """Build the frame at `anchor.stamp_ns`: images rectified, motion between the measurements removed."""
     odom_T_body = odometry.at(anchor.stamp_ns)
-    points, intensity = _scan(anchor, odometry, calibration, odom_T_body)
+    points, intensity, motion = _scan(anchor, odometry, calibration, odom_T_body)
     rectifier = calibration.rectifier
     return Frame(
         stamp_ns=anchor.stamp_ns,
@@ -74,6 +63,7 @@ def assemble(
         odom_T_body=odom_T_body,
         image_stamp_ns=left.stamp_ns if left else None,
         session=session,
+        motion=motion,
     )
 
 
@@ -95,16 +85,20 @@ def _camera_pose(
 
 def _scan(
     anchor: Anchor, odometry: OdometryBuffer, calibration: Calibration, odom_T_body: Array | None
-) -> tuple[Points | None, Points | None]:
+) -> tuple[Points | None, Points | None, ScanMotion | None]:
+    """Points in the body frame at the anchor's key, their intensity, and the motion that was removed from them."""
     cloud = anchor.cloud
     if cloud is None or not len(cloud.points):
-        return None, None
+        return None, None, None
     points = transform(calibration.body_T_lidar, cloud.points)
+    motion = None
     if odom_T_body is not None and cloud.time_offset_ns is not None:
         path = odometry.path(*anchor.span_ns())
         if path[1]:
-            points = deskew(points, anchor.measured_ns + cloud.time_offset_ns, path, odom_T_body)
-    return points, cloud.intensity
+            stamps = anchor.measured_ns + cloud.time_offset_ns
+            points = deskew(points, stamps, path, odom_T_body)
+            motion = scan_motion((stamps - anchor.stamp_ns) * 1e-9, anchor.span_ns(), path, odometry)
+    return points, cloud.intensity, motion
 
 
 def deskew(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from dataclasses import dataclass, field
 
@@ -154,6 +154,12 @@ class OdometryBuffer:
         stamps = sorted({start_ns, *self._stamps[first:last], end_ns})
         known = [(stamp, pose) for stamp in stamps if (pose := self.at(stamp)) is not None]
         return np.array([stamp for stamp, _ in known], np.int64), [pose for _, pose in known]
+
+    def samples(self, start_ns: int, end_ns: int) -> tuple[NDArray[np.int64], list[Array]]:
+        """Stamps and poses from start to end as they came, no further back than the buffer's length before the end."""
+        first = bisect_left(self._stamps, max(start_ns, end_ns - self._length_ns))
+        last = bisect_right(self._stamps, end_ns)
+        return np.array(self._stamps[first:last], np.int64), self._poses[first:last]
 
     def clear(self) -> None:
         """Forget everything."""

@@ -1,7 +1,7 @@
 """From a retrieved candidate to a metric loop closure, or to the reason why not."""
 
 from umf_ros.verification.measurement import Measurement
-from umf_ros.verification.registration import thin_scan
+from umf_ros.verification.thinning import thin_frame, thin_scan
 from umf_ros.verification.verifier import Verdict, Verifier
 
-__all__ = ["Measurement", "Verdict", "Verifier", "thin_scan"]
+__all__ = ["Measurement", "Verdict", "Verifier", "thin_frame", "thin_scan"]

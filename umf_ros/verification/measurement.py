@@ -18,8 +18,9 @@ from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, prior_sigmas
-from umf_ros.verification.registration import NOMINAL, Alignment, PreparedScan, covariance_of
+from umf_ros.verification.registration import NOMINAL, Alignment, CovarianceModel, PreparedScan, covariance_of
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
+from umf_ros.verification.scan_motion import closure_covariance
 from umf_ros.verification.views import ViewAlignment
 
 SCAN, IMAGE = "scan", "image"
@@ -121,6 +122,12 @@ class AlignedHypothesis:
     def pose(self) -> Array:
         """(4, 4) `match_T_query`."""
         return self.alignment.pose
+
+    def covariance(self, model: CovarianceModel) -> Array:
+        """Covariance (6, 6) of the pose in ROS order, match axes, m^2 and rad^2."""
+        if isinstance(self.alignment, ViewAlignment):
+            return covariance_of(self.alignment.information, model)
+        return closure_covariance(self.match, self.query, self.alignment, model)
 
     @property
     def consistent_pixels(self) -> Points:

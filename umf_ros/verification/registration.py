@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,9 @@ from umf_ros.frames import Keyframe, Points
 from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import ElevationMap
+from umf_ros.verification.field_of_view import FieldOfView
+from umf_ros.verification.surroundings import Surroundings
+from umf_ros.verification.upright import upright
 
 
 class PreparedScan:
@@ -23,6 +26,7 @@ class PreparedScan:
         """Args: points (M, 3) m, body frame, thinned."""
         self._thinned = points
         self.points: Array = points.astype(float)
+        self._around: dict[float, Surroundings] = {}
 
     @property
     def usable(self) -> bool:
@@ -35,6 +39,48 @@ class PreparedScan:
         return ElevationMap(self._thinned)
 
     @cached_property
+    def up(self) -> Array:
+        """Rotation (3, 3) that sets the scan upright."""
+        return upright(self.normals[self._picks(const.SAMPLE)])
+
+    @cached_property
+    def upright_points(self) -> Array:
+        """(M, 3) m."""
+        turned: Array = self.points @ self.up.T
+        return turned
+
+    @cached_property
+    def view(self) -> FieldOfView:
+        """The directions it looks into, upright."""
+        return FieldOfView(self.upright_points)
+
+    @cached_property
+    def reach_m(self) -> float:
+        """Median distance of the points, m."""
+        return float(np.median(np.linalg.norm(self.points, axis=1)))
+
+    def around(self, cell_m: float) -> Surroundings:
+        """Map of what stands around it, in cells of this size, m."""
+        if cell_m not in self._around:
+            self._around[cell_m] = Surroundings(self.upright_points, cell_m)
+        return self._around[cell_m]
+
+    @cached_property
+    def scouts(self) -> Array:
+        """(S, 3) a few points, evenly taken, m."""
+        return self.points[self._picks(const.SCOUTS)]
+
+    @cached_property
+    def scouts_cloud(self) -> small_gicp.PointCloud:
+        """The few with covariances of their own."""
+        cloud = small_gicp.PointCloud(self.scouts)
+        small_gicp.estimate_normals_covariances(cloud, None, const.NORMAL_NEIGHBOURS, 1)
+        return cloud
+
+    def _picks(self, count: int) -> NDArray[np.intp]:
+        return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(int)
+
+    @cached_property
     def cloud(self) -> small_gicp.PointCloud:
         """Points, normals and covariances."""
         cloud = small_gicp.PointCloud(self.points)
@@ -42,10 +88,14 @@ class PreparedScan:
         return cloud
 
     @cached_property
+    def picks(self) -> NDArray[np.intp]:
+        """(S,) indices of at most 1500 points, evenly taken."""
+        return self._picks(const.SAMPLE)
+
+    @cached_property
     def sample(self) -> Array:
         """(S, 3) at most 1500 points, evenly taken."""
-        picks = np.linspace(0, len(self.points) - 1, min(const.SAMPLE, len(self.points))).astype(int)
-        return self.points[picks]
+        return self.points[self.picks]
 
     @cached_property
     def sample_cloud(self) -> small_gicp.PointCloud:
@@ -104,18 +154,36 @@ class CovarianceModel:
 
     Attributes:
         inflation: factor on the variance, for neighbouring residuals are not independent.
-        floor_m: standard deviation of every translation, m, from calibration and motion inside a scan.
+        floor_m: standard deviation of every translation, m, from calibration.
         floor_deg: of every rotation, deg.
+        disorder: logarithm of one more factor on the variance where nothing overlaps, in proportion to the share of
+            the points that have no counterpart: what grows, sways or hides each other misleads the others too.
+        motion: factor on the standard deviation of what the odometry within a scan is measured to add.
+        unknown_motion_m: like `floor_m`, added where the motion inside a scan was not removed.
+        unknown_motion_deg: like `floor_deg`, likewise.
     """
 
     inflation: float
     floor_m: float
     floor_deg: float
+    disorder: float = 0.0
+    motion: float = 1.0
+    unknown_motion_m: float = 0.0
+    unknown_motion_deg: float = 0.0
 
     @property
     def floor(self) -> Array:
         """The floor as a covariance (6, 6), m^2 and rad^2."""
-        return np.diag([self.floor_m**2] * 3 + [np.radians(self.floor_deg) ** 2] * 3)
+        return _diagonal(self.floor_m, self.floor_deg)
+
+    @property
+    def unknown_motion(self) -> Array:
+        """What motion that was not removed adds to the covariance, (6, 6), m^2 and rad^2."""
+        return _diagonal(self.unknown_motion_m, self.unknown_motion_deg)
+
+
+def _diagonal(metres: float, degrees: float) -> Array:
+    return np.diag([metres**2] * 3 + [np.radians(degrees) ** 2] * 3)
 
 
 # a fixed yardstick of what a pose is known to: refitting the covariance must not move the decision
@@ -132,6 +200,7 @@ class Alignment:
         jacobian: (N, 6) of the residuals by (x y z rx ry rz) about the match axes at the query's origin.
         overlap: share of the query points seen by both that have a counterpart.
         points: (P, 3) m: the query points that have one, in the match's body frame.
+        pairs: (N, 2) index of the query's and of the match's point behind each residual; one row per residual.
     """
 
     pose: Array
@@ -139,15 +208,21 @@ class Alignment:
     jacobian: Array
     overlap: float
     points: Array
+    pairs: NDArray[np.intp] = field(default_factory=lambda: np.empty((0, 2), np.intp))
+
+    @property
+    def weights(self) -> Array:
+        """Information (N,) of each residual as if they were independent, 1/m^2, with outliers weighed down."""
+        if not len(self.residuals):
+            return np.empty(0)
+        noise = max(1.4826 * float(np.median(np.abs(self.residuals))), const.MIN_RESIDUAL_NOISE_M)
+        found: Array = 1.0 / (1.0 + (self.residuals / (2 * noise)) ** 2) / noise**2
+        return found
 
     @property
     def information(self) -> Array:
-        """Information (6, 6) of the residuals as if they were independent, with outliers weighed down."""
-        if not len(self.residuals):
-            return np.zeros((6, 6))
-        noise = max(1.4826 * float(np.median(np.abs(self.residuals))), const.MIN_RESIDUAL_NOISE_M)
-        weight = 1.0 / (1.0 + (self.residuals / (2 * noise)) ** 2)
-        found: Array = (self.jacobian * weight[:, None]).T @ self.jacobian / noise**2
+        """Information (6, 6) of the residuals."""
+        found: Array = (self.jacobian * self.weights[:, None]).T @ self.jacobian
         return found
 
 
@@ -181,26 +256,21 @@ def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
     seen = solid & (squared < const.COARSE_REACH_M**2)
     arm = np.cross(moved[close] - pose[:3, 3], normals[close])
     overlap = float(close.sum()) / max(int(seen.sum()), 1)
-    return Alignment(pose, residual[close], np.hstack([normals[close], arm]), overlap, moved[close])
+    pairs = np.column_stack([query.picks, index])[close]
+    return Alignment(pose, residual[close], np.hstack([normals[close], arm]), overlap, moved[close], pairs)
 
 
-def covariance_of(found: Array, model: CovarianceModel) -> Array:
+def covariance_of(found: Array, model: CovarianceModel, overlap: float | Array = 1.0) -> Array:
     """Covariance (..., 6, 6) of a pose in ROS order (x y z rx ry rz, match axes), m^2 and rad^2.
 
     The information gives the shape: a plane leaves two shifts and a turn as wide as the search.
+
+    Args:
+        found: information (..., 6, 6) of the residuals.
+        model: what they do not say.
+        overlap: (...) of the alignment.
     """
     known = np.diag([const.SEARCH_M**-2] * 3 + [const.SEARCH_RAD**-2] * 3)
-    covariance = np.linalg.inv(known + found / model.inflation) + model.floor
+    inflation = np.asarray(model.inflation * np.exp(model.disorder * (1.0 - np.asarray(overlap, float))))
+    covariance = np.linalg.inv(known + found / inflation[..., None, None]) + model.floor
     return (covariance + covariance.swapaxes(-1, -2)) / 2
-
-
-def thin_scan(points: Points | None, cell_m: float = const.THIN_CELL_M) -> Points:
-    """One mean point per occupied cube of `cell_m`, nearer than 40 m: (M, 3) float32, body frame."""
-    points = np.empty((0, 3), np.float32) if points is None else points
-    near = points[np.einsum("ij,ij->i", points, points) < const.MAX_RANGE_M**2].astype(float)
-    cells = np.floor((near + const.MAX_RANGE_M) / cell_m).astype(np.int64)
-    side = int(2 * const.MAX_RANGE_M / cell_m) + 2
-    keys = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
-    _, owner, count = np.unique(keys, return_inverse=True, return_counts=True)
-    means = [np.bincount(owner, near[:, axis]) / count for axis in range(3)]
-    return np.column_stack(means).astype(np.float32)

@@ -13,14 +13,14 @@ from umf_ros.frames import Candidate, Keyframe, LoopClosure, Points
 from umf_ros.geometry import heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance
-from umf_ros.verification.elevation_map import TurnedMap
+from umf_ros.verification.all_round import TurnedSurroundings
 from umf_ros.verification.hypotheses import (
     Hypothesis,
     TemporalMemory,
     find_hypotheses,
 )
 from umf_ros.verification.measurement import AlignedHypothesis, Measurement, measure, measure_candidate
-from umf_ros.verification.registration import ScanCache, align_scans, covariance_of
+from umf_ros.verification.registration import ScanCache, align_scans
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
 
@@ -135,10 +135,12 @@ class Verifier:
                     return judged, tested
         return judged, tested
 
-    def _turned(self, query: Keyframe) -> TurnedMap | None:
-        return TurnedMap(self._scans[query].elevation) if self._scans[query].usable else None
+    def _turned(self, query: Keyframe) -> TurnedSurroundings | None:
+        return TurnedSurroundings(self._scans[query]) if self._scans[query].usable else None
 
-    def _hypotheses(self, query: Keyframe, ranked: list[RankedCandidate], turned: TurnedMap | None) -> list[Hypothesis]:
+    def _hypotheses(
+        self, query: Keyframe, ranked: list[RankedCandidate], turned: TurnedSurroundings | None
+    ) -> list[Hypothesis]:
         """Hypotheses about the given candidates, the most promising first."""
         found: list[Hypothesis] = []
         for item in ranked:
@@ -176,7 +178,8 @@ class Verifier:
         objection = self._objection(judged)
         if objection:
             return Verdict(ranked.candidate, objection, measurement, None, pixels, probability)
-        covariance = covariance_of(aligned.alignment.information, self._acceptance.covariances[measurement.kind])
+        model = self._acceptance.covariances[measurement.kind]
+        covariance = aligned.covariance(model)
         closure = LoopClosure(aligned.query.stamp_ns, ranked.candidate.stamp_ns, aligned.pose, covariance, probability)
         return Verdict(ranked.candidate, "accepted", measurement, closure, pixels, probability)
 

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from umf_ros.frames import Frame
+from umf_ros.frames import Frame, ScanMotion
 from umf_ros.geometry import Array
 from umf_ros.lab.simulation.camera import resized
 from umf_ros.lab.simulation.families import FAMILIES
@@ -125,5 +125,6 @@ def _visit(stamp: int, sample: SurveyFrame, calibration: Calibration) -> Visit:
         left=sample.image,
         points=points[:, :3],
         intensity=points[:, 3],
+        motion=ScanMotion.none(len(points)),
     )
     return Visit(frame, sample.world_T_body.astype(float), sample.pass_index)

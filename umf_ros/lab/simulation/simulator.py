@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from umf_ros.errors import ConfigError
-from umf_ros.frames import Frame, Image
+from umf_ros.frames import Frame, Image, ScanMotion
 from umf_ros.geometry import Array, relative, transform
 from umf_ros.lab.simulation.camera import Rendering
 from umf_ros.lab.simulation.lidar import PERIOD_NS, Lidar, Scan
@@ -148,6 +148,7 @@ class Simulator:
                 intensity=scan.intensity[usable].astype(np.float32),
                 odom_T_body=self._odometry_at(int(stamp)),
                 image_stamp_ns=exposure.stamp_ns,
+                motion=ScanMotion.none(int(usable.sum())),
             )
 
     def _rectified(self, exposure: Exposure) -> tuple[Image, Image | None]:

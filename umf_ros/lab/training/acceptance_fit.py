@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from umf_ros.geometry import Array
+from umf_ros.runs.honesty import normalised_errors, share_inside
 from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, criteria_of, scores
 from umf_ros.verification.measurement import Measurement
 from umf_ros.verification.registration import CovarianceModel, covariance_of
@@ -60,7 +61,7 @@ def fit_logistic(examples: list[Example], kind: str, ridge: float = 0.003) -> Lo
 
 def inside_ellipsoid(errors: Array, covariances: Array, confidence: float = 0.95) -> float:
     """Share of the errors (N, 6) inside the confidence ellipsoid of their covariances (N, 6, 6)."""
-    return float(np.mean(_squared_distances(errors, covariances) < chi2.ppf(confidence, 6)))
+    return share_inside(normalised_errors(errors, covariances), confidence)
 
 
 def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: str, results: dict[str, float]) -> None:
@@ -92,7 +93,7 @@ def fit_covariance(errors: Array, informations: Array) -> CovarianceModel:
 
     def surprise(logarithms: Array) -> float:
         covariances = covariance_of(informations, _model_of(logarithms))
-        squared = _squared_distances(errors, covariances)
+        squared = normalised_errors(errors, covariances)
         # a heavy tail, so that a few bad fits do not widen all others
         return float(np.mean(np.linalg.slogdet(covariances)[1] + 16 * np.log1p(squared / 10)))
 
@@ -109,16 +110,16 @@ def scale_covariance(model: CovarianceModel, errors: Array, covariances: Array) 
         errors: (N, 6), ROS order.
         covariances: (N, 6, 6) of the same poses.
     """
-    variance = float(np.quantile(_squared_distances(errors, covariances), 0.95)) / float(chi2.ppf(0.95, 6))
+    variance = float(np.quantile(normalised_errors(errors, covariances), 0.95)) / float(chi2.ppf(0.95, 6))
     deviation = variance**0.5
-    return CovarianceModel(model.inflation * variance, model.floor_m * deviation, model.floor_deg * deviation)
+    return replace(
+        model,
+        inflation=model.inflation * variance,
+        floor_m=model.floor_m * deviation,
+        floor_deg=model.floor_deg * deviation,
+    )
 
 
 def _model_of(logarithms: Array) -> CovarianceModel:
     inflation, floor_m, floor_deg = np.exp(np.clip(logarithms, np.log([0.1, 2e-3, 1e-2]), np.log([1e4, 0.5, 5.0])))
     return CovarianceModel(float(inflation), float(floor_m), float(floor_deg))
-
-
-def _squared_distances(errors: Array, covariances: Array) -> Array:
-    distances: Array = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
-    return distances
