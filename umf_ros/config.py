@@ -118,6 +118,9 @@ class Verification(Group):
         le=1000,
         description="what e times as many inliers weigh against cosine similarity; 1000: inliers alone [UMF 4.5]",
     )
+    features: Literal["umf", "xfeat"] = Field(
+        "xfeat", description="local features of images: xfeat's, or those of the network that embeds"
+    )
     modalities: Literal["both", "image", "cloud"] = Field("both", description="local features that reranking uses")
     rerank_features: int = Field(
         200, ge=20, le=2000, description="strongest features per modality that reranking matches"
