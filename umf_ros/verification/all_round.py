@@ -81,7 +81,7 @@ def search(match: PreparedScan, turned: TurnedSurroundings) -> list[Fit]:
     fits = []
     for heading, row, column in _peaks(_correlate(around, turned.spectra(wanted)), wanted):
         shift = (np.array([row, column]) - const.AROUND_SHIFT) * turned.cell_m
-        level = _settle(around, turned.around, float(const.ALL_HEADINGS[heading]), shift)
+        level = settle(around, turned.around, float(const.ALL_HEADINGS[heading]), shift)
         to_match = make_pose(match.up.T, np.zeros(3))
         fits.append(scout(match, turned.scan, to_match @ level @ make_pose(turned.scan.up, np.zeros(3))))
     return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
@@ -146,7 +146,7 @@ def _peaks(volumes: NDArray[np.float32], headings: NDArray[np.intp]) -> list[tup
     return peaks
 
 
-def _settle(match: Surroundings, query: Surroundings, heading: float, shift: Array) -> Array:
+def settle(match: Surroundings, query: Surroundings, heading: float, shift: Array) -> Array:
     """Full pose of a planar fit: height and tilt from the height differences of the shared cells."""
     planar = make_pose(Rotation.from_rotvec([0, 0, heading]).as_matrix(), [*shift, 0.0])
     heights = query.lowest[query.rows, query.columns]

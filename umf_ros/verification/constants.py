@@ -109,3 +109,23 @@ MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of ke
 ODOMETRY_REACH_M = 15.0  # by hand: odometry is trusted over this distance
 PRIOR_M = 1.0  # by hand: standard deviation of what odometry predicts before any way is driven
 AGREE_M, AGREE_RAD = 0.5, 0.05  # by hand: two findings this near are one
+
+# submaps: what a narrow sensor saw along some metres of way
+NARROW_DEG = 270.0  # geometry: a sensor that sees more recognises a place from any side without submaps
+SUBMAP_BEFORE_M, SUBMAP_AFTER_M = 20.0, 15.0  # measured: way before and behind a keyframe; 10 and 10 find less
+MIN_SUBMAP_M = 5.0  # by hand: way below which a submap is hardly more than a scan
+MIN_COMMON = 0.1  # by hand: of a submap that must have counterparts: a strip at its edge fits many places
+SUBMAP_CELL_M = 0.3  # by hand: coarser than a scan, for odometry drifts inside
+SUBMAP_STEP_M = 1.5  # measured: between the scans that are merged; 1 and 2 m are as good
+SUBMAP_NEAR_M = 8.0  # by hand: of an expected stop; further apart, two submaps share too little
+SUBMAPS_KEPT = 12  # prepared submaps in memory: bounds it, changes no result
+ODOMETRY_ALONE_M = 80.0  # by hand: way over which odometry without a closure is worth a look
+ASKED_EVERY_M = 2.0  # by hand: way between two searches for what looks alike; bounds the time
+DESCRIBED_STOPS = 2  # by hand: every second stop can be found by its looks
+LOOKALIKES = 2  # that get a metric pose; bounds the time
+KEYPOINTS, KEYPOINT_CONTRAST = 120, 0.01  # measured: 80 and .02 find less
+MIN_KEYPOINTS = 4  # by hand: two of them make a motion, and two more confirm it
+KEYPOINT_M, KEYPOINT_SCALE = 1.0, 0.1  # geometry: two cells; odometry that is off by a tenth is useless
+KEYPOINT_VOTES = 15  # measured: stored keypoints that each of the query's votes for
+SUBMAPS_COMPARED = 10  # measured: the right one is among the ten most voted for in four of five
+RIVAL_TERRAIN_M = (1.5, 3.0)  # geometry: beyond the error of a right pose, within a wrong one's

@@ -23,7 +23,7 @@ from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
 from umf_ros.verification.scan_motion import closure_covariance
 from umf_ros.verification.views import ViewAlignment
 
-SCAN, IMAGE = "scan", "image"
+SCAN, IMAGE, SUBMAP = "scan", "image", "submap"
 
 
 def measured(*kinds: str) -> Any:
@@ -38,7 +38,8 @@ class Measurement:
     The name of a field is its name in `candidates.csv` and on `~/candidates`.
 
     Attributes:
-        kind: "scan" when two scans were aligned, "image" when only local features could be.
+        kind: "scan" when two scans were aligned, "image" when only local features could be, "submap" when what was
+            seen along the way was aligned.
         similarity: cosine similarity of the global descriptors.
         inliers_image: pairs of image features that one homography explains.
         inliers_cloud: pairs of the scan's features that one rigid motion explains.
@@ -52,6 +53,7 @@ class Measurement:
         relief_m: standard deviation of the relief on the ground that both scans saw.
         terrain_correlation: of both elevation maps' relief, -1 to 1.
         terrain_score: the same in standard deviations of chance.
+        terrain_rival: correlation at the best of some poses beside this one.
         pose_inliers: feature pairs that agree with the pose.
         spread: of those pairs across the image: smaller deviation of column and row, of its width and height.
         two_way_m: distance of the poses that the query's depths and the match's give by themselves.
@@ -68,24 +70,25 @@ class Measurement:
     inliers_image: float = 0.0
     inliers_cloud: float = 0.0
     superfeatures: float = 0.0
-    residual_m: float = measured(SCAN, IMAGE)
+    residual_m: float = measured(SCAN, IMAGE, SUBMAP)
     residual_sigmas: float = measured(IMAGE)
     residual_p90_m: float = measured(SCAN)
     noise_m: float = measured(SCAN)
-    overlap: float = measured(SCAN, IMAGE)
-    points: float = measured(SCAN)
-    relief_m: float = measured(SCAN)
-    terrain_correlation: float = measured(SCAN)
-    terrain_score: float = measured(SCAN)
+    overlap: float = measured(SCAN, IMAGE, SUBMAP)
+    points: float = measured(SCAN, SUBMAP)
+    relief_m: float = measured(SCAN, SUBMAP)
+    terrain_correlation: float = measured(SCAN, SUBMAP)
+    terrain_score: float = measured(SCAN, SUBMAP)
+    terrain_rival: float = measured(SUBMAP)
     pose_inliers: float = measured(IMAGE)
     spread: float = measured(IMAGE)
     two_way_m: float = measured(IMAGE)
-    position_std_m: float = measured(SCAN, IMAGE)
-    heading_std_deg: float = measured(SCAN, IMAGE)
+    position_std_m: float = measured(SCAN, IMAGE, SUBMAP)
+    heading_std_deg: float = measured(SCAN, IMAGE, SUBMAP)
     agreement_image: float = measured(SCAN, IMAGE)
     agreement_cloud: float = measured(SCAN, IMAGE)
-    prior_sigmas: float = measured(SCAN, IMAGE)
-    support: float = measured(SCAN, IMAGE)
+    prior_sigmas: float = measured(SCAN, IMAGE, SUBMAP)
+    support: float = measured(SCAN, IMAGE, SUBMAP)
 
     @property
     def numbers(self) -> dict[str, float]:

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from umf_ros.geometry import Array
 from umf_ros.runs.honesty import normalised_errors, share_inside
-from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, criteria_of, scores
+from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, scores
 from umf_ros.verification.measurement import Measurement
 from umf_ros.verification.registration import CovarianceModel, covariance_of
 
@@ -50,8 +50,18 @@ def fit_logistic(examples: list[Example], kind: str, ridge: float = 0.003) -> Lo
     right = np.array([example.right for example in mine], bool)
     if right.all() or not right.any():
         raise ValueError(f"need right and wrong examples of kind {kind}, got {int(right.sum())} right of {len(right)}")
-    rows = [scores(example.measurement) for example in mine]
-    names = list(criteria_of(kind))
+    return fit_weights([scores(example.measurement) for example in mine], right, ridge)
+
+
+def fit_weights(rows: list[dict[str, float]], right: NDArray[np.bool_], ridge: float = 0.003) -> Logistic:
+    """Weights >= 0 of named scores, by penalised maximum likelihood.
+
+    Args:
+        rows: scores of every example, 0 to 1, by name.
+        right: (N,) whether the example was.
+        ridge: penalty per example on the squared weights.
+    """
+    names = list(rows[0])
     design = np.array([[1.0, *(row[name] for name in names)] for row in rows])
     bounds = [(None, None)] + [(0.0, None)] * len(names)
     start = np.concatenate([[-1.0], np.ones(len(names))])
