@@ -88,13 +88,15 @@ def surveyed(domain: Domain, seed: int, extent: Extent, folder: Path | None) -> 
     return scans
 
 
-def keyframe_of(points: Array, intensity: Array | None, embedder: Embedder, stamp_ns: int) -> Keyframe:
-    """A keyframe of a robot with a LiDAR and nothing else."""
+def keyframe_of(
+    points: Array, intensity: Array | None, embedder: Embedder, stamp_ns: int, body_T_lidar: Array | None = None
+) -> Keyframe:
+    """A keyframe of a robot with a LiDAR and nothing else; without a pose of the LiDAR its frame is the body's."""
     frame = Frame(
         stamp_ns=stamp_ns,
         camera=NO_CAMERA,
         body_T_camera=np.eye(4),
-        body_T_lidar=np.eye(4),
+        body_T_lidar=np.eye(4) if body_T_lidar is None else body_T_lidar,
         points=points.astype(np.float32),
         intensity=intensity,
     )
@@ -107,7 +109,8 @@ def places_of(domain: Domain, seeds: range, extent: Extent, folder: Path | None,
     for seed in seeds:
         for scan in surveyed(domain, seed, extent, folder):
             stamp_ns = (len(places) + 1) * 10**9
-            keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, stamp_ns)
+            body_T_lidar = relative(scan.world_T_body, scan.world_T_lidar)
+            keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, stamp_ns, body_T_lidar)
             places.append(Place(keyframe, scan, seed))
     return places
 

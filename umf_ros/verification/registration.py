@@ -11,18 +11,25 @@ import small_gicp
 from numpy.typing import NDArray
 
 from umf_ros.frames import Keyframe, Points
-from umf_ros.geometry import Array, skew, transform
+from umf_ros.geometry import Array, invert, skew, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import ElevationMap
+from umf_ros.verification.free_space import RangeImage
 from umf_ros.verification.ransac import kabsch
 
 
 class PreparedScan:
     """A keyframe's scan made ready for comparison, each part when it is first asked for."""
 
-    def __init__(self, points: Points) -> None:
-        """Args: points (M, 3) m, body frame, thinned."""
+    def __init__(self, points: Points, body_T_lidar: Array | None = None) -> None:
+        """Prepare nothing yet.
+
+        Args:
+            points: (M, 3) m, body frame, thinned.
+            body_T_lidar: where they were seen from; without it the origin.
+        """
         self._thinned = points
+        self._lidar_T_body = np.eye(4) if body_T_lidar is None else invert(body_T_lidar)
         self.points: Array = points.astype(float)
 
     @property
@@ -43,10 +50,29 @@ class PreparedScan:
         return cloud
 
     @cached_property
+    def range_image(self) -> RangeImage:
+        """How far the LiDAR saw."""
+        return RangeImage(transform(self._lidar_T_body, self.points))
+
+    def look_at(self, points: Array) -> NDArray[np.int8]:
+        """(N,) what the rays of this scan say of points (N, 3) of its body frame, each a `Sight`."""
+        return self.range_image.look_at(transform(self._lidar_T_body, points))
+
+    @cached_property
+    def picks(self) -> NDArray[np.intp]:
+        """(S,) indices of at most 1500 points, evenly taken."""
+        return np.linspace(0, len(self.points) - 1, min(const.SAMPLE, len(self.points))).astype(np.intp)
+
+    @cached_property
     def sample(self) -> Array:
         """(S, 3) at most 1500 points, evenly taken."""
-        picks = np.linspace(0, len(self.points) - 1, min(const.SAMPLE, len(self.points))).astype(int)
-        return self.points[picks]
+        return self.points[self.picks]
+
+    @cached_property
+    def spacing(self) -> Array:
+        """(S,) m: how far the points of the sample are from the fifth of their neighbours."""
+        _, squared = self.tree.batch_knn_search(self.sample, const.SPACING_NEIGHBOURS, 1)
+        return np.sqrt(np.asarray(squared)[:, -1])
 
     @cached_property
     def sample_cloud(self) -> small_gicp.PointCloud:
@@ -88,7 +114,7 @@ class ScanCache:
 
     def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
         key = (keyframe.session, keyframe.stamp_ns)
-        scan = self._scans.pop(key, None) or PreparedScan(keyframe.points)
+        scan = self._scans.pop(key, None) or PreparedScan(keyframe.points, keyframe.body_T_lidar)
         self._scans[key] = scan
         if len(self._scans) > const.SCANS_KEPT:
             self._scans.popitem(last=False)
