@@ -32,20 +32,33 @@ MIN_MAP_SCORE = 5.0  # by hand, in standard deviations of chance: below, two ele
 MAX_REFINED = 3  # hypotheses per group of candidates that are aligned: bounds the time
 EXPECTED_M = 4.0  # by hand: a candidate this near to where odometry carries an accepted closure is tested first
 
-# elevation maps
+# elevation maps: how well does the ground fit at a pose?
 CELL_M = 0.5  # by hand: rocks and ripples are seen, and ten thousand returns leave few holes
-ROWS, COLUMNS = 72, 96  # geometry: 36 m along, 48 m across, the reach of the scan with its shifts
-BEHIND = 12  # cells kept free behind the body for rotated and shifted maps: as MAX_SHIFT
+ROWS, COLUMNS = 116, 116  # geometry: to RANGE_M all around
 RANGE_M = 28.0  # geometry: beyond, cells without a return outnumber the others
-MAX_SHIFT = 12  # cells, 6 m to every side; by hand
-HEADINGS = np.radians(np.arange(-36.0, 37.0, 6.0))  # geometry: half a step is within reach of the alignment
-PLANE_SIGMA_M = 1.2  # by hand: relief is what rises above a plane about this wide
-PLANE_RIDGE_M2 = 0.3  # keeps the slope of that plane finite where the neighbours lie on a line
-MAX_RELIEF_M = 0.2  # by hand: one boulder must not outvote a field
-MIN_CELLS = 50  # by hand: shared cells below which a fit means nothing
+PLANE_SIGMA_CELLS = 2.4  # by hand: relief is what rises above a plane about this wide
+PLANE_RIDGE_CELLS2 = 1.2  # keeps the slope of that plane finite where the neighbours lie on a line
+MAX_RELIEF_CELLS = 0.4  # by hand: one boulder must not outvote a field
+MIN_CELLS = 50  # by hand: cells below which a fit means nothing
 MIN_NEIGHBOURHOOD = 0.25  # by hand: weight of the occupied cells around one, of all, below which it has no relief
+
+# search over all headings
+UPRIGHT_CONES = np.radians([32.0, 24.0, 16.0, 12.0])  # measured: rights LiDARs tilted by 28 deg to 1 or 2
+MIN_UPRIGHT = 10  # normals of ground that a direction is worth
+SECTORS = 72  # of 5 deg, by hand
+MIN_SECTOR_SHARE = 1e-3  # by hand: of all points; fewer are strays
+AROUND_CELLS, AROUND_RADIUS, AROUND_SHIFT = 64, 26, 12  # geometry: 26 + 26 + 12 cells come round to themselves no more
+REACH_CELLS = 15.0  # measured: the median range of a scan in cells
+AROUND_CELL_M = (0.25, 1.0)  # by hand: rooms, fields
+LAYER_M = 0.3  # by hand: just more than the thinning
+ALL_HEADINGS = np.radians(np.arange(0.0, 360.0, 6.0))  # geometry: half a step is within reach of the alignment
+SEARCHED_OVERLAP = 0.45  # by hand: a view of 70 deg is looked for within 38
+PEAKS = (3, 4)  # by hand: of relief alone, of relief and structure
 SETTLE_MEDIANS, SETTLE_M = 2.5, 0.05  # by hand: cells that a plane between two maps is fitted to lie so near to it
 MAX_SLOPE = 0.3  # by hand: of one map against the other, rad
+SCOUTS, SCOUT_STEPS = 300, 5
+SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells
+TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain in the open
 
 # registration
 THIN_CELL_M = 0.25  # by hand: a scan keeps some 4,500 of its returns

@@ -15,7 +15,7 @@ from umf_ros.config import Verification
 from umf_ros.frames import Keyframe, Points
 from umf_ros.geometry import Array, make_pose, relative, rotation_angle, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.elevation_map import MapFit, TurnedMap, evaluate, search
+from umf_ros.verification.all_round import Fit, TurnedSurroundings, scout, search
 from umf_ros.verification.ransac import fit_rigid
 from umf_ros.verification.registration import PreparedScan
 from umf_ros.verification.rerank import RankedCandidate
@@ -39,7 +39,7 @@ class Hypothesis:
 def find_hypotheses(
     query: Keyframe,
     ranked: RankedCandidate,
-    turned: TurnedMap | None,
+    turned: TurnedSurroundings | None,
     match: PreparedScan,
     settings: Verification,
 ) -> list[Hypothesis]:
@@ -48,7 +48,7 @@ def find_hypotheses(
     Args:
         query: the query keyframe.
         ranked: the candidate.
-        turned: the query's elevation map at every heading; None without a usable scan.
+        turned: the query's surroundings at every heading; None without a usable scan.
         match: the candidate's scan, usable or not.
         settings: RANSAC iterations and seed.
     """
@@ -60,10 +60,9 @@ def find_hypotheses(
     found = [pose for pose in poses if pose is not None and np.isfinite(pose).all()]
     if turned is None or not match.usable:
         return [Hypothesis(ranked, pose, ranked.score) for pose in found[:1]]
-    fits = [evaluate(match.elevation, turned.elevation, pose) for pose in found]
-    fits += search(match.elevation, turned)
+    fits = [scout(match, turned.scan, pose) for pose in found] + search(match, turned)
     fits.sort(key=lambda fit: -fit.score)
-    return [Hypothesis(ranked, fit.pose, fit.score) for fit in _distinct(fits) if fit.score >= const.MIN_MAP_SCORE]
+    return [Hypothesis(ranked, fit.pose, fit.score) for fit in _distinct(fits)]
 
 
 def pose_from_points(query: Keyframe, ranked: RankedCandidate, iterations: int, seed: int) -> Array | None:
@@ -179,8 +178,8 @@ def prior_sigmas(query: Keyframe, match: Keyframe, match_T_query: Array, drift: 
     return float(np.linalg.norm(predicted[:3, 3] - match_T_query[:3, 3]) / (const.PRIOR_M + drift * driven))
 
 
-def _distinct(fits: list[MapFit]) -> list[MapFit]:
-    kept: list[MapFit] = []
+def _distinct(fits: list[Fit]) -> list[Fit]:
+    kept: list[Fit] = []
     for fit in fits:
         if not any(_near(fit.pose, other.pose, const.DISTINCT_M, const.DISTINCT_RAD) for other in kept):
             kept.append(fit)

@@ -59,8 +59,8 @@ def meet(match: PreparedScan, query: PreparedScan, pose: Array) -> tuple[Meeting
     ours, theirs = match.nearest(moved), query.nearest(back)
     reach_ours, reach_theirs = _reach(query.spacing), _reach(match.spacing)
     return (
-        Meeting(match.look_at(moved), np.sqrt(ours[1]) / reach_ours, _upright(match.normals[ours[0]])),
-        Meeting(query.look_at(back), np.sqrt(theirs[1]) / reach_theirs, _upright(match.normals[match.picks])),
+        Meeting(match.look_at(moved), np.sqrt(ours[1]) / reach_ours, _upright(match, ours[0])),
+        Meeting(query.look_at(back), np.sqrt(theirs[1]) / reach_theirs, _upright(match, match.picks)),
     )
 
 
@@ -112,10 +112,11 @@ def _reach(spacing: Array) -> Array:
     return const.COUNTERPART_M + const.COUNTERPART_SPACINGS * spacing
 
 
-def _upright(normals: Array) -> Mask:
-    """(N,) whether surfaces with these unit normals stand; those without a normal do not."""
+def _upright(scan: PreparedScan, index: NDArray[np.intp]) -> Mask:
+    """(N,) whether the surfaces at these points of a scan stand; those without a normal do not."""
+    normals = scan.normals[index]
     size = np.einsum("ij,ij->i", normals, normals)
-    return (np.abs(normals[:, 2]) < const.UPRIGHT) & (size > 0.5)
+    return (np.abs(normals @ scan.up[2]) < const.UPRIGHT) & (size > 0.5)
 
 
 def _share(what: Mask, of: Mask, otherwise: float) -> float:

@@ -14,8 +14,11 @@ from umf_ros.frames import Keyframe, Points
 from umf_ros.geometry import Array, invert, skew, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import ElevationMap
+from umf_ros.verification.field_of_view import FieldOfView
 from umf_ros.verification.free_space import RangeImage
 from umf_ros.verification.ransac import kabsch
+from umf_ros.verification.surroundings import Surroundings
+from umf_ros.verification.upright import upright
 
 
 class PreparedScan:
@@ -31,6 +34,7 @@ class PreparedScan:
         self._thinned = points
         self._lidar_T_body = np.eye(4) if body_T_lidar is None else invert(body_T_lidar)
         self.points: Array = points.astype(float)
+        self._around: dict[float, Surroundings] = {}
 
     @property
     def usable(self) -> bool:
@@ -41,6 +45,48 @@ class PreparedScan:
     def elevation(self) -> ElevationMap:
         """Heights and relief, for the search."""
         return ElevationMap(self._thinned)
+
+    @cached_property
+    def up(self) -> Array:
+        """Rotation (3, 3) that sets the scan upright."""
+        return upright(self.normals[self.picks])
+
+    @cached_property
+    def upright_points(self) -> Array:
+        """(M, 3) m."""
+        turned: Array = self.points @ self.up.T
+        return turned
+
+    @cached_property
+    def view(self) -> FieldOfView:
+        """The directions it looks into, upright."""
+        return FieldOfView(self.upright_points)
+
+    @cached_property
+    def reach_m(self) -> float:
+        """Median distance of the points, m."""
+        return float(np.median(np.linalg.norm(self.points, axis=1)))
+
+    def around(self, cell_m: float) -> Surroundings:
+        """Map of what stands around it, in cells of this size, m."""
+        if cell_m not in self._around:
+            self._around[cell_m] = Surroundings(self.upright_points, cell_m)
+        return self._around[cell_m]
+
+    @cached_property
+    def scouts(self) -> Array:
+        """(S, 3) a few points, evenly taken, m."""
+        return self.points[self._picks(const.SCOUTS)]
+
+    @cached_property
+    def scouts_cloud(self) -> small_gicp.PointCloud:
+        """The few with covariances of their own."""
+        cloud = small_gicp.PointCloud(self.scouts)
+        small_gicp.estimate_normals_covariances(cloud, None, const.NORMAL_NEIGHBOURS, 1)
+        return cloud
+
+    def _picks(self, count: int) -> NDArray[np.intp]:
+        return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(np.intp)
 
     @cached_property
     def cloud(self) -> small_gicp.PointCloud:
@@ -61,7 +107,7 @@ class PreparedScan:
     @cached_property
     def picks(self) -> NDArray[np.intp]:
         """(S,) indices of at most 1500 points, evenly taken."""
-        return np.linspace(0, len(self.points) - 1, min(const.SAMPLE, len(self.points))).astype(np.intp)
+        return self._picks(const.SAMPLE)
 
     @cached_property
     def sample(self) -> Array:

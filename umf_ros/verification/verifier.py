@@ -13,7 +13,7 @@ from umf_ros.frames import Candidate, Keyframe, LoopClosure, Points
 from umf_ros.geometry import heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance
-from umf_ros.verification.elevation_map import TurnedMap
+from umf_ros.verification.all_round import TurnedSurroundings
 from umf_ros.verification.hypotheses import (
     Hypothesis,
     TemporalMemory,
@@ -137,10 +137,12 @@ class Verifier:
                     return judged, tested
         return judged, tested
 
-    def _turned(self, query: Keyframe) -> TurnedMap | None:
-        return TurnedMap(self._scans[query].elevation) if self._scans[query].usable else None
+    def _turned(self, query: Keyframe) -> TurnedSurroundings | None:
+        return TurnedSurroundings(self._scans[query]) if self._scans[query].usable else None
 
-    def _hypotheses(self, query: Keyframe, ranked: list[RankedCandidate], turned: TurnedMap | None) -> list[Hypothesis]:
+    def _hypotheses(
+        self, query: Keyframe, ranked: list[RankedCandidate], turned: TurnedSurroundings | None
+    ) -> list[Hypothesis]:
         """Hypotheses about the given candidates, the most promising first."""
         found: list[Hypothesis] = []
         for item in ranked:

@@ -1,0 +1,159 @@
+"""Where one scan could lie on another, whatever the heading: an exhaustive search over heading and position.
+
+The query's surroundings are turned to every heading that lets the two see the same things and are correlated with
+the match's over all shifts at once (FFT). Relief alone is asked, and relief with structure: in the open the one is
+right, among walls the other. Every peak is settled in height and tilt, drawn to the match by some steps of ICP on
+a few points, and ranked by how many of these then have a counterpart. It needs no training and does not
+know about the sun.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+import small_gicp
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from umf_ros.geometry import Array, make_pose, transform
+from umf_ros.verification import constants as const
+from umf_ros.verification.elevation_map import evaluate
+from umf_ros.verification.registration import PreparedScan
+from umf_ros.verification.surroundings import SIDE, Spectra, Surroundings
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """One way two scans could lie on each other.
+
+    Attributes:
+        pose: (4, 4) `match_T_query`.
+        share: of some of the query's points, how many have a counterpart.
+        terrain: how well the elevation maps fit there, in standard deviations of chance.
+    """
+
+    pose: Array
+    share: float
+    terrain: float
+
+    @property
+    def score(self) -> float:
+        """What fits are ranked by: counterparts, and terrain where they say little."""
+        return self.share + const.TERRAIN_WEIGHT * self.terrain
+
+
+class TurnedSurroundings:
+    """A query's surroundings at every heading, each made when it is first asked for."""
+
+    def __init__(self, scan: PreparedScan) -> None:
+        self.scan = scan
+        self.cell_m = _cell_for(scan)
+        self.around = scan.around(self.cell_m)
+        self._ready = np.zeros(len(const.ALL_HEADINGS), bool)
+        self._spectra: Spectra = np.zeros((len(const.ALL_HEADINGS), 2, SIDE, SIDE // 2 + 1), np.complex64)
+
+    def spectra(self, wanted: NDArray[np.intp]) -> Spectra:
+        """Spectra (H, 2, ...), conjugated, at the headings (H,) by index."""
+        fresh = wanted[~self._ready[wanted]]
+        self._ready[fresh] = True
+        if len(fresh):
+            maps = np.stack([self.around.turned(heading) for heading in const.ALL_HEADINGS[fresh]])
+            self._spectra[fresh] = scipy.fft.rfft2(maps.transpose(0, 3, 1, 2)).conj()
+        return self._spectra[wanted]
+
+
+def search(match: PreparedScan, turned: TurnedSurroundings) -> list[Fit]:
+    """The best fits, best first, each from a peak of its own."""
+    overlap = match.view.overlap(turned.scan.view, const.ALL_HEADINGS)
+    wanted = np.flatnonzero(overlap >= const.SEARCHED_OVERLAP)
+    around = match.around(turned.cell_m)
+    if not len(wanted) or min(len(around.rows), len(turned.around.rows)) < const.MIN_CELLS:
+        return []
+    fits = []
+    for heading, row, column in _peaks(_correlate(around, turned.spectra(wanted)), wanted):
+        shift = (np.array([row, column]) - const.AROUND_SHIFT) * turned.cell_m
+        level = _settle(around, turned.around, float(const.ALL_HEADINGS[heading]), shift)
+        to_match = make_pose(match.up.T, np.zeros(3))
+        fits.append(scout(match, turned.scan, to_match @ level @ make_pose(turned.scan.up, np.zeros(3))))
+    return sorted(fits, key=lambda fit: -fit.score)
+
+
+def scout(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
+    """Draw a pose to the match by a few points, and see how many of them find a counterpart."""
+    result = small_gicp.align(
+        match.cloud,
+        query.scouts_cloud,
+        match.tree,
+        guess,
+        registration_type="GICP",
+        max_correspondence_distance=const.SCOUT_REACH * _cell_for(query),
+        num_threads=1,
+        max_iterations=const.SCOUT_STEPS,
+    )
+    pose = np.asarray(result.T_target_source)
+    squared = match.nearest(transform(pose, query.scouts))[1]
+    near = squared < (const.SCOUT_NEAR * _cell_for(query)) ** 2
+    return Fit(pose, float(near.mean()), evaluate(match.elevation, query.elevation, pose).score)
+
+
+def _cell_for(scan: PreparedScan) -> float:
+    """Side of a cell, m, as the place around a scan asks for it."""
+    steps = np.round(np.log2(scan.reach_m / const.REACH_CELLS) * 2) / 2
+    return float(np.clip(2.0**steps, *const.AROUND_CELL_M))
+
+
+def _correlate(around: Surroundings, turned: Spectra) -> NDArray[np.float32]:
+    """Correlation (2, H, shifts, shifts) of the relief, and of relief and structure together."""
+    products = around.spectra * turned
+    products[:, 1] += products[:, 0]
+    window = np.arange(-const.AROUND_SHIFT, const.AROUND_SHIFT + 1)
+    rows = scipy.fft.ifft(products, axis=-2)[..., window, :]
+    found: NDArray[np.float32] = scipy.fft.irfft(rows, SIDE, axis=-1)[..., window].swapaxes(0, 1)
+    return found
+
+
+def _peaks(volumes: NDArray[np.float32], headings: NDArray[np.intp]) -> list[tuple[int, int, int]]:
+    """Heading, row and column of the highest peaks, no two of them neighbours."""
+    peaks: list[tuple[int, int, int]] = []
+    around = len(const.ALL_HEADINGS)
+    blocked = np.zeros((around, *volumes.shape[2:]), bool)
+    for volume, count in zip(volumes, const.PEAKS, strict=True):
+        score = np.full(blocked.shape, -np.inf, np.float32)
+        score[headings] = volume
+        score[blocked] = -np.inf
+        for _ in range(count):
+            heading, row, column = (int(i) for i in np.unravel_index(int(score.argmax()), score.shape))
+            if not score[heading, row, column] > 0:
+                break
+            peaks.append((heading, row, column))
+            beside = (heading + np.array([-1, 0, 1])) % around
+            for part in (score, blocked):
+                part[beside, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = (
+                    -np.inf if part is score else True
+                )
+    return peaks
+
+
+def _settle(match: Surroundings, query: Surroundings, heading: float, shift: Array) -> Array:
+    """Full pose of a planar fit: height and tilt from the height differences of the shared cells."""
+    planar = make_pose(Rotation.from_rotvec([0, 0, heading]).as_matrix(), [*shift, 0.0])
+    heights = query.lowest[query.rows, query.columns]
+    moved = transform(planar, np.column_stack([query.centres, heights]))
+    row, column = (np.floor(moved[:, :2] / match.cell_m).astype(int) + SIDE // 2).T.clip(0, SIDE - 1)
+    below = match.lowest[row, column]
+    known = np.isfinite(below)
+    place, offset = moved[known, :2], (below - moved[:, 2])[known]
+    if len(offset) < 3:
+        return planar
+    design = np.column_stack([np.ones(len(place)), place])
+    keep = np.abs(offset - np.median(offset)) <= np.median(np.abs(offset - np.median(offset))) * 3 + const.SETTLE_M
+    for _ in range(3):
+        kept = design[keep]
+        plane = np.linalg.solve(kept.T @ kept + 1e-3 * np.eye(3), kept.T @ offset[keep])
+        residual = np.abs(offset - design @ plane)
+        keep = residual <= max(const.SETTLE_MEDIANS * float(np.median(residual)), const.SETTLE_M)
+    lift, slope_x, slope_y = plane
+    tilt = Rotation.from_rotvec(np.clip([slope_y, -slope_x, 0.0], -const.MAX_SLOPE, const.MAX_SLOPE)).as_matrix()
+    return make_pose(np.eye(3), [0, 0, lift]) @ make_pose(tilt, [0, 0, 0]) @ planar
