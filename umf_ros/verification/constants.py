@@ -82,6 +82,7 @@ SIGHT_FILLED_M = 5.0  # geometry: nearer, a thinned point is wider than a cell a
 # meeting of two scans
 MEETING_POINTS = 20  # by hand: of a kind, below which a share of them means nothing
 COUNTERPART_M, COUNTERPART_SPACINGS = 0.05, 0.5  # measured: .3 m and 1 spacing tell places apart less well
+UNEXPLAINED = 2.0  # measured: in these reaches; of all measures the most alike from one kind of place to another
 SPACING_NEIGHBOURS = 6  # by hand: the point itself and five, so that they reach the next ring
 UPRIGHT = 0.7  # geometry: surfaces steeper than 45 deg
 RIVAL_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: beyond the error of a right pose, within a wrong one's

@@ -18,6 +18,7 @@ from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, prior_sigmas
+from umf_ros.verification.meeting import meet, rivalry
 from umf_ros.verification.registration import NOMINAL, Alignment, PreparedScan, covariance_of
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
 
@@ -49,6 +50,13 @@ class Measurement:
         relief_m: standard deviation of the relief on the ground that both scans saw.
         terrain_correlation: of both elevation maps' relief, -1 to 1.
         terrain_score: the same in standard deviations of chance.
+        common: share of a scan's points that the other should see, the smaller of both ways, as all that follow.
+        contradiction: share of these that the other's rays passed by, the larger of both.
+        counterparts: share of these that have a counterpart, as near as both scans' points let one expect.
+        upright_counterparts: the same of walls, trunks and rocks alone; NaN where next to nothing stands.
+        unexplained: share of what stands and should be seen that is far from everything, the larger of both.
+        rival_near: logarithm of how much worse the fit is half a metre on, along the way that is known least.
+        rival_far: the same of the best fit 1 to 6 m on: 0 when another place fits as well.
         pose_inliers: feature pairs that agree with the pose.
         spread: of those pairs across the view: smaller deviation of bearing (rad) and of log range.
         position_std_m: standard deviation of the position along its least known direction, from the residuals.
@@ -72,6 +80,13 @@ class Measurement:
     relief_m: float = measured(SCAN)
     terrain_correlation: float = measured(SCAN)
     terrain_score: float = measured(SCAN)
+    common: float = measured(SCAN)
+    contradiction: float = measured(SCAN)
+    counterparts: float = measured(SCAN)
+    upright_counterparts: float = measured(SCAN)
+    unexplained: float = measured(SCAN)
+    rival_near: float = measured(SCAN)
+    rival_far: float = measured(SCAN)
     pose_inliers: float = measured(IMAGE)
     spread: float = measured(IMAGE)
     position_std_m: float = measured(SCAN, IMAGE)
@@ -185,7 +200,10 @@ def cloud_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
 
 def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan, query: PreparedScan) -> Measurement:
     """Tests of how two scans fit."""
-    fit = evaluate(match.elevation, query.elevation, alignment.pose)
+    pose = alignment.pose
+    fit = evaluate(match.elevation, query.elevation, pose)
+    meetings = meet(match, query, pose)
+    near, far = rivalry(match, query, pose, alignment.information)
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     return replace(
         known,
@@ -195,9 +213,16 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
         noise_m=max(match.noise_m, const.MIN_SURFACE_NOISE_M),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),
-        relief_m=shared_relief(match.elevation, query.elevation, alignment.pose),
+        relief_m=shared_relief(match.elevation, query.elevation, pose),
         terrain_correlation=fit.correlation,
         terrain_score=fit.score,
+        common=min(one.common for one in meetings),
+        contradiction=max(one.contradiction for one in meetings),
+        counterparts=min(one.counterparts for one in meetings),
+        upright_counterparts=float(np.fmin(*(one.upright_counterparts for one in meetings))),
+        unexplained=float(np.fmax(*(one.unexplained for one in meetings))),
+        rival_near=near,
+        rival_far=far,
     )
 
 

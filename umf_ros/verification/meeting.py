@@ -52,6 +52,11 @@ class Meeting:
         """The same of what stands: walls, trunks, rocks; NaN where next to nothing does."""
         return _share(self.misfit < 1, visible(self.sight) & self.upright, float("nan"))
 
+    @property
+    def unexplained(self) -> float:
+        """Share of what stands that is far from anything of the scan that should see it; NaN likewise."""
+        return _share(self.misfit > const.UNEXPLAINED, visible(self.sight) & self.upright, float("nan"))
+
 
 def meet(match: PreparedScan, query: PreparedScan, pose: Array) -> tuple[Meeting, Meeting]:
     """What the match says of the query's points under `match_T_query`, and the query of the match's."""

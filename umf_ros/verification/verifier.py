@@ -187,6 +187,8 @@ class Verifier:
 
     def _objection(self, judged: JudgedHypothesis) -> str:
         """Why a hypothesis is no closure; empty when it is one."""
+        if judged.probability >= self._threshold and (strange := self._acceptance.unlike(judged.measurement)):
+            return f"unlike anything the decision was fitted on: {strange}"
         if judged.probability < self._threshold:
             return f"probability {judged.probability:.2f} is below {self._threshold:g}"
         pose = judged.aligned.pose
