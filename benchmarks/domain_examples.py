@@ -19,7 +19,7 @@ from umf_ros.lab.simulation.domains import Domain
 from umf_ros.lab.training.acceptance_examples import Example
 from umf_ros.verification import Verifier
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory
-from umf_ros.verification.measurement import SCAN, AlignedHypothesis, Measurement, measure
+from umf_ros.verification.measurement import SCAN, AlignedHypothesis, Measurement, beside, measure
 from umf_ros.verification.registration import ScanCache, align_scans
 from umf_ros.verification.rerank import RankedCandidate, rerank
 
@@ -80,9 +80,8 @@ def examples_of(domain: Domain, seeds: range, pairs: int, scans: Path | None, em
     verifier = Verifier(Verification())
     for number, pair in enumerate(chosen):
         view = VIEWS[number % len(VIEWS)]
-        tried = Tried(
-            *(_seen(place.keyframe, view, domain.scanner.all_round) for place in (pair.query, pair.match)), pair
-        )
+        query, match = (_seen(place.keyframe, view, domain.scanner.all_round) for place in (pair.query, pair.match))
+        tried = Tried(query, match, pair)
         yield from _examples(tried, verifier, domain, rng)
 
 
@@ -98,7 +97,9 @@ def _examples(tried: Tried, verifier: Verifier, domain: Domain, rng: np.random.G
     scans = ScanCache()
     if all(scans[keyframe].usable for keyframe in (tried.match, tried.query)):
         ranked = rerank(tried.query, candidates, Verification())[0]
-        found += [_aligned(tried, ranked, scans, guess) for guess in _guesses(tried, domain.scanner.all_round, rng)]
+        guesses = _guesses(tried, domain.scanner.all_round, rng)
+        guessed = [_aligned(tried, ranked, scans, guess) for guess in guesses]
+        found += [(pose, beside(measurement, pose, found)) for pose, measurement in guessed]
     kept: list[Array] = []
     for pose, measurement in found:
         right = tried.is_right(pose)

@@ -5,21 +5,22 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.frames import Frame, Keyframe, StereoCamera
+from umf_ros.frames import Keyframe
 from umf_ros.geometry import Array, relative, rotation_angle
 from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
 from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, SAME_WAY
 from umf_ros.loop_detector import make_keyframe
+from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.snapshots import make_snapshot
 
 SAME_M, ELSEWHERE_M = 4.0, 12.0
 SAME_WAY_DEG, OTHER_WAY_DEG = 25.0, 155.0
-NO_CAMERA = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)
 SAME, TURNED, ELSEWHERE = "same way", "other way", "elsewhere"
 
 
@@ -88,19 +89,10 @@ def surveyed(domain: Domain, seed: int, extent: Extent, folder: Path | None) -> 
     return scans
 
 
-def keyframe_of(
-    points: Array, intensity: Array | None, embedder: Embedder, stamp_ns: int, body_T_lidar: Array | None = None
-) -> Keyframe:
-    """A keyframe of a robot with a LiDAR and nothing else; without a pose of the LiDAR its frame is the body's."""
-    frame = Frame(
-        stamp_ns=stamp_ns,
-        camera=NO_CAMERA,
-        body_T_camera=np.eye(4),
-        body_T_lidar=np.eye(4) if body_T_lidar is None else body_T_lidar,
-        points=points.astype(np.float32),
-        intensity=intensity,
-    )
-    return make_keyframe(frame, embedder)
+def keyframe_of(points: Array, intensity: Array | None, embedder: Embedder, stamp_ns: int) -> Keyframe:
+    """A keyframe of a robot with a LiDAR and nothing else."""
+    cloud = Cloud(points.astype(np.float32), intensity)
+    return make_keyframe(make_snapshot(cloud, stamp_ns=stamp_ns), embedder)
 
 
 def places_of(domain: Domain, seeds: range, extent: Extent, folder: Path | None, embedder: Embedder) -> list[Place]:
@@ -109,9 +101,9 @@ def places_of(domain: Domain, seeds: range, extent: Extent, folder: Path | None,
     for seed in seeds:
         for scan in surveyed(domain, seed, extent, folder):
             stamp_ns = (len(places) + 1) * 10**9
-            body_T_lidar = relative(scan.world_T_body, scan.world_T_lidar)
-            keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, stamp_ns, body_T_lidar)
-            places.append(Place(keyframe, scan, seed))
+            keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, stamp_ns)
+            seen_from = relative(scan.world_T_body, scan.world_T_lidar)
+            places.append(Place(replace(keyframe, body_T_lidar=seen_from), scan, seed))
     return places
 
 

@@ -84,9 +84,7 @@ def main(
     folder: Annotated[Path | None, typer.Option(help="keeps the domains' simulated scans for the next time")] = None,
     pairs: Annotated[int, typer.Option(help="pairs per domain")] = PAIRS,
     jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1,
-    examples: Annotated[
-        Path | None, typer.Option(help="keeps the domains' examples, for the same code")
-    ] = None,
+    examples: Annotated[Path | None, typer.Option(help="keeps the domains' examples, for the same code")] = None,
     out: Annotated[Path, typer.Option(help="where the model goes")] = DEFAULT_OUT,
 ) -> None:
     """Examine candidates of validation worlds, fit acceptance and covariance to them, and write the model.

@@ -2,9 +2,9 @@
 
 python benchmarks/real_scans.py FOLDER [--sample N] [--apart N] [--crop DEG] [--json FILE]
 
-The folder holds scans, .npy or .bin, (N, 3) or (N, 4) float32 (x y z in metres and, fourth, intensity; .bin always
-has four), and `pairs.csv` with the columns match_scan, query_scan (paths relative to the folder) and same_place
-(1 or 0), and where it is known the true pose of the query in the match: x, y, z, qx, qy, qz, qw.
+The folder holds scans as `umf compare` reads them, and `pairs.csv` with the columns match_scan, query_scan (paths
+relative to the folder) and same_place (1 or 0), and where it is known the true pose of the query in the match: x, y,
+z, qx, qy, qz, qw.
 
 Without `pairs.csv` the scans in `scans/`, in the order of their names, are taken for a drive that sees no place
 twice: of pairs further apart in that order, half are drawn at random, the other half are those most alike.
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import csv
 import json
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,16 +22,20 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from domain_pairs import keyframe_of
 from domains import error_vector, is_wrong
 from rich.console import Console
 from rich.progress import track
 
+from umf_ros.comparison.comparer import judge
 from umf_ros.config import EmbeddingSettings, Verification
 from umf_ros.embedding import make_embedder
-from umf_ros.frames import Candidate, Keyframe
+from umf_ros.frames import Keyframe
 from umf_ros.geometry import Array, from_quaternion
 from umf_ros.lab.training.acceptance_fit import inside_ellipsoid
+from umf_ros.loop_detector import make_keyframe
+from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.scan_files import read_scan
+from umf_ros.sensors.snapshots import make_snapshot
 from umf_ros.verification import Verdict, Verifier
 
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -69,15 +72,16 @@ def main(
 
     @lru_cache(KEPT)
     def keyframe(path: str) -> Keyframe:
-        points = cropped(read_scan(folder / path), crop)
-        # the stamp is a key: whatever the path, the same again
-        stamp_ns = zlib.crc32(path.encode())
-        return keyframe_of(points[:, :3], points[:, 3] if points.shape[1] > 3 else None, embedder, stamp_ns)
+        cloud = cropped(read_scan(folder / path), crop)
+        return make_keyframe(make_snapshot(cloud), embedder)
 
     listed = (folder / "pairs.csv").is_file()
     pairs = list(read_pairs(folder / "pairs.csv") if listed else draw_pairs(folder, keyframe, sample, apart))
     verifier = Verifier(Verification())
-    verdicts = [(pair, _verify(verifier, keyframe, pair)) for pair in track(pairs, folder.name, transient=True)]
+    verdicts = [
+        (pair, judge(verifier, keyframe(pair.match), keyframe(pair.query)))
+        for pair in track(pairs, folder.name, transient=True)
+    ]
     figures = summary(verdicts)
     for name, value in figures.items():
         console.print(f"{name:24} {value:.4g}")
@@ -88,17 +92,10 @@ def main(
         json_file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
 
 
-def read_scan(path: Path) -> Array:
-    """(N, 3) or (N, 4) finite points of a .npy or .bin file."""
-    points: Array = np.load(path) if path.suffix == ".npy" else np.fromfile(path, np.float32).reshape(-1, 4)
-    finite: Array = points[np.isfinite(points).all(axis=1)].astype(np.float32)
-    return finite
-
-
-def cropped(points: Array, half_width_deg: float) -> Array:
+def cropped(cloud: Cloud, half_width_deg: float) -> Cloud:
     """What a LiDAR that looks forward and no further than this to either side would have seen."""
-    ahead: Array = points[np.abs(np.degrees(np.arctan2(points[:, 1], points[:, 0]))) <= half_width_deg]
-    return ahead
+    ahead = np.abs(np.degrees(np.arctan2(cloud.points[:, 1], cloud.points[:, 0]))) <= half_width_deg
+    return Cloud(cloud.points[ahead], None if cloud.intensity is None else cloud.intensity[ahead])
 
 
 def read_pairs(path: Path) -> Iterator[RealPair]:
@@ -148,13 +145,6 @@ def summary(verdicts: list[tuple[RealPair, Verdict]]) -> dict[str, float]:
         "error_median_m": float(np.median(np.linalg.norm(np.array(errors)[:, :3], axis=1))) if errors else nan,
         "inside_95": inside_ellipsoid(np.array(errors), np.array(covariances)) if errors else nan,
     }
-
-
-def _verify(verifier: Verifier, keyframe: Callable[[str], Keyframe], pair: RealPair) -> Verdict:
-    query, match = keyframe(pair.query), keyframe(pair.match)
-    verifier.reset()
-    similarity = float(query.embedding.descriptor @ match.embedding.descriptor)
-    return verifier.verify(query, [(Candidate(0, match.stamp_ns, similarity), match)])[0]
 
 
 def _misplaced(pair: RealPair, verdict: Verdict) -> bool:

@@ -19,6 +19,7 @@ COMMANDS = {
     "demo": "umf_ros.lab.commands.demo",
     "simulate": "umf_ros.lab.commands.simulate",
     "replay": "umf_ros.commands.replay",
+    "compare": "umf_ros.commands.compare",
     "play": "umf_ros.lab.commands.play",
     "report": "umf_ros.lab.commands.report",
     "evaluate": "umf_ros.lab.commands.evaluate",

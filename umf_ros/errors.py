@@ -22,6 +22,10 @@ class BagError(UmfError):
     """A recording that is missing, foreign or damaged beyond use."""
 
 
+class SensorFileError(UmfError):
+    """A file of a scan or an image that is missing, or not what its name says."""
+
+
 class ConfigError(UmfError):
     """A parameter that is unknown, of the wrong type or out of range."""
 

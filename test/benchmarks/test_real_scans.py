@@ -6,20 +6,12 @@ import numpy as np
 import pytest
 from conftest import make_keyframe
 from measurements import GOOD
-from real_scans import RealPair, cropped, draw_pairs, read_pairs, read_scan, summary
+from real_scans import RealPair, cropped, draw_pairs, read_pairs, summary
 
 from umf_ros.frames import Candidate, LoopClosure
 from umf_ros.geometry import make_pose
+from umf_ros.sensors.messages import Cloud
 from umf_ros.verification import Verdict
-
-
-@pytest.mark.parametrize("suffix", [".npy", ".bin"])
-def test_scans_are_read_without_what_is_not_finite(tmp_path, suffix):
-    points = np.arange(12, dtype=np.float32).reshape(3, 4)
-    points[1, 2] = np.nan
-    path = tmp_path / f"scan{suffix}"
-    np.save(path, points) if suffix == ".npy" else points.tofile(path)
-    assert read_scan(path) == pytest.approx(points[[0, 2]])
 
 
 def test_pairs_are_read_with_their_pose_where_it_is_known(tmp_path):
@@ -35,9 +27,10 @@ def test_pairs_are_read_with_their_pose_where_it_is_known(tmp_path):
 
 
 def test_cropping_leaves_a_view_ahead():
-    points = np.array([[5, 0, 1], [5, 4, 0], [-5, 0, 0]], np.float32)
-    assert cropped(points, 36.0) == pytest.approx(points[:1])
-    assert len(cropped(points, 180.0)) == 3
+    cloud = Cloud(np.array([[5, 0, 1], [5, 4, 0], [-5, 0, 0]], np.float32), np.arange(3, dtype=np.float32))
+    narrow = cropped(cloud, 36.0)
+    assert narrow.points == pytest.approx(cloud.points[:1]) and narrow.intensity == pytest.approx([0])
+    assert len(cropped(cloud, 180.0).points) == 3
 
 
 def test_drawn_pairs_are_far_apart_and_half_of_them_alike(tmp_path):

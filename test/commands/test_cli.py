@@ -14,7 +14,7 @@ from umf_ros.commands import checks
 from umf_ros.errors import either
 from umf_ros.resources import dataset_names
 
-COMMANDS = ["demo", "simulate", "replay", "play", "report", "evaluate", "explain", "train", "export", "doctor"]
+COMMANDS = "demo simulate replay compare play report evaluate explain train export doctor".split()
 GROUPS = {"pretrain": ["image", "lidar"], "graph": ["optimize", "plot"]}
 
 

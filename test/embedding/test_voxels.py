@@ -6,7 +6,7 @@ from tiny_worlds import some_scan
 
 from umf_ros.embedding.inputs import is_blank, shrink, standardise
 from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_salient
-from umf_ros.embedding.voxels import voxelise
+from umf_ros.embedding.voxels import CELLS, ORIGIN_M, VOXEL_M, _brightness, voxelise
 
 
 def cluster(x: float, y: float, z: float, count: int = 30) -> np.ndarray:
@@ -76,6 +76,21 @@ def test_the_unit_of_the_intensity_does_not_matter():
     one, two = voxelise(points, level, 60, 300), voxelise(points, level * 100, 60, 300)
     np.testing.assert_allclose(one.grid, two.grid, atol=0.05)
     assert np.isfinite(voxelise(points, np.full(2000, np.nan, np.float32), 60, 300).grid).all()
+
+
+@pytest.mark.parametrize("scale", [1.0, 255.0, 4095.0])
+def test_the_same_scan_of_sensors_of_other_scales_is_the_same(scale):
+    points, level = some_scan(1), np.random.default_rng(0).uniform(0, 1, 2000).astype(np.float32)
+    of_the_cube = voxelise(points, level * 4095, 60, 300)
+    np.testing.assert_allclose(voxelise(points, level * np.float32(scale), 60, 300).grid, of_the_cube.grid, atol=1e-5)
+
+
+def test_intensities_of_the_cube_are_taken_as_they_are():
+    """What the network was trained on: bit for bit."""
+    points, level = some_scan(1), np.random.default_rng(0).uniform(16, 900, 2000).astype(np.float32)
+    inside = (np.abs((points - ORIGIN_M) / VOXEL_M / CELLS - 0.5) < 0.5).all(axis=1)
+    logs = np.log1p(level[inside])
+    np.testing.assert_array_equal(_brightness(level, inside), np.clip((logs - logs.mean()) / (logs.std() + 0.1), -3, 3))
 
 
 def test_exposure_does_not_matter():

@@ -89,13 +89,15 @@ def test_text_stays_text(folder: Path) -> None:
 
 def test_stamps_are_whole_and_figures_short_and_both_set_to_the_right(folder: Path) -> None:
     one, other = closure(0), closure(1)
-    judged = JudgedRun([JudgedClosure(one, 5.0, 0.0123456, float("nan"), True), JudgedClosure(other, 5, 0.7, 1, False)])
-    cells = written(folder, [one, other, closure(2)], judged).cells[-24:]
-    rows = [[text for _, text in cells[i : i + 8]] for i in (0, 8, 16)]
-    assert rows[0] == [str(STAMP), str(STAMP - 1), "5", "90", "0.9124", "0.01235", "nan", "yes"]
-    assert rows[1][5:] == ["0.7", "1", "NO"] and rows[2][5:] == ["", "", ""]
-    assert [kind for kind, _ in cells[:8]] == ["number"] * 7 + ["good"]
-    assert cells[15][0] == "bad"
+    judged = JudgedRun(
+        [JudgedClosure(one, 5.0, 0.0123456, float("nan"), True), JudgedClosure(other, 5, 0.7, 1, False, 5.125)]
+    )
+    cells = written(folder, [one, other, closure(2)], judged).cells[-27:]
+    rows = [[text for _, text in cells[i : i + 9]] for i in (0, 9, 18)]
+    assert rows[0] == [str(STAMP), str(STAMP - 1), "5", "90", "0.9124", "0.01235", "nan", "nan", "yes"]
+    assert rows[1][5:] == ["0.7", "1", "5.125", "NO"] and rows[2][5:] == ["", "", "", ""]
+    assert [kind for kind, _ in cells[:9]] == ["number"] * 8 + ["good"]
+    assert cells[17][0] == "bad"
 
 
 def test_a_picture_is_inside_the_page(folder: Path) -> None:
@@ -147,6 +149,20 @@ def test_the_terminal_gets_the_same_facts(folder: Path) -> None:
     assert "latency 40 ms per keyframe, median (embed 30, query 1, verify 9)" in lines
     assert "memory 512 MB at most" in lines and lines[-1] == f"Report: {folder}/report.html"
     assert any(line.startswith("4 true and 0 false") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("honesty", "said"),
+    [
+        ({}, "not judged"),
+        ({"nees_median": None, "inside_95": None}, "not judged"),
+        ({"nees_median": 5.3, "inside_95": 0.95}, "honest; 95% of the closures inside their 95 % ellipsoid"),
+        ({"nees_median": 135.0, "inside_95": 0.0}, "too small by a factor of 5; 0% of the closures"),
+    ],
+)
+def test_stated_errors_are_judged_in_a_plain_word(folder: Path, honesty: dict[str, Any], said: str) -> None:
+    page = written(folder, [], ground_truth=TRUTH | honesty)
+    assert any(text.startswith(said) for text in page.text)
 
 
 def test_without_a_keyframe_there_is_no_latency(folder: Path) -> None:

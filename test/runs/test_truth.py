@@ -126,6 +126,15 @@ def test_a_truth_without_headings_judges_distances(folder: Path) -> None:
     assert all(math.isnan(one.rotation_error_deg) for one in found.closures)
 
 
+def test_the_summary_says_whether_stated_errors_are_honest(folder: Path) -> None:
+    # a standard deviation of a metre stated everywhere: the normalised error is the error in metres
+    found = judged(folder, truth(), [closure(42, 2, 0.1), closure(44, 5, 2.0), closure(46, 6, 4.0)])
+    assert [one.nees for one in found.closures] == pytest.approx([0.01, 4.0, 16.0])
+    assert found.summary()["nees_median"] == 4.0 and found.summary()["inside_95"] == pytest.approx(2 / 3, abs=1e-4)
+    blind = judged(folder, truth(has_orientation=False), [closure(42, 2, 0.1)])
+    assert blind.summary()["nees_median"] is None and blind.summary()["inside_95"] is None
+
+
 def test_the_summary_has_its_keys_and_plain_numbers() -> None:
     assert JudgedRun([], 7, 1.23456789, None).summary() == {
         "closures_true": 0,
@@ -133,6 +142,8 @@ def test_the_summary_has_its_keys_and_plain_numbers() -> None:
         "revisits": 7,
         "ate_odometry_m": 1.2346,
         "ate_optimized_m": None,
+        "nees_median": None,
+        "inside_95": None,
     }
 
 

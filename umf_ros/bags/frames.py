@@ -68,7 +68,7 @@ class FrameReader:
         self.progress = 0.0
         self._bag = bag
         self._odometry = odometry
-        self._synchronizer = Synchronizer(settings.sync, calibration, inputs)
+        self._synchronizer = Synchronizer(settings.sync, calibration, inputs, warn)
         self._samples: list[OdometrySample] = []
         self._intake = Intake(self._synchronizer, topics, warn, self._samples.append)
         if bag.warning:

@@ -15,6 +15,10 @@ VOXEL_M = np.array([1.0, 1.0, 0.3], np.float32)
 CELLS = 40
 FEATURES = 6
 MIN_POINTS = 20
+FULL_SCALES = (1.0, 255.0)
+"""Largest intensities of sensors that say less than the network was trained on, smallest first."""
+TRAINED_SCALE = 4095.0
+"""Of the Cube-1's, which the network was trained on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +88,18 @@ def _brightness(intensity: Points | None, inside: Any) -> Points:
     """Logarithm of the intensity, standardised within the scan: units differ between sensors."""
     if intensity is None or not inside.any():
         return np.zeros(int(inside.sum()), np.float32)
-    level = np.log1p(np.maximum(np.nan_to_num(np.asarray(intensity, np.float32)[inside]), 0))
+    level = np.log1p(_in_trained_unit(np.nan_to_num(np.asarray(intensity, np.float32)))[inside])
     return np.clip((level - level.mean()) / (level.std() + 0.1), -3, 3)
+
+
+def _in_trained_unit(intensity: Points) -> Points:
+    """Intensities (N,) of a scan in the Cube-1's unit: those of 0 to 1 and 0 to 255 stretched, none below 0.
+
+    The logarithm alone does not take the unit out: below 1 it is a straight line.
+    """
+    strongest = intensity.max(initial=0.0)
+    scale = next((scale for scale in FULL_SCALES if strongest <= scale), TRAINED_SCALE)
+    return np.maximum(intensity, 0) * np.float32(TRAINED_SCALE / scale)
 
 
 def _features(occupied: NDArray[np.int64], means: Points) -> Points:

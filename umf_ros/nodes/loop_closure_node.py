@@ -54,8 +54,9 @@ class LoopClosureNode(BaseNode):
         self._detector = LoopDetector(self._settings, embedder)
         calibration = calibration_of(self._settings)
         topics = topics_of(self._settings)
-        self._synchronizer = Synchronizer(self._settings.sync, calibration, wanted_inputs(topics))
-        self._intake = Intake(self._synchronizer, topics, self.get_logger().warning)
+        warn = self.get_logger().warning
+        self._synchronizer = Synchronizer(self._settings.sync, calibration, wanted_inputs(topics), warn)
+        self._intake = Intake(self._synchronizer, topics, warn)
         folder = Path(self._results)
         self._recorder = RunRecorder(folder, self._settings, embedder.name) if self._results else None
         self._announcer = Announcer(self, self._settings.frames)

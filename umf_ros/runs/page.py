@@ -16,6 +16,7 @@ from rich.table import Table as Grid
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import rotation_angle
 from umf_ros.runs.folder import write_atomically
+from umf_ros.runs.honesty import MEDIAN_EXPECTED, in_words
 from umf_ros.runs.truth import JudgedClosure, JudgedRun, endpoints
 
 MAX_PICTURES = 40
@@ -114,12 +115,24 @@ def _facts(summary: Summary) -> list[tuple[str, str]]:
     }
     if truth:
         facts["revisits"] = str(truth["revisits"])
+        facts["stated errors"] = _honesty(truth)
     if latency["total"]["p50"] is not None:
         stages = ", ".join(f"{stage} {latency[stage]['p50']:.0f}" for stage in ("embed", "query", "verify"))
         facts["latency"] = f"{latency['total']['p50']:.0f} ms per keyframe, median ({stages})"
     facts["dropped"] = ", ".join(f"{name} {count}" for name, count in summary["drops"].items())
     facts["memory"] = f"{summary['peak_rss_mb']:.0f} MB at most"
     return list(facts.items())
+
+
+def _honesty(truth: Summary) -> str:
+    """How the covariances of the closures compare with their errors; older runs do not say."""
+    median, inside = truth.get("nees_median"), truth.get("inside_95")
+    if median is None or inside is None:
+        return "not judged: no closure, or a truth without orientations"
+    return (
+        f"{in_words(median, inside)}; {inside:.0%} of the closures inside their 95 % ellipsoid, "
+        f"normalised error squared {median:.1f} in the median ({MEDIAN_EXPECTED:.1f} expected)"
+    )
 
 
 def _row(closure: LoopClosure, judged: JudgedClosure | None) -> ClosureRow:

@@ -12,14 +12,15 @@ import numpy as np
 
 from umf_ros.errors import UmfError, writing
 from umf_ros.frames import LoopClosure
-from umf_ros.geometry import from_quaternion, to_quaternion
+from umf_ros.geometry import Array, from_quaternion, to_quaternion
 
 if TYPE_CHECKING:
     from umf_ros.verification import Verdict
 
 POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
 SIGMA = ["sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"]
-CLOSURES = ["query_stamp_ns", "match_stamp_ns", *POSE, *SIGMA, "probability", "similarity"]
+COVARIANCE = "covariance"
+CLOSURES = ["query_stamp_ns", "match_stamp_ns", *POSE, *SIGMA, "probability", "similarity", COVARIANCE]
 CANDIDATES = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "numbers"]
 KEYFRAMES = ["stamp_ns", "session", "travelled_m"]
 INLIERS = ["query_stamp_ns", "match_stamp_ns", "query_u", "query_v", "match_u", "match_v"]
@@ -48,11 +49,15 @@ class CsvTable:
 
 
 def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:
-    """Row of `closures.csv`: `match_T_query`, one sigma per axis of the match body, probability."""
+    """Row of `closures.csv`: `match_T_query`, one sigma per axis of the match body, probability, covariance.
+
+    Of the covariance the upper triangle is written, row by row, 21 numbers in one cell.
+    """
     pose = closure.match_T_query
     sigma = np.sqrt(np.diag(closure.covariance))
     numbers = [*pose[:3, 3], *to_quaternion(pose), *sigma, closure.probability, similarity]
-    return [closure.query_stamp_ns, closure.match_stamp_ns, *(f"{number:.9g}" for number in numbers)]
+    triangle = " ".join(f"{value:.9g}" for value in closure.covariance[np.triu_indices(6)])
+    return [closure.query_stamp_ns, closure.match_stamp_ns, *(f"{number:.9g}" for number in numbers), triangle]
 
 
 def candidate_row(query_stamp_ns: int, verdict: Verdict) -> list[Any]:
@@ -90,7 +95,7 @@ def read_table(path: Path, parse: Callable[[dict[str, str]], Row]) -> list[Row]:
 
 
 def read_closures(path: Path) -> list[LoopClosure]:
-    """The closures of a `closures.csv`, with a diagonal covariance.
+    """The closures of a `closures.csv`; with a diagonal covariance where an older version wrote no other.
 
     Raises:
         UmfError: the file cannot be read; names the line that is damaged.
@@ -104,6 +109,15 @@ def _closure(row: dict[str, str]) -> LoopClosure:
         query_stamp_ns=int(row["query_stamp_ns"]),
         match_stamp_ns=int(row["match_stamp_ns"]),
         match_T_query=from_quaternion(numbers[:3], numbers[3:7]),
-        covariance=np.diag(np.square(numbers[7:13])),
+        covariance=_covariance(row, numbers[7:13]),
         probability=numbers[13],
     )
+
+
+def _covariance(row: dict[str, str], sigmas: list[float]) -> Array:
+    triangle = [float(number) for number in (row.get(COVARIANCE) or "").split()]
+    if not triangle:
+        return np.diag(np.square(sigmas))
+    upper = np.zeros((6, 6))
+    upper[np.triu_indices(6)] = triangle
+    return upper + np.triu(upper, 1).T

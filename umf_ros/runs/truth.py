@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import radians
+from math import isfinite, nan, radians
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from umf_ros.config import Loop
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, align, heading, invert, relative, rotation_angle, transform, wrap_angle
 from umf_ros.keyframes import is_past
+from umf_ros.runs.honesty import normalised_errors, pose_error, share_inside
 from umf_ros.runs.tables import read_table
 from umf_ros.trajectory import Trajectory
 
@@ -38,6 +39,7 @@ class JudgedClosure:
         translation_error_m: error of the relative translation; of its length where the truth has no orientation.
         rotation_error_deg: error of the relative rotation, NaN where the truth has no orientation.
         is_true: whether the closure is right.
+        nees: normalised error squared under the stated covariance, NaN where the truth has no orientation.
     """
 
     closure: LoopClosure
@@ -45,6 +47,7 @@ class JudgedClosure:
     translation_error_m: float
     rotation_error_deg: float
     is_true: bool
+    nees: float = nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +75,15 @@ class JudgedRun:
             "revisits": self.revisits,
             "ate_odometry_m": _rounded(self.ate_odometry_m),
             "ate_optimized_m": _rounded(self.ate_optimized_m),
+            **self._honesty(),
         }
+
+    def _honesty(self) -> dict[str, float | None]:
+        """How the stated covariances do: None where no closure could be judged by the whole pose."""
+        squared = np.array([judged.nees for judged in self.closures if isfinite(judged.nees)])
+        if not len(squared):
+            return {"nees_median": None, "inside_95": None}
+        return {"nees_median": _rounded(float(np.median(squared))), "inside_95": _rounded(share_inside(squared))}
 
     def by_endpoints(self) -> dict[Endpoints, JudgedClosure]:
         """The judged closures, to be found by the stamps of query and match."""
@@ -117,14 +128,14 @@ def judge_closure(
         error = invert(truth) @ closure.match_T_query
         translation_m = float(np.linalg.norm(error[:3, 3]))
         rotation_deg = float(np.degrees(rotation_angle(error)))
+        nees = float(normalised_errors(pose_error(closure.match_T_query, truth), closure.covariance))
         heading_ok = abs(wrap_angle(heading(world_T_query) - heading(world_T_match))) <= radians(PLACE_ANGLE_DEG)
     else:
         translation_m = abs(float(np.linalg.norm(closure.match_T_query[:3, 3])) - distance_m)
-        rotation_deg, heading_ok = float("nan"), True
+        rotation_deg, heading_ok, nees = nan, True, nan
     pose_ok = translation_m <= POSE_TOLERANCE_M and not rotation_deg > POSE_TOLERANCE_DEG
-    return JudgedClosure(
-        closure, distance_m, translation_m, rotation_deg, distance_m <= PLACE_RADIUS_M and heading_ok and pose_ok
-    )
+    is_true = distance_m <= PLACE_RADIUS_M and heading_ok and pose_ok
+    return JudgedClosure(closure, distance_m, translation_m, rotation_deg, is_true, nees)
 
 
 def count_revisits(

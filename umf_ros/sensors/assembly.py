@@ -38,18 +38,6 @@ class Anchor:
         return self.measured_ns + int(offsets.min()), self.measured_ns + int(offsets.max())
 
 
-def filter_cloud(cloud: Cloud, calibration: Calibration) -> Cloud:
-    """Drop weak returns and those far above or below the LiDAR."""
-    keep = np.abs(cloud.points[:, 2]) <= calibration.max_height_m
-    if cloud.intensity is not None:
-        keep &= cloud.intensity > calibration.min_intensity
-    return Cloud(
-        cloud.points[keep],
-        None if cloud.intensity is None else cloud.intensity[keep],
-        None if cloud.time_offset_ns is None else cloud.time_offset_ns[keep],
-    )
-
-
 def assemble(
     anchor: Anchor,
     left: StampedImage | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -26,8 +27,8 @@ class Calibration:
         body_T_lidar: pose of the LiDAR (Cube-1: x right, y forward, z up).
         body_T_imu: pose of the IMU.
         lidar_time_offset_s: seconds to add to the stamp of a scan.
-        min_intensity: returns up to this intensity are dropped.
-        max_height_m: returns further than this from the LiDAR's horizontal plane are dropped.
+        min_intensity: returns up to this intensity, in the sensor's unit, are dropped; 0: none.
+        max_height_m: returns further than this from the LiDAR's horizontal plane are dropped; infinite: none.
         rectifier: makes the pair of `camera` from raw images; None where they arrive rectified.
     """
 
@@ -36,8 +37,8 @@ class Calibration:
     body_T_lidar: Array
     body_T_imu: Array = field(default_factory=lambda: np.eye(4))
     lidar_time_offset_s: float = 0.0
-    min_intensity: float = 15.0
-    max_height_m: float = 7.0
+    min_intensity: float = 0.0
+    max_height_m: float = math.inf
     rectifier: StereoRectifier | None = None
 
     @property
@@ -115,8 +116,8 @@ class _File(Group):
     body_T_lidar: _Pose
     body_T_imu: _Pose
     lidar_time_offset_s: float
-    min_intensity: float = Field(ge=0)
-    max_height_m: float = Field(gt=0)
+    min_intensity: float = Field(0.0, ge=0, allow_inf_nan=False)
+    max_height_m: float = Field(0.0, ge=0)
 
     @model_validator(mode="after")
     def _one_camera(self) -> _File:
@@ -139,6 +140,6 @@ class _File(Group):
             self.body_T_imu.matrix(),
             self.lidar_time_offset_s,
             self.min_intensity,
-            self.max_height_m,
+            self.max_height_m or math.inf,
             rectifier,
         )

@@ -128,12 +128,13 @@ def decode_cloud(message: Any) -> Cloud:
     names = records.dtype.names or ()
     points = np.stack([records[axis] for axis in "xyz"], axis=1, dtype=np.float32, casting="unsafe")
     intensity = records["intensity"].astype(np.float32) if "intensity" in names else None
-    real = _real_returns(points, intensity)
+    real = real_returns(points, intensity)
     offsets = records["point_time_offset"][real].astype(np.int64) if "point_time_offset" in names else None
     return Cloud(points[real], None if intensity is None else intensity[real], offsets)
 
 
-def _real_returns(points: Points, intensity: Points | None) -> NDArray[np.bool_]:
+def real_returns(points: Points, intensity: Points | None) -> NDArray[np.bool_]:
+    """(N,) which of the points (N, 3), m, are echoes: finite, away from the sensor, and no dummy of the Cube-1."""
     x, y, z = points.T
     squared = x * x + y * y + z * z
     dummy = np.abs(squared - NO_RETURN_RANGE_M**2) < 2e-5

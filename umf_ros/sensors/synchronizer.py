@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 from umf_ros.config import Sync
 from umf_ros.errors import MessageError
 from umf_ros.frames import Frame, Image, StereoCamera
-from umf_ros.sensors.assembly import Anchor, assemble, filter_cloud
+from umf_ros.sensors.assembly import Anchor, assemble
 from umf_ros.sensors.buffers import ImageBuffer, InputCounter, OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.limits import ScanLimits
 from umf_ros.sensors.messages import Cloud
 from umf_ros.sensors.sessions import ODOMETRY, Arrival, Input, Reset, SessionClock
+
+_log = logging.getLogger(__name__)
 
 INPUTS: tuple[Input, ...] = ("left", "right", "cloud", ODOMETRY)
 
@@ -44,11 +48,21 @@ class Synchronizer:
         session: number of resets of the clock or the odometry so far.
     """
 
-    def __init__(self, settings: Sync, calibration: Calibration, inputs: Collection[Input] = INPUTS) -> None:
-        """Wait for `inputs` only; "camera_info" among them: frames also wait for `use_camera`."""
+    def __init__(
+        self,
+        settings: Sync,
+        calibration: Calibration,
+        inputs: Collection[Input] = INPUTS,
+        warn: Callable[[str], None] = _log.warning,
+    ) -> None:
+        """Wait for `inputs` only; "camera_info" among them: frames also wait for `use_camera`.
+
+        `warn` is told, once each, what the limits of the calibration do to the scans that nobody can have meant.
+        """
         self.counters: dict[Input, InputCounter] = {name: InputCounter() for name in INPUTS}
         self._settings = settings
         self._calibration = calibration
+        self._limits = ScanLimits(calibration, warn)
         self._inputs = set(inputs)
         self._absent: set[Input] = set()
         self._slop_ns = round(settings.slop_s * 1e9)
@@ -134,7 +148,7 @@ class Synchronizer:
     def _use(self, name: Input, stamp_ns: int, value: Any) -> None:
         if name == "cloud":
             key = stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
-            self._anchors.append(Anchor(key, stamp_ns, filter_cloud(value, self._calibration)))
+            self._anchors.append(Anchor(key, stamp_ns, self._limits.apply(value)))
         elif name == ODOMETRY:
             self._odometry.add(stamp_ns, value)
             self.counters[name].used += 1

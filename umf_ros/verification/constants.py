@@ -90,6 +90,9 @@ RIVAL_FAR_M = np.concatenate([np.arange(-6.0, -0.9, 0.5), np.arange(1.0, 6.1, 0.
 RIVAL_EVERY = 10  # of the sample: bounds the time
 RIVAL_MISFIT = 3.0  # by hand: how bad a misfit can be, in counterparts' reach
 
+RUNNER_UP_ROOM = 0.02  # by hand: shares nearer to nothing than this are alike
+MIN_RUNNER_UP = 0.1  # measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 94
+
 # covariance
 SEARCH_M, SEARCH_RAD = 3.0, 0.35  # what the search itself knows, standard deviation: nothing is wider than this
 NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG = 20.0, 0.01, 0.05  # by hand: a yardstick of nobody's data

@@ -8,6 +8,7 @@ fills with it, and a `Criterion` in `acceptance` that says which values speak fo
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -17,7 +18,7 @@ from umf_ros.frames import Keyframe, LocalFeatures
 from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
-from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, prior_sigmas
+from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, near, prior_sigmas
 from umf_ros.verification.meeting import meet, rivalry
 from umf_ros.verification.registration import NOMINAL, Alignment, PreparedScan, covariance_of
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
@@ -57,6 +58,7 @@ class Measurement:
         unexplained: share of what stands and should be seen that is far from everything, the larger of both.
         rival_near: logarithm of how much worse the fit is half a metre on, along the way that is known least.
         rival_far: the same of the best fit 1 to 6 m on: 0 when another place fits as well.
+        runner_up: logarithm of how much more is missing at the next best hypothesis about the pair; NaN without one.
         pose_inliers: feature pairs that agree with the pose.
         spread: of those pairs across the view: smaller deviation of bearing (rad) and of log range.
         position_std_m: standard deviation of the position along its least known direction, from the residuals.
@@ -87,6 +89,7 @@ class Measurement:
     unexplained: float = measured(SCAN)
     rival_near: float = measured(SCAN)
     rival_far: float = measured(SCAN)
+    runner_up: float = measured(SCAN)
     pose_inliers: float = measured(IMAGE)
     spread: float = measured(IMAGE)
     position_std_m: float = measured(SCAN, IMAGE)
@@ -95,6 +98,12 @@ class Measurement:
     agreement_cloud: float = measured(SCAN, IMAGE)
     prior_sigmas: float = measured(SCAN, IMAGE)
     support: float = measured(SCAN, IMAGE)
+
+    @property
+    def missing(self) -> float:
+        """Share of what stands, or where nothing does of all, that should have a counterpart and has none."""
+        known = self.upright_counterparts
+        return 1.0 - (known if math.isfinite(known) else self.counterparts)
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -166,6 +175,15 @@ def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) ->
     )
 
 
+def beside(measurement: Measurement, pose: Array, others: Sequence[tuple[Array, Measurement]]) -> Measurement:
+    """The same, knowing the other hypotheses about the pair: poses `match_T_query` and what was measured there."""
+    distinct = [other.missing for there, other in others if not near(pose, there, const.DISTINCT_M, const.DISTINCT_RAD)]
+    if measurement.kind != SCAN or not distinct:
+        return measurement
+    room = const.RUNNER_UP_ROOM
+    return replace(measurement, runner_up=math.log((min(distinct) + room) / (measurement.missing + room)))
+
+
 def image_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
     """Whether the query's image features reappear where the pose says, in standard deviations of chance.
 
@@ -202,8 +220,8 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
     """Tests of how two scans fit."""
     pose = alignment.pose
     fit = evaluate(match.elevation, query.elevation, pose)
-    meetings = meet(match, query, pose)
-    near, far = rivalry(match, query, pose, alignment.information)
+    ours, theirs = meet(match, query, pose)
+    close, far = rivalry(match, query, pose, alignment.information)
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     return replace(
         known,
@@ -216,12 +234,12 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
         relief_m=shared_relief(match.elevation, query.elevation, pose),
         terrain_correlation=fit.correlation,
         terrain_score=fit.score,
-        common=min(one.common for one in meetings),
-        contradiction=max(one.contradiction for one in meetings),
-        counterparts=min(one.counterparts for one in meetings),
-        upright_counterparts=float(np.fmin(*(one.upright_counterparts for one in meetings))),
-        unexplained=float(np.fmax(*(one.unexplained for one in meetings))),
-        rival_near=near,
+        common=min(ours.common, theirs.common),
+        contradiction=max(ours.contradiction, theirs.contradiction),
+        counterparts=min(ours.counterparts, theirs.counterparts),
+        upright_counterparts=float(np.fmin(ours.upright_counterparts, theirs.upright_counterparts)),
+        unexplained=float(np.fmax(ours.unexplained, theirs.unexplained)),
+        rival_near=close,
         rival_far=far,
     )
 

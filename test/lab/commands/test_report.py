@@ -132,6 +132,7 @@ def test_closures_are_judged_by_the_truth_of_the_recording(run: Path, bag: Path)
     assert found["ate_optimized_m"] == pytest.approx(0, abs=1e-3) and found["ate_odometry_m"] > 0.02
     # 18 scans; the first five are less than a second old when they look back
     assert found["revisits"] == 13
+    assert found["nees_median"] > 0 and 0 <= found["inside_95"] <= 1 and "stated errors" in ended.text
     assert "2 true and 1 false loop closures" in ended.text and f"Report: {run}/report.html" in ended.out
 
 
@@ -150,9 +151,9 @@ def test_the_page_lists_every_closure_with_its_errors(run: Path, bag: Path) -> N
     report(run, bag)
     with (run / "closures.csv").open() as file:
         written = [(row["query_stamp_ns"], row["match_stamp_ns"]) for row in csv.DictReader(file)]
-    rows = [row for row in page_of(run).rows if len(row) == 8]
+    rows = [row for row in page_of(run).rows if len(row) == 9]
     assert [(row[0], row[1]) for row in rows] == written
-    assert [row[7] for row in rows] == ["yes", "yes", "NO"]
+    assert [row[8] for row in rows] == ["yes", "yes", "NO"]
     assert [float(row[5]) for row in rows] == pytest.approx([0.1, 0.3, 0.8], abs=2e-3)
     assert [row[4] for row in rows] == ["0.99", "0.95", "0.9123"]
     facts = {row[0]: row[1] for row in page_of(run).rows if len(row) == 2}
@@ -195,8 +196,8 @@ def test_without_a_truth_nothing_is_judged(bag: Path, tmp_path: Path) -> None:
     ended = report(tmp_path / "run", blind)
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["ground_truth"] is None
     assert "3 loop closures; there is no ground truth to judge them by." in ended.text
-    rows = [row for row in page_of(tmp_path / "run").rows if len(row) == 8]
-    assert [row[5:] for row in rows] == [["", "", ""]] * 3
+    rows = [row for row in page_of(tmp_path / "run").rows if len(row) == 9]
+    assert [row[5:] for row in rows] == [["", "", "", ""]] * 3
 
 
 def test_a_truth_file_goes_before_that_of_the_recording(run: Path, bag: Path, tmp_path: Path) -> None:
@@ -216,7 +217,7 @@ def test_closures_outside_of_the_truth_are_not_judged(run: Path, bag: Path, tmp_
     report(run, bag, "--ground-truth", tmp_path / "short.tum")
     found = json.loads((run / "summary.json").read_text())["ground_truth"]
     assert (found["closures_true"], found["closures_false"]) == (2, 0)
-    assert [row[7] for row in page_of(run).rows if len(row) == 8] == ["yes", "yes", ""]
+    assert [row[8] for row in page_of(run).rows if len(row) == 9] == ["yes", "yes", ""]
 
 
 def test_without_images_there_are_no_match_pictures(bag: Path, tmp_path: Path) -> None:

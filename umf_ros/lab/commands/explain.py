@@ -10,9 +10,7 @@ import typer
 from umf_ros.commands.recordings import BagPath, ConfigPath, DatasetName, EmbedderName, WeightsPath, open_recording
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from umf_ros.frames import Frame
+    from umf_ros.bags.moments import Moment
 
 Optional = typer.Option
 
@@ -31,6 +29,7 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.frames import FrameReader
+    from umf_ros.bags.moments import nearest_frames
     from umf_ros.lab.evaluation.explanation import draw, explain
     from umf_ros.loop_detector import make_detector_embedder, make_keyframe
 
@@ -39,7 +38,8 @@ def command(
     recording, settings = open_recording(bag, config, dataset, embedder, weights)
     network = make_detector_embedder(settings)
     with console.status("looking for the two moments"):
-        frames = _nearest(FrameReader(recording, settings), moments)
+        found = nearest_frames(FrameReader(recording, settings), moments)
+    frames = [one.checked() for one in found]
     query_keyframe, match_keyframe = (make_keyframe(frame, network) for frame in frames)
     explanation = explain(query_keyframe, match_keyframe, settings.verification)
     draw(explanation, frames[0].left, frames[1].left, out)
@@ -50,42 +50,10 @@ def command(
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _moment(text: str) -> int | float:
-    """Nanoseconds since the epoch (16 digits or more), or seconds from the start of the recording."""
-    if text.isdigit() and len(text) >= 16:
-        return int(text)
+def _moment(text: str) -> Moment:
+    from umf_ros.bags.moments import parse_moment
+
     try:
-        value = float(text)
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is neither a stamp in ns nor seconds from the start") from None
-    if not value >= 0:
-        raise typer.BadParameter(f"{text!r} is before the start")
-    return value
-
-
-def _nearest(frames: Iterable[Frame], moments: list[int | float]) -> list[Frame]:
-    """The frame nearest to each moment.
-
-    Raises:
-        BagError: the recording has no frame, or none within a second of a moment.
-    """
-    from umf_ros.errors import BagError
-
-    best: list[Frame | None] = [None] * len(moments)
-    wanted: list[int] = []
-    for frame in frames:
-        if not wanted:
-            wanted = [one if isinstance(one, int) else frame.stamp_ns + round(1e9 * one) for one in moments]
-        for position, stamp in enumerate(wanted):
-            held = best[position]
-            if held is None or abs(frame.stamp_ns - stamp) < abs(held.stamp_ns - stamp):
-                best[position] = frame
-        if frame.stamp_ns > max(wanted) + 10**9:
-            break
-    found = [frame for frame in best if frame is not None]
-    if len(found) < len(moments):
-        raise BagError("the recording has no frame with an image or a scan")
-    for frame, stamp, moment in zip(found, wanted, moments, strict=True):
-        if abs(frame.stamp_ns - stamp) > 10**9:
-            raise BagError(f"no frame within a second of {moment}; the nearest is at {frame.stamp_ns} ns")
-    return found
+        return parse_moment(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None

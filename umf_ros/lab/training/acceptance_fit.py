@@ -16,6 +16,8 @@ from scipy.stats import chi2
 
 from umf_ros.geometry import Array
 from umf_ros.lab.training.acceptance_examples import Example
+from umf_ros.runs.honesty import normalised_errors, share_inside
+from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, criteria_of, scores
 from umf_ros.verification.measurement import IMAGE, SCAN
 from umf_ros.verification.registration import CovarianceModel, covariance_of
@@ -67,10 +69,12 @@ def fit_decision(examples: list[Example], kind: str, threshold: float) -> tuple[
     Returns:
         The model, and the log-odds (N,) of the examples of this kind, each without its domain, lowered alike.
     """
-    right = np.array([example.right for example in examples if example.measurement.kind == kind], bool)
-    odds = left_out_odds(examples, kind)
-    model = fit_logistic(examples, kind)
-    safe = made_safe(model, odds[~right], threshold)
+    mine = [example for example in examples if example.measurement.kind == kind]
+    odds = left_out_odds(mine, kind)
+    model = fit_logistic(mine, kind)
+    # whoever has a rival is refused anyway
+    wrong = [not (one.right or one.measurement.runner_up < const.MIN_RUNNER_UP) for one in mine]
+    safe = made_safe(model, odds[np.array(wrong, bool)], threshold)
     return safe, odds + safe.bias - model.bias
 
 
@@ -110,7 +114,7 @@ def bounds_of(examples: list[Example], kind: str) -> dict[str, tuple[float, floa
 
 def inside_ellipsoid(errors: Array, covariances: Array, confidence: float = 0.95) -> float:
     """Share of the errors (N, 6) inside the confidence ellipsoid of their covariances (N, 6, 6)."""
-    return float(np.mean(_squared_distances(errors, covariances) < chi2.ppf(confidence, 6)))
+    return share_inside(normalised_errors(errors, covariances), confidence)
 
 
 def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: str, results: dict[str, float]) -> None:
@@ -153,7 +157,7 @@ def fit_covariance(errors: Array, informations: Array) -> CovarianceModel:
 
     def surprise(logarithms: Array) -> float:
         covariances = covariance_of(informations, _model_of(logarithms))
-        squared = _squared_distances(errors, covariances)
+        squared = normalised_errors(errors, covariances)
         # a heavy tail, so that a few bad fits do not widen all others
         return float(np.mean(np.linalg.slogdet(covariances)[1] + 16 * np.log1p(squared / 10)))
 
@@ -170,7 +174,7 @@ def scale_covariance(model: CovarianceModel, errors: Array, covariances: Array) 
         errors: (N, 6), ROS order.
         covariances: (N, 6, 6) of the same poses.
     """
-    variance = float(np.quantile(_squared_distances(errors, covariances), 0.95)) / float(chi2.ppf(0.95, 6))
+    variance = float(np.quantile(normalised_errors(errors, covariances), 0.95)) / float(chi2.ppf(0.95, 6))
     deviation = variance**0.5
     return CovarianceModel(model.inflation * variance, model.floor_m * deviation, model.floor_deg * deviation)
 
@@ -178,8 +182,3 @@ def scale_covariance(model: CovarianceModel, errors: Array, covariances: Array) 
 def _model_of(logarithms: Array) -> CovarianceModel:
     inflation, floor_m, floor_deg = np.exp(np.clip(logarithms, np.log([0.1, 2e-3, 1e-2]), np.log([1e4, 0.5, 5.0])))
     return CovarianceModel(float(inflation), float(floor_m), float(floor_deg))
-
-
-def _squared_distances(errors: Array, covariances: Array) -> Array:
-    distances: Array = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
-    return distances

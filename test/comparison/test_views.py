@@ -1,0 +1,142 @@
+"""Views from files and recordings become keyframes, each once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from recordings import CALIBRATION, traverse, write_mcap
+
+from umf_ros.comparison import views
+from umf_ros.comparison.views import KeyframeSource, PlaceView, ReadingRules
+from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.errors import CalibrationError, SensorFileError, UmfError
+from umf_ros.frames import Embedding, Frame
+
+
+class CountingEmbedder(ThumbnailEmbedder):
+    """Keeps what it was asked to embed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.frames: list[Frame] = []
+
+    def embed(self, frame: Frame) -> Embedding:
+        self.frames.append(frame)
+        return super().embed(frame)
+
+
+@pytest.fixture
+def here(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(1)
+    np.save(tmp_path / "scan.npy", rng.uniform(-20, 20, (400, 4)).astype(np.float32))
+    cv2.imwrite(str(tmp_path / "left.png"), rng.integers(0, 255, (48, 64, 3), np.uint8))
+    (tmp_path / "calibration.yaml").write_text(CALIBRATION.replace("min_intensity: 15", ""))
+    write_mcap(tmp_path / "drive.mcap", traverse(3.0))
+    return tmp_path
+
+
+def calibrated(here: Path) -> ReadingRules:
+    return ReadingRules(here / "calibration.yaml")
+
+
+def test_a_scan_alone_is_in_the_body_frame(here: Path) -> None:
+    embedder = CountingEmbedder()
+    keyframe = KeyframeSource(embedder).keyframe(PlaceView(str(here / "scan.npy")))
+    (frame,) = embedder.frames
+    np.testing.assert_array_equal(frame.points, np.load(here / "scan.npy")[:, :3])
+    np.testing.assert_array_equal(keyframe.body_T_lidar, np.eye(4))
+
+
+def test_with_a_calibration_images_belong_to_it(here: Path) -> None:
+    embedder = CountingEmbedder()
+    source = KeyframeSource(embedder, calibrated(here))
+    image = str(here / "left.png")
+    source.keyframe(PlaceView(str(here / "scan.npy"), image, image))
+    (frame,) = embedder.frames
+    assert frame.left is not None and frame.right is not None and frame.points is not None
+    assert frame.camera.fx == 60 and source.calibrated
+
+
+def test_without_one_they_are_left_aside_and_it_says_so_once(here: Path) -> None:
+    told: list[str] = []
+    embedder = CountingEmbedder()
+    source = KeyframeSource(embedder, warn=told.append)
+    for right in ("", "other.png"):
+        source.keyframe(PlaceView(str(here / "scan.npy"), str(here / "left.png"), right))
+    assert [frame.left for frame in embedder.frames] == [None, None]
+    assert told == ["images beside a scan are not used without a calibration"]
+
+
+def test_a_view_in_many_pairs_is_embedded_once(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(views, "KEPT", 2)
+    embedder = CountingEmbedder()
+    source = KeyframeSource(embedder, calibrated(here))
+    one, two = PlaceView(str(here / "scan.npy")), PlaceView("", str(here / "left.png"))
+    three = PlaceView(str(here / "drive.mcap@1"))
+    for view in (one, two, one, one, two):
+        source.keyframe(view)
+    assert len(embedder.frames) == 2
+    source.keyframe(three)  # no room: the one that was not used for longest goes
+    source.keyframe(two)
+    assert len(embedder.frames) == 3
+    source.keyframe(one)
+    assert len(embedder.frames) == 4
+
+
+def test_a_recording_is_read_once_for_all_that_is_expected_of_it(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[Path] = []
+    really_open = views.open_bag
+
+    def count(path: Path) -> object:
+        opened.append(path)
+        return really_open(path)
+
+    monkeypatch.setattr(views, "open_bag", count)
+    source = KeyframeSource(ThumbnailEmbedder(), calibrated(here))
+    asked = [PlaceView(f"{here}/drive.mcap@{second}") for second in (2, 0.5, 1, 0.5, 99)]
+    source.expect(asked)
+    stamps = [source.keyframe(view).stamp_ns for view in asked[:4]]
+    assert len(opened) == 1
+    assert stamps[1] == stamps[3] and stamps[1] < stamps[2] < stamps[0]
+    with pytest.raises(UmfError, match="no frame within a second of 99"):
+        source.keyframe(asked[4])
+    assert len(opened) == 1
+    source.keyframe(PlaceView(f"{here}/drive.mcap@1.2"))  # nobody expected it
+    assert len(opened) == 2
+
+
+@pytest.mark.parametrize(
+    ("view", "text"),
+    [
+        (PlaceView(), "neither a scan nor a left image"),
+        (PlaceView("", "", "left.png"), "neither a scan nor a left image"),
+        (PlaceView("nowhere.pcd"), "cannot read .*nowhere.pcd"),
+        (PlaceView("", "nowhere.png"), "cannot read .*nowhere.png"),
+        (PlaceView("nowhere.mcap@1"), "there is no recording .*nowhere.mcap"),
+        (PlaceView("drive.mcap@soon"), "drive.mcap@soon: 'soon' is neither"),
+        (PlaceView("drive.mcap@1", "left.png"), "drive.mcap@1 brings its own images"),
+        (PlaceView("calibration.yaml@1"), "calibration.yaml"),
+    ],
+)
+def test_what_cannot_be_read_is_said_every_time(here: Path, view: PlaceView, text: str) -> None:
+    source = KeyframeSource(ThumbnailEmbedder(), calibrated(here))
+    there = PlaceView(*(str(here / name) if name else "" for name in (view.scan, view.left, view.right)))
+    for _ in range(2):
+        with pytest.raises(UmfError, match=text):
+            source.keyframe(there)
+
+
+@pytest.mark.parametrize("change", [lambda points: points * 1000, lambda points: points + 1e5], ids=["mm", "map"])
+def test_a_scan_in_another_unit_or_frame_is_none(here: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    np.save(here / "scan.npy", change(np.load(here / "scan.npy")))
+    with pytest.raises(SensorFileError, match=r"scan\.npy has no return within reach: expected metres"):
+        KeyframeSource(ThumbnailEmbedder()).keyframe(PlaceView(str(here / "scan.npy")))
+
+
+def test_a_calibration_that_cannot_be_read_is_said_at_once(here: Path) -> None:
+    with pytest.raises(CalibrationError, match="cannot read"):
+        KeyframeSource(ThumbnailEmbedder(), ReadingRules(here / "nowhere.yaml"))

@@ -1,0 +1,167 @@
+"""Scans in files: those that Open3D writes, and the odd ones of old recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from umf_ros.errors import SensorFileError
+from umf_ros.sensors.scan_files import read_scan
+
+COUNT = 500
+POINTS = np.random.default_rng(1).uniform(-30, 30, (COUNT, 3)).astype(np.float32)
+INTENSITY = np.random.default_rng(2).uniform(0, 200, COUNT).astype(np.float32)
+ALL = np.column_stack([POINTS, INTENSITY])
+
+
+@pytest.mark.parametrize("suffix", [".pcd", ".ply"])
+@pytest.mark.parametrize("form", [{"write_ascii": True}, {}, {"compressed": True}], ids=["ascii", "binary", "packed"])
+def test_what_open3d_writes_is_read(tmp_path: Path, suffix: str, form: dict[str, bool]) -> None:
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(POINTS))
+    cloud.point["intensity"] = o3d.core.Tensor(INTENSITY[:, None])
+    path = tmp_path / f"scan{suffix}"
+    assert o3d.t.io.write_point_cloud(str(path), cloud, **form)
+    found = read_scan(path)
+    np.testing.assert_allclose(found.points, POINTS, atol=1e-4)
+    assert found.intensity is not None
+    np.testing.assert_allclose(found.intensity, INTENSITY, rtol=1e-5)
+
+
+def test_repetitions_are_unpacked(tmp_path: Path) -> None:
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.tile([[1.5, -2.0, 0.25]], (3000, 1)).astype(np.float32)))
+    o3d.t.io.write_point_cloud(str(tmp_path / "same.pcd"), cloud, compressed=True)
+    assert (tmp_path / "same.pcd").stat().st_size < 5000
+    found = read_scan(tmp_path / "same.pcd")
+    assert len(found.points) == 3000 and np.all(found.points == [1.5, -2.0, 0.25]) and found.intensity is None
+
+
+def test_odd_headers_are_understood(tmp_path: Path) -> None:
+    """Padding, counts, other types and cases, a width of 0, Windows' line ends, and a file that breaks off."""
+    record = np.dtype(
+        [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("_", "u1", (4,)), ("Intensity", "<u2"), ("pad", "u1"), ("t", "<i8")]
+    )
+    rows = np.zeros(COUNT, record)
+    rows["x"], rows["y"], rows["z"], rows["Intensity"] = *POINTS.T, INTENSITY
+    header = (
+        "# a comment\r\nVERSION .7\r\nFIELDS x y z _ Intensity _ t\r\nSIZE 8 8 8 1 2 1 8\r\nTYPE F F F U U U I\r\n"
+        "COUNT 1 1 1 4 1 1 1\r\nWIDTH 0\r\nHEIGHT 1\r\nPOINTS 0\r\nDATA binary\r\n"
+    )
+    path = tmp_path / "odd.PCD"
+    path.write_bytes(header.encode() + rows.tobytes()[:-5])
+    found = read_scan(path)
+    assert found.intensity is not None and len(found.points) == COUNT - 1
+    np.testing.assert_allclose(found.points, POINTS[:-1])
+    np.testing.assert_array_equal(found.intensity, np.floor(INTENSITY[:-1]))
+
+
+def test_text_with_more_and_less_than_the_header_says(tmp_path: Path) -> None:
+    path = tmp_path / "scan.pcd"
+    path.write_text("COLUMNS x y z\nPOINTS 9\nDATA ascii\n1 2 3\n\nnan nan nan\n0 0 0\n-nan 1 1\n4 5 6\n7 8\n")
+    np.testing.assert_array_equal(read_scan(path).points, [[1, 2, 3], [4, 5, 6]])
+
+
+def test_vertices_behind_other_elements_and_in_the_other_byte_order(tmp_path: Path) -> None:
+    header = (
+        "ply\nformat binary_big_endian 1.0\nobj_info odd\nelement camera 1\nproperty float view\nelement vertex {}\n"
+        "property double X\nproperty double Y\nproperty double Z\nproperty uchar scalar_Intensity\n"
+        "element face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.zeros(COUNT, [("x", ">f8"), ("y", ">f8"), ("z", ">f8"), ("i", "u1")])
+    rows["x"], rows["y"], rows["z"], rows["i"] = *POINTS.T, INTENSITY
+    path = tmp_path / "scan.ply"
+    path.write_bytes(header.format(COUNT).encode() + np.float32(1).tobytes() + rows.tobytes())
+    found = read_scan(path)
+    np.testing.assert_allclose(found.points, POINTS)
+    np.testing.assert_array_equal(found.intensity, np.floor(INTENSITY))
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_arrays(tmp_path: Path, columns: int, dtype: type) -> None:
+    array = np.column_stack([ALL, np.arange(COUNT)])[:, :columns].astype(dtype)
+    np.save(tmp_path / "scan.npy", array)
+    found = read_scan(tmp_path / "scan.npy")
+    np.testing.assert_array_equal(found.points, POINTS)
+    assert found.points.dtype == np.float32
+    assert (found.intensity is None) == (columns == 3)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(COUNT, 4), (COUNT, 3), (COUNT - 1, 3), (COUNT - 2, 4)])
+def test_the_columns_of_raw_numbers_are_found(tmp_path: Path, rows: int, columns: int) -> None:
+    """Also where either could be: 500 and 498 points of 3 and 4 numbers make a multiple of 12."""
+    ALL[:rows, :columns].tofile(tmp_path / "scan.bin")
+    found = read_scan(tmp_path / "scan.bin")
+    np.testing.assert_array_equal(found.points, POINTS[:rows])
+    assert (found.intensity is None) == (columns == 3)
+
+
+def test_the_columns_can_be_said(tmp_path: Path) -> None:
+    np.column_stack([ALL, np.arange(COUNT)]).astype(np.float32).tofile(tmp_path / "scan.pcd.bin")
+    np.testing.assert_array_equal(read_scan(tmp_path / "scan.pcd.bin", bin_columns=5).points, POINTS)
+    with pytest.raises(SensorFileError, match=r"2500 numbers are no \(N, 7\)"):
+        read_scan(tmp_path / "scan.pcd.bin", bin_columns=7)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".bin"])
+def test_what_did_not_come_back_is_left_out(tmp_path: Path, suffix: str) -> None:
+    array = ALL[:6].copy()
+    array[1, 2], array[2, 0] = np.nan, np.inf
+    array[3] = 0
+    path = tmp_path / f"scan{suffix}"
+    np.save(path, array) if suffix == ".npy" else array.tofile(path)
+    np.testing.assert_array_equal(read_scan(path).points, POINTS[[0, 4, 5]])
+
+
+PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "text"),
+    [
+        ("a.pcd", b"", "without a DATA line"),
+        ("a.pcd", b"FIELDS x y z\nSIZE four 4 4\nDATA ascii\n", "header that cannot be read"),
+        ("a.pcd", b"FIELDS x y z\nSIZE 4 4\nTYPE F F F\nDATA ascii\n", "header that cannot be read"),
+        ("a.pcd", b"FIELDS x y z\nTYPE F F Q\nDATA ascii\n", "type 'Q'"),
+        ("a.pcd", b"FIELDS x y\nDATA ascii\n1 2\n", "no field z"),
+        ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 three\n", "not numbers"),
+        ("a.pcd", b"FIELDS x y z\nDATA binary\n", "holds no return"),
+        ("a.pcd", b"FIELDS x y z\nDATA zipped\n", "'zipped'"),
+        ("a.pcd", b"FIELDS x y z\nDATA binary_compressed\n\x05\0\0\0\x0c\0\0\0\xe0", "break off"),
+        ("a.pcd", b"FIELDS x y z\nDATA binary_compressed\n\x02\0\0\0\x0c\0\0\0\x40\x10", "damaged"),
+        ("a.ply", b"plywood", "breaks off"),
+        ("a.ply", PLY.replace("ascii", "oral").encode(), "'oral'"),
+        ("a.ply", (PLY + "1 2 3\n").encode(), "break off before 2"),
+        ("a.ply", (PLY + "1 2 3\n4 5 b\n").encode(), "not numbers"),
+        ("a.ply", (PLY.replace("ascii", "binary_little_endian") + "123").encode(), "break off before 2"),
+        ("a.ply", PLY.replace("vertex", "edge").encode(), "without vertices"),
+        ("a.npy", b"no array", "no array of numbers"),
+        ("a.bin", b"123", "3 bytes"),
+        ("a.bin", b"1234" * 7, "--bin-columns"),
+        ("a.bin", b"", "holds no return"),
+        ("a.las", b"LASF", "expected .pcd, .ply, .npy or .bin"),
+    ],
+)
+def test_what_is_no_scan_is_named_on_one_line(tmp_path: Path, name: str, content: bytes, text: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(SensorFileError) as caught:
+        read_scan(path)
+    assert text in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("array", [np.zeros(3), np.zeros((4, 2)), np.zeros((3, 4, 5)), np.array([["a"] * 3])])
+def test_arrays_that_are_no_scan(tmp_path: Path, array: np.ndarray) -> None:
+    np.save(tmp_path / "a.npy", array)
+    with pytest.raises(SensorFileError, match=r"expected \(N, 3\) or \(N, 4\) numbers"):
+        read_scan(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("make", [lambda path: None, Path.mkdir], ids=["missing", "folder"])
+def test_a_file_that_cannot_be_opened(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    make(tmp_path / "a.pcd")
+    with pytest.raises(SensorFileError, match="cannot read"):
+        read_scan(tmp_path / "a.pcd")

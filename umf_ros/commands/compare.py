@@ -1,0 +1,153 @@
+"""`umf compare`: whether two views show the same place."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from umf_ros.commands.recordings import ConfigPath, DatasetName, EmbedderName, WeightsPath
+from umf_ros.errors import ConfigError, UmfError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from umf_ros.comparison.comparer import Comparer, Comparison
+    from umf_ros.comparison.tables import Pair, Row
+    from umf_ros.comparison.views import PlaceView
+
+Image = Annotated[Path | None, typer.Option(help="Image file; needs --calibration.", show_default=False)]
+ViewName = Annotated[
+    str | None, typer.Argument(help="Scan (.pcd, .ply, .npy, .bin), left image, or BAG@STAMP.", show_default=False)
+]
+
+
+def command(
+    match: ViewName = None,
+    query: ViewName = None,
+    match_left: Image = None,
+    match_right: Image = None,
+    query_left: Image = None,
+    query_right: Image = None,
+    pairs: Annotated[Path | None, typer.Option("--list", help="CSV of pairs, paths relative to it.")] = None,
+    out: Annotated[Path | None, typer.Option(help="CSV of verdicts about the list.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file of scans and images.")] = None,
+    bin_columns: Annotated[int, typer.Option(min=0, max=64, help="Numbers per point of a .bin; 0: 4 or 3.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
+    config: ConfigPath = None,
+    dataset: DatasetName = "auto",
+    embedder: EmbedderName = None,
+    weights: WeightsPath = None,
+) -> None:
+    """Tell whether two views show the same place, and how the second lies in the first.
+
+    A view is a scan, an image (left, and right for its depth), or both; or a frame of a recording at a stamp in ns or
+    at seconds from its start. Without --calibration a scan is in the body frame: x forward, y left, z up.
+    """
+    from rich.console import Console
+
+    from umf_ros.commands.progress import WARNING
+    from umf_ros.comparison.comparer import Comparer
+    from umf_ros.comparison.tables import read_pairs
+    from umf_ros.comparison.views import KeyframeSource, ReadingRules
+    from umf_ros.config import load_settings
+    from umf_ros.loop_detector import make_detector_embedder
+
+    images = match_left, match_right, query_left, query_right
+    if pairs is not None:
+        if match is not None or any(images) or as_json or out is None:
+            raise ConfigError("--list PAIRS.csv needs --out VERDICTS.csv, and neither MATCH, QUERY, images nor --json")
+        asked = read_pairs(pairs)
+    else:
+        asked = [_named_pair(match, query, images, out)]
+    method = {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}
+    settings = load_settings(config, **method)
+    errors = Console(stderr=True)
+    rules = ReadingRules(calibration, bin_columns, config, dataset)
+    source = KeyframeSource(make_detector_embedder(settings), rules, warn=lambda text: errors.print(text, **WARNING))
+    source.expect(view for pair in asked for view in pair)
+    comparer = Comparer(source, settings.verification)
+    if pairs is not None and out is not None:
+        _compare_list(comparer, asked, pairs.parent, out, errors)
+    else:
+        _show(comparer.compare(*asked[0]), as_json)
+
+
+def _named_pair(match: str | None, query: str | None, images: tuple[Path | None, ...], out: Path | None) -> Pair:
+    if out is not None:
+        raise ConfigError("--out VERDICTS.csv goes with --list PAIRS.csv; one pair is printed (--json)")
+    views = _view(match, *images[:2]), _view(query, *images[2:])
+    for name, view in zip(("MATCH", "QUERY"), views, strict=True):
+        if not view.scan and not view.left:
+            raise ConfigError(f"say what to compare: {name} is missing (or --list PAIRS.csv --out VERDICTS.csv)")
+    return views
+
+
+def _view(name: str | None, left: Path | None, right: Path | None) -> PlaceView:
+    from umf_ros.comparison.views import PlaceView
+    from umf_ros.sensors.snapshots import IMAGE_SUFFIXES
+
+    scan, images = name or "", [str(path) if path else "" for path in (left, right)]
+    if Path(scan).suffix.lower() in IMAGE_SUFFIXES:
+        if images[0]:
+            raise ConfigError(f"{scan} and {images[0]} are both the left image")
+        scan, images[0] = "", scan
+    return PlaceView(scan, *images)
+
+
+def _compare_list(comparer: Comparer, asked: list[Pair], base: Path, out: Path, errors: Console) -> None:
+    """Write one row per pair; what goes wrong with one is told, and the others go on."""
+    from rich.progress import track
+
+    from umf_ros.comparison.tables import RESULT_COLUMNS, VIEW_COLUMNS, view_row
+    from umf_ros.runs.tables import CsvTable
+
+    columns = [*VIEW_COLUMNS, *RESULT_COLUMNS]
+    table, accepted, failures = CsvTable(out, columns), 0, []
+    for number, pair in enumerate(
+        track(asked, "Comparing", console=errors, transient=True, disable=not errors.is_terminal), 1
+    ):
+        row, fault = _verdict(comparer, pair)
+        accepted += row["accepted"]
+        failures += [f"pair {number}: {fault}"] if fault else []
+        row |= view_row(*pair, base)
+        table.append([[row[name] for name in columns]])
+    table.close()
+    for line in failures:
+        typer.echo(line, err=True)
+    typer.echo(f"{out}: {len(asked)} pairs, {accepted} the same place, {len(failures)} could not be compared")
+    if failures:
+        raise typer.Exit(1)
+
+
+def _verdict(comparer: Comparer, pair: Pair) -> tuple[Row, str]:
+    """The row of a pair, and what went wrong with it."""
+    from umf_ros.comparison.tables import failed_row, result_row
+
+    try:
+        return result_row(comparer.compare(*pair)), ""
+    except UmfError as error:
+        fault = str(error)
+    except Exception as error:  # the data of strangers: one pair must not cost the others their verdicts
+        fault = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    return failed_row(fault), fault
+
+
+def _show(comparison: Comparison, as_json: bool) -> None:
+    from umf_ros.comparison.tables import POSE, SIGMA, result_row
+
+    row = result_row(comparison)
+    if as_json:
+        typer.echo(json.dumps(row, indent=2))
+        return
+    sure = "" if comparison.probability is None else f", probability {comparison.probability:.3f}"
+    if comparison.closure is None:
+        typer.echo(f"not accepted as the same place: {comparison.reason}{sure}")
+    else:
+        typer.echo(f"the same place{sure}")
+        for title, names in (("match_T_query", POSE), ("sigma (m, rad)", SIGMA)):
+            numbers = "  ".join(f"{name.removeprefix('sigma_')} {row[name]:.4f}" for name in names)
+            typer.echo(f"  {title:15} {numbers}")
+    typer.echo(f"  similarity {comparison.similarity:.3f}, {comparison.milliseconds:.0f} ms")
