@@ -58,7 +58,6 @@ class Measurement:
         unexplained: share of what stands and should be seen that is far from everything, the larger of both.
         rival_near: logarithm of how much worse the fit is half a metre on, along the way that is known least.
         rival_far: the same of the best fit 1 to 6 m on: 0 when another place fits as well.
-        runner_up: logarithm of how much more is missing at the next best hypothesis about the pair; NaN without one.
         pose_inliers: feature pairs that agree with the pose.
         spread: of those pairs across the view: smaller deviation of bearing (rad) and of log range.
         position_std_m: standard deviation of the position along its least known direction, from the residuals.
@@ -67,6 +66,7 @@ class Measurement:
         agreement_cloud: the same of the scan's features.
         prior_sigmas: distance from what odometry predicts, in standard deviations of its drift.
         support: earlier keyframes, of the last few, that found a pose which odometry carries over to this one.
+        runner_up: logarithm of how much more is missing at the next best hypothesis about the pair; NaN without one.
     """
 
     kind: str = ""
@@ -89,7 +89,6 @@ class Measurement:
     unexplained: float = measured(SCAN)
     rival_near: float = measured(SCAN)
     rival_far: float = measured(SCAN)
-    runner_up: float = measured(SCAN)
     pose_inliers: float = measured(IMAGE)
     spread: float = measured(IMAGE)
     position_std_m: float = measured(SCAN, IMAGE)
@@ -98,6 +97,7 @@ class Measurement:
     agreement_cloud: float = measured(SCAN, IMAGE)
     prior_sigmas: float = measured(SCAN, IMAGE)
     support: float = measured(SCAN, IMAGE)
+    runner_up: float = measured(SCAN)
 
     @property
     def missing(self) -> float:
