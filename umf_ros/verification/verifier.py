@@ -19,7 +19,7 @@ from umf_ros.verification.hypotheses import (
     TemporalMemory,
     find_hypotheses,
 )
-from umf_ros.verification.measurement import AlignedHypothesis, Measurement, measure, measure_candidate
+from umf_ros.verification.measurement import AlignedHypothesis, Measurement, beside, measure, measure_candidate
 from umf_ros.verification.registration import ScanCache, align_scans
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
@@ -112,7 +112,7 @@ class Verifier:
     def examine(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[JudgedHypothesis]:
         """Every hypothesis about every candidate, without a decision: what the decision is fitted on."""
         hypotheses = self._hypotheses(query, rerank(query, candidates, self._settings), self._turned(query))
-        examined = [self._judge(query, hypothesis) for hypothesis in hypotheses]
+        examined = self._compared([self._judge(query, hypothesis) for hypothesis in hypotheses])
         first = {one.match_stamp_ns: one.aligned for one in reversed(examined)}
         self._memory.remember(query, [(one.match, one.pose, False) for one in first.values()])
         return examined
@@ -128,11 +128,11 @@ class Verifier:
         for group in (self._memory.expected(query, ranked), select(ranked, self._settings.refine_best)):
             fresh = [item for item in group if item.candidate.stamp_ns not in tested]
             tested |= {item.candidate.stamp_ns for item in fresh}
-            for hypothesis in self._hypotheses(query, fresh, turned)[: const.MAX_REFINED]:
-                judged.append(self._judge(query, hypothesis))
-                accepted = {one.match_stamp_ns for one in judged if not self._objection(one)}
-                if len(accepted) >= self._settings.max_closures:
-                    return judged, tested
+            hypotheses = self._hypotheses(query, fresh, turned)[: const.MAX_REFINED]
+            judged += self._compared([self._judge(query, hypothesis) for hypothesis in hypotheses])
+            accepted = {one.match_stamp_ns for one in judged if not self._objection(one)}
+            if len(accepted) >= self._settings.max_closures:
+                break
         return judged, tested
 
     def _turned(self, query: Keyframe) -> TurnedSurroundings | None:
@@ -155,6 +155,19 @@ class Verifier:
             aligned = AlignedHypothesis(query, hypothesis, align_scans(*scans, hypothesis.pose), scans)
         measurement = measure(aligned, self._memory, self._settings.odometry_drift)
         return JudgedHypothesis(aligned, measurement, self._acceptance.probability(measurement))
+
+    def _compared(self, judged: list[JudgedHypothesis]) -> list[JudgedHypothesis]:
+        """The same, each knowing the others about its candidate."""
+        compared = []
+        for one in judged:
+            others = [
+                (other.aligned.pose, other.measurement)
+                for other in judged
+                if other.match_stamp_ns == one.match_stamp_ns
+            ]
+            measurement = beside(one.measurement, one.aligned.pose, others)
+            compared.append(JudgedHypothesis(one.aligned, measurement, self._acceptance.probability(measurement)))
+        return compared
 
     def _decide(self, ranked: list[RankedCandidate], judged: list[JudgedHypothesis], tested: set[int]) -> list[Verdict]:
         best: dict[int, JudgedHypothesis] = {}
@@ -185,6 +198,10 @@ class Verifier:
 
     def _objection(self, judged: JudgedHypothesis) -> str:
         """Why a hypothesis is no closure; empty when it is one."""
+        if judged.probability >= self._threshold and (strange := self._acceptance.unlike(judged.measurement)):
+            return f"unlike anything the decision was fitted on: {strange}"
+        if judged.measurement.runner_up < const.MIN_RUNNER_UP:
+            return "another pose fits as well"
         if judged.probability < self._threshold:
             return f"probability {judged.probability:.2f} is below {self._threshold:g}"
         pose = judged.aligned.pose
