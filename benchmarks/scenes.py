@@ -71,6 +71,7 @@ def take(ground: Landscape, world_T_body: Array, stamp_s: float, seed: int = 0, 
         _scan(ground, world_T_body, rng),
         odom_T_body=odom,
         travelled_m=stamp_s if odom is not None else float("nan"),
+        body_T_lidar=make_pose(np.eye(3), [0.0, 0.0, LIDAR_HEIGHT_M]),
     )
 
 

@@ -148,7 +148,7 @@ class AcceptanceModel:
         """What no right pose that the decision was fitted on ever measured, or nothing: name and value of a number."""
         for name, (least, greatest) in self.bounds.get(measurement.kind, {}).items():
             value = getattr(measurement, name)
-            if not least <= value <= greatest:
+            if value < least or value > greatest:  # what is unknown is neither
                 return f"{name} {value:.3g}"
         return ""
 

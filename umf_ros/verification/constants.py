@@ -94,6 +94,10 @@ SIGHT_KNOWN = 0.3  # by hand: of a cell's neighbourhood that must have returns f
 SIGHT_FROM_M = 0.8  # by hand: nearer than this is the robot itself
 SIGHT_FILLED_M = 5.0  # geometry: nearer, a thinned point is wider than a cell and its neighbours' gaps
 
+# discord of the modalities, told in words: agreement in standard deviations of chance, contradiction of free space
+IMAGE_CONTRADICTS, IMAGE_SUPPORTS = 0.0, 4.0  # by hand
+SCANS_SUPPORT, SCANS_CONTRADICT = 0.05, 0.12  # measured: right poses stay below the one, half of the wrong ones above
+
 # meeting of two scans
 MEETING_POINTS = 20  # by hand: of a kind, below which a share of them means nothing
 COUNTERPART_M, COUNTERPART_SPACINGS = 0.05, 0.5  # measured: .3 m and 1 spacing tell places apart less well

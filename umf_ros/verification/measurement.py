@@ -115,6 +115,15 @@ class Measurement:
         return 1.0 - (known if math.isfinite(known) else self.counterparts)
 
     @property
+    def discord(self) -> str:
+        """What to say where one modality supports a pose that the other contradicts; else nothing."""
+        if self.agreement_image < const.IMAGE_CONTRADICTS and self.contradiction < const.SCANS_SUPPORT:
+            return "the scans support it, the image contradicts it"
+        if self.agreement_image > const.IMAGE_SUPPORTS and self.contradiction > const.SCANS_CONTRADICT:
+            return "the image supports it, the scans contradict it"
+        return ""
+
+    @property
     def numbers(self) -> dict[str, float]:
         """What was measured for this kind, by name: for tables, messages and people."""
         return {

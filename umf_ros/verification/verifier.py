@@ -198,12 +198,13 @@ class Verifier:
 
     def _objection(self, judged: JudgedHypothesis) -> str:
         """Why a hypothesis is no closure; empty when it is one."""
-        if judged.probability >= self._threshold and (strange := self._acceptance.unlike(judged.measurement)):
+        if judged.probability < self._threshold:
+            below = f"probability {judged.probability:.2f} is below {self._threshold:g}"
+            return ": ".join(filter(None, (below, judged.measurement.discord)))
+        if strange := self._acceptance.unlike(judged.measurement):
             return f"unlike anything the decision was fitted on: {strange}"
         if judged.measurement.runner_up < const.MIN_RUNNER_UP:
             return "another pose fits as well"
-        if judged.probability < self._threshold:
-            return f"probability {judged.probability:.2f} is below {self._threshold:g}"
         pose = judged.aligned.pose
         turn_deg, shift_m = abs(np.degrees(heading(pose))), float(np.linalg.norm(pose[:3, 3]))
         # a place is a position and a view [UMF 5.1.2]: whoever looks elsewhere is somewhere else

@@ -23,9 +23,12 @@ from umf_ros.verification.measurement import IMAGE, SCAN
 from umf_ros.verification.registration import CovarianceModel, covariance_of
 
 RIDGE = 0.03  # measured: leaving domains out, a tenth of it accepts less at no wrong one
-SAFETY = 0.5  # by hand: log-odds between the most probable wrong pose and the threshold
+SAFETY = 0.25  # by hand: log-odds between the most probable wrong pose and the threshold
 # numbers that describe the scans rather than how well they fit; beyond what was fitted nobody knows what they mean
 BOUNDED = {SCAN: ("noise_m", "residual_m", "points", "common", "position_std_m", "heading_std_deg"), IMAGE: ()}
+# however well all the rest fits
+NECESSARY = {SCAN: ("contradiction", "unexplained"), IMAGE: ()}
+COMMONLY = 0.99  # of the right poses meet what is necessary
 BOUNDS_ROOM = 1.5  # by hand
 
 
@@ -119,9 +122,12 @@ def bounds_of(examples: list[Example], kind: str) -> dict[str, tuple[float, floa
     """What right poses of a kind measured at least and at most, with some room, by the name of the number."""
     mine = [example.measurement for example in examples if example.measurement.kind == kind and example.right]
     bounds = {}
-    for name in BOUNDED[kind]:
+    for name in (*BOUNDED[kind], *NECESSARY[kind]):
         values = np.array([getattr(measurement, name) for measurement in mine])
-        bounds[name] = float(values.min() / BOUNDS_ROOM), float(values.max() * BOUNDS_ROOM)
+        known = values[np.isfinite(values)]
+        share = COMMONLY if name in NECESSARY[kind] else 1.0
+        least, greatest = np.quantile(known, [1.0 - share, share])
+        bounds[name] = float(least / BOUNDS_ROOM), float(greatest * BOUNDS_ROOM)
     return bounds
 
 
