@@ -55,10 +55,10 @@ TALL_LAYERS, MIN_TALL = 3, 20  # by hand: cells of walls, trunks and boxes, and 
 ALL_HEADINGS = np.radians(np.arange(0.0, 360.0, 6.0))  # geometry: half a step is within reach of the alignment
 MIN_SHARED_VIEW = 0.6  # of the narrower view; by hand: a LiDAR of 70 deg may be turned by 28
 SEARCHED_OVERLAP = 0.45  # by hand: a view of 70 deg is looked for within 38
-PEAKS = (2, 3)  # measured: of relief alone, of relief and structure; 3 and 4 find as much
+PEAKS = (3, 4)  # by hand: of relief alone, of relief and structure
 SETTLE_MEDIANS, SETTLE_M = 2.5, 0.05  # by hand: cells that a plane between two maps is fitted to lie so near to it
 MAX_SLOPE = 0.3  # by hand: of one map against the other, rad
-SCOUTS, SCOUT_STEPS = 200, 4  # measured: 300 and 5 find as much in 1.5 times the time
+SCOUTS, SCOUT_STEPS = 300, 5  # by hand: points and steps that draw a peak to the match
 SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells; geometry: a peak is off by less than a cell and half a heading
 TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain in the open
 
