@@ -127,22 +127,18 @@ def _correlate(around: Surroundings, turned: Spectra) -> NDArray[np.float32]:
 def _peaks(volumes: NDArray[np.float32], headings: NDArray[np.intp]) -> list[tuple[int, int, int]]:
     """Heading, row and column of the highest peaks, no two of them neighbours."""
     peaks: list[tuple[int, int, int]] = []
-    around = len(const.ALL_HEADINGS)
-    blocked = np.zeros((around, *volumes.shape[2:]), bool)
+    every = np.full((len(const.ALL_HEADINGS), *volumes.shape[2:]), -np.inf, np.float32)
+    taken = np.zeros(every.shape, bool)
     for volume, count in zip(volumes, const.PEAKS, strict=True):
-        score = np.full(blocked.shape, -np.inf, np.float32)
-        score[headings] = volume
-        score[blocked] = -np.inf
+        every[headings] = volume
         for _ in range(count):
-            heading, row, column = (int(i) for i in np.unravel_index(int(score.argmax()), score.shape))
-            if not score[heading, row, column] > 0:
+            every[taken] = -np.inf
+            heading, row, column = (int(i) for i in np.unravel_index(int(every.argmax()), every.shape))
+            if not every[heading, row, column] > 0:
                 break
             peaks.append((heading, row, column))
-            beside = (heading + np.array([-1, 0, 1])) % around
-            for part in (score, blocked):
-                part[beside, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = (
-                    -np.inf if part is score else True
-                )
+            beside = np.arange(heading - 1, heading + 2) % len(every)
+            taken[beside, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = True
     return peaks
 
 

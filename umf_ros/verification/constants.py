@@ -58,7 +58,7 @@ MIN_NEIGHBOURHOOD = 0.25  # by hand: weight of the occupied cells around one, of
 
 # search over all headings
 UPRIGHT_CONES = np.radians([32.0, 24.0, 16.0, 12.0])  # measured: rights LiDARs tilted by 28 deg to 1 or 2
-MIN_UPRIGHT = 10  # normals of ground that a direction is worth
+MIN_UPRIGHT = 10  # by hand: normals of ground that a direction is worth
 SECTORS = 72  # of 5 deg, by hand
 MIN_SECTOR_SHARE = 1e-3  # by hand: of all points; fewer are strays
 AROUND_CELLS, AROUND_RADIUS, AROUND_SHIFT = 64, 26, 12  # geometry: 26 + 26 + 12 cells come round to themselves no more
@@ -69,11 +69,11 @@ TALL_LAYERS, MIN_TALL = 3, 20  # by hand: cells of walls, trunks and boxes, and 
 ALL_HEADINGS = np.radians(np.arange(0.0, 360.0, 6.0))  # geometry: half a step is within reach of the alignment
 MIN_SHARED_VIEW = 0.6  # of the narrower view; by hand: a LiDAR of 70 deg may be turned by 28
 SEARCHED_OVERLAP = 0.45  # by hand: a view of 70 deg is looked for within 38
-PEAKS = (2, 3)  # by hand: of relief alone, of relief and structure
+PEAKS = (3, 4)  # by hand: of relief alone, of relief and structure
 SETTLE_MEDIANS, SETTLE_M = 2.5, 0.05  # by hand: cells that a plane between two maps is fitted to lie so near to it
 MAX_SLOPE = 0.3  # by hand: of one map against the other, rad
-SCOUTS, SCOUT_STEPS = 200, 4
-SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells
+SCOUTS, SCOUT_STEPS = 300, 5  # by hand: points and steps that draw a peak to the match
+SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells; geometry: a peak is off by less than a cell and half a heading
 TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain in the open
 
 # registration
