@@ -8,18 +8,22 @@ fills with it, and a `Criterion` in `acceptance` that says which values speak fo
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
-from umf_ros.frames import Keyframe, LocalFeatures
+from umf_ros.frames import Keyframe, LocalFeatures, Points
 from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
-from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, prior_sigmas
-from umf_ros.verification.registration import NOMINAL, Alignment, PreparedScan, covariance_of
+from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, near, prior_sigmas
+from umf_ros.verification.meeting import meet, rivalry
+from umf_ros.verification.registration import NOMINAL, Alignment, CovarianceModel, PreparedScan, covariance_of
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
+from umf_ros.verification.scan_motion import closure_covariance
+from umf_ros.verification.views import ViewAlignment
 
 SCAN, IMAGE, SUBMAP = "scan", "image", "submap"
 
@@ -42,23 +46,33 @@ class Measurement:
         inliers_image: pairs of image features that one homography explains.
         inliers_cloud: pairs of the scan's features that one rigid motion explains.
         superfeatures: eligible pairs of super-features, where the reranking goes by them.
-        residual_m: median point-to-plane distance of the scans; root mean square of the pairs without scans.
+        residual_m: median point-to-plane distance of the scans; median distance of the pairs' points without scans.
+        residual_sigmas: size of the errors of reprojection in standard deviations of the features' noise.
         residual_p90_m: nine of ten points are nearer than this to their counterpart's plane.
         noise_m: how far the match's points scatter about their own planes.
-        overlap: share of the points seen by both (of the feature pairs) that have a counterpart.
+        overlap: share of the points seen by both that have a counterpart (of the feature pairs: that agree).
         points: points that have one.
         relief_m: standard deviation of the relief on the ground that both scans saw.
         terrain_correlation: of both elevation maps' relief, -1 to 1.
         terrain_score: the same in standard deviations of chance.
         terrain_rival: correlation at the best of some poses beside this one.
+        common: share of a scan's points that the other should see, the smaller of both ways, as all that follow.
+        contradiction: share of these that the other's rays passed by, the larger of both.
+        counterparts: share of these that have a counterpart, as near as both scans' points let one expect.
+        upright_counterparts: the same of walls, trunks and rocks alone; NaN where next to nothing stands.
+        unexplained: share of what stands and should be seen that is far from everything, the larger of both.
+        rival_near: logarithm of how much worse the fit is half a metre on, along the way that is known least.
+        rival_far: the same of the best fit 1 to 6 m on: 0 when another place fits as well.
         pose_inliers: feature pairs that agree with the pose.
-        spread: of those pairs across the view: smaller deviation of bearing (rad) and of log range.
+        spread: of those pairs across the image: smaller deviation of column and row, of its width and height.
+        two_way_m: distance of the poses that the query's depths and the match's give by themselves.
         position_std_m: standard deviation of the position along its least known direction, from the residuals.
         heading_std_deg: of the heading.
         agreement_image: whether image features reappear where the pose says, standard deviations of chance.
         agreement_cloud: the same of the scan's features.
         prior_sigmas: distance from what odometry predicts, in standard deviations of its drift.
         support: earlier keyframes, of the last few, that found a pose which odometry carries over to this one.
+        runner_up: logarithm of how much more is missing at the next best hypothesis about the pair; NaN without one.
     """
 
     kind: str = ""
@@ -67,6 +81,7 @@ class Measurement:
     inliers_cloud: float = 0.0
     superfeatures: float = 0.0
     residual_m: float = measured(SCAN, IMAGE, SUBMAP)
+    residual_sigmas: float = measured(IMAGE)
     residual_p90_m: float = measured(SCAN)
     noise_m: float = measured(SCAN)
     overlap: float = measured(SCAN, IMAGE, SUBMAP)
@@ -75,14 +90,38 @@ class Measurement:
     terrain_correlation: float = measured(SCAN, SUBMAP)
     terrain_score: float = measured(SCAN, SUBMAP)
     terrain_rival: float = measured(SUBMAP)
+    common: float = measured(SCAN)
+    contradiction: float = measured(SCAN)
+    counterparts: float = measured(SCAN)
+    upright_counterparts: float = measured(SCAN)
+    unexplained: float = measured(SCAN)
+    rival_near: float = measured(SCAN)
+    rival_far: float = measured(SCAN)
     pose_inliers: float = measured(IMAGE)
     spread: float = measured(IMAGE)
+    two_way_m: float = measured(IMAGE)
     position_std_m: float = measured(SCAN, IMAGE, SUBMAP)
     heading_std_deg: float = measured(SCAN, IMAGE, SUBMAP)
     agreement_image: float = measured(SCAN, IMAGE)
     agreement_cloud: float = measured(SCAN, IMAGE)
     prior_sigmas: float = measured(SCAN, IMAGE, SUBMAP)
     support: float = measured(SCAN, IMAGE, SUBMAP)
+    runner_up: float = measured(SCAN)
+
+    @property
+    def missing(self) -> float:
+        """Share of what stands, or where nothing does of all, that should have a counterpart and has none."""
+        known = self.upright_counterparts
+        return 1.0 - (known if math.isfinite(known) else self.counterparts)
+
+    @property
+    def discord(self) -> str:
+        """What to say where one modality supports a pose that the other contradicts; else nothing."""
+        if self.agreement_image < const.IMAGE_CONTRADICTS and self.contradiction < const.SCANS_SUPPORT:
+            return "the scans support it, the image contradicts it"
+        if self.agreement_image > const.IMAGE_SUPPORTS and self.contradiction > const.SCANS_CONTRADICT:
+            return "the image supports it, the scans contradict it"
+        return ""
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -102,12 +141,12 @@ class AlignedHypothesis:
         query: the query keyframe.
         hypothesis: as it was found, with its candidate.
         alignment: the refined pose, its residuals and what they were measured on.
-        scans: of the match and of the query; None when only local features were aligned.
+        scans: of the match and of the query; None when only their views were aligned.
     """
 
     query: Keyframe
     hypothesis: Hypothesis
-    alignment: Alignment
+    alignment: Alignment | ViewAlignment
     scans: tuple[PreparedScan, PreparedScan] | None
 
     @property
@@ -119,6 +158,18 @@ class AlignedHypothesis:
     def pose(self) -> Array:
         """(4, 4) `match_T_query`."""
         return self.alignment.pose
+
+    def covariance(self, model: CovarianceModel) -> Array:
+        """Covariance (6, 6) of the pose in ROS order, match axes, m^2 and rad^2."""
+        if isinstance(self.alignment, ViewAlignment):
+            return covariance_of(self.alignment.information, model)
+        return closure_covariance(self.match, self.query, self.alignment, model)
+
+    @property
+    def consistent_pixels(self) -> Points:
+        """Pixels (K, 4) of the image features that obey the pose: u, v of the query and u, v of the match."""
+        views = self.hypothesis.views
+        return views.consistent_pixels(self.pose) if views else np.empty((0, 4), np.float32)
 
 
 def measure_candidate(ranked: RankedCandidate) -> Measurement:
@@ -141,7 +192,11 @@ def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) ->
     """
     query, match, pose, alignment = aligned.query, aligned.match, aligned.pose, aligned.alignment
     known = measure_candidate(aligned.hypothesis.ranked)
-    fit = _measure_scans(known, alignment, *aligned.scans) if aligned.scans else _measure_pairs(known, alignment)
+    if isinstance(alignment, ViewAlignment):
+        fit = _measure_views(known, alignment)
+    else:
+        assert aligned.scans is not None
+        fit = _measure_scans(known, alignment, *aligned.scans)
     nominal = covariance_of(alignment.information, NOMINAL)
     return replace(
         fit,
@@ -152,6 +207,15 @@ def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) ->
         prior_sigmas=prior_sigmas(query, match, pose, drift),
         support=memory.support(query, match, pose),
     )
+
+
+def beside(measurement: Measurement, pose: Array, others: Sequence[tuple[Array, Measurement]]) -> Measurement:
+    """The same, knowing the other hypotheses about the pair: poses `match_T_query` and what was measured there."""
+    distinct = [other.missing for there, other in others if not near(pose, there, const.DISTINCT_M, const.DISTINCT_RAD)]
+    if measurement.kind != SCAN or not distinct:
+        return measurement
+    room = const.RUNNER_UP_ROOM
+    return replace(measurement, runner_up=math.log((min(distinct) + room) / (measurement.missing + room)))
 
 
 def image_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
@@ -188,7 +252,10 @@ def cloud_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
 
 def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan, query: PreparedScan) -> Measurement:
     """Tests of how two scans fit."""
-    fit = evaluate(match.elevation, query.elevation, alignment.pose)
+    pose = alignment.pose
+    fit = evaluate(match.elevation, query.elevation, pose)
+    ours, theirs = meet(match, query, pose)
+    close, far = rivalry(match, query, pose, alignment.information)
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     return replace(
         known,
@@ -198,32 +265,31 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
         noise_m=max(match.noise_m, const.MIN_SURFACE_NOISE_M),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),
-        relief_m=shared_relief(match.elevation, query.elevation, alignment.pose),
+        relief_m=shared_relief(match.elevation, query.elevation, pose),
         terrain_correlation=fit.correlation,
         terrain_score=fit.score,
+        common=min(ours.common, theirs.common),
+        contradiction=max(ours.contradiction, theirs.contradiction),
+        counterparts=min(ours.counterparts, theirs.counterparts),
+        upright_counterparts=float(np.fmin(ours.upright_counterparts, theirs.upright_counterparts)),
+        unexplained=float(np.fmax(ours.unexplained, theirs.unexplained)),
+        rival_near=close,
+        rival_far=far,
     )
 
 
-def _measure_pairs(known: Measurement, alignment: Alignment) -> Measurement:
-    """Tests of how pairs of lifted features fit, where there are no two scans."""
-    residuals = alignment.residuals
+def _measure_views(known: Measurement, alignment: ViewAlignment) -> Measurement:
+    """Tests of how two views fit, where there are no two scans."""
     return replace(
         known,
         kind=IMAGE,
-        residual_m=float(np.sqrt(np.mean(residuals**2))) if len(residuals) else const.INLIER_M,
-        overlap=alignment.overlap,
-        pose_inliers=float(len(alignment.points)),
-        spread=_spread(alignment.points),
+        residual_m=alignment.distance_m,
+        residual_sigmas=alignment.spread_sigmas,
+        overlap=alignment.share,
+        pose_inliers=float(len(alignment.residuals)),
+        spread=alignment.spread,
+        two_way_m=alignment.two_way_m,
     )
-
-
-def _spread(points: Array) -> float:
-    """How wide the points lie across the view: the smaller standard deviation of bearing and log range."""
-    if len(points) < 3:
-        return 0.0
-    bearing = np.arctan2(points[:, 1], points[:, 0])
-    distance = np.log(np.maximum(np.linalg.norm(points, axis=1), 0.1))
-    return float(min(bearing.std(), distance.std()))
 
 
 def _rank_agreement(ours: LocalFeatures, theirs: LocalFeatures, distance: Array, reach: float, peers: Array) -> float:

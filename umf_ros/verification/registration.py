@@ -1,4 +1,4 @@
-"""Fine alignment of two keyframes, by their scans or by their features, and what the geometry says about the result."""
+"""Fine alignment of the scans of two keyframes, and what the geometry says about the result."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import small_gicp
 from numpy.typing import NDArray
 
 from umf_ros.frames import Keyframe, Points
-from umf_ros.geometry import Array, skew, transform
+from umf_ros.geometry import Array, invert, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import ElevationMap
 from umf_ros.verification.field_of_view import FieldOfView
-from umf_ros.verification.ransac import kabsch
+from umf_ros.verification.free_space import RangeImage
 from umf_ros.verification.surroundings import Surroundings
 from umf_ros.verification.upright import upright
 
@@ -23,9 +23,15 @@ from umf_ros.verification.upright import upright
 class PreparedScan:
     """A keyframe's scan made ready for comparison, each part when it is first asked for."""
 
-    def __init__(self, points: Points) -> None:
-        """Args: points (M, 3) m, body frame, thinned."""
+    def __init__(self, points: Points, body_T_lidar: Array | None = None) -> None:
+        """Prepare nothing yet.
+
+        Args:
+            points: (M, 3) m, body frame, thinned.
+            body_T_lidar: where they were seen from; without it the origin.
+        """
         self._thinned = points
+        self._lidar_T_body = np.eye(4) if body_T_lidar is None else invert(body_T_lidar)
         self.points: Array = points.astype(float)
         self._around: dict[float, Surroundings] = {}
 
@@ -42,7 +48,7 @@ class PreparedScan:
     @cached_property
     def up(self) -> Array:
         """Rotation (3, 3) that sets the scan upright."""
-        return upright(self.normals[self._picks(const.SAMPLE)])
+        return upright(self.normals[self.picks])
 
     @cached_property
     def upright_points(self) -> Array:
@@ -79,7 +85,7 @@ class PreparedScan:
         return cloud
 
     def _picks(self, count: int) -> NDArray[np.intp]:
-        return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(int)
+        return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(np.intp)
 
     @cached_property
     def cloud(self) -> small_gicp.PointCloud:
@@ -87,6 +93,15 @@ class PreparedScan:
         cloud = small_gicp.PointCloud(self.points)
         small_gicp.estimate_normals_covariances(cloud, self.tree, const.NORMAL_NEIGHBOURS, 1)
         return cloud
+
+    @cached_property
+    def range_image(self) -> RangeImage:
+        """How far the LiDAR saw."""
+        return RangeImage(transform(self._lidar_T_body, self.points))
+
+    def look_at(self, points: Array) -> NDArray[np.int8]:
+        """(N,) what the rays of this scan say of points (N, 3) of its body frame, each a `Sight`."""
+        return self.range_image.look_at(transform(self._lidar_T_body, points))
 
     @cached_property
     def picks(self) -> NDArray[np.intp]:
@@ -97,6 +112,12 @@ class PreparedScan:
     def sample(self) -> Array:
         """(S, 3) at most 1500 points, evenly taken."""
         return self.points[self.picks]
+
+    @cached_property
+    def spacing(self) -> Array:
+        """(S,) m: how far the points of the sample are from the fifth of their neighbours."""
+        _, squared = self.tree.batch_knn_search(self.sample, const.SPACING_NEIGHBOURS, 1)
+        return np.sqrt(np.asarray(squared)[:, -1])
 
     @cached_property
     def sample_cloud(self) -> small_gicp.PointCloud:
@@ -138,7 +159,7 @@ class ScanCache:
 
     def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
         key = (keyframe.session, keyframe.stamp_ns)
-        scan = self._scans.pop(key, None) or PreparedScan(keyframe.points)
+        scan = self._scans.pop(key, None) or PreparedScan(keyframe.points, keyframe.body_T_lidar)
         self._scans[key] = scan
         if len(self._scans) > const.SCANS_KEPT:
             self._scans.popitem(last=False)
@@ -193,16 +214,15 @@ NOMINAL = CovarianceModel(const.NOMINAL_INFLATION, const.NOMINAL_FLOOR_M, const.
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """How a query lies on a match.
+    """How the scan of a query lies on that of a match.
 
     Attributes:
         pose: (4, 4) `match_T_query`.
-        residuals: (N,) m: point-to-plane distances of the query points that have a counterpart, or, without
-            scans, the three coordinates of the distances of the feature pairs that agree.
+        residuals: (N,) m: point-to-plane distances of the query points that have a counterpart.
         jacobian: (N, 6) of the residuals by (x y z rx ry rz) about the match axes at the query's origin.
-        overlap: share of the query points seen by both, or of the feature pairs, that have a counterpart.
+        overlap: share of the query points seen by both that have a counterpart.
         points: (P, 3) m: the query points that have one, in the match's body frame.
-        pairs: (N, 2) index of the query's and of the match's point behind each residual; (0, 2) without scans.
+        pairs: (N, 2) index of the query's and of the match's point behind each residual; one row per residual.
     """
 
     pose: Array
@@ -260,19 +280,6 @@ def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
     overlap = float(close.sum()) / max(int(seen.sum()), 1)
     pairs = np.column_stack([query.picks, index])[close]
     return Alignment(pose, residual[close], np.hstack([normals[close], arm]), overlap, moved[close], pairs)
-
-
-def align_features(match_points: Array, query_points: Array, guess: Array) -> Alignment:
-    """Refine the pose `guess` on the pairs (N, 3) of lifted features that agree with it, each in its body frame, m."""
-    near = np.linalg.norm(transform(guess, query_points) - match_points, axis=1) < const.INLIER_M
-    pose = kabsch(query_points[near], match_points[near])
-    if pose is None:
-        pose = guess
-    moved = transform(pose, query_points[near])
-    arms = -skew(moved - pose[:3, 3])
-    jacobian = np.concatenate([np.broadcast_to(np.eye(3), arms.shape), arms], axis=2).reshape(-1, 6)
-    residuals = (moved - match_points[near]).ravel()
-    return Alignment(pose, residuals, jacobian, float(near.mean()) if len(near) else 0.0, moved)
 
 
 def covariance_of(found: Array, model: CovarianceModel, overlap: float | Array = 1.0) -> Array:
