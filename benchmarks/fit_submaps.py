@@ -149,11 +149,11 @@ def _wrong_answers(number: int, truth: Truth, finder: SubmapFinder, query: Keyfr
     rng = np.random.default_rng([number, query.stamp_ns % 2**32])
     rows = rng.permutation(len(finder.trail.stops))[:ANYWHERE].tolist()
     proposals = finder.lookalikes(query) + [Proposal(row, _anywhere(rng), planar=True) for row in rows]
-    here = truth[query.stamp_ns]
-    for row, stop in enumerate(finder.trail.stops):
-        pose = relative(truth[stop.stamp_ns], here)
-        if np.linalg.norm(pose[:3, 3]) < BESIDE_M and stop.travelled_m < query.travelled_m - const.SUBMAP_BEFORE_M:
-            proposals.append(Proposal(row, _beside(rng) @ pose))
+    here, way_m = truth[query.stamp_ns], query.travelled_m - const.SUBMAP_BEFORE_M
+    right = {row: relative(truth[stop.stamp_ns], here) for row, stop in enumerate(finder.trail.stops)}
+    near = [row for row, pose in right.items() if np.linalg.norm(pose[:3, 3]) < BESIDE_M]
+    near = [row for row in near if finder.trail.stops[row].travelled_m < way_m]
+    proposals += [Proposal(row, _beside(rng) @ right[row]) for row in rng.permutation(near)[:1].tolist()]
     for proposal in proposals:
         tested = finder.test(query, proposal)
         if tested is not None:
