@@ -158,13 +158,14 @@ def make_keyframe(
 
 
 def make_detector_embedder(settings: Settings) -> Embedder:
-    """The embedder the settings name, with super-features where the reranking asks for them.
+    """The embedder the settings name, with the features that verification asks for.
 
     Raises:
         ConfigError: unknown method, runtime or device.
         WeightsError: the weights cannot be used.
     """
-    return make_embedder(settings.embedding, super_features=settings.verification.rerank == "superfeatures")
+    chosen = settings.verification
+    return make_embedder(settings.embedding, chosen.rerank == "superfeatures", chosen.features)
 
 
 class Stopwatch:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from recordings import CALIBRATION, traverse, write_mcap
 from umf_ros.comparison import views
 from umf_ros.comparison.views import KeyframeSource, PlaceView, ReadingRules
 from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
-from umf_ros.errors import CalibrationError, UmfError
+from umf_ros.errors import CalibrationError, SensorFileError, UmfError
 from umf_ros.frames import Embedding, Frame
 
 
@@ -74,11 +75,8 @@ def test_a_view_in_many_pairs_is_embedded_once(here: Path, monkeypatch: pytest.M
     monkeypatch.setattr(views, "KEPT", 2)
     embedder = CountingEmbedder()
     source = KeyframeSource(embedder, calibrated(here))
-    one, two, three = (
-        PlaceView(str(here / "scan.npy")),
-        PlaceView("", str(here / "left.png")),
-        PlaceView(str(here / "drive.mcap@1")),
-    )
+    one, two = PlaceView(str(here / "scan.npy")), PlaceView("", str(here / "left.png"))
+    three = PlaceView(str(here / "drive.mcap@1"))
     for view in (one, two, one, one, two):
         source.keyframe(view)
     assert len(embedder.frames) == 2
@@ -132,6 +130,17 @@ def test_what_cannot_be_read_is_said_every_time(here: Path, view: PlaceView, tex
             source.keyframe(there)
 
 
+@pytest.mark.parametrize("change", [lambda points: points * 1000, lambda points: points + 1e5], ids=["mm", "map"])
+def test_a_scan_in_another_unit_or_frame_is_none(here: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    np.save(here / "scan.npy", change(np.load(here / "scan.npy")))
+    with pytest.raises(SensorFileError, match=r"scan\.npy has no return within reach: expected metres"):
+        KeyframeSource(ThumbnailEmbedder()).keyframe(PlaceView(str(here / "scan.npy")))
+
+
 def test_a_calibration_that_cannot_be_read_is_said_at_once(here: Path) -> None:
     with pytest.raises(CalibrationError, match="cannot read"):
         KeyframeSource(ThumbnailEmbedder(), ReadingRules(here / "nowhere.yaml"))
+
+
+def test_a_data_set_names_its_calibration() -> None:
+    assert KeyframeSource(ThumbnailEmbedder(), ReadingRules(Path("simulated"))).calibrated

@@ -8,12 +8,8 @@ from scenes import landscape, pose_at, take, without_image, without_scan
 
 from umf_ros.config import Verification
 from umf_ros.frames import Candidate, Keyframe
-from umf_ros.geometry import Array, make_pose, relative, rotation_angle
-from umf_ros.verification.hypotheses import (
-    consistent_pixels,
-    pose_from_pixels,
-    pose_from_points,
-)
+from umf_ros.geometry import Array, relative, rotation_angle
+from umf_ros.verification.hypotheses import pose_from_points
 from umf_ros.verification.rerank import RankedCandidate, rerank
 
 GROUND = landscape(20)
@@ -39,31 +35,11 @@ def test_points_give_the_pose_from_either_modality_or_both(match: Keyframe) -> N
     assert metres < 0.3 and degrees < 2.0
 
 
-def test_pixels_give_the_pose_without_depths_of_the_match() -> None:
-    image = MATCH.embedding.image
-    assert image is not None
-    flat = replace(image, points=np.full_like(image.points, np.nan))
-    match = replace(without_scan(MATCH), embedding=replace(MATCH.embedding, image=flat, cloud=None))
-    metres, degrees = gap(pose_from_pixels(QUERY, paired(match), 200))
-    assert metres < 0.6 and degrees < 2.0
-    assert pose_from_points(QUERY, paired(match), 200, seed=0) is None
-
-
 def test_unrelated_frames_give_no_pose() -> None:
     ranked = paired(OTHER)
     assert pose_from_points(QUERY, ranked, 200, seed=0) is None
-    assert pose_from_pixels(QUERY, ranked, 200) is None
 
 
 def test_nothing_to_match_gives_no_pose() -> None:
     bare = replace(MATCH, embedding=replace(MATCH.embedding, image=None, cloud=None))
     assert pose_from_points(QUERY, paired(bare), 200, seed=0) is None
-    assert pose_from_pixels(QUERY, paired(bare), 200) is None
-    assert consistent_pixels(QUERY, paired(bare), TRUE).shape == (0, 4)
-
-
-def test_consistent_pixels_obey_the_pose_and_vanish_with_a_wrong_one() -> None:
-    ranked = paired(MATCH)
-    right = consistent_pixels(QUERY, ranked, TRUE)
-    wrong = consistent_pixels(QUERY, ranked, TRUE @ make_pose(np.eye(3), [0.0, 8.0, 0.0]))
-    assert len(right) > 0.7 * len(ranked.image_pairs) > 4 * len(wrong)

@@ -25,11 +25,11 @@ OTHER = take(landscape(99), pose_at(landscape(99), -15.0, 0.0, 0.0), 20.0)
 COUNTS = ["similarity", "inliers_image", "inliers_cloud", "superfeatures"]
 SCANS = ["residual_m", "residual_p90_m", "noise_m", "overlap", "points", "relief_m"]
 MAPS = ["terrain_correlation", "terrain_score"]
-PAIRS = ["residual_m", "overlap", "pose_inliers", "spread"]
+VIEWS = ["residual_m", "residual_sigmas", "overlap", "pose_inliers", "spread", "two_way_m"]
 POSE = ["position_std_m", "heading_std_deg", "agreement_image", "agreement_cloud", "prior_sigmas", "support"]
 
-KNOWN = {*COUNTS, *SCANS, *MAPS, *PAIRS, *POSE}
-KINDS = {"": COUNTS, SCAN: COUNTS + SCANS + MAPS + POSE, IMAGE: COUNTS + PAIRS + POSE}
+KNOWN = {*COUNTS, *SCANS, *MAPS, *VIEWS, *POSE}
+KINDS = {"": COUNTS, SCAN: COUNTS + SCANS + MAPS + POSE, IMAGE: COUNTS + VIEWS + POSE}
 
 
 def measured(query: Keyframe, match: Keyframe) -> Measurement:
@@ -61,10 +61,11 @@ def test_a_pair_of_scans_is_measured_completely() -> None:
     assert math.isnan(found.prior_sigmas) and math.isnan(found.pose_inliers)  # no odometry; not of this kind
 
 
-def test_without_a_scan_the_pairs_of_features_are_measured() -> None:
+def test_without_a_scan_the_views_are_measured() -> None:
     found = measured(without_scan(QUERY), MATCH)
     assert found.kind == IMAGE
-    assert found.pose_inliers >= 10 and found.spread > 0.05 and found.residual_m < 0.5 and 0.3 < found.overlap <= 1
+    assert found.pose_inliers >= 15 and found.spread > 0.05 and found.residual_m < 0.5 and 0.3 < found.overlap <= 1
+    assert found.two_way_m < 0.5 and 0.5 < found.residual_sigmas < 3
     assert math.isnan(found.agreement_cloud) and math.isnan(found.points)
 
 

@@ -33,7 +33,7 @@ def command(
     query_right: Image = None,
     pairs: Annotated[Path | None, typer.Option("--list", help="CSV of pairs, paths relative to it.")] = None,
     out: Annotated[Path | None, typer.Option(help="CSV of verdicts about the list.")] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Calibration file of scans and images.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file, or name of a data set.")] = None,
     bin_columns: Annotated[int, typer.Option(min=0, max=64, help="Numbers per point of a .bin; 0: 4 or 3.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
     config: ConfigPath = None,

@@ -75,7 +75,7 @@ class KeyframeSource:
         self._embedder = embedder
         self._rules = rules
         self._warn = _once(warn)
-        self._calibration = UNCALIBRATED if rules.calibration is None else load_calibration(rules.calibration)
+        self._calibration = UNCALIBRATED if rules.calibration is None else load_calibration(str(rules.calibration))
         self._kept: OrderedDict[PlaceView, Keyframe | UmfError] = OrderedDict()
         self._expected: dict[Path, list[PlaceView]] = {}
 
@@ -109,11 +109,17 @@ class KeyframeSource:
         reference = split_reference(view.scan)
         try:
             if reference is None:
-                self._keep(view, make_keyframe(self._snapshot(view), self._embedder))
+                self._keep(view, self._from_files(view))
             else:
                 self._read_recording(reference[0], view)
         except UmfError as error:
             self._keep(view, error)
+
+    def _from_files(self, view: PlaceView) -> Keyframe:
+        keyframe = make_keyframe(self._snapshot(view), self._embedder)
+        if not view.left and not len(keyframe.points):
+            raise SensorFileError(f"{view.scan} has no return within reach: expected metres, from the sensor")
+        return keyframe
 
     def _snapshot(self, view: PlaceView) -> Frame:
         if not view.scan and not view.left:

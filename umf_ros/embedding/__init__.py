@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 SUFFIX = "_embedder"
 DEFAULT = "umf"
+OWN_FEATURES = "umf"
 
 
 def find_methods() -> tuple[str, ...]:
@@ -31,12 +32,13 @@ CHOICES = either(METHODS)
 """For help texts."""
 
 
-def make_embedder(settings: EmbeddingSettings, super_features: bool = False) -> Embedder:
+def make_embedder(settings: EmbeddingSettings, super_features: bool = False, features: str = OWN_FEATURES) -> Embedder:
     """The embedder that the settings name.
 
     Args:
         settings: method, weights, runtime, device and threads.
         super_features: whether the network's super-features are wanted too.
+        features: local features of images: "umf", what the embedder gives itself, or "xfeat".
 
     Raises:
         ConfigError: unknown method or device.
@@ -45,4 +47,8 @@ def make_embedder(settings: EmbeddingSettings, super_features: bool = False) -> 
     if settings.method not in METHODS:
         raise ConfigError(f"embedding.method: unknown method {settings.method!r}; known: {', '.join(METHODS)}")
     embedder: Embedder = import_module(f"{__name__}.{settings.method}{SUFFIX}").make(settings, super_features)
-    return embedder
+    if features == OWN_FEATURES:
+        return embedder
+    from umf_ros.embedding.image_features import with_xfeat
+
+    return with_xfeat(embedder, settings)

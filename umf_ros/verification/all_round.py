@@ -32,16 +32,23 @@ class Fit:
         pose: (4, 4) `match_T_query`.
         share: of some of the query's points, how many have a counterpart.
         terrain: how well the elevation maps fit there, in standard deviations of chance.
+        structured: whether enough stands around both to be compared, where terrain says nothing.
     """
 
     pose: Array
     share: float
     terrain: float
+    structured: bool
 
     @property
     def score(self) -> float:
         """What fits are ranked by: counterparts, and terrain where they say little."""
         return self.share + const.TERRAIN_WEIGHT * self.terrain
+
+    @property
+    def telling(self) -> bool:
+        """Whether there is anything that could have spoken against it; two bare planes fit anywhere."""
+        return self.structured or self.terrain >= const.MIN_MAP_SCORE
 
 
 class TurnedSurroundings:
@@ -77,25 +84,28 @@ def search(match: PreparedScan, turned: TurnedSurroundings) -> list[Fit]:
         level = _settle(around, turned.around, float(const.ALL_HEADINGS[heading]), shift)
         to_match = make_pose(match.up.T, np.zeros(3))
         fits.append(scout(match, turned.scan, to_match @ level @ make_pose(turned.scan.up, np.zeros(3))))
-    return sorted(fits, key=lambda fit: -fit.score)
+    return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
 
 
 def scout(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
     """Draw a pose to the match by a few points, and see how many of them find a counterpart."""
+    cell_m = _cell_for(query)
     result = small_gicp.align(
         match.cloud,
         query.scouts_cloud,
         match.tree,
         guess,
         registration_type="GICP",
-        max_correspondence_distance=const.SCOUT_REACH * _cell_for(query),
+        max_correspondence_distance=const.SCOUT_REACH * cell_m,
         num_threads=1,
         max_iterations=const.SCOUT_STEPS,
     )
     pose = np.asarray(result.T_target_source)
     squared = match.nearest(transform(pose, query.scouts))[1]
-    near = squared < (const.SCOUT_NEAR * _cell_for(query)) ** 2
-    return Fit(pose, float(near.mean()), evaluate(match.elevation, query.elevation, pose).score)
+    near = squared < (const.SCOUT_NEAR * cell_m) ** 2
+    terrain = evaluate(match.elevation, query.elevation, pose).score
+    structured = all(scan.around(cell_m).structured for scan in (match, query))
+    return Fit(pose, float(near.mean()), terrain, structured)
 
 
 def _cell_for(scan: PreparedScan) -> float:

@@ -24,13 +24,27 @@ MAX_TILT_RAD = 0.5  # by hand: a rover does not lie on its side
 
 # hypotheses: which poses are worth a closer look?
 POINT_THRESHOLD_M = 0.75  # geometry: as CLOUD_THRESHOLD_M
-PIXEL_THRESHOLD = 0.025  # of the image's width; geometry: as IMAGE_THRESHOLD, but for a pose and its parallax
 MIN_POINTS = 6  # by hand: that agree on a motion
-MIN_PIXELS = 10  # by hand: that agree on a view: with two coordinates each, more of them agree by chance
+MIN_PIXELS = 15  # measured: that agree on a view; of other places never more than 13 did
 DISTINCT_M, DISTINCT_RAD = 0.8, 0.1  # geometry: nearer hypotheses end in the same basin of the alignment
 MIN_MAP_SCORE = 5.0  # by hand, in standard deviations of chance: below, two elevation maps fit no better than noise
 MAX_REFINED = 3  # hypotheses per group of candidates that are aligned: bounds the time
 EXPECTED_M = 4.0  # by hand: a candidate this near to where odometry carries an accepted closure is tested first
+
+# views: what two images say about a pose
+# standard deviation of a feature's place, of the image's width. XFeat's: a pixel in 688, measured on right pairs under
+# another sun; the network's own lie at the centres of cells of 1.8 %
+VIEW_NOISE = {"xfeat": 0.0015, "umf": 0.006}
+DISPARITY_NOISE = 0.0005  # of the image's width, a third of a pixel; measured likewise
+VIEW_REACH = 4.0  # standard deviations: what agrees with a pose of RANSAC
+VIEW_SAMPLES = 300  # measured: three times as many find 3 % more, a third of them 3 % less
+VIEW_STEPS, VIEW_TOLERANCE = 8, 1e-4  # of Gauss-Newton; m and rad, far below what is known
+VIEW_KERNEL = 9.0  # squared standard deviations: three of them halve the pull of a feature
+VIEW_GATE, VIEW_NEAR = 11.3, 100.0  # likewise; 99 % of a chi-square of three, and what the refinement may draw in
+MIN_VIEW_SIGMAS = 0.5  # no pair of images is better than half the noise assumed
+UNMEASURED = 1e6  # pixels^2: the variance of a disparity nobody measured
+NEAREST_SEEN_M = 0.3  # nothing nearer than this is in front of a camera
+NOMINAL_BASELINE_M = 0.2  # S3LI's: how well depths of a camera without a right one are taken to be known
 
 # elevation maps: how well does the ground fit at a pose?
 CELL_M = 0.5  # by hand: rocks and ripples are seen, and ten thousand returns leave few holes
@@ -51,12 +65,14 @@ AROUND_CELLS, AROUND_RADIUS, AROUND_SHIFT = 64, 26, 12  # geometry: 26 + 26 + 12
 REACH_CELLS = 15.0  # measured: the median range of a scan in cells
 AROUND_CELL_M = (0.25, 1.0)  # by hand: rooms, fields
 LAYER_M = 0.3  # by hand: just more than the thinning
+TALL_LAYERS, MIN_TALL = 3, 20  # by hand: cells of walls, trunks and boxes, and how many make a place
 ALL_HEADINGS = np.radians(np.arange(0.0, 360.0, 6.0))  # geometry: half a step is within reach of the alignment
+MIN_SHARED_VIEW = 0.6  # of the narrower view; by hand: a LiDAR of 70 deg may be turned by 28
 SEARCHED_OVERLAP = 0.45  # by hand: a view of 70 deg is looked for within 38
-PEAKS = (3, 4)  # by hand: of relief alone, of relief and structure
+PEAKS = (2, 3)  # by hand: of relief alone, of relief and structure
 SETTLE_MEDIANS, SETTLE_M = 2.5, 0.05  # by hand: cells that a plane between two maps is fitted to lie so near to it
 MAX_SLOPE = 0.3  # by hand: of one map against the other, rad
-SCOUTS, SCOUT_STEPS = 300, 5
+SCOUTS, SCOUT_STEPS = 200, 4
 SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells
 TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain in the open
 
@@ -69,7 +85,6 @@ SAMPLE = 1500  # measured: points of the query that are aligned; a third of the 
 COARSE_REACH_M, COARSE_STEPS = 1.0, 10  # geometry: two cells of the elevation maps
 FINE_REACH_M, FINE_STEPS = 0.4, 8  # by hand: the spacing of far returns is wider than the noise
 MIN_SCAN_POINTS = 100  # by hand: below, there is nothing to align
-INLIER_M = 0.75  # geometry: as POINT_THRESHOLD_M; pairs of features a pose without scans is refined on
 SCANS_KEPT = 60  # prepared scans in memory: bounds it, changes no result
 
 # covariance

@@ -8,17 +8,17 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from umf_ros.config import Verification
-from umf_ros.frames import Keyframe, Points
-from umf_ros.geometry import Array, make_pose, relative, rotation_angle, transform
+from umf_ros.frames import Keyframe
+from umf_ros.geometry import Array, relative, rotation_angle
 from umf_ros.verification import constants as const
 from umf_ros.verification.all_round import Fit, TurnedSurroundings, scout, search
 from umf_ros.verification.ransac import fit_rigid
 from umf_ros.verification.registration import PreparedScan
 from umf_ros.verification.rerank import RankedCandidate
+from umf_ros.verification.views import PairedViews
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +29,13 @@ class Hypothesis:
         ranked: the candidate it belongs to.
         pose: (4, 4) `match_T_query`.
         score: of the elevation maps at that pose, or inliers without scans; larger is better.
+        views: both images, where there are any.
     """
 
     ranked: RankedCandidate
     pose: Array
     score: float
+    views: PairedViews | None = None
 
 
 def find_hypotheses(
@@ -52,17 +54,17 @@ def find_hypotheses(
         match: the candidate's scan, usable or not.
         settings: RANSAC iterations and seed.
     """
-    poses = [
-        pose_from_points(query, ranked, settings.ransac_iterations, settings.seed),
-        pose_from_pixels(query, ranked, settings.ransac_iterations),
-    ]
-    # P3P on a degenerate view can succeed with numbers that are none
-    found = [pose for pose in poses if pose is not None and np.isfinite(pose).all()]
+    views = None
+    if settings.modalities != "cloud":
+        views = PairedViews.of(query, ranked.keyframe, const.VIEW_NOISE[settings.features])
+    seen = views.best_pose() if views else None
     if turned is None or not match.usable:
-        return [Hypothesis(ranked, pose, ranked.score) for pose in found[:1]]
-    fits = [scout(match, turned.scan, pose) for pose in found] + search(match, turned)
+        return [Hypothesis(ranked, seen[0], float(seen[1]), views)] if seen else []
+    from_points = pose_from_points(query, ranked, settings.ransac_iterations, settings.seed)
+    poses = [pose for pose in (from_points, seen[0] if seen else None) if pose is not None]
+    fits = [fit for pose in poses if (fit := scout(match, turned.scan, pose)).telling] + search(match, turned)
     fits.sort(key=lambda fit: -fit.score)
-    return [Hypothesis(ranked, fit.pose, fit.score) for fit in _distinct(fits)]
+    return [Hypothesis(ranked, fit.pose, fit.score, views) for fit in _distinct(fits)]
 
 
 def pose_from_points(query: Keyframe, ranked: RankedCandidate, iterations: int, seed: int) -> Array | None:
@@ -70,31 +72,6 @@ def pose_from_points(query: Keyframe, ranked: RankedCandidate, iterations: int, 
     ours, theirs = paired_points(query, ranked)
     consensus = fit_rigid(ours, theirs, const.POINT_THRESHOLD_M, iterations, seed)
     return consensus.model if consensus is not None and consensus.count >= const.MIN_POINTS else None
-
-
-def pose_from_pixels(query: Keyframe, ranked: RankedCandidate, iterations: int) -> Array | None:
-    """`match_T_query` from the query's lifted features seen in the match's image (P3P in RANSAC), or None."""
-    ours, theirs = query.embedding.image, ranked.keyframe.embedding.image
-    if ours is None or theirs is None:
-        return None
-    points = ours.points[ranked.image_pairs[:, 0]].astype(float)
-    pixels = theirs.positions[ranked.image_pairs[:, 1]].astype(float)
-    known = np.isfinite(points).all(axis=1)
-    if known.sum() < const.MIN_PIXELS:
-        return None
-    camera = ranked.keyframe.camera
-    found, rotation, translation, inliers = cv2.solvePnPRansac(
-        points[known],
-        pixels[known],
-        np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]]),
-        None,
-        iterationsCount=iterations,
-        reprojectionError=const.PIXEL_THRESHOLD * camera.width,
-        flags=cv2.SOLVEPNP_P3P,
-    )
-    if not found or inliers is None or len(inliers) < const.MIN_PIXELS:
-        return None
-    return ranked.keyframe.body_T_camera @ make_pose(cv2.Rodrigues(rotation)[0], translation.ravel())
 
 
 def paired_points(query: Keyframe, ranked: RankedCandidate) -> tuple[Array, Array]:
@@ -110,19 +87,6 @@ def paired_points(query: Keyframe, ranked: RankedCandidate) -> tuple[Array, Arra
             ours.append(a[known])
             theirs.append(b[known])
     return np.concatenate(ours), np.concatenate(theirs)
-
-
-def consistent_pixels(query: Keyframe, ranked: RankedCandidate, pose: Array) -> Points:
-    """Pixels (K, 4) of the image pairs that obey the pose: u, v of the query and u, v of the match."""
-    ours, theirs = query.embedding.image, ranked.keyframe.embedding.image
-    if ours is None or theirs is None or not len(ranked.image_pairs):
-        return np.empty((0, 4), np.float32)
-    here, there = ranked.image_pairs.T
-    camera = ranked.keyframe.camera
-    pixels, depth = camera.project(transform(pose, ours.points[here].astype(float)), ranked.keyframe.body_T_camera)
-    error = np.hypot(*(pixels - theirs.positions[there]).T)
-    obeys = (depth > 0) & (error < 2 * const.PIXEL_THRESHOLD * camera.width)
-    return np.hstack([ours.positions[here[obeys]], theirs.positions[there[obeys]]]).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,13 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.frames import Keyframe, LocalFeatures
+from umf_ros.frames import Keyframe, LocalFeatures, Points
 from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, prior_sigmas
-from umf_ros.verification.registration import NOMINAL, Alignment, PreparedScan, covariance_of
+from umf_ros.verification.registration import NOMINAL, Alignment, CovarianceModel, PreparedScan, covariance_of
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
+from umf_ros.verification.scan_motion import closure_covariance
+from umf_ros.verification.views import ViewAlignment
 
 SCAN, IMAGE = "scan", "image"
 
@@ -41,16 +43,18 @@ class Measurement:
         inliers_image: pairs of image features that one homography explains.
         inliers_cloud: pairs of the scan's features that one rigid motion explains.
         superfeatures: eligible pairs of super-features, where the reranking goes by them.
-        residual_m: median point-to-plane distance of the scans; root mean square of the pairs without scans.
+        residual_m: median point-to-plane distance of the scans; median distance of the pairs' points without scans.
+        residual_sigmas: size of the errors of reprojection in standard deviations of the features' noise.
         residual_p90_m: nine of ten points are nearer than this to their counterpart's plane.
         noise_m: how far the match's points scatter about their own planes.
-        overlap: share of the points seen by both (of the feature pairs) that have a counterpart.
+        overlap: share of the points seen by both that have a counterpart (of the feature pairs: that agree).
         points: points that have one.
         relief_m: standard deviation of the relief on the ground that both scans saw.
         terrain_correlation: of both elevation maps' relief, -1 to 1.
         terrain_score: the same in standard deviations of chance.
         pose_inliers: feature pairs that agree with the pose.
-        spread: of those pairs across the view: smaller deviation of bearing (rad) and of log range.
+        spread: of those pairs across the image: smaller deviation of column and row, of its width and height.
+        two_way_m: distance of the poses that the query's depths and the match's give by themselves.
         position_std_m: standard deviation of the position along its least known direction, from the residuals.
         heading_std_deg: of the heading.
         agreement_image: whether image features reappear where the pose says, standard deviations of chance.
@@ -65,6 +69,7 @@ class Measurement:
     inliers_cloud: float = 0.0
     superfeatures: float = 0.0
     residual_m: float = measured(SCAN, IMAGE)
+    residual_sigmas: float = measured(IMAGE)
     residual_p90_m: float = measured(SCAN)
     noise_m: float = measured(SCAN)
     overlap: float = measured(SCAN, IMAGE)
@@ -74,6 +79,7 @@ class Measurement:
     terrain_score: float = measured(SCAN)
     pose_inliers: float = measured(IMAGE)
     spread: float = measured(IMAGE)
+    two_way_m: float = measured(IMAGE)
     position_std_m: float = measured(SCAN, IMAGE)
     heading_std_deg: float = measured(SCAN, IMAGE)
     agreement_image: float = measured(SCAN, IMAGE)
@@ -99,12 +105,12 @@ class AlignedHypothesis:
         query: the query keyframe.
         hypothesis: as it was found, with its candidate.
         alignment: the refined pose, its residuals and what they were measured on.
-        scans: of the match and of the query; None when only local features were aligned.
+        scans: of the match and of the query; None when only their views were aligned.
     """
 
     query: Keyframe
     hypothesis: Hypothesis
-    alignment: Alignment
+    alignment: Alignment | ViewAlignment
     scans: tuple[PreparedScan, PreparedScan] | None
 
     @property
@@ -116,6 +122,18 @@ class AlignedHypothesis:
     def pose(self) -> Array:
         """(4, 4) `match_T_query`."""
         return self.alignment.pose
+
+    def covariance(self, model: CovarianceModel) -> Array:
+        """Covariance (6, 6) of the pose in ROS order, match axes, m^2 and rad^2."""
+        if isinstance(self.alignment, ViewAlignment):
+            return covariance_of(self.alignment.information, model)
+        return closure_covariance(self.match, self.query, self.alignment, model)
+
+    @property
+    def consistent_pixels(self) -> Points:
+        """Pixels (K, 4) of the image features that obey the pose: u, v of the query and u, v of the match."""
+        views = self.hypothesis.views
+        return views.consistent_pixels(self.pose) if views else np.empty((0, 4), np.float32)
 
 
 def measure_candidate(ranked: RankedCandidate) -> Measurement:
@@ -138,7 +156,11 @@ def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) ->
     """
     query, match, pose, alignment = aligned.query, aligned.match, aligned.pose, aligned.alignment
     known = measure_candidate(aligned.hypothesis.ranked)
-    fit = _measure_scans(known, alignment, *aligned.scans) if aligned.scans else _measure_pairs(known, alignment)
+    if isinstance(alignment, ViewAlignment):
+        fit = _measure_views(known, alignment)
+    else:
+        assert aligned.scans is not None
+        fit = _measure_scans(known, alignment, *aligned.scans)
     nominal = covariance_of(alignment.information, NOMINAL)
     return replace(
         fit,
@@ -201,26 +223,18 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
     )
 
 
-def _measure_pairs(known: Measurement, alignment: Alignment) -> Measurement:
-    """Tests of how pairs of lifted features fit, where there are no two scans."""
-    residuals = alignment.residuals
+def _measure_views(known: Measurement, alignment: ViewAlignment) -> Measurement:
+    """Tests of how two views fit, where there are no two scans."""
     return replace(
         known,
         kind=IMAGE,
-        residual_m=float(np.sqrt(np.mean(residuals**2))) if len(residuals) else const.INLIER_M,
-        overlap=alignment.overlap,
-        pose_inliers=float(len(alignment.points)),
-        spread=_spread(alignment.points),
+        residual_m=alignment.distance_m,
+        residual_sigmas=alignment.spread_sigmas,
+        overlap=alignment.share,
+        pose_inliers=float(len(alignment.residuals)),
+        spread=alignment.spread,
+        two_way_m=alignment.two_way_m,
     )
-
-
-def _spread(points: Array) -> float:
-    """How wide the points lie across the view: the smaller standard deviation of bearing and log range."""
-    if len(points) < 3:
-        return 0.0
-    bearing = np.arctan2(points[:, 1], points[:, 0])
-    distance = np.log(np.maximum(np.linalg.norm(points, axis=1), 0.1))
-    return float(min(bearing.std(), distance.std()))
 
 
 def _rank_agreement(ours: LocalFeatures, theirs: LocalFeatures, distance: Array, reach: float, peers: Array) -> float:

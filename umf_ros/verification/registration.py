@@ -1,4 +1,4 @@
-"""Fine alignment of two keyframes, by their scans or by their features, and what the geometry says about the result."""
+"""Fine alignment of the scans of two keyframes, and what the geometry says about the result."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ import small_gicp
 from numpy.typing import NDArray
 
 from umf_ros.frames import Keyframe, Points
-from umf_ros.geometry import Array, skew, transform
+from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import ElevationMap
 from umf_ros.verification.field_of_view import FieldOfView
-from umf_ros.verification.ransac import kabsch
 from umf_ros.verification.surroundings import Surroundings
 from umf_ros.verification.upright import upright
 
@@ -193,16 +192,15 @@ NOMINAL = CovarianceModel(const.NOMINAL_INFLATION, const.NOMINAL_FLOOR_M, const.
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """How a query lies on a match.
+    """How the scan of a query lies on that of a match.
 
     Attributes:
         pose: (4, 4) `match_T_query`.
-        residuals: (N,) m: point-to-plane distances of the query points that have a counterpart, or, without
-            scans, the three coordinates of the distances of the feature pairs that agree.
+        residuals: (N,) m: point-to-plane distances of the query points that have a counterpart.
         jacobian: (N, 6) of the residuals by (x y z rx ry rz) about the match axes at the query's origin.
-        overlap: share of the query points seen by both, or of the feature pairs, that have a counterpart.
+        overlap: share of the query points seen by both that have a counterpart.
         points: (P, 3) m: the query points that have one, in the match's body frame.
-        pairs: (N, 2) index of the query's and of the match's point behind each residual; (0, 2) without scans.
+        pairs: (N, 2) index of the query's and of the match's point behind each residual; one row per residual.
     """
 
     pose: Array
@@ -260,19 +258,6 @@ def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
     overlap = float(close.sum()) / max(int(seen.sum()), 1)
     pairs = np.column_stack([query.picks, index])[close]
     return Alignment(pose, residual[close], np.hstack([normals[close], arm]), overlap, moved[close], pairs)
-
-
-def align_features(match_points: Array, query_points: Array, guess: Array) -> Alignment:
-    """Refine the pose `guess` on the pairs (N, 3) of lifted features that agree with it, each in its body frame, m."""
-    near = np.linalg.norm(transform(guess, query_points) - match_points, axis=1) < const.INLIER_M
-    pose = kabsch(query_points[near], match_points[near])
-    if pose is None:
-        pose = guess
-    moved = transform(pose, query_points[near])
-    arms = -skew(moved - pose[:3, 3])
-    jacobian = np.concatenate([np.broadcast_to(np.eye(3), arms.shape), arms], axis=2).reshape(-1, 6)
-    residuals = (moved - match_points[near]).ravel()
-    return Alignment(pose, residuals, jacobian, float(near.mean()) if len(near) else 0.0, moved)
 
 
 def covariance_of(found: Array, model: CovarianceModel, overlap: float | Array = 1.0) -> Array:

@@ -17,14 +17,11 @@ from umf_ros.verification.all_round import TurnedSurroundings
 from umf_ros.verification.hypotheses import (
     Hypothesis,
     TemporalMemory,
-    consistent_pixels,
     find_hypotheses,
-    paired_points,
 )
 from umf_ros.verification.measurement import AlignedHypothesis, Measurement, measure, measure_candidate
-from umf_ros.verification.registration import ScanCache, align_features, align_scans
+from umf_ros.verification.registration import ScanCache, align_scans
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
-from umf_ros.verification.scan_motion import closure_covariance
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,11 +149,10 @@ class Verifier:
 
     def _judge(self, query: Keyframe, hypothesis: Hypothesis) -> JudgedHypothesis:
         scans = self._scans[hypothesis.ranked.keyframe], self._scans[query]
-        if all(scan.usable for scan in scans):
-            aligned = AlignedHypothesis(query, hypothesis, align_scans(*scans, hypothesis.pose), scans)
+        if hypothesis.views is not None and not all(scan.usable for scan in scans):
+            aligned = AlignedHypothesis(query, hypothesis, hypothesis.views.align(hypothesis.pose), None)
         else:
-            ours, theirs = paired_points(query, hypothesis.ranked)
-            aligned = AlignedHypothesis(query, hypothesis, align_features(theirs, ours, hypothesis.pose), None)
+            aligned = AlignedHypothesis(query, hypothesis, align_scans(*scans, hypothesis.pose), scans)
         measurement = measure(aligned, self._memory, self._settings.odometry_drift)
         return JudgedHypothesis(aligned, measurement, self._acceptance.probability(measurement))
 
@@ -178,12 +174,12 @@ class Verifier:
 
     def _verdict(self, ranked: RankedCandidate, judged: JudgedHypothesis) -> Verdict:
         aligned, measurement, probability = judged.aligned, judged.measurement, judged.probability
-        pixels = consistent_pixels(aligned.query, ranked, aligned.pose)
+        pixels = aligned.consistent_pixels
         objection = self._objection(judged)
         if objection:
             return Verdict(ranked.candidate, objection, measurement, None, pixels, probability)
         model = self._acceptance.covariances[measurement.kind]
-        covariance = closure_covariance(aligned.match, aligned.query, aligned.alignment, model)
+        covariance = aligned.covariance(model)
         closure = LoopClosure(aligned.query.stamp_ns, ranked.candidate.stamp_ns, aligned.pose, covariance, probability)
         return Verdict(ranked.candidate, "accepted", measurement, closure, pixels, probability)
 
@@ -194,8 +190,19 @@ class Verifier:
         pose = judged.aligned.pose
         turn_deg, shift_m = abs(np.degrees(heading(pose))), float(np.linalg.norm(pose[:3, 3]))
         # a place is a position and a view [UMF 5.1.2]: whoever looks elsewhere is somewhere else
-        if turn_deg > self._settings.max_turn_deg:
+        if 0 < self._settings.max_turn_deg < turn_deg:
             return f"turned by {turn_deg:.0f} deg, more than {self._settings.max_turn_deg:g}"
+        if (shared := _shared_view(judged.aligned)) < const.MIN_SHARED_VIEW:
+            return f"turned by {turn_deg:.0f} deg: the views share only {max(shared, 0):.0%}"
         if shift_m > self._settings.max_shift_m:
             return f"{shift_m:.1f} m apart, more than {self._settings.max_shift_m:g}"
         return ""
+
+
+def _shared_view(aligned: AlignedHypothesis) -> float:
+    """Share of the narrower view that both sensors see at the pose that was found."""
+    if aligned.scans is None:
+        return 1.0 - abs(heading(aligned.pose)) / min(one.camera.width_rad for one in (aligned.query, aligned.match))
+    match, query = aligned.scans
+    turn = heading(match.up @ aligned.pose[:3, :3] @ query.up.T)
+    return float(match.view.overlap(query.view, np.array([turn]))[0])

@@ -13,7 +13,6 @@ from umf_ros.errors import writing
 from umf_ros.frames import Candidate, Image, Keyframe, Points
 from umf_ros.geometry import transform
 from umf_ros.verification.acceptance import load_acceptance
-from umf_ros.verification.hypotheses import consistent_pixels
 from umf_ros.verification.verifier import JudgedHypothesis, Verifier
 
 MOST_LINES = 60
@@ -56,8 +55,7 @@ def explain(query: Keyframe, match: Keyframe, settings: Verification) -> Explana
         return Explanation(query, match, None, settings.min_probability, {}, np.empty((0, 4), np.float32))
     best = max(examined, key=lambda one: one.probability)
     contributions = load_acceptance(settings.calibration).contributions(best.measurement)
-    pixels = consistent_pixels(query, best.aligned.hypothesis.ranked, best.aligned.pose)
-    return Explanation(query, match, best, settings.min_probability, contributions, pixels)
+    return Explanation(query, match, best, settings.min_probability, contributions, best.aligned.consistent_pixels)
 
 
 def draw(explanation: Explanation, query_image: Image | None, match_image: Image | None, path: Path) -> None:
