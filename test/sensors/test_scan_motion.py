@@ -21,7 +21,7 @@ def drive(noise: Array, rate_hz: float = 25.0, seconds: float = 60.0) -> tuple[A
     sway = np.radians(1.0) * np.sin(2 * np.pi * times / 4)
     turns = Rotation.from_euler("xyz", np.column_stack([sway, sway[::-1], 0.1 * times]) + walk[:, 3:])
     poses = [
-        make_pose(turn.as_matrix(), [time, 0, 0] + step)
+        make_pose(turn.as_matrix(), step + np.array([time, 0, 0]))
         for turn, time, step in zip(turns, times, walk[:, :3], strict=True)
     ]
     return (times * 1e9).astype(np.int64), poses
