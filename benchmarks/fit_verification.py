@@ -14,7 +14,7 @@ import math
 import multiprocessing
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -41,9 +41,8 @@ from umf_ros.lab.training.acceptance_fit import (
 )
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
-from umf_ros.verification.acceptance import KINDS, AcceptanceModel, load_acceptance
-from umf_ros.verification.measurement import IMAGE, SCAN
-from umf_ros.verification.verifier import JudgedHypothesis
+from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
+from umf_ros.verification.measurement import SCAN
 
 RIGHT_M, RIGHT_DEG = 0.4, 3.0
 EXAMINED = 5  # candidates per query: what retrieval offers first
@@ -54,22 +53,6 @@ SURVEYS, PAIRS = range(VALIDATION[0], VALIDATION[0] + 3), 60  # in every domain
 ENOUGH = 100  # right examples that a fit needs
 Survey = tuple[Drive, list[Keyframe]]
 DEFAULT_OUT = Path(__file__).parent.parent / "config" / "verification" / "calibration.json"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One examined hypothesis, and the error (6,) of its pose, of the drive with this seed."""
-
-    drive: int
-    examined: JudgedHypothesis
-    error: Array
-    right: bool
-    pristine: bool
-
-    @property
-    def example(self) -> Example:
-        """What the acceptance model is fitted to; a drive's world counts as a domain."""
-        return Example(self.examined.measurement, self.right, f"drive {self.drive}")
 
 
 def main(
@@ -99,7 +82,7 @@ def main(
         with console.status(f"simulating world {number} ({family}, aliasing {aliasing:g})"):
             drive = kept(drives, number, family, aliasing)
         surveyed.append((drive, embedded(drive, embedder)))
-    model, results = fit([finding for survey in surveyed for finding in examine(*survey)], elsewhere)
+    model, results = fit([example for survey in surveyed for example in examine(*survey)] + elsewhere)
     for name, value in results.items():
         console.print(f"{name:32} {value:.4g}")
     save_acceptance(model, out, f"python benchmarks/fit_verification.py --worlds {count}", results)
@@ -122,14 +105,13 @@ def _in_domain(
     return kept_examples(domain, SURVEYS, pairs, folder, make_embedder(settings), kept)
 
 
-def fit(findings: list[Finding], elsewhere: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
-    """The model that explains the findings and what other domains gave, and how it does in domains left out.
+def fit(examples: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
+    """The model that explains the examples, and how it does in domains left out.
 
     What the shipped model says of other kinds than scans stays.
     """
     shipped = load_acceptance()
-    known = [finding.example for finding in findings] + elsewhere + _sprung_traps()
-    mine = [example for example in known if example.measurement.kind == SCAN]
+    mine = [example for example in examples + _sprung_traps() if example.measurement.kind == SCAN]
     save_examples(mine, EXAMPLES)
     model, odds = fit_decision(mine, SCAN, THRESHOLD)
     bounds = shipped.bounds | {SCAN: bounds_of(mine, SCAN)}
@@ -137,12 +119,12 @@ def fit(findings: list[Finding], elsewhere: list[Example]) -> tuple[AcceptanceMo
     return fitted, _judge(SCAN, mine, odds)
 
 
-def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Finding]:
-    """Hypotheses about candidates along a drive, with whole keyframes and without scans, and how wrong each pose is."""
+def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Example]:
+    """Hypotheses about candidates along a drive, and whether their poses are right; its world counts as a domain."""
     rng = np.random.default_rng(drive.seed)
     rules = Loop()
     database = PlaceDatabase(Database(), "drive", len(keyframes[0].embedding.descriptor))
-    whole, blind = Verifier(Verification()), Verifier(Verification())
+    verifier = Verifier(Verification())
     for query, keyframe in enumerate(track(keyframes, f"world {drive.name}", transient=True)):
         candidates = database.query(keyframe, rules)
         # consecutive ones, for a keyframe is supported by what its neighbours found
@@ -150,14 +132,10 @@ def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Finding]:
             chosen = _choose(drive, query, candidates, rng)
             strength = float(rng.choice([0.0, 0.0, 1.0, 2.0]))
             pairs = [(one, _degraded(database[one.index], strength, rng)) for one in chosen]
-            scanless = [(one, _without_scan(match)) for one, match in pairs]
-            found = whole.examine(_degraded(keyframe, strength, rng), pairs)
-            for one in found + blind.examine(_without_scan(keyframe), scanless):
-                match, pose = one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose
-                metres, degrees = drive.error(query, match, pose)
+            for one in verifier.examine(_degraded(keyframe, strength, rng), pairs):
+                metres, degrees = drive.error(query, one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose)
                 right = metres < RIGHT_M and degrees < RIGHT_DEG
-                pristine = strength == 0 or one.measurement.kind == IMAGE
-                yield Finding(drive.seed, one, drive.error_vector(query, match, pose), right, pristine)
+                yield Example(one.measurement, right, f"drive {drive.seed}")
         database.add(keyframe)
     database.close()
 
@@ -187,10 +165,6 @@ def _degraded(keyframe: Keyframe, strength: float, rng: np.random.Generator) -> 
     if rng.random() < 0.2:
         embedding = replace(embedding, image=None)
     return replace(keyframe, points=(points + moment * shift).astype(np.float32), embedding=embedding)
-
-
-def _without_scan(keyframe: Keyframe) -> Keyframe:
-    return replace(keyframe, points=np.empty((0, 3), np.float32), embedding=replace(keyframe.embedding, cloud=None))
 
 
 def _sprung_traps() -> list[Example]:
