@@ -29,7 +29,8 @@ GOOD = Measurement(
 def test_the_shipped_decision_accepts_what_fits_and_nothing_of_the_rest() -> None:
     acceptance = load_submap_acceptance()
     assert acceptance.probability(GOOD) > 0.9
-    elsewhere = replace(GOOD, terrain_correlation=0.1, terrain_score=4.0, terrain_rival=0.1, overlap=0.65)
+    fit = {"terrain_correlation": 0.1, "terrain_score": 4.0, "terrain_rival": 0.1, "overlap": 0.65}
+    elsewhere = replace(GOOD, **fit, residual_m=0.05)
     assert acceptance.probability(elsewhere) < 0.5
     assert all(weight >= 0 for weight in acceptance.model.weights.values())
 

@@ -157,6 +157,8 @@ class SubmapFinder:
         shift_m, turn_deg = float(np.linalg.norm(pose[:3, 3])), abs(np.degrees(heading(pose)))
         if probability < self._settings.min_probability:
             return f"probability {probability:.2f} is below {self._settings.min_probability:g}"
+        if tested.measurement.terrain_correlation < const.MIN_TERRAIN:
+            return "the terrain does not fit"
         if tested.common < const.MIN_COMMON:
             return f"only {tested.common:.0%} of the submap in common"
         if 0 < self._settings.max_turn_deg < turn_deg:

@@ -140,6 +140,7 @@ NARROW_DEG = 270.0  # geometry: a sensor that sees more recognises a place from 
 SUBMAP_BEFORE_M, SUBMAP_AFTER_M = 20.0, 15.0  # measured: way before and behind a keyframe; 10 and 10 find less
 MIN_SUBMAP_M = 5.0  # by hand: way below which a submap is hardly more than a scan
 MIN_COMMON = 0.1  # by hand: of a submap that must have counterparts: a strip at its edge fits many places
+MIN_TERRAIN = 0.3  # by hand: correlation of the terrain without which nothing else speaks for a place
 SUBMAP_CELL_M = 0.3  # by hand: coarser than a scan, for odometry drifts inside
 SUBMAP_STEP_M = 1.5  # measured: between the scans that are merged; 1 and 2 m are as good
 SUBMAP_NEAR_M = 8.0  # by hand: of an expected stop; further apart, two submaps share too little
