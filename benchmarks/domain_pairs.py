@@ -108,7 +108,8 @@ def places_of(domain: Domain, seeds: range, extent: Extent, folder: Path | None,
             stamp_ns = (len(places) + 1) * 10**9
             steady = scan.sweep.offset_s is not None
             keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, stamp_ns, steady)
-            places.append(Place(keyframe, scan, seed))
+            seen_from = relative(scan.world_T_body, scan.world_T_lidar)
+            places.append(Place(replace(keyframe, body_T_lidar=seen_from), scan, seed))
     return places
 
 

@@ -4,12 +4,16 @@ python benchmarks/domains.py [--quick] [--seed N] [--jobs N] [--folder FOLDER] [
 
 With `--folder` the simulated scans are kept and used again. Descriptors and local features are those of the shipped
 network; there is no odometry, and every pair is verified on its own, so that no other pair supports it.
+
+Every domain is verified twice: by what is shipped, and by a decision fitted without any example of the domain
+(`left out`), from the examples that `fit_verification.py` keeps beside it.
 """
 
 from __future__ import annotations
 
 import json
 import multiprocessing
+import tempfile
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,15 +32,19 @@ from umf_ros.frames import Candidate, LoopClosure
 from umf_ros.geometry import Array, relative, rotation_angle
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
 from umf_ros.lab.simulation.seeds import TEST
-from umf_ros.lab.training.acceptance_fit import inside_ellipsoid
+from umf_ros.lab.training.acceptance_examples import load_examples
+from umf_ros.lab.training.acceptance_fit import bounds_of, fit_decision, inside_ellipsoid, save_acceptance
 from umf_ros.verification import Verifier
+from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
+from umf_ros.verification.measurement import SCAN
 
 WRONG_M, WRONG_DEG = 1.0, 5.0
+EXAMPLES = Path(__file__).parent / "acceptance_examples.npz"
 
 
 @dataclass
 class Outcome:
-    """What the verifier made of one domain's pairs."""
+    """What the verifier made of one domain's pairs; `left_out`: what one does that never saw the domain."""
 
     name: str
     pairs: dict[str, int] = field(default_factory=lambda: dict.fromkeys((SAME, TURNED, ELSEWHERE), 0))
@@ -45,6 +53,7 @@ class Outcome:
     errors: list[Array] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
     refine_ms: list[float] = field(default_factory=list)
+    left_out: Outcome | None = None
 
     def judge(self, pair: Pair, closure: LoopClosure | None) -> None:
         """Count one verdict."""
@@ -71,6 +80,8 @@ class Outcome:
             "accepted": sum(self.right.values()) + sum(self.wrong.values()),
             "wrong": sum(self.wrong.values()),
             "wrong_elsewhere": self.wrong[ELSEWHERE],
+            "wrong_left_out": sum(self.left_out.wrong.values()) if self.left_out else 0,
+            "recall_left_out": self.left_out.share(SAME) if self.left_out else float("nan"),
             "recall": self.share(SAME),
             "turned_recall": self.share(TURNED),
             "inside_95": inside,
@@ -112,10 +123,13 @@ def run(domain: Domain, seed: int, extent: Extent, folder: Path | None) -> Outco
     embedder = make_embedder(EmbeddingSettings(threads=1))
     start = TEST[100 * seed % len(TEST)]
     places = places_of(domain, range(start, start + extent.worlds), extent, folder, embedder)
-    verifier, outcome = Verifier(Verification()), Outcome(domain.name)
+    outcome, left_out = Outcome(domain.name), Outcome(domain.name)
+    verifier, stranger = Verifier(Verification()), _without(domain)
     for pair in pairs_of(places, domain, np.random.default_rng(seed)):
         outcome.judge(pair, _closure(verifier, pair))
         outcome.refine_ms.append(verifier.latency_ms["refine"])
+        left_out.judge(pair, _closure(stranger, pair))
+    outcome.left_out = left_out
     return outcome
 
 
@@ -128,6 +142,7 @@ def summary(outcomes: list[Outcome]) -> dict[str, float]:
     return {
         "accepted": sum(outcome.figures["accepted"] for outcome in outcomes),
         "wrong": sum(outcome.figures["wrong"] for outcome in outcomes),
+        "wrong_left_out": sum(outcome.figures["wrong_left_out"] for outcome in outcomes),
         "recall_mean": float(np.mean(recall)),
         "recall_worst": float(np.min(recall)),
         "inside_95_mean": float(np.mean(known)) if known else float("nan"),
@@ -135,6 +150,19 @@ def summary(outcomes: list[Outcome]) -> dict[str, float]:
         "turned_recall": turned[0] / max(turned[1], 1),
         "refine_ms": float(np.median(np.concatenate([outcome.refine_ms for outcome in outcomes]))),
     }
+
+
+def _without(domain: Domain) -> Verifier:
+    """A verifier whose decision was fitted, threshold and all, without any example of the domain."""
+    examples = [one for one in load_examples(EXAMPLES) if one.domain != domain.name]
+    shipped = load_acceptance()
+    decision, _ = fit_decision(examples, SCAN, Verification().min_probability)
+    bounds = shipped.bounds | {SCAN: bounds_of(examples, SCAN)}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "acceptance.json"
+        model = AcceptanceModel(shipped.models | {SCAN: decision}, shipped.covariances, bounds)
+        save_acceptance(model, path, f"without {domain.name}", {})
+        return Verifier(Verification(calibration=str(path)))
 
 
 def _closure(verifier: Verifier, pair: Pair) -> LoopClosure | None:
@@ -157,12 +185,23 @@ def error_vector(estimated: Array, true: Array) -> Array:
 
 def _table(outcomes: list[Outcome]) -> Table:
     table = Table(title="pairs (same way, other way, elsewhere) and verdicts", box=None)
-    for name in ("sensor-place-mount", "same", "other", "else", "acc.", "wrong", "recall", "turned", "in 95 %"):
+    for name in (
+        "sensor-place-mount",
+        "same",
+        "other",
+        "else",
+        "acc.",
+        "wrong",
+        "left out",
+        "recall",
+        "turned",
+        "in 95 %",
+    ):
         first = name == "sensor-place-mount"
         table.add_column(name, justify="left" if first else "right", no_wrap=True)
     for outcome in outcomes:
         figures = outcome.figures
-        counts = (*outcome.pairs.values(), figures["accepted"], figures["wrong"])
+        counts = (*outcome.pairs.values(), figures["accepted"], figures["wrong"], figures["wrong_left_out"])
         shares = (f"{figures[key]:.3f}" for key in ("recall", "turned_recall", "inside_95"))
         table.add_row(outcome.name, *map(str, counts), *shares)
     return table

@@ -1,22 +1,27 @@
-"""Fit the acceptance model and the covariance to simulated validation worlds.
+"""Fit the acceptance model and the covariance to simulated validation worlds, in all domains together.
 
-python benchmarks/fit_verification.py [--drives FOLDER] [--weights FILE] [--out FILE]
+python benchmarks/fit_verification.py [--drives FOLDER] [--folder FOLDER] [--jobs N] [--weights FILE] [--out FILE]
 
-Run it again whenever the network's weights change, for the features' share of the decision changes with them; no
-other step is needed. A world takes about two minutes of one core; with `--drives` the simulated drives
-are kept, and the next fit takes a quarter less.
+Run it again whenever the network's weights, the hypotheses or the measures change, for the decision changes with
+them; no other step is needed. With `--drives` and `--folder` the simulated drives and the scans of the domains are
+kept for the next time. Beside the model it writes the examples, which `domains.py` leaves single domains out of.
 """
 
 from __future__ import annotations
 
+import math
+import multiprocessing
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
+from domain_examples import kept_examples
+from domains import EXAMPLES
 from drives import Drive, embedded, kept, worlds
 from rich.console import Console
 from rich.progress import track
@@ -27,18 +32,20 @@ from umf_ros.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.embedding import make_embedder
 from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array
+from umf_ros.lab.simulation.domains import DOMAINS, Domain
 from umf_ros.lab.simulation.seeds import VALIDATION
+from umf_ros.lab.training.acceptance_examples import Example, save_examples
 from umf_ros.lab.training.acceptance_fit import (
-    Example,
+    bounds_of,
     fit_covariance,
-    fit_logistic,
+    fit_decision,
     inside_ellipsoid,
     save_acceptance,
     scale_covariance,
 )
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
-from umf_ros.verification.acceptance import KINDS, AcceptanceModel, load_acceptance, scores
+from umf_ros.verification.acceptance import KINDS, AcceptanceModel, load_acceptance
 from umf_ros.verification.measurement import IMAGE, SCAN
 from umf_ros.verification.verifier import JudgedHypothesis
 
@@ -46,6 +53,8 @@ RIGHT_M, RIGHT_DEG = 0.4, 3.0
 EXAMINED = 5  # candidates per query: what retrieval offers first
 EVERY, CONSECUTIVE = 12, 3  # of so many keyframes, the first few are queries
 THRESHOLD = Verification().min_probability
+ACCEPTED_ODDS = math.log(THRESHOLD / (1 - THRESHOLD))
+SURVEYS, PAIRS = range(VALIDATION[0], VALIDATION[0] + 3), 60  # in every domain
 ENOUGH = 100  # right examples that a fit needs
 Survey = tuple[Drive, list[Keyframe]]
 DEFAULT_OUT = Path(__file__).parent.parent / "config" / "verification" / "calibration.json"
@@ -63,8 +72,8 @@ class Finding:
 
     @property
     def example(self) -> Example:
-        """What the acceptance model is fitted to."""
-        return Example(self.examined.measurement, self.right)
+        """What the acceptance model is fitted to; a drive's world counts as a domain."""
+        return Example(self.examined.measurement, self.right, f"drive {self.drive}")
 
 
 def main(
@@ -72,6 +81,10 @@ def main(
     drives: Annotated[Path | None, typer.Option(help="folder that keeps simulated drives for the next time")] = None,
     weights: Annotated[str, typer.Option(help="safetensors; empty: the shipped ones")] = "",
     method: Annotated[str, typer.Option(help="embedder")] = "umf",
+    folder: Annotated[Path | None, typer.Option(help="keeps the domains' simulated scans for the next time")] = None,
+    pairs: Annotated[int, typer.Option(help="pairs per domain")] = PAIRS,
+    jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1,
+    examples: Annotated[Path | None, typer.Option(help="keeps the domains' examples, for the same code")] = None,
     out: Annotated[Path, typer.Option(help="where the model goes")] = DEFAULT_OUT,
 ) -> None:
     """Examine candidates of validation worlds, fit acceptance and covariance to them, and write the model.
@@ -82,13 +95,15 @@ def main(
     wrong ones, and how many errors lie inside the 95 % ellipsoid. Zero wrong is what counts.
     """
     console = Console()
-    embedder = make_embedder(EmbeddingSettings(method=method, weights=weights, threads=1))
+    settings = EmbeddingSettings(method=method, weights=weights, threads=1)
+    elsewhere = in_domains(settings, pairs, folder, examples, jobs)
+    embedder = make_embedder(settings)
     surveyed: list[Survey] = []
     for number, family, aliasing in worlds(VALIDATION[0], count):
         with console.status(f"simulating world {number} ({family}, aliasing {aliasing:g})"):
             drive = kept(drives, number, family, aliasing)
         surveyed.append((drive, embedded(drive, embedder)))
-    model, results = fit([finding for survey in surveyed for finding in examine(*survey)])
+    model, results = fit([finding for survey in surveyed for finding in examine(*survey)], elsewhere)
     model, honest = scaled(model, surveyed)
     for name, value in (results := results | honest).items():
         console.print(f"{name:32} {value:.4g}")
@@ -96,29 +111,47 @@ def main(
     console.print(f"wrote {out}")
 
 
-def fit(findings: list[Finding]) -> tuple[AcceptanceModel, dict[str, float]]:
-    """The model that explains the findings best, and figures of how it does on worlds it was not fitted to.
+def in_domains(
+    settings: EmbeddingSettings, pairs: int, folder: Path | None, kept: Path | None, jobs: int
+) -> list[Example]:
+    """Examples of all domains."""
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        waiting = [pool.submit(_in_domain, domain, settings, pairs, folder, kept) for domain in DOMAINS]
+        found = [one.result() for one in track(waiting, "domains", transient=True)]
+    return [example for domain in found for example in domain]
+
+
+def _in_domain(
+    domain: Domain, settings: EmbeddingSettings, pairs: int, folder: Path | None, kept: Path | None
+) -> list[Example]:
+    return kept_examples(domain, SURVEYS, pairs, folder, make_embedder(settings), kept)
+
+
+def fit(findings: list[Finding], elsewhere: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
+    """The model that explains the findings and what other domains gave, and how it does in domains left out.
 
     A kind of hypothesis with next to no right examples, as images are to an embedder without local features,
     keeps what is shipped.
     """
     shipped = load_acceptance()
-    models, covariances = dict(shipped.models), dict(shipped.covariances)
+    models, covariances, bounds = dict(shipped.models), dict(shipped.covariances), dict(shipped.bounds)
     results: dict[str, float] = {}
-    sprung = _sprung_traps()
+    known = [finding.example for finding in findings] + elsewhere + _sprung_traps()
+    save_examples([example for example in known if example.measurement.kind == SCAN], EXAMPLES)
     for kind in KINDS:
-        mine = [finding for finding in findings if finding.examined.measurement.kind == kind]
-        if sum(finding.right for finding in mine) < ENOUGH:
+        mine = [example for example in known if example.measurement.kind == kind]
+        if sum(example.right for example in mine) < ENOUGH:
             continue
-        models[kind] = fit_logistic([finding.example for finding in mine] + sprung, kind)
-        odds = _held_out(mine, sprung, kind)
+        models[kind], odds = fit_decision(mine, kind, THRESHOLD)
+        bounds[kind] = bounds_of(mine, kind)
         results |= _judge(kind, mine, odds)
         # of untouched scans only, for the covariance describes the sensor
-        chosen = [one for one, p in zip(mine, odds, strict=True) if one.right and one.pristine and p >= THRESHOLD]
+        own = [finding for finding in findings if finding.examined.measurement.kind == kind]
+        chosen = [one for one, p in zip(own, odds, strict=False) if one.right and one.pristine and p >= ACCEPTED_ODDS]
         if len(chosen) >= ENOUGH:
             informations = np.array([one.examined.aligned.alignment.information for one in chosen])
             covariances[kind] = fit_covariance(np.array([one.error for one in chosen]), informations)
-    return AcceptanceModel(models, covariances), results
+    return AcceptanceModel(models, covariances, bounds), results
 
 
 def scaled(model: AcceptanceModel, surveyed: list[Survey]) -> tuple[AcceptanceModel, dict[str, float]]:
@@ -136,7 +169,7 @@ def scaled(model: AcceptanceModel, surveyed: list[Survey]) -> tuple[AcceptanceMo
         "published_wrong": float(sum(world.wrong for world in published)),
         "published_inside_95_before": inside_ellipsoid(errors, covariances),
     }
-    return AcceptanceModel(model.models, model.covariances | {SCAN: covariance}), figures
+    return replace(model, covariances=model.covariances | {SCAN: covariance}), figures
 
 
 def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Finding]:
@@ -202,30 +235,21 @@ def _sprung_traps() -> list[Example]:
         for seed in range(100, 110):
             query, match = trap(seed)
             examined = Verifier(Verification()).examine(query, [(Candidate(0, match.stamp_ns, 0.9), match)])
-            found += [Example(one.measurement, False) for one in examined]
+            found += [Example(one.measurement, False, "traps") for one in examined]
     return found
 
 
-def _held_out(findings: list[Finding], sprung: list[Example], kind: str) -> Array:
-    """Probability (N,) of each finding, every world judged by a fit to the others."""
-    odds = np.zeros(len(findings))
-    seeds = np.array([finding.drive for finding in findings])
-    for seed in np.unique(seeds):
-        others = [finding.example for finding in findings if finding.drive != seed]
-        model = fit_logistic(others + sprung, kind)
-        for index in np.flatnonzero(seeds == seed):
-            odds[index] = model.probability(scores(findings[index].examined.measurement))
-    return odds
-
-
-def _judge(kind: str, findings: list[Finding], odds: Array) -> dict[str, float]:
-    right = np.array([finding.right for finding in findings])
+def _judge(kind: str, examples: list[Example], odds: Array) -> dict[str, float]:
+    """Figures of log-odds that every example got without its domain."""
+    right, accepted = np.array([example.right for example in examples]), odds >= ACCEPTED_ODDS
+    domains = np.array([example.domain for example in examples])
+    recall = [float(accepted[right & (domains == name)].mean()) for name in np.unique(domains[right])]
     return {
-        f"{kind}_examples": float(len(findings)),
+        f"{kind}_examples": float(len(examples)),
         f"{kind}_right": float(right.sum()),
-        f"{kind}_recall_held_out": float((odds[right] >= THRESHOLD).mean()),
-        f"{kind}_wrong_held_out": float((odds[~right] >= THRESHOLD).sum()),
-        f"{kind}_largest_wrong": float(odds[~right].max(initial=0.0)),
+        f"{kind}_recall_left_out": float(np.mean(recall)),
+        f"{kind}_recall_left_out_worst": min(recall),
+        f"{kind}_wrong_left_out": float(accepted[~right].sum()),
     }
 
 

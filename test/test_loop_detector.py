@@ -125,8 +125,9 @@ def test_every_verdict_has_a_reason_and_every_stage_a_time(detections: list[Dete
     last = detections[-1]
     assert last.keyframe is not None and last.verdicts
     assert all(verdict.reason for verdict in last.verdicts)
-    assert set(last.latency_ms) == {"embed", "query", "verify", "total"}
-    assert last.latency_ms["total"] == pytest.approx(sum(last.latency_ms[s] for s in ("embed", "query", "verify")))
+    stages = "embed", "query", "verify", "submaps"
+    assert set(last.latency_ms) == {*stages, "total"}
+    assert last.latency_ms["total"] == pytest.approx(sum(last.latency_ms[stage] for stage in stages))
 
 
 def test_the_same_frames_give_the_same_verdicts_bit_for_bit(frames: list[Frame], detections: list[Detection]) -> None:

@@ -6,6 +6,7 @@ z up), the camera frame is optical (x right, y down, z forward). Poses follow `g
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,6 +32,11 @@ class StereoCamera:
     cx: float
     cy: float
     baseline: float
+
+    @property
+    def width_rad(self) -> float:
+        """Angle of view from the left to the right edge, rad."""
+        return 2 * math.atan(self.width / (2 * self.fx))
 
     def project(self, points: Array, body_T_camera: Array) -> tuple[Array, Array]:
         """Left pixels (N, 2) and depths (N,) of points (N, 3) of the body frame; a depth <= 0 lies behind the camera.

@@ -16,6 +16,7 @@ from umf_ros.errors import OutputError
 from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure
 from umf_ros.keyframes import KeyframeSelector
 from umf_ros.places.database import PlaceDatabase
+from umf_ros.submaps import SubmapFinder
 from umf_ros.verification import NO_DEPTH, Verdict, Verifier, thin_frame
 
 logger = logging.getLogger(__name__)
@@ -30,7 +31,7 @@ class Detection:
         frame_stamp_ns: key of the frame.
         keyframe: the keyframe it became, or None when it was passed over.
         verdicts: one for every candidate that was tested, best first.
-        latency_ms: milliseconds of embed, query and verify, and of their total.
+        latency_ms: milliseconds of embed, query, verify and submaps, and of their total.
         fault: why the keyframe could not be remembered (a full disk); what was found stands.
     """
 
@@ -49,7 +50,8 @@ class Detection:
 class LoopDetector:
     """Finds loop closures in a stream of frames; the live node, the replay and the evaluation run this same class.
 
-    `process` takes a frame through all stages: `select`, `embed`, `query`, `verify`, `remember`.
+    `process` takes a frame through all stages: `select`, `embed`, `query`, `verify`, `look_around`,
+    `remember`.
 
     Args:
         settings: all settings.
@@ -65,6 +67,7 @@ class LoopDetector:
         self._embedder = embedder
         self._verifier = Verifier(settings.verification)
         self.database = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
+        self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
         self._first_session = self.database.next_session
         self._session = 0
         self._depth_told = False
@@ -85,6 +88,8 @@ class LoopDetector:
             candidates = self.query(keyframe)
         with latency.measure("verify"):
             verdicts = self.verify(keyframe, candidates)
+        with latency.measure("submaps"):
+            verdicts = self.look_around(keyframe, verdicts)
         fault = None
         try:
             self.remember(keyframe)
@@ -112,6 +117,16 @@ class LoopDetector:
         self._tell_depthless(verdicts)
         return verdicts
 
+    def look_around(self, keyframe: Keyframe, verdicts: list[Verdict]) -> list[Verdict]:
+        """The verdicts, accepted ones first, with those about what a narrow sensor saw before from another side."""
+        accepted = [
+            (self.database[verdict.candidate.index], verdict.closure.match_T_query)
+            for verdict in verdicts
+            if verdict.closure is not None
+        ]
+        found = self._submaps.find(keyframe, accepted)
+        return sorted(verdicts + found, key=lambda verdict: verdict.closure is None)
+
     def remember(self, keyframe: Keyframe) -> None:
         """Make a keyframe a place that later ones may find.
 
@@ -119,12 +134,14 @@ class LoopDetector:
             OutputError: the disk is full.
         """
         self.database.add(keyframe)
+        self._submaps.remember(keyframe)
 
     def reset(self) -> None:
         """Forget all places."""
         self.database.forget_from(-(2**62))
         self._selector.reset()
         self._verifier.reset()
+        self._submaps.reset()
 
     def _tell_depthless(self, verdicts: Sequence[Verdict]) -> None:
         """Say, once, why nothing becomes metric: one camera without a LiDAR recognises places, no more."""
@@ -139,6 +156,7 @@ class LoopDetector:
         logger.warning("a new session begins, %d places are forgotten", forgotten)
         self._selector.reset()
         self._verifier.reset()
+        self._submaps.reset()
 
 
 def make_keyframe(

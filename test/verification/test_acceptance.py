@@ -111,7 +111,24 @@ def test_a_criterion_younger_than_the_model_has_no_weight(shipped: AcceptanceMod
     assert old.probability(GOOD) < shipped.probability(GOOD)
 
 
-@pytest.mark.parametrize("name", ["residual_m", "position_std_m", "prior_sigmas"])
+def test_what_no_right_pose_ever_measured_is_named(shipped: AcceptanceModel, tmp_path: Path) -> None:
+    bounded = replace(shipped, bounds={"scan": {"noise_m": (0.001, 0.1), "common": (0.2, 1.0)}})
+    assert bounded.unlike(GOOD) == ""
+    assert bounded.unlike(replace(GOOD, noise_m=0.3)) == "noise_m 0.3"
+    assert bounded.unlike(replace(GOOD, common=0.05)) == "common 0.05"
+    assert bounded.unlike(replace(GOOD, kind="image", noise_m=0.3)) == ""
+    assert load_acceptance(str(saved(bounded, tmp_path))) == bounded
+
+
+@pytest.mark.parametrize(("name", "value"), [("unexplained", 0.9), ("contradiction", 0.4), ("noise_m", 1.0)])
+def test_one_strong_contradiction_sinks_a_closure_however_well_the_rest_fits(
+    shipped: AcceptanceModel, name: str, value: float
+) -> None:
+    assert shipped.unlike(GOOD) == ""
+    assert shipped.unlike(replace(GOOD, **{name: value})).startswith(name)
+
+
+@pytest.mark.parametrize("name", ["residual_m", "position_std_m", "prior_sigmas", "unexplained", "contradiction"])
 def test_larger_errors_never_make_a_closure_more_probable(shipped: AcceptanceModel, name: str) -> None:
     value = GOOD.numbers[name]
     odds = [shipped.probability(replace(GOOD, **{name: value * factor})) for factor in (0.5, 1, 2, 5, 20)]

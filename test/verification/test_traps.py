@@ -11,9 +11,9 @@ from traps import TRAPS, spring
 from umf_ros.config import Verification
 from umf_ros.frames import Candidate
 from umf_ros.verification import Verifier
-from umf_ros.verification.constants import MIN_MAP_SCORE
-from umf_ros.verification.elevation_map import ElevationMap, TurnedMap, search
+from umf_ros.verification.all_round import TurnedSurroundings, search
 from umf_ros.verification.ransac import fit_homography
+from umf_ros.verification.registration import PreparedScan
 from umf_ros.verification.rerank import mutual_neighbours, similarities
 
 
@@ -60,8 +60,8 @@ def test_the_crowded_trap_is_a_real_one() -> None:
 @pytest.mark.parametrize("name", ["empty_scans", "planar_scans"])
 def test_no_relief_no_pose_from_it(name: str) -> None:
     query, match = TRAPS[name](0)
-    fits = search(ElevationMap(match.points), TurnedMap(ElevationMap(query.points)))
-    assert all(fit.score < MIN_MAP_SCORE for fit in fits)
+    scan = PreparedScan(query.points)
+    assert not scan.usable or search(PreparedScan(match.points), TurnedSurroundings(scan)) == []
 
 
 @pytest.mark.parametrize("name", list(TRAPS))

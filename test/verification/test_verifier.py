@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import landscape, pose_at, take, without_image, without_scan
+from scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
 
 from umf_ros.config import Verification
 from umf_ros.frames import Candidate, Keyframe
@@ -195,3 +195,21 @@ def test_right_pose_of_another_view_is_no_closure(limits: dict[str, float], word
     )[0]
     assert verdict.closure is None and word in verdict.reason
     assert verdict.probability is not None and verdict.probability > 0.9
+
+
+def test_a_view_that_shares_too_little_is_no_closure() -> None:
+    far = take(GROUND, pose_at(GROUND, -15.0, 0.4, 34.0), 100.0)
+    verdict = Verifier(Verification(min_probability=0.0)).verify(far, [candidate(take(GROUND, THERE, 10.0))])[0]
+    assert verdict.closure is None and "the views share only" in verdict.reason
+
+
+def test_a_view_all_around_may_be_turned_as_far_as_the_user_lets_it() -> None:
+    level = make_pose(np.eye(3), [0.0, 0.0, 1.0])
+    turned = make_pose(np.diag([-1.0, -1.0, 1.0]), [0.6, 0.3, 1.0])
+    match = replace(without_image(take(GROUND, THERE, 10.0)), points=yard_scan(1, level))
+    query = replace(without_image(take(GROUND, HERE, 100.0)), points=yard_scan(1, turned))
+    for limit, accepted in ((0.0, True), (90.0, False), (180.0, True)):
+        settings = Verification(min_probability=0.0, max_turn_deg=limit)
+        verdict = Verifier(settings).verify(query, [candidate(match)])[0]
+        assert (verdict.closure is not None) == accepted, verdict.reason
+        assert accepted or "turned by 180 deg, more than 90" in verdict.reason

@@ -33,6 +33,7 @@ class PlaceDatabase:
         self._stamps: list[int] = []
         self._travelled: list[float] = []
         self._sessions: list[int] = []
+        self._by_key: dict[tuple[int, int], int] = {}
         for entry in self._store.entries():
             self._register(entry)
 
@@ -41,6 +42,10 @@ class PlaceDatabase:
 
     def __getitem__(self, index: int) -> Keyframe:
         return self._store[index]
+
+    def index_of(self, stamp_ns: int, session: int) -> int | None:
+        """Index of a keyframe by its key; None when it is not, or no longer, there."""
+        return self._by_key.get((session, stamp_ns))
 
     @property
     def next_session(self) -> int:
@@ -80,6 +85,7 @@ class PlaceDatabase:
             self._stamps = [self._stamps[i] for i in kept]
             self._travelled = [self._travelled[i] for i in kept]
             self._sessions = [self._sessions[i] for i in kept]
+            self._by_key = {key: i for i, key in enumerate(zip(self._sessions, self._stamps, strict=True))}
         return forgotten
 
     def save(self, path: Path) -> None:
@@ -94,6 +100,7 @@ class PlaceDatabase:
         self._stamps.append(entry.stamp_ns)
         self._travelled.append(entry.travelled_m)
         self._sessions.append(entry.session)
+        self._by_key[entry.session, entry.stamp_ns] = len(self._index)
         return self._index.add(entry.descriptor)
 
     def _admissible(self, keyframe: Keyframe, rules: Loop) -> Mask:

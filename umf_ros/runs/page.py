@@ -114,14 +114,22 @@ def _facts(summary: Summary) -> list[tuple[str, str]]:
         "closures": f"{summary['closures_published']} published, {summary['closures_rejected']} candidates rejected",
     }
     if truth:
-        facts["revisits"] = str(truth["revisits"])
+        facts["revisits"] = _revisits(truth)
         facts["stated errors"] = _honesty(truth)
     if latency["total"]["p50"] is not None:
-        stages = ", ".join(f"{stage} {latency[stage]['p50']:.0f}" for stage in ("embed", "query", "verify"))
+        stages = ", ".join(f"{stage} {times['p50']:.0f}" for stage, times in latency.items() if stage != "total")
         facts["latency"] = f"{latency['total']['p50']:.0f} ms per keyframe, median ({stages})"
     facts["dropped"] = ", ".join(f"{name} {count}" for name, count in summary["drops"].items())
     facts["memory"] = f"{summary['peak_rss_mb']:.0f} MB at most"
     return list(facts.items())
+
+
+def _revisits(truth: Summary) -> str:
+    """How often a place was seen again, and how many of those times found it; older runs do not say the latter."""
+    again, closed = truth.get("revisits_any_heading"), truth.get("closed_any_heading")
+    if not again or closed is None:
+        return str(truth["revisits"])
+    return f"{truth['revisits']} in the same direction; {again} from any side, {closed} of them closed"
 
 
 def _honesty(truth: Summary) -> str:

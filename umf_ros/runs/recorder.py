@@ -23,7 +23,7 @@ from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
 COUNTS = ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected")
-STAGES = ("embed", "query", "verify", "total")
+STAGES = ("embed", "query", "verify", "submaps", "total")
 
 
 class RunRecorder:

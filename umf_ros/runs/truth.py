@@ -56,15 +56,17 @@ class JudgedRun:
 
     Attributes:
         closures: one per closure whose endpoints the truth covers.
-        revisits: keyframes that saw an earlier place again.
+        revisits: keyframes that saw an earlier place again, in about the same direction.
         ate_odometry_m: error of the odometry, or None without odometry.
         ate_optimized_m: error of the optimised trajectory, or None.
+        any_heading: keyframes that were near an earlier place again, and those of them with a true closure.
     """
 
     closures: list[JudgedClosure] = field(default_factory=list)
     revisits: int = 0
     ate_odometry_m: float | None = None
     ate_optimized_m: float | None = None
+    any_heading: tuple[int, int] = (0, 0)
 
     def summary(self) -> dict[str, Any]:
         """The `ground_truth` entry of `summary.json`."""
@@ -73,6 +75,8 @@ class JudgedRun:
             "closures_true": true,
             "closures_false": len(self.closures) - true,
             "revisits": self.revisits,
+            "revisits_any_heading": self.any_heading[0],
+            "closed_any_heading": self.any_heading[1],
             "ate_odometry_m": _rounded(self.ate_odometry_m),
             "ate_optimized_m": _rounded(self.ate_optimized_m),
             **self._honesty(),
@@ -106,9 +110,14 @@ def judge_run(
     """Hold closures, odometry and optimised trajectory of a run folder against the truth."""
     stamps, travelled = _read_keyframes(folder / "keyframes.csv")
     poses, known = truth.at(stamps)
+    stamps, poses, travelled = stamps[known], poses[known], travelled[known]
+    judged = _judge_closures(closures, truth)
+    again = find_revisits(stamps, poses, travelled, rules, same_view=False)
+    closed = np.isin(stamps[again], [one.closure.query_stamp_ns for one in judged if one.is_true])
     return JudgedRun(
-        closures=_judge_closures(closures, truth),
-        revisits=count_revisits(stamps[known], poses[known], travelled[known], rules, truth.has_orientation),
+        closures=judged,
+        revisits=int(find_revisits(stamps, poses, travelled, rules, truth.has_orientation).sum()),
+        any_heading=(int(again.sum()), int(closed.sum())),
         ate_odometry_m=trajectory_error(odometry, truth),
         ate_optimized_m=trajectory_error(optimized, truth),
     )
@@ -119,8 +128,9 @@ def judge_closure(
 ) -> JudgedClosure:
     """Hold one closure against the truth.
 
-    True means: both keyframes within 12 m and 30 deg of heading of each other [UMF 5.1.2], and the
-    published relative pose within 0.5 m and 5 deg. A truth of positions alone (RTKLIB) checks distances only.
+    True means: both keyframes within 12 m of each other [UMF 5.1.2], whatever their headings (who recognises a place
+    from another side is not wrong), and the published relative pose within 0.5 m and 5 deg. A truth of positions
+    alone (RTKLIB) checks distances only.
     """
     truth = relative(world_T_match, world_T_query)
     distance_m = float(np.linalg.norm(truth[:3, 3]))
@@ -129,35 +139,34 @@ def judge_closure(
         translation_m = float(np.linalg.norm(error[:3, 3]))
         rotation_deg = float(np.degrees(rotation_angle(error)))
         nees = float(normalised_errors(pose_error(closure.match_T_query, truth), closure.covariance))
-        heading_ok = abs(wrap_angle(heading(world_T_query) - heading(world_T_match))) <= radians(PLACE_ANGLE_DEG)
     else:
         translation_m = abs(float(np.linalg.norm(closure.match_T_query[:3, 3])) - distance_m)
-        rotation_deg, heading_ok, nees = nan, True, nan
+        rotation_deg, nees = nan, nan
     pose_ok = translation_m <= POSE_TOLERANCE_M and not rotation_deg > POSE_TOLERANCE_DEG
-    is_true = distance_m <= PLACE_RADIUS_M and heading_ok and pose_ok
+    is_true = distance_m <= PLACE_RADIUS_M and pose_ok
     return JudgedClosure(closure, distance_m, translation_m, rotation_deg, is_true, nees)
 
 
-def count_revisits(
-    stamps: Stamps, world_T_body: Array, travelled_m: Array, rules: Loop, has_orientation: bool = True
-) -> int:
-    """How many keyframes saw a place again: an admissible earlier keyframe within 12 m and 30 deg.
+def find_revisits(
+    stamps: Stamps, world_T_body: Array, travelled_m: Array, rules: Loop, same_view: bool = True
+) -> NDArray[np.bool_]:
+    """Which keyframes (N,) saw a place again: an admissible earlier keyframe within 12 m, and 30 deg of heading.
 
     Args:
         stamps: (N,) ns, ascending.
         world_T_body: (N, 4, 4) true poses.
         travelled_m: (N,) path length, NaN where unknown.
         rules: which earlier keyframes are admissible.
-        has_orientation: whether the truth knows headings.
+        same_view: whether headings count; without, a place may be seen again from any side.
     """
     positions, headings = world_T_body[:, :3, 3], heading(world_T_body)
-    revisits = 0
+    revisits = np.zeros(len(stamps), bool)
     for i in range(len(stamps)):
         near = np.linalg.norm(positions[:i] - positions[i], axis=1) <= PLACE_RADIUS_M
-        if has_orientation:
+        if same_view:
             near &= np.abs(wrap_angle(headings[:i] - headings[i])) <= radians(PLACE_ANGLE_DEG)
         past = is_past(stamps[i] - stamps[:i], travelled_m[i] - travelled_m[:i], rules)
-        revisits += bool((near & past).any())
+        revisits[i] = bool((near & past).any())
     return revisits
 
 

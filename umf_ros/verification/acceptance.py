@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,10 @@ def _log_ratio(above: float, below: float) -> float:
     return math.log(max(above, 1e-6) / max(below, 1e-6))
 
 
+def _log(share: float) -> float:
+    return math.log(max(share, 1e-3))  # of NaN it is NaN
+
+
 # every range is by hand: wide enough for right poses, beyond the reach of most wrong ones
 CRITERIA: dict[str, Criterion] = {
     "residual_like_noise": Criterion(lambda m: _log_ratio(m.noise_m, m.residual_m), math.log(0.5), math.log(2.0)),
@@ -62,6 +66,17 @@ CRITERIA: dict[str, Criterion] = {
     "terrain_correlation": Criterion(lambda m: m.terrain_correlation, 0.2, 0.9),
     "terrain_score": Criterion(lambda m: m.terrain_score, 3.0, 15.0),
     "overlap": Criterion(lambda m: m.overlap, 0.4, 0.95),
+    "common_view": Criterion(lambda m: _log(m.common), math.log(0.1), math.log(0.8)),
+    "uncontradicted": Criterion(lambda m: _log(m.contradiction + 0.003), math.log(0.3), math.log(0.01)),
+    "counterparts": Criterion(lambda m: m.counterparts, 0.3, 0.9),
+    "upright_counterparts": Criterion(lambda m: m.upright_counterparts, 0.3, 0.9, missing=0.4),
+    "upright_at_all": Criterion(lambda m: m.upright_counterparts, 0.4, 0.65, missing=0.5),
+    "explained": Criterion(lambda m: m.unexplained, 0.2, 0.02, missing=0.5),
+    "wholly_explained": Criterion(lambda m: _log(m.unexplained + 0.004), math.log(0.2), math.log(0.01), missing=0.5),
+    "known_along": Criterion(lambda m: m.rival_near, 0.0, 0.1),
+    "well_known_along": Criterion(lambda m: m.rival_near, 0.0, 0.4),
+    "no_rival": Criterion(lambda m: m.rival_far, 0.0, 0.2),
+    "no_rival_near_it": Criterion(lambda m: m.rival_far, 0.05, 0.5),
     "points": Criterion(lambda m: math.log(max(m.points, 1.0)), math.log(100), math.log(1000)),
     "position_known": Criterion(lambda m: math.log(m.position_std_m), math.log(1.0), math.log(0.05)),
     "heading_known": Criterion(lambda m: math.log(m.heading_std_deg), math.log(5.0), math.log(0.2)),
@@ -104,8 +119,11 @@ class Logistic:
 
     def probability(self, scores: dict[str, float]) -> float:
         """Probability that a closure with these scores is right."""
-        odds = self.bias + sum(self.contributions(scores).values())
-        return 1.0 / (1.0 + math.exp(-min(max(odds, -60.0), 60.0)))
+        return 1.0 / (1.0 + math.exp(-min(max(self.odds(scores), -60.0), 60.0)))
+
+    def odds(self, scores: dict[str, float]) -> float:
+        """Logarithm of the odds for a closure with these scores."""
+        return self.bias + sum(self.contributions(scores).values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,14 +133,24 @@ class AcceptanceModel:
     Attributes:
         models: one logistic model per kind of hypothesis, "scan" or "image" (without a scan).
         covariances: likewise, what turns residuals into a covariance.
+        bounds: likewise, least and greatest of what right poses measured, by the name of the number.
     """
 
     models: dict[str, Logistic]
     covariances: dict[str, CovarianceModel]
+    bounds: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
 
     def probability(self, measurement: Measurement) -> float:
         """Probability that the closure with this measurement is right."""
         return self.models[measurement.kind].probability(scores(measurement))
+
+    def unlike(self, measurement: Measurement) -> str:
+        """What no right pose that the decision was fitted on ever measured, or nothing: name and value of a number."""
+        for name, (least, greatest) in self.bounds.get(measurement.kind, {}).items():
+            value = getattr(measurement, name)
+            if value < least or value > greatest:  # what is unknown is neither
+                return f"{name} {value:.3g}"
+        return ""
 
     def contributions(self, measurement: Measurement) -> dict[str, float]:
         """Log-odds of each criterion by name; "bias" is what has to be overcome."""
@@ -143,7 +171,11 @@ def load_acceptance(path: str = "") -> AcceptanceModel:
         content = json.loads(file.read_text(encoding="utf-8"))
         models = {kind: _logistic(content["models"][kind], kind) for kind in KINDS}
         covariances = {kind: CovarianceModel(**content["covariance"][kind]) for kind in KINDS}
-        return AcceptanceModel(models, covariances)
+        bounds = {
+            kind: {name: (float(least), float(greatest)) for name, (least, greatest) in numbers.items()}
+            for kind, numbers in content.get("bounds", {}).items()
+        }
+        return AcceptanceModel(models, covariances, bounds)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{file}: not an acceptance model of this version ({error!r})") from None
 

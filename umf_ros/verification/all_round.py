@@ -32,16 +32,23 @@ class Fit:
         pose: (4, 4) `match_T_query`.
         share: of some of the query's points, how many have a counterpart.
         terrain: how well the elevation maps fit there, in standard deviations of chance.
+        structured: whether enough stands around both to be compared, where terrain says nothing.
     """
 
     pose: Array
     share: float
     terrain: float
+    structured: bool
 
     @property
     def score(self) -> float:
         """What fits are ranked by: counterparts, and terrain where they say little."""
         return self.share + const.TERRAIN_WEIGHT * self.terrain
+
+    @property
+    def telling(self) -> bool:
+        """Whether there is anything that could have spoken against it; two bare planes fit anywhere."""
+        return self.structured or self.terrain >= const.MIN_MAP_SCORE
 
 
 class TurnedSurroundings:
@@ -74,28 +81,31 @@ def search(match: PreparedScan, turned: TurnedSurroundings) -> list[Fit]:
     fits = []
     for heading, row, column in _peaks(_correlate(around, turned.spectra(wanted)), wanted):
         shift = (np.array([row, column]) - const.AROUND_SHIFT) * turned.cell_m
-        level = _settle(around, turned.around, float(const.ALL_HEADINGS[heading]), shift)
+        level = settle(around, turned.around, float(const.ALL_HEADINGS[heading]), shift)
         to_match = make_pose(match.up.T, np.zeros(3))
         fits.append(scout(match, turned.scan, to_match @ level @ make_pose(turned.scan.up, np.zeros(3))))
-    return sorted(fits, key=lambda fit: -fit.score)
+    return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
 
 
 def scout(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
     """Draw a pose to the match by a few points, and see how many of them find a counterpart."""
+    cell_m = _cell_for(query)
     result = small_gicp.align(
         match.cloud,
         query.scouts_cloud,
         match.tree,
         guess,
         registration_type="GICP",
-        max_correspondence_distance=const.SCOUT_REACH * _cell_for(query),
+        max_correspondence_distance=const.SCOUT_REACH * cell_m,
         num_threads=1,
         max_iterations=const.SCOUT_STEPS,
     )
     pose = np.asarray(result.T_target_source)
     squared = match.nearest(transform(pose, query.scouts))[1]
-    near = squared < (const.SCOUT_NEAR * _cell_for(query)) ** 2
-    return Fit(pose, float(near.mean()), evaluate(match.elevation, query.elevation, pose).score)
+    near = squared < (const.SCOUT_NEAR * cell_m) ** 2
+    terrain = evaluate(match.elevation, query.elevation, pose).score
+    structured = all(scan.around(cell_m).structured for scan in (match, query))
+    return Fit(pose, float(near.mean()), terrain, structured)
 
 
 def _cell_for(scan: PreparedScan) -> float:
@@ -117,26 +127,22 @@ def _correlate(around: Surroundings, turned: Spectra) -> NDArray[np.float32]:
 def _peaks(volumes: NDArray[np.float32], headings: NDArray[np.intp]) -> list[tuple[int, int, int]]:
     """Heading, row and column of the highest peaks, no two of them neighbours."""
     peaks: list[tuple[int, int, int]] = []
-    around = len(const.ALL_HEADINGS)
-    blocked = np.zeros((around, *volumes.shape[2:]), bool)
+    every = np.full((len(const.ALL_HEADINGS), *volumes.shape[2:]), -np.inf, np.float32)
+    taken = np.zeros(every.shape, bool)
     for volume, count in zip(volumes, const.PEAKS, strict=True):
-        score = np.full(blocked.shape, -np.inf, np.float32)
-        score[headings] = volume
-        score[blocked] = -np.inf
+        every[headings] = volume
         for _ in range(count):
-            heading, row, column = (int(i) for i in np.unravel_index(int(score.argmax()), score.shape))
-            if not score[heading, row, column] > 0:
+            every[taken] = -np.inf
+            heading, row, column = (int(i) for i in np.unravel_index(int(every.argmax()), every.shape))
+            if not every[heading, row, column] > 0:
                 break
             peaks.append((heading, row, column))
-            beside = (heading + np.array([-1, 0, 1])) % around
-            for part in (score, blocked):
-                part[beside, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = (
-                    -np.inf if part is score else True
-                )
+            beside = np.arange(heading - 1, heading + 2) % len(every)
+            taken[beside, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = True
     return peaks
 
 
-def _settle(match: Surroundings, query: Surroundings, heading: float, shift: Array) -> Array:
+def settle(match: Surroundings, query: Surroundings, heading: float, shift: Array) -> Array:
     """Full pose of a planar fit: height and tilt from the height differences of the shared cells."""
     planar = make_pose(Rotation.from_rotvec([0, 0, heading]).as_matrix(), [*shift, 0.0])
     heights = query.lowest[query.rows, query.columns]

@@ -58,20 +58,22 @@ MIN_NEIGHBOURHOOD = 0.25  # by hand: weight of the occupied cells around one, of
 
 # search over all headings
 UPRIGHT_CONES = np.radians([32.0, 24.0, 16.0, 12.0])  # measured: rights LiDARs tilted by 28 deg to 1 or 2
-MIN_UPRIGHT = 10  # normals of ground that a direction is worth
+MIN_UPRIGHT = 10  # by hand: normals of ground that a direction is worth
 SECTORS = 72  # of 5 deg, by hand
 MIN_SECTOR_SHARE = 1e-3  # by hand: of all points; fewer are strays
 AROUND_CELLS, AROUND_RADIUS, AROUND_SHIFT = 64, 26, 12  # geometry: 26 + 26 + 12 cells come round to themselves no more
 REACH_CELLS = 15.0  # measured: the median range of a scan in cells
 AROUND_CELL_M = (0.25, 1.0)  # by hand: rooms, fields
 LAYER_M = 0.3  # by hand: just more than the thinning
+TALL_LAYERS, MIN_TALL = 3, 20  # by hand: cells of walls, trunks and boxes, and how many make a place
 ALL_HEADINGS = np.radians(np.arange(0.0, 360.0, 6.0))  # geometry: half a step is within reach of the alignment
+MIN_SHARED_VIEW = 0.6  # of the narrower view; by hand: a LiDAR of 70 deg may be turned by 28
 SEARCHED_OVERLAP = 0.45  # by hand: a view of 70 deg is looked for within 38
 PEAKS = (3, 4)  # by hand: of relief alone, of relief and structure
 SETTLE_MEDIANS, SETTLE_M = 2.5, 0.05  # by hand: cells that a plane between two maps is fitted to lie so near to it
 MAX_SLOPE = 0.3  # by hand: of one map against the other, rad
-SCOUTS, SCOUT_STEPS = 300, 5
-SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells
+SCOUTS, SCOUT_STEPS = 300, 5  # by hand: points and steps that draw a peak to the match
+SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells; geometry: a peak is off by less than a cell and half a heading
 TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain in the open
 
 # registration
@@ -84,6 +86,31 @@ COARSE_REACH_M, COARSE_STEPS = 1.0, 10  # geometry: two cells of the elevation m
 FINE_REACH_M, FINE_STEPS = 0.4, 8  # by hand: the spacing of far returns is wider than the noise
 MIN_SCAN_POINTS = 100  # by hand: below, there is nothing to align
 SCANS_KEPT = 60  # prepared scans in memory: bounds it, changes no result
+
+# free space: what the rays of one scan say of the points of another
+SIGHT_ROWS, SIGHT_COLUMNS = 90, 180  # geometry: cells of two degrees, as far apart as the rings of sixteen beams
+SIGHT_MARGIN_M, SIGHT_MARGIN = 0.3, 0.03  # by hand: noise, motion and error of the pose, which grows with the range
+SIGHT_KNOWN = 0.3  # by hand: of a cell's neighbourhood that must have returns for its rays to be known
+SIGHT_FROM_M = 0.8  # by hand: nearer than this is the robot itself
+SIGHT_FILLED_M = 5.0  # geometry: nearer, a thinned point is wider than a cell and its neighbours' gaps
+
+# discord of the modalities, told in words: agreement in standard deviations of chance, contradiction of free space
+IMAGE_CONTRADICTS, IMAGE_SUPPORTS = 0.0, 4.0  # by hand
+SCANS_SUPPORT, SCANS_CONTRADICT = 0.05, 0.12  # measured: right poses stay below the one, half of the wrong ones above
+
+# meeting of two scans
+MEETING_POINTS = 20  # by hand: of a kind, below which a share of them means nothing
+COUNTERPART_M, COUNTERPART_SPACINGS = 0.05, 0.5  # measured: .3 m and 1 spacing tell places apart less well
+UNEXPLAINED = 2.0  # measured: in these reaches; of all measures the most alike from one kind of place to another
+SPACING_NEIGHBOURS = 6  # by hand: the point itself and five, so that they reach the next ring
+UPRIGHT = 0.7  # geometry: surfaces steeper than 45 deg
+RIVAL_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: beyond the error of a right pose, within a wrong one's
+RIVAL_FAR_M = np.concatenate([np.arange(-6.0, -0.9, 0.5), np.arange(1.0, 6.1, 0.5)])  # geometry: what repeats: doors
+RIVAL_EVERY = 10  # of the sample: bounds the time
+RIVAL_MISFIT = 3.0  # by hand: how bad a misfit can be, in counterparts' reach
+
+RUNNER_UP_ROOM = 0.02  # by hand: shares nearer to nothing than this are alike
+MIN_RUNNER_UP = 0.1  # measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 94
 
 # covariance
 SEARCH_M, SEARCH_RAD = 3.0, 0.35  # what the search itself knows, standard deviation: nothing is wider than this
@@ -107,3 +134,23 @@ MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of ke
 ODOMETRY_REACH_M = 15.0  # by hand: odometry is trusted over this distance
 PRIOR_M = 1.0  # by hand: standard deviation of what odometry predicts before any way is driven
 AGREE_M, AGREE_RAD = 0.5, 0.05  # by hand: two findings this near are one
+
+# submaps: what a narrow sensor saw along some metres of way
+NARROW_DEG = 270.0  # geometry: a sensor that sees more recognises a place from any side without submaps
+SUBMAP_BEFORE_M, SUBMAP_AFTER_M = 20.0, 15.0  # measured: way before and behind a keyframe; 10 and 10 find less
+MIN_SUBMAP_M = 5.0  # by hand: way below which a submap is hardly more than a scan
+MIN_COMMON = 0.1  # by hand: of a submap that must have counterparts: a strip at its edge fits many places
+SUBMAP_CELL_M = 0.3  # by hand: coarser than a scan, for odometry drifts inside
+SUBMAP_STEP_M = 1.5  # measured: between the scans that are merged; 1 and 2 m are as good
+SUBMAP_NEAR_M = 8.0  # by hand: of an expected stop; further apart, two submaps share too little
+SUBMAPS_KEPT = 12  # prepared submaps in memory: bounds it, changes no result
+ODOMETRY_ALONE_M = 80.0  # by hand: way over which odometry without a closure is worth a look
+ASKED_EVERY_M = 2.0  # by hand: way between two searches for what looks alike; bounds the time
+DESCRIBED_STOPS = 2  # by hand: every second stop can be found by its looks
+LOOKALIKES = 2  # that get a metric pose; bounds the time
+KEYPOINTS, KEYPOINT_CONTRAST = 120, 0.01  # measured: 80 and .02 find less
+MIN_KEYPOINTS = 4  # by hand: two of them make a motion, and two more confirm it
+KEYPOINT_M, KEYPOINT_SCALE = 1.0, 0.1  # geometry: two cells; odometry that is off by a tenth is useless
+KEYPOINT_VOTES = 15  # measured: stored keypoints that each of the query's votes for
+SUBMAPS_COMPARED = 10  # measured: the right one is among the ten most voted for in four of five
+RIVAL_TERRAIN_M = (1.5, 3.0)  # geometry: beyond the error of a right pose, within a wrong one's

@@ -1,10 +1,8 @@
-"""Elevation maps of scans, and where two of them could fit: an exhaustive search over heading and position.
+"""Elevation maps of scans, and how well two of them fit at a pose.
 
-A scan becomes a bird's-eye map of heights, and of *relief*: the height of each cell above a plane fitted to its
-neighbourhood. Relief keeps rocks, ripples and rims, and forgets the rover's own height and tilt as
-well as the slope that every cell of a hillside shares. Two maps are compared by normalised
-cross-correlation over all shifts at once (FFT), for a fan of headings. Unlike features it needs no
-training and does not know about the sun.
+A scan becomes a bird's-eye map of heights and of relief (see `relief`), all around the body. At a pose, the relief of
+both is compared cell by cell by normalised cross-correlation. Unlike features it needs no training and does not know
+about the sun.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def find_hypotheses(
         return [Hypothesis(ranked, seen[0], float(seen[1]), views)] if seen else []
     from_points = pose_from_points(query, ranked, settings.ransac_iterations, settings.seed)
     poses = [pose for pose in (from_points, seen[0] if seen else None) if pose is not None]
-    fits = [scout(match, turned.scan, pose) for pose in poses] + search(match, turned)
+    fits = [fit for pose in poses if (fit := scout(match, turned.scan, pose)).telling] + search(match, turned)
     fits.sort(key=lambda fit: -fit.score)
     return [Hypothesis(ranked, fit.pose, fit.score, views) for fit in _distinct(fits)]
 
@@ -145,19 +145,20 @@ def prior_sigmas(query: Keyframe, match: Keyframe, match_T_query: Array, drift: 
 def _distinct(fits: list[Fit]) -> list[Fit]:
     kept: list[Fit] = []
     for fit in fits:
-        if not any(_near(fit.pose, other.pose, const.DISTINCT_M, const.DISTINCT_RAD) for other in kept):
+        if not any(near(fit.pose, other.pose, const.DISTINCT_M, const.DISTINCT_RAD) for other in kept):
             kept.append(fit)
     return kept
 
 
-def _near(a: Array, b: Array, metres: float, radians: float) -> bool:
+def near(a: Array, b: Array, metres: float, radians: float) -> bool:
+    """Whether two poses are one within these tolerances."""
     gap = relative(a, b)
     return bool(np.linalg.norm(gap[:3, 3]) < metres and rotation_angle(gap) < radians)
 
 
 def _agrees(found: _Finding, query: Keyframe, match: Keyframe, match_T_query: Array) -> bool:
     carried = _carried(found, query, match)
-    return carried is not None and _near(carried, match_T_query, const.AGREE_M, const.AGREE_RAD)
+    return carried is not None and near(carried, match_T_query, const.AGREE_M, const.AGREE_RAD)
 
 
 def _carried(found: _Finding, query: Keyframe, match: Keyframe) -> Array | None:

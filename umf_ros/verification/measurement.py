@@ -8,6 +8,7 @@ fills with it, and a `Criterion` in `acceptance` that says which values speak fo
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -17,13 +18,14 @@ from umf_ros.frames import Keyframe, LocalFeatures, Points
 from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
-from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, prior_sigmas
+from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, near, prior_sigmas
+from umf_ros.verification.meeting import meet, rivalry
 from umf_ros.verification.registration import NOMINAL, Alignment, CovarianceModel, PreparedScan, covariance_of
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
 from umf_ros.verification.scan_motion import closure_covariance
 from umf_ros.verification.views import ViewAlignment
 
-SCAN, IMAGE = "scan", "image"
+SCAN, IMAGE, SUBMAP = "scan", "image", "submap"
 
 
 def measured(*kinds: str) -> Any:
@@ -38,7 +40,8 @@ class Measurement:
     The name of a field is its name in `candidates.csv` and on `~/candidates`.
 
     Attributes:
-        kind: "scan" when two scans were aligned, "image" when only local features could be.
+        kind: "scan" when two scans were aligned, "image" when only local features could be, "submap" when what was
+            seen along the way was aligned.
         similarity: cosine similarity of the global descriptors.
         inliers_image: pairs of image features that one homography explains.
         inliers_cloud: pairs of the scan's features that one rigid motion explains.
@@ -52,6 +55,14 @@ class Measurement:
         relief_m: standard deviation of the relief on the ground that both scans saw.
         terrain_correlation: of both elevation maps' relief, -1 to 1.
         terrain_score: the same in standard deviations of chance.
+        terrain_rival: correlation at the best of some poses beside this one.
+        common: share of a scan's points that the other should see, the smaller of both ways, as all that follow.
+        contradiction: share of these that the other's rays passed by, the larger of both.
+        counterparts: share of these that have a counterpart, as near as both scans' points let one expect.
+        upright_counterparts: the same of walls, trunks and rocks alone; NaN where next to nothing stands.
+        unexplained: share of what stands and should be seen that is far from everything, the larger of both.
+        rival_near: logarithm of how much worse the fit is half a metre on, along the way that is known least.
+        rival_far: the same of the best fit 1 to 6 m on: 0 when another place fits as well.
         pose_inliers: feature pairs that agree with the pose.
         spread: of those pairs across the image: smaller deviation of column and row, of its width and height.
         two_way_m: distance of the poses that the query's depths and the match's give by themselves.
@@ -61,6 +72,7 @@ class Measurement:
         agreement_cloud: the same of the scan's features.
         prior_sigmas: distance from what odometry predicts, in standard deviations of its drift.
         support: earlier keyframes, of the last few, that found a pose which odometry carries over to this one.
+        runner_up: logarithm of how much more is missing at the next best hypothesis about the pair; NaN without one.
     """
 
     kind: str = ""
@@ -68,24 +80,48 @@ class Measurement:
     inliers_image: float = 0.0
     inliers_cloud: float = 0.0
     superfeatures: float = 0.0
-    residual_m: float = measured(SCAN, IMAGE)
+    residual_m: float = measured(SCAN, IMAGE, SUBMAP)
     residual_sigmas: float = measured(IMAGE)
     residual_p90_m: float = measured(SCAN)
     noise_m: float = measured(SCAN)
-    overlap: float = measured(SCAN, IMAGE)
-    points: float = measured(SCAN)
-    relief_m: float = measured(SCAN)
-    terrain_correlation: float = measured(SCAN)
-    terrain_score: float = measured(SCAN)
+    overlap: float = measured(SCAN, IMAGE, SUBMAP)
+    points: float = measured(SCAN, SUBMAP)
+    relief_m: float = measured(SCAN, SUBMAP)
+    terrain_correlation: float = measured(SCAN, SUBMAP)
+    terrain_score: float = measured(SCAN, SUBMAP)
+    terrain_rival: float = measured(SUBMAP)
+    common: float = measured(SCAN)
+    contradiction: float = measured(SCAN)
+    counterparts: float = measured(SCAN)
+    upright_counterparts: float = measured(SCAN)
+    unexplained: float = measured(SCAN)
+    rival_near: float = measured(SCAN)
+    rival_far: float = measured(SCAN)
     pose_inliers: float = measured(IMAGE)
     spread: float = measured(IMAGE)
     two_way_m: float = measured(IMAGE)
-    position_std_m: float = measured(SCAN, IMAGE)
-    heading_std_deg: float = measured(SCAN, IMAGE)
+    position_std_m: float = measured(SCAN, IMAGE, SUBMAP)
+    heading_std_deg: float = measured(SCAN, IMAGE, SUBMAP)
     agreement_image: float = measured(SCAN, IMAGE)
     agreement_cloud: float = measured(SCAN, IMAGE)
-    prior_sigmas: float = measured(SCAN, IMAGE)
-    support: float = measured(SCAN, IMAGE)
+    prior_sigmas: float = measured(SCAN, IMAGE, SUBMAP)
+    support: float = measured(SCAN, IMAGE, SUBMAP)
+    runner_up: float = measured(SCAN)
+
+    @property
+    def missing(self) -> float:
+        """Share of what stands, or where nothing does of all, that should have a counterpart and has none."""
+        known = self.upright_counterparts
+        return 1.0 - (known if math.isfinite(known) else self.counterparts)
+
+    @property
+    def discord(self) -> str:
+        """What to say where one modality supports a pose that the other contradicts; else nothing."""
+        if self.agreement_image < const.IMAGE_CONTRADICTS and self.contradiction < const.SCANS_SUPPORT:
+            return "the scans support it, the image contradicts it"
+        if self.agreement_image > const.IMAGE_SUPPORTS and self.contradiction > const.SCANS_CONTRADICT:
+            return "the image supports it, the scans contradict it"
+        return ""
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -173,6 +209,15 @@ def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) ->
     )
 
 
+def beside(measurement: Measurement, pose: Array, others: Sequence[tuple[Array, Measurement]]) -> Measurement:
+    """The same, knowing the other hypotheses about the pair: poses `match_T_query` and what was measured there."""
+    distinct = [other.missing for there, other in others if not near(pose, there, const.DISTINCT_M, const.DISTINCT_RAD)]
+    if measurement.kind != SCAN or not distinct:
+        return measurement
+    room = const.RUNNER_UP_ROOM
+    return replace(measurement, runner_up=math.log((min(distinct) + room) / (measurement.missing + room)))
+
+
 def image_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
     """Whether the query's image features reappear where the pose says, in standard deviations of chance.
 
@@ -207,7 +252,10 @@ def cloud_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
 
 def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan, query: PreparedScan) -> Measurement:
     """Tests of how two scans fit."""
-    fit = evaluate(match.elevation, query.elevation, alignment.pose)
+    pose = alignment.pose
+    fit = evaluate(match.elevation, query.elevation, pose)
+    ours, theirs = meet(match, query, pose)
+    close, far = rivalry(match, query, pose, alignment.information)
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     return replace(
         known,
@@ -217,9 +265,16 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
         noise_m=max(match.noise_m, const.MIN_SURFACE_NOISE_M),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),
-        relief_m=shared_relief(match.elevation, query.elevation, alignment.pose),
+        relief_m=shared_relief(match.elevation, query.elevation, pose),
         terrain_correlation=fit.correlation,
         terrain_score=fit.score,
+        common=min(ours.common, theirs.common),
+        contradiction=max(ours.contradiction, theirs.contradiction),
+        counterparts=min(ours.counterparts, theirs.counterparts),
+        upright_counterparts=float(np.fmin(ours.upright_counterparts, theirs.upright_counterparts)),
+        unexplained=float(np.fmax(ours.unexplained, theirs.unexplained)),
+        rival_near=close,
+        rival_far=far,
     )
 
 

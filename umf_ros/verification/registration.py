@@ -11,10 +11,11 @@ import small_gicp
 from numpy.typing import NDArray
 
 from umf_ros.frames import Keyframe, Points
-from umf_ros.geometry import Array, transform
+from umf_ros.geometry import Array, invert, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import ElevationMap
 from umf_ros.verification.field_of_view import FieldOfView
+from umf_ros.verification.free_space import RangeImage
 from umf_ros.verification.surroundings import Surroundings
 from umf_ros.verification.upright import upright
 
@@ -22,9 +23,15 @@ from umf_ros.verification.upright import upright
 class PreparedScan:
     """A keyframe's scan made ready for comparison, each part when it is first asked for."""
 
-    def __init__(self, points: Points) -> None:
-        """Args: points (M, 3) m, body frame, thinned."""
+    def __init__(self, points: Points, body_T_lidar: Array | None = None) -> None:
+        """Prepare nothing yet.
+
+        Args:
+            points: (M, 3) m, body frame, thinned.
+            body_T_lidar: where they were seen from; without it the origin.
+        """
         self._thinned = points
+        self._lidar_T_body = np.eye(4) if body_T_lidar is None else invert(body_T_lidar)
         self.points: Array = points.astype(float)
         self._around: dict[float, Surroundings] = {}
 
@@ -41,7 +48,7 @@ class PreparedScan:
     @cached_property
     def up(self) -> Array:
         """Rotation (3, 3) that sets the scan upright."""
-        return upright(self.normals[self._picks(const.SAMPLE)])
+        return upright(self.normals[self.picks])
 
     @cached_property
     def upright_points(self) -> Array:
@@ -78,7 +85,7 @@ class PreparedScan:
         return cloud
 
     def _picks(self, count: int) -> NDArray[np.intp]:
-        return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(int)
+        return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(np.intp)
 
     @cached_property
     def cloud(self) -> small_gicp.PointCloud:
@@ -86,6 +93,15 @@ class PreparedScan:
         cloud = small_gicp.PointCloud(self.points)
         small_gicp.estimate_normals_covariances(cloud, self.tree, const.NORMAL_NEIGHBOURS, 1)
         return cloud
+
+    @cached_property
+    def range_image(self) -> RangeImage:
+        """How far the LiDAR saw."""
+        return RangeImage(transform(self._lidar_T_body, self.points))
+
+    def look_at(self, points: Array) -> NDArray[np.int8]:
+        """(N,) what the rays of this scan say of points (N, 3) of its body frame, each a `Sight`."""
+        return self.range_image.look_at(transform(self._lidar_T_body, points))
 
     @cached_property
     def picks(self) -> NDArray[np.intp]:
@@ -96,6 +112,12 @@ class PreparedScan:
     def sample(self) -> Array:
         """(S, 3) at most 1500 points, evenly taken."""
         return self.points[self.picks]
+
+    @cached_property
+    def spacing(self) -> Array:
+        """(S,) m: how far the points of the sample are from the fifth of their neighbours."""
+        _, squared = self.tree.batch_knn_search(self.sample, const.SPACING_NEIGHBOURS, 1)
+        return np.sqrt(np.asarray(squared)[:, -1])
 
     @cached_property
     def sample_cloud(self) -> small_gicp.PointCloud:
@@ -137,7 +159,7 @@ class ScanCache:
 
     def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
         key = (keyframe.session, keyframe.stamp_ns)
-        scan = self._scans.pop(key, None) or PreparedScan(keyframe.points)
+        scan = self._scans.pop(key, None) or PreparedScan(keyframe.points, keyframe.body_T_lidar)
         self._scans[key] = scan
         if len(self._scans) > const.SCANS_KEPT:
             self._scans.popitem(last=False)

@@ -12,7 +12,7 @@ from umf_ros.verification import constants as const
 Grid = NDArray[np.float32]
 
 
-def relief_of(height: Grid, known: NDArray[np.bool_], cell_m: float) -> Grid:
+def relief_of(height: Array, known: NDArray[np.bool_], cell_m: float) -> Grid:
     """Height above a Gaussian-weighted local plane, clipped; NaN where a cell has no neighbourhood.
 
     Relief keeps rocks, ripples and rims, and forgets the rover's own height and tilt as well as the slope that every

@@ -32,6 +32,7 @@ class Surroundings:
         rows, columns: (C,) of the cells with points.
         centres: (C, 2) of these cells, m.
         lowest: (SIDE, SIDE) height of the lowest point of every cell, m; NaN without points.
+        structured: whether enough of it stands up from the ground to tell one place from another.
         values: (2, C) relief and structure, each of mean 0 and, all cells together, of length 1.
     """
 
@@ -50,8 +51,12 @@ class Surroundings:
         self.lowest: Array = np.where(count > 0, bottom, np.nan).reshape(SIDE, SIDE)
         mean = np.bincount(cell, points[:, 2], SIDE * SIDE) / np.maximum(count, 1)
         relief = relief_of(mean.reshape(SIDE, SIDE), np.isfinite(self.lowest), cell_m)[self.rows, self.columns]
-        structure = np.sqrt(_layers(cell, points[:, 2])[occupied])
-        self.values = np.stack([_unit(np.nan_to_num(relief)), _unit(structure - structure.mean())])
+        layers = _layers(cell, points[:, 2] - bottom[cell])[occupied]
+        self.structured = bool((layers >= const.TALL_LAYERS).sum() >= const.MIN_TALL)
+        structure = np.sqrt(layers)
+        self.values = np.stack(
+            [_unit(np.nan_to_num(relief)), _unit(structure - structure.sum() / max(len(structure), 1))]
+        )
 
     @cached_property
     def maps(self) -> Grid:
@@ -75,13 +80,16 @@ class Surroundings:
         return np.asarray(turned, np.float32)
 
 
-def _layers(cell: NDArray[np.intp], height: Array) -> Array:
-    """In how many layers every cell (SIDE^2,) has points."""
-    layer = np.floor(height / const.LAYER_M).astype(int)
-    layer -= layer.min(initial=0)
+def _layers(cell: NDArray[np.intp], rise: Array) -> Array:
+    """In how many layers above its lowest point every cell (SIDE^2,) has points; 1 on any ground but a steep one."""
+    layer = np.floor(rise / const.LAYER_M).astype(int)
     occupied = np.zeros((SIDE * SIDE, layer.max(initial=0) + 1), bool)
     occupied[cell, layer] = True
     return occupied.sum(axis=1).astype(float)
+
+
+def _centred(values: Array) -> Array:
+    return values - values.mean() if len(values) else values
 
 
 def _unit(values: Array) -> Grid:

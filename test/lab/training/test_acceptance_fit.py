@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from measurements import BAD, GOOD
 
+from umf_ros.lab.training.acceptance_examples import Example
 from umf_ros.lab.training.acceptance_fit import (
-    Example,
+    bounds_of,
     fit_covariance,
+    fit_decision,
     fit_logistic,
     inside_ellipsoid,
     scale_covariance,
@@ -46,6 +48,52 @@ def test_fit_separates_and_is_calibrated() -> None:
 def test_fit_needs_both_classes() -> None:
     with pytest.raises(ValueError, match="need right and wrong"):
         fit_logistic([Example(GOOD, True)] * 3, SCAN)
+
+
+def in_domains(rng: np.random.Generator) -> list[Example]:
+    """Four domains; in the last of them wrong poses look nearly as right as right ones do."""
+    found = []
+    for domain in ("a", "b", "c", "last"):
+        found += [replace(example, domain=domain) for example in examples(100, rng)]
+    lookalike = replace(GOOD, similarity=0.5, residual_m=0.02, upright_counterparts=0.7, unexplained=0.1, runner_up=0.9)
+    return [*found, *[Example(lookalike, False, "last")] * 20]
+
+
+def accepted(examples: list[Example], odds: np.ndarray, right: bool) -> float:
+    chosen = np.array([example.right == right for example in examples])
+    return float((odds[chosen] > np.log(9)).mean())
+
+
+def test_decision_lets_no_wrong_pose_of_a_domain_pass_that_it_does_not_know() -> None:
+    known = in_domains(np.random.default_rng(3))
+    decision, odds = fit_decision(known, SCAN, 0.9)
+    assert accepted(known, odds, right=False) == 0
+    assert decision.bias < fit_logistic(known, SCAN).bias
+    without_trap = [example for example in known if example.measurement.runner_up != 0.9]
+    assert accepted(without_trap, fit_decision(without_trap, SCAN, 0.9)[1], right=True) > accepted(known, odds, True)
+
+
+def test_a_wrong_pose_with_a_rival_does_not_lower_the_decision() -> None:
+    """It is refused anyway."""
+    known = in_domains(np.random.default_rng(3))
+    rivalled = [
+        replace(one, measurement=replace(one.measurement, runner_up=0.0)) if one.measurement.runner_up == 0.9 else one
+        for one in known
+    ]
+    assert fit_decision(rivalled, SCAN, 0.9)[0].bias > fit_decision(known, SCAN, 0.9)[0].bias
+
+
+def test_every_domain_counts_as_much_as_any_other() -> None:
+    rng = np.random.default_rng(4)
+    few, many = ([replace(one, domain=name) for one in examples(60, rng)] for name in ("few", "many"))
+    once, often = fit_logistic(few + many, SCAN), fit_logistic(few + many * 5, SCAN)
+    assert often.bias == pytest.approx(once.bias, abs=0.05)
+
+
+def test_bounds_hold_what_right_poses_measured_with_some_room() -> None:
+    known = [Example(replace(GOOD, noise_m=noise), True) for noise in (0.01, 0.04)]
+    least, greatest = bounds_of([*known, Example(replace(GOOD, noise_m=5.0), False)], SCAN)["noise_m"]
+    assert 0.005 < least < 0.01 and 0.04 < greatest < 0.1
 
 
 def test_covariance_is_recovered_and_honest() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -130,26 +130,33 @@ class Simulator:
 
     def frames(self) -> Iterator[Frame]:
         """Synchronised frames, one per scan, without a file in between; needs one exposure per scan."""
-        kept = self.calibration
-        for number, (stamp, exposure) in enumerate(zip(self.scan_stamps_ns, self.exposures, strict=True)):
-            scan, (left, right) = self.scan(number), self._rectified(exposure)
-            usable = scan.usable(kept.min_intensity, kept.max_height_m)
-            start, end = self._lidar_poses(number)
-            points = self._lidar.motion_free(scan, relative(start, end))
-            moved = relative(self.pose(int(stamp)), self.pose(exposure.stamp_ns))
-            yield Frame(
-                stamp_ns=int(stamp),
-                camera=kept.camera,
-                body_T_camera=moved @ kept.body_T_camera,
-                body_T_lidar=kept.body_T_lidar,
+        for number, exposure in zip(range(len(self.scan_stamps_ns)), self.exposures, strict=True):
+            frame, (left, right) = self.scan_frame(number), self._rectified(exposure)
+            moved = relative(self.pose(frame.stamp_ns), self.pose(exposure.stamp_ns))
+            yield replace(
+                frame,
+                body_T_camera=moved @ frame.body_T_camera,
                 left=left,
                 right=right,
-                points=transform(kept.body_T_lidar, points[usable]),
-                intensity=scan.intensity[usable].astype(np.float32),
-                odom_T_body=self._odometry_at(int(stamp)),
                 image_stamp_ns=exposure.stamp_ns,
-                motion=ScanMotion.none(int(usable.sum())),
             )
+
+    def scan_frame(self, number: int) -> Frame:
+        """The frame of the numbered scan, without images."""
+        kept, stamp = self.calibration, int(self.scan_stamps_ns[number])
+        scan, (start, end) = self.scan(number), self._lidar_poses(number)
+        usable = scan.usable(kept.min_intensity, kept.max_height_m)
+        points = self._lidar.motion_free(scan, relative(start, end))
+        return Frame(
+            stamp_ns=stamp,
+            camera=kept.camera,
+            body_T_camera=kept.body_T_camera,
+            body_T_lidar=kept.body_T_lidar,
+            points=transform(kept.body_T_lidar, points[usable]),
+            intensity=scan.intensity[usable].astype(np.float32),
+            odom_T_body=self.odometry_at(stamp),
+            motion=ScanMotion.none(int(usable.sum())),
+        )
 
     def _rectified(self, exposure: Exposure) -> tuple[Image, Image | None]:
         left, right = self.stereo(exposure)
@@ -158,7 +165,7 @@ class Simulator:
             return left.image, right.image if right else None
         return rectifier.left(left.image), rectifier.right(right.image) if right else None
 
-    def _odometry_at(self, stamp_ns: int) -> Array:
+    def odometry_at(self, stamp_ns: int) -> Array:
         """Odometry at any time: the last sample, moved on by the true motion since."""
         time_s = _seconds(stamp_ns)
         last = int(np.searchsorted(self.odometry.times_s, time_s, side="right")) - 1

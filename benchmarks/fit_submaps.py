@@ -1,0 +1,232 @@
+"""Fit the decision about submaps, and what odometry adds to their covariance, to simulated validation drives.
+
+python benchmarks/fit_submaps.py [--drives FOLDER] [--out FILE]
+
+Only LiDAR and odometry are simulated: a drive takes about a minute of one core. What a single scan would have found
+(revisits in the same direction) is taken from the truth.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import track
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from umf_ros.config import Database, KeyframePolicy, Loop, Verification
+from umf_ros.frames import Embedding, Frame, Keyframe, StereoCamera
+from umf_ros.geometry import Array, relative
+from umf_ros.keyframes import KeyframeSelector, is_past
+from umf_ros.lab.simulation.presets import find_preset
+from umf_ros.lab.simulation.simulator import Simulator
+from umf_ros.lab.training.acceptance_fit import fit_weights
+from umf_ros.places.database import PlaceDatabase
+from umf_ros.runs.honesty import normalised_errors, pose_error, share_inside
+from umf_ros.runs.truth import POSE_TOLERANCE_DEG, POSE_TOLERANCE_M, find_revisits
+from umf_ros.submaps import SubmapFinder
+from umf_ros.submaps.finder import Tested
+from umf_ros.submaps.judgement import SubmapAcceptance, scores
+from umf_ros.verification import Measurement
+from umf_ros.verification import constants as const
+from umf_ros.verification.acceptance import Logistic
+from umf_ros.verification.thinning import thin_scan
+
+Truth = dict[int, Array]
+NO_CAMERA = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)
+LIMITS = np.log([[1.0, 1e-4, 1e-3], [1e4, 0.1, 1.0]])
+DRIVES = [
+    ("mapping", 10111, "etna", 0.3),
+    ("mapping", 10112, "etna", 1.0),
+    ("mapping", 10113, "dunes", 1.0),
+    ("mapping", 10114, "moon", 1.0),
+    ("mapping", 10115, "canyon", 1.0),
+    ("mapping", 10116, "terrain", 1.0),
+    ("mapping", 10117, "mesa", 1.0),
+    ("mapping", 10118, "mounds", 1.0),
+    ("traverse_1", 10119, "etna", 1.0),
+    ("traverse_2", 10120, "dunes", 0.3),
+    ("landmarks", 10121, "etna", 1.0),
+]
+WRONG_FROM_M = 15.0  # stops further away than this from the truth are what a wrong answer may be drawn from
+EVERY = 3  # keyframes, for wrong answers
+DEFAULT_OUT = Path(__file__).parent.parent / "config" / "verification" / "submaps.json"
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Keyframes without a network's help, and their true poses (N, 4, 4)."""
+
+    keyframes: list[Keyframe]
+    truth: Array
+
+
+@dataclass(frozen=True)
+class Example:
+    """A tested proposal of a drive: what was measured, the error (6,) of its pose, and whether that was right."""
+
+    drive: int
+    measurement: Measurement
+    information: Array
+    way_m: float
+    error: Array
+    right: bool
+
+
+def drive_of(preset: str, seed: int, family: str, aliasing: float, folder: Path | None) -> Drive:
+    """A drive with a LiDAR and odometry; kept in a folder, if there is one."""
+    path = folder / f"{preset}_{seed}_{family}_{aliasing:g}.pkl" if folder else None
+    if path is not None and path.exists():
+        kept: Drive = pickle.loads(path.read_bytes())
+        return kept
+    simulator = Simulator(find_preset(preset), seed, family=family, aliasing=aliasing)
+    selector, keyframes = KeyframeSelector(KeyframePolicy()), []
+    for number, stamp in enumerate(int(stamp) for stamp in simulator.scan_stamps_ns):
+        where = Frame(stamp, NO_CAMERA, np.eye(4), np.eye(4), odom_T_body=simulator.odometry_at(stamp))
+        if selector.select(where):
+            frame = simulator.scan_frame(number)
+            points, metres = thin_scan(frame.points), selector.travelled_m(where)
+            blind = Embedding(np.zeros(1, np.float32))
+            keyframes.append(
+                Keyframe(stamp, blind, NO_CAMERA, np.eye(4), points, where.odom_T_body, metres, 0, frame.body_T_lidar)
+            )
+    drive = Drive(keyframes, np.stack([simulator.pose(keyframe.stamp_ns) for keyframe in keyframes]))
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(pickle.dumps(drive))
+    return drive
+
+
+def examples_of(number: int, drive: Drive) -> Iterator[Example]:
+    """What the finder tests along a drive when all that is right is accepted, and wrong answers on top."""
+    database = PlaceDatabase(Database(), "none", 1)
+    finder = SubmapFinder(Verification(), Loop(), database)
+    truth = {one.stamp_ns: pose for one, pose in zip(drive.keyframes, drive.truth, strict=True)}
+    by_scan = _found_by_scan(drive)
+    for i, query in enumerate(track(drive.keyframes, f"drive {number}", transient=True)):
+        tested = [] if i in by_scan else finder.examine(query)
+        found = [_example(number, truth, one) for one in tested]
+        yield from found
+        if i % EVERY == 0:
+            yield from _wrong_answers(number, truth, finder, query)
+        right = [
+            (one.match.keyframe, one.alignment.pose) for one, known in zip(tested, found, strict=True) if known.right
+        ]
+        closures = by_scan.get(i, right)
+        if closures:
+            finder.find(query, closures)
+        database.add(query)
+        finder.remember(query)
+    database.close()
+
+
+def _found_by_scan(drive: Drive) -> dict[int, list[tuple[Keyframe, Array]]]:
+    """The nearest earlier keyframe of every revisit in the same direction, with the true pose."""
+    stamps = np.array([one.stamp_ns for one in drive.keyframes], np.int64)
+    travelled = np.array([one.travelled_m for one in drive.keyframes])
+    positions, found = drive.truth[:, :3, 3], {}
+    for i in np.flatnonzero(find_revisits(stamps, drive.truth, travelled, Loop())):
+        past = is_past(stamps[i] - stamps[:i], travelled[i] - travelled[:i], Loop())
+        away = np.where(past, np.linalg.norm(positions[:i] - positions[i], axis=1), np.inf)
+        nearest = int(away.argmin())
+        found[int(i)] = [(drive.keyframes[nearest], relative(drive.truth[nearest], drive.truth[i]))]
+    return found
+
+
+def _wrong_answers(number: int, truth: Truth, finder: SubmapFinder, query: Keyframe) -> Iterator[Example]:
+    """What looks alike and is another place."""
+    if query.travelled_m < const.SUBMAP_BEFORE_M:
+        return
+    for proposal in finder.lookalikes(query):
+        stop = finder.trail.stops[proposal.row]
+        if np.linalg.norm(relative(truth[stop.stamp_ns], truth[query.stamp_ns])[:3, 3]) < WRONG_FROM_M:
+            continue
+        tested = finder.test(query, proposal)
+        if tested is not None:
+            yield _example(number, truth, tested)
+
+
+def _example(number: int, truth: Truth, tested: Tested) -> Example:
+    true = relative(truth[tested.match.keyframe.stamp_ns], truth[tested.query.keyframe.stamp_ns])
+    error = pose_error(tested.alignment.pose, true)
+    right = np.linalg.norm(error[:3]) <= POSE_TOLERANCE_M and np.linalg.norm(error[3:]) <= np.radians(
+        POSE_TOLERANCE_DEG
+    )
+    return Example(number, tested.measurement, tested.alignment.information, tested.way_m, error, bool(right))
+
+
+def fit(examples: list[Example]) -> SubmapAcceptance:
+    """The decision and the covariance that these examples speak for."""
+    right = np.array([one.right for one in examples])
+    model = fit_weights([scores(one.measurement) for one in examples], right)
+    return SubmapAcceptance(model, *fit_covariance([one for one in examples if one.right]))
+
+
+def fit_covariance(examples: list[Example]) -> tuple[float, float, float]:
+    """Inflation, drift and drift of the rotation under which the errors are most likely, half of them at the median."""
+    errors = np.stack([one.error for one in examples])
+
+    def covariances(logarithms: Array) -> Array:
+        model = SubmapAcceptance(Logistic(0.0, {}), *np.exp(np.clip(logarithms, *LIMITS)))
+        return np.stack([model.covariance(one.information, one.way_m) for one in examples])
+
+    def surprise(logarithms: Array) -> float:
+        found = covariances(logarithms)
+        # a heavy tail, so that a few bad fits do not widen all others
+        return float(np.mean(np.linalg.slogdet(found)[1] + 16 * np.log1p(normalised_errors(errors, found) / 10)))
+
+    best = minimize(surprise, np.log([20.0, 2e-3, 6e-3]), method="Nelder-Mead", options={"maxiter": 200}).x
+    inflation, drift, drift_deg_m = np.exp(np.clip(best, *LIMITS))
+    variance = np.quantile(normalised_errors(errors, covariances(best)), 0.95) / chi2.ppf(0.95, 6)
+    return float(inflation * variance), float(drift * variance**0.5), float(drift_deg_m * variance**0.5)
+
+
+def results(examples: list[Example], model: SubmapAcceptance, threshold: float) -> dict[str, float]:
+    """What the decision makes of examples."""
+    accepted = [one for one in examples if model.probability(one.measurement) >= threshold]
+    right = [one for one in accepted if one.right]
+    squared = [float(normalised_errors(one.error, model.covariance(one.information, one.way_m))) for one in right]
+    return {
+        "examples": len(examples),
+        "right": sum(one.right for one in examples),
+        "accepted": len(accepted),
+        "wrong": len(accepted) - len(right),
+        "recall": round(len(right) / max(sum(one.right for one in examples), 1), 4),
+        "inside_95": round(share_inside(np.array(squared)), 4),
+    }
+
+
+def main(
+    drives: Annotated[Path | None, typer.Option(help="Keep the simulated drives here.")] = None,
+    out: Annotated[Path, typer.Option(help="Where to write the fitted decision.")] = DEFAULT_OUT,
+) -> None:
+    """Fit, leave every drive out once to see what that costs, and write."""
+    console = Console()
+    examples = [example for i, plan in enumerate(DRIVES) for example in examples_of(i, drive_of(*plan, drives))]
+    threshold = Verification().min_probability
+    for i, plan in enumerate(DRIVES):
+        others = fit([one for one in examples if one.drive != i])
+        console.print(*plan, "left out:", results([one for one in examples if one.drive == i], others, threshold))
+    model = fit(examples)
+    found = results(examples, model, threshold)
+    console.print("all:", found, model)
+    content = {
+        "fitted_with": "benchmarks/fit_submaps.py",
+        "results": found,
+        "bias": model.model.bias,
+        "weights": model.model.weights,
+        "covariance": {"inflation": model.inflation, "drift": model.drift, "drift_deg_m": model.drift_deg_m},
+    }
+    out.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from submaps_drives import Drive, drive, rough_ground
+
+from umf_ros.config import Database, Loop, Verification
+from umf_ros.geometry import invert, relative, rotation_angle
+from umf_ros.places.database import PlaceDatabase
+from umf_ros.submaps import SubmapFinder
+from umf_ros.verification import Verdict
+
+
+def replay(outing: Drive, database: PlaceDatabase, **settings: float) -> Iterator[tuple[int, list[Verdict]]]:
+    finder = SubmapFinder(Verification(**settings), Loop(), database)
+    for i, keyframe in enumerate(outing.keyframes):
+        yield i, finder.find(keyframe, [])
+        database.add(keyframe)
+        finder.remember(keyframe)
+
+
+def test_a_way_driven_back_is_recognised_with_the_right_pose(outing: Drive, database: PlaceDatabase) -> None:
+    stamps = {keyframe.stamp_ns: i for i, keyframe in enumerate(outing.keyframes)}
+    closed = set()
+    for i, verdicts in replay(outing, database):
+        for closure in (verdict.closure for verdict in verdicts if verdict.closure is not None):
+            true = relative(outing.truth[stamps[closure.match_stamp_ns]], outing.truth[i])
+            error = invert(true) @ closure.match_T_query
+            assert np.linalg.norm(error[:3, 3]) < 0.5 and np.degrees(rotation_angle(error)) < 3
+            assert np.degrees(rotation_angle(closure.match_T_query)) > 150
+            assert np.linalg.eigvalsh(closure.covariance).min() > 0
+            closed.add(i)
+    back = range(len(outing.truth) // 2 + 14, len(outing.truth))
+    assert len(closed & set(back)) > 0.8 * len(back)
+
+
+def test_what_never_was_seen_is_not_recognised(outing: Drive, database: PlaceDatabase) -> None:
+    elsewhere = drive(rough_ground(6))
+    half = len(outing.keyframes) // 2
+    mixed = Drive([*outing.keyframes[:half], *elsewhere.keyframes[half:]], outing.truth)
+    verdicts = [verdict for _, found in replay(mixed, database) for verdict in found]
+    assert verdicts and not any(verdict.closure for verdict in verdicts)
+    assert all(verdict.measurement.kind == "submap" for verdict in verdicts)
+
+
+@pytest.mark.parametrize("what", ["no odometry", "sees all around"])
+def test_who_needs_no_submaps_gets_none(outing: Drive, database: PlaceDatabase, what: str) -> None:
+    def changed(keyframe):
+        if what == "no odometry":
+            return replace(keyframe, odom_T_body=None)
+        angle = np.arange(0, 2 * np.pi, 0.01)
+        ring = np.column_stack([5 * np.cos(angle), 5 * np.sin(angle), 0 * angle]).astype(np.float32)
+        return replace(keyframe, points=np.repeat(ring, 4, axis=0))
+
+    spun = Drive([changed(keyframe) for keyframe in outing.keyframes], outing.truth)
+    assert not any(found for _, found in replay(spun, database))
+
+
+def test_a_place_that_a_scan_has_found_is_not_looked_for(outing: Drive, database: PlaceDatabase) -> None:
+    finder = SubmapFinder(Verification(), Loop(), database)
+    for keyframe in outing.keyframes[:-1]:
+        database.add(keyframe)
+        finder.remember(keyframe)
+    assert finder.examine(outing.keyframes[-1])
+    assert finder.find(outing.keyframes[-1], [(outing.keyframes[0], np.eye(4))]) == []
+
+
+def test_what_the_database_forgot_is_not_found(outing: Drive, database: PlaceDatabase) -> None:
+    finder = SubmapFinder(Verification(), Loop(), database)
+    for keyframe in outing.keyframes[:-1]:
+        database.add(keyframe)
+        finder.remember(keyframe)
+    database.forget_from(0)
+    finder.reset()
+    assert not finder.trail.stops and not finder.examine(outing.keyframes[-1])
+
+
+def test_results_do_not_depend_on_what_is_in_memory(outing: Drive, database: PlaceDatabase) -> None:
+    small = PlaceDatabase(Database(cached_keyframes=20), "none", 2)
+    for (_, one), (_, other) in zip(replay(outing, database), replay(outing, small), strict=True):
+        assert [v.reason for v in one] == [v.reason for v in other]

@@ -1,0 +1,121 @@
+"""The way driven so far in steps of a metre or two, and the submaps along it."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.config import Loop
+from umf_ros.frames import Keyframe
+from umf_ros.geometry import Array
+from umf_ros.keyframes import is_past
+from umf_ros.places.database import PlaceDatabase
+from umf_ros.submaps.submap import Submap, merge
+from umf_ros.verification import constants as const
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """A remembered keyframe with odometry.
+
+    Attributes:
+        stamp_ns: its key.
+        session: its session.
+        travelled_m: metres driven since the start of the session.
+        odom_T_body: its odometry.
+    """
+
+    stamp_ns: int
+    session: int
+    travelled_m: float
+    odom_T_body: Array
+
+
+def _way(stop: Stop) -> tuple[int, float]:
+    return stop.session, stop.travelled_m
+
+
+class Trail:
+    """Stops in the order they were driven, and submaps of the scans taken there.
+
+    Args:
+        database: has the keyframes; only the stops themselves are kept here.
+
+    Attributes:
+        stops: sessions one after the other.
+    """
+
+    def __init__(self, database: PlaceDatabase) -> None:
+        self.database = database
+        self.stops: list[Stop] = []
+        self._submaps: OrderedDict[tuple[int, int, float], Submap] = OrderedDict()
+
+    def add(self, keyframe: Keyframe) -> bool:
+        """Remember a keyframe of the database if it lies far enough from the stop before; returns whether it did."""
+        if keyframe.odom_T_body is None:
+            return False
+        last = self.stops[-1] if self.stops else None
+        same_way = last is not None and last.session == keyframe.session
+        if last is not None and same_way and keyframe.travelled_m - last.travelled_m < const.SUBMAP_STEP_M:
+            return False
+        self.stops.append(Stop(keyframe.stamp_ns, keyframe.session, keyframe.travelled_m, keyframe.odom_T_body))
+        return True
+
+    def forget(self) -> NDArray[np.intp]:
+        """Forget what the database has forgotten, and return the rows that stay."""
+        kept = [row for row, stop in enumerate(self.stops) if self.index_of(stop) is not None]
+        self.stops = [self.stops[row] for row in kept]
+        self._submaps.clear()
+        return np.array(kept, np.intp)
+
+    def index_of(self, stop: Stop) -> int | None:
+        """Its index in the database; None when it was forgotten."""
+        return self.database.index_of(stop.stamp_ns, stop.session)
+
+    def past(self, query: Keyframe, rows: NDArray[np.intp], rules: Loop) -> NDArray[np.bool_]:
+        """Which of some stops are old enough and far enough back to be a place seen again."""
+        stops = [self.stops[row] for row in rows]
+        age_ns = query.stamp_ns - np.array([stop.stamp_ns for stop in stops], np.int64)
+        way_m = query.travelled_m - np.array([stop.travelled_m for stop in stops])
+        return is_past(age_ns, way_m, rules, np.array([stop.session for stop in stops], np.int64) == query.session)
+
+    def rows(self, session: int, first_m: float, last_m: float) -> NDArray[np.intp]:
+        """Rows of a session's stops between two places of the way."""
+        first = bisect_left(self.stops, (session, first_m), key=_way)
+        return np.arange(first, bisect_right(self.stops, (session, last_m), key=_way))
+
+    def around(self, row: int, last_m: float) -> Submap:
+        """The submap of a stop: what was seen before it, and behind it up to a place of the way.
+
+        Args:
+            row: of the stop.
+            last_m: metres driven up to the last scan.
+        """
+        stop = self.stops[row]
+        key = stop.session, stop.stamp_ns, round(last_m)
+        if key not in self._submaps:
+            last_m = max(last_m, stop.travelled_m)
+            self._submaps[key] = merge(self._load(row), self._scans(stop.session, stop.travelled_m, last_m))
+            while len(self._submaps) > const.SUBMAPS_KEPT:
+                self._submaps.popitem(last=False)
+        self._submaps.move_to_end(key)
+        return self._submaps[key]
+
+    def behind(self, keyframe: Keyframe, way_m: float) -> Submap:
+        """The submap of the newest keyframe: what was seen on the last metres up to it."""
+        first_m = keyframe.travelled_m - way_m
+        rows = self.rows(keyframe.session, first_m, keyframe.travelled_m)
+        return merge(keyframe, [*(self._load(row) for row in rows), keyframe])
+
+    def _scans(self, session: int, metres: float, last_m: float) -> list[Keyframe]:
+        return [self._load(row) for row in self.rows(session, metres - const.SUBMAP_BEFORE_M, last_m)]
+
+    def _load(self, row: int) -> Keyframe:
+        index = self.index_of(self.stops[row])
+        if index is None:
+            raise KeyError(self.stops[row].stamp_ns)
+        return self.database[index]

@@ -1,0 +1,129 @@
+"""How two scans meet under a pose: what each says of the other's points, and whether another pose would do as well.
+
+Everything here is a function of two prepared scans and a pose, whatever found the pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.geometry import Array, invert, transform
+from umf_ros.verification import constants as const
+from umf_ros.verification.free_space import Sight, visible
+from umf_ros.verification.registration import PreparedScan
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Meeting:
+    """What one scan says of points of another.
+
+    Attributes:
+        sight: (N,) a `Sight` for each point.
+        misfit: (N,) distance to the nearest point of the scan, of what a counterpart may be away: below 1 it is one.
+        upright: (N,) whether the surface there stands rather than lies.
+    """
+
+    sight: NDArray[np.int8]
+    misfit: Array
+    upright: Mask
+
+    @property
+    def common(self) -> float:
+        """Share of the points that the scan should see."""
+        return float(visible(self.sight).mean()) if len(self.sight) else 0.0
+
+    @property
+    def contradiction(self) -> float:
+        """Share of the points that should be seen which the rays passed by; 1 where too few should be seen."""
+        return _share(self.sight == Sight.PASSED, visible(self.sight), 1.0)
+
+    @property
+    def counterparts(self) -> float:
+        """Share of the points that should be seen which have a counterpart; 0 where too few should be seen."""
+        return _share(self.misfit < 1, visible(self.sight), 0.0)
+
+    @property
+    def upright_counterparts(self) -> float:
+        """The same of what stands: walls, trunks, rocks; NaN where next to nothing does."""
+        return _share(self.misfit < 1, visible(self.sight) & self.upright, float("nan"))
+
+    @property
+    def unexplained(self) -> float:
+        """Share of what stands that is far from anything of the scan that should see it; NaN likewise."""
+        return _share(self.misfit > const.UNEXPLAINED, visible(self.sight) & self.upright, float("nan"))
+
+
+def meet(match: PreparedScan, query: PreparedScan, pose: Array) -> tuple[Meeting, Meeting]:
+    """What the match says of the query's points under `match_T_query`, and the query of the match's."""
+    moved, back = transform(pose, query.sample), transform(invert(pose), match.sample)
+    ours, theirs = match.nearest(moved), query.nearest(back)
+    reach_ours, reach_theirs = _reach(query.spacing), _reach(match.spacing)
+    return (
+        Meeting(match.look_at(moved), np.sqrt(ours[1]) / reach_ours, _upright(match, ours[0])),
+        Meeting(query.look_at(back), np.sqrt(theirs[1]) / reach_theirs, _upright(match, match.picks)),
+    )
+
+
+def rivalry(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> tuple[float, float]:
+    """How much worse the scans fit at poses beside this one, along the way that is known least: near and far.
+
+    A corridor fits anywhere along it; where it repeats, it fits better at the right place than at the wrong ones.
+
+    Args:
+        match: the matched scan.
+        query: the query's scan.
+        pose: (4, 4) `match_T_query`.
+        information: (6, 6) of the alignment.
+
+    Returns:
+        Logarithm of the ratio of the mean misfits, half a metre away and at the best of the places up to 6 m
+        away: 0 when another place fits as well, negative when it fits better.
+    """
+    way = _least_known(information)
+    shifts = np.concatenate([[0.0], const.RIVAL_NEAR_M, const.RIVAL_FAR_M])[:, None] * way
+    here = _misfits(match, query, transform(pose, query.sample[:: const.RIVAL_EVERY]), shifts)
+    back = shifts @ -pose[:3, :3]
+    there = _misfits(query, match, transform(invert(pose), match.sample[:: const.RIVAL_EVERY]), back)
+    fit = np.log(np.maximum((here + there) / 2, 0.05))
+    near = 1 + len(const.RIVAL_NEAR_M)
+    return float(fit[1:near].min() - fit[0]), float(fit[near:].min() - fit[0])
+
+
+def _misfits(scan: PreparedScan, other: PreparedScan, moved: Array, shifts: Array) -> Array:
+    """(K,) mean misfit of the visible points (N, 3), shifted by each of (K, 3); as bad as can be where few are."""
+    points = (moved[None] + shifts[:, None]).reshape(-1, 3)
+    reach = np.tile(_reach(other.spacing[:: const.RIVAL_EVERY]), len(shifts))
+    misfit = np.minimum(np.sqrt(scan.nearest(points)[1]) / reach, const.RIVAL_MISFIT)
+    seen = visible(scan.look_at(points)).reshape(len(shifts), -1)
+    count = seen.sum(axis=1)
+    mean = (misfit.reshape(seen.shape) * seen).sum(axis=1) / np.maximum(count, 1)
+    return np.where(count >= const.MEETING_POINTS, mean, const.RIVAL_MISFIT)
+
+
+def _least_known(information: Array) -> Array:
+    """(3,) the horizontal direction in which the position is known least."""
+    ridge = np.diag([const.SEARCH_M**-2] * 3 + [const.SEARCH_RAD**-2] * 3)
+    across = np.linalg.eigh(np.linalg.inv(information + ridge)[:2, :2])[1][:, -1]
+    return np.append(across, 0.0)
+
+
+def _reach(spacing: Array) -> Array:
+    """(N,) how far away a counterpart may be, m: scans of one surface fall between each other's points."""
+    return const.COUNTERPART_M + const.COUNTERPART_SPACINGS * spacing
+
+
+def _upright(scan: PreparedScan, index: NDArray[np.intp]) -> Mask:
+    """(N,) whether the surfaces at these points of a scan stand; those without a normal do not."""
+    normals = scan.normals[index]
+    size = np.einsum("ij,ij->i", normals, normals)
+    return (np.abs(normals @ scan.up[2]) < const.UPRIGHT) & (size > 0.5)
+
+
+def _share(what: Mask, of: Mask, otherwise: float) -> float:
+    count = int(of.sum())
+    return float(what[of].sum()) / count if count >= const.MEETING_POINTS else otherwise
