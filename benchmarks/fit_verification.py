@@ -1,20 +1,20 @@
-"""Fit the acceptance model and the covariance to simulated validation worlds, in all domains together.
+"""Fit the acceptance model of scans to simulated validation worlds, in all domains together.
 
 python benchmarks/fit_verification.py [--drives FOLDER] [--folder FOLDER] [--jobs N] [--weights FILE] [--out FILE]
 
 Run it again whenever the network's weights, the hypotheses or the measures change, for the decision changes with
 them; no other step is needed. With `--drives` and `--folder` the simulated drives and the scans of the domains are
 kept for the next time. Beside the model it writes the examples, which `domains.py` leaves single domains out of.
+The model of views is fitted by `fit_views.py`, the covariance of scans by `fit_covariance.py`: both on recordings.
 """
 
 from __future__ import annotations
 
 import math
 import multiprocessing
-import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +26,6 @@ from drives import Drive, embedded, kept, worlds
 from rich.console import Console
 from rich.progress import track
 from traps import TRAPS
-from verification import replay
 
 from umf_ros.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.embedding import make_embedder
@@ -37,17 +36,13 @@ from umf_ros.lab.simulation.seeds import VALIDATION
 from umf_ros.lab.training.acceptance_examples import Example, save_examples
 from umf_ros.lab.training.acceptance_fit import (
     bounds_of,
-    fit_covariance,
     fit_decision,
-    inside_ellipsoid,
     save_acceptance,
-    scale_covariance,
 )
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
-from umf_ros.verification.acceptance import KINDS, AcceptanceModel, load_acceptance
-from umf_ros.verification.measurement import IMAGE, SCAN
-from umf_ros.verification.verifier import JudgedHypothesis
+from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
+from umf_ros.verification.measurement import SCAN
 
 RIGHT_M, RIGHT_DEG = 0.4, 3.0
 EXAMINED = 5  # candidates per query: what retrieval offers first
@@ -58,22 +53,6 @@ SURVEYS, PAIRS = range(VALIDATION[0], VALIDATION[0] + 3), 60  # in every domain
 ENOUGH = 100  # right examples that a fit needs
 Survey = tuple[Drive, list[Keyframe]]
 DEFAULT_OUT = Path(__file__).parent.parent / "config" / "verification" / "calibration.json"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One examined hypothesis, and the error (6,) of its pose, of the drive with this seed."""
-
-    drive: int
-    examined: JudgedHypothesis
-    error: Array
-    right: bool
-    pristine: bool
-
-    @property
-    def example(self) -> Example:
-        """What the acceptance model is fitted to; a drive's world counts as a domain."""
-        return Example(self.examined.measurement, self.right, f"drive {self.drive}")
 
 
 def main(
@@ -103,9 +82,8 @@ def main(
         with console.status(f"simulating world {number} ({family}, aliasing {aliasing:g})"):
             drive = kept(drives, number, family, aliasing)
         surveyed.append((drive, embedded(drive, embedder)))
-    model, results = fit([finding for survey in surveyed for finding in examine(*survey)], elsewhere)
-    model, honest = scaled(model, surveyed)
-    for name, value in (results := results | honest).items():
+    model, results = fit([example for survey in surveyed for example in examine(*survey)] + elsewhere)
+    for name, value in results.items():
         console.print(f"{name:32} {value:.4g}")
     save_acceptance(model, out, f"python benchmarks/fit_verification.py --worlds {count}", results)
     console.print(f"wrote {out}")
@@ -127,57 +105,26 @@ def _in_domain(
     return kept_examples(domain, SURVEYS, pairs, folder, make_embedder(settings), kept)
 
 
-def fit(findings: list[Finding], elsewhere: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
-    """The model that explains the findings and what other domains gave, and how it does in domains left out.
+def fit(examples: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
+    """The model that explains the examples, and how it does in domains left out.
 
-    A kind of hypothesis with next to no right examples, as images are to an embedder without local features,
-    keeps what is shipped.
+    What the shipped model says of other kinds than scans stays.
     """
     shipped = load_acceptance()
-    models, covariances, bounds = dict(shipped.models), dict(shipped.covariances), dict(shipped.bounds)
-    results: dict[str, float] = {}
-    known = [finding.example for finding in findings] + elsewhere + _sprung_traps()
-    save_examples([example for example in known if example.measurement.kind == SCAN], EXAMPLES)
-    for kind in KINDS:
-        mine = [example for example in known if example.measurement.kind == kind]
-        if sum(example.right for example in mine) < ENOUGH:
-            continue
-        models[kind], odds = fit_decision(mine, kind, THRESHOLD)
-        bounds[kind] = bounds_of(mine, kind)
-        results |= _judge(kind, mine, odds)
-        # of untouched scans only, for the covariance describes the sensor
-        own = [finding for finding in findings if finding.examined.measurement.kind == kind]
-        chosen = [one for one, p in zip(own, odds, strict=False) if one.right and one.pristine and p >= ACCEPTED_ODDS]
-        if len(chosen) >= ENOUGH:
-            informations = np.array([one.examined.aligned.alignment.information for one in chosen])
-            covariances[kind] = fit_covariance(np.array([one.error for one in chosen]), informations)
-    return AcceptanceModel(models, covariances, bounds), results
+    mine = [example for example in examples + _sprung_traps() if example.measurement.kind == SCAN]
+    save_examples(mine, EXAMPLES)
+    model, odds = fit_decision(mine, SCAN, THRESHOLD)
+    bounds = shipped.bounds | {SCAN: bounds_of(mine, SCAN)}
+    fitted = replace(shipped, models=dict(shipped.models) | {SCAN: model}, bounds=bounds)
+    return fitted, _judge(SCAN, mine, odds)
 
 
-def scaled(model: AcceptanceModel, surveyed: list[Survey]) -> tuple[AcceptanceModel, dict[str, float]]:
-    """The same with covariances that hold for what is published, the best poses, rather than for any right one."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "acceptance.json"
-        save_acceptance(model, path, "", {})
-        settings = Verification(calibration=str(path))
-        published = [replay(*survey, Verifier(settings))[0] for survey in surveyed]
-    errors = np.array([error for world in published for error in world.vectors])
-    covariances = np.array([covariance for world in published for covariance in world.covariances])
-    covariance = scale_covariance(model.covariances[SCAN], errors, covariances)
-    figures = {
-        "published": float(len(errors)),
-        "published_wrong": float(sum(world.wrong for world in published)),
-        "published_inside_95_before": inside_ellipsoid(errors, covariances),
-    }
-    return replace(model, covariances=model.covariances | {SCAN: covariance}), figures
-
-
-def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Finding]:
-    """Hypotheses about candidates along a drive, with whole keyframes and without scans, and how wrong each pose is."""
+def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Example]:
+    """Hypotheses about candidates along a drive, and whether their poses are right; its world counts as a domain."""
     rng = np.random.default_rng(drive.seed)
     rules = Loop()
     database = PlaceDatabase(Database(), "drive", len(keyframes[0].embedding.descriptor))
-    whole, blind = Verifier(Verification()), Verifier(Verification())
+    verifier = Verifier(Verification())
     for query, keyframe in enumerate(track(keyframes, f"world {drive.name}", transient=True)):
         candidates = database.query(keyframe, rules)
         # consecutive ones, for a keyframe is supported by what its neighbours found
@@ -185,14 +132,10 @@ def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Finding]:
             chosen = _choose(drive, query, candidates, rng)
             strength = float(rng.choice([0.0, 0.0, 1.0, 2.0]))
             pairs = [(one, _degraded(database[one.index], strength, rng)) for one in chosen]
-            scanless = [(one, _without_scan(match)) for one, match in pairs]
-            found = whole.examine(_degraded(keyframe, strength, rng), pairs)
-            for one in found + blind.examine(_without_scan(keyframe), scanless):
-                match, pose = one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose
-                metres, degrees = drive.error(query, match, pose)
+            for one in verifier.examine(_degraded(keyframe, strength, rng), pairs):
+                metres, degrees = drive.error(query, one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose)
                 right = metres < RIGHT_M and degrees < RIGHT_DEG
-                pristine = strength == 0 or one.measurement.kind == IMAGE
-                yield Finding(drive.seed, one, drive.error_vector(query, match, pose), right, pristine)
+                yield Example(one.measurement, right, f"drive {drive.seed}")
         database.add(keyframe)
     database.close()
 
@@ -222,10 +165,6 @@ def _degraded(keyframe: Keyframe, strength: float, rng: np.random.Generator) -> 
     if rng.random() < 0.2:
         embedding = replace(embedding, image=None)
     return replace(keyframe, points=(points + moment * shift).astype(np.float32), embedding=embedding)
-
-
-def _without_scan(keyframe: Keyframe) -> Keyframe:
-    return replace(keyframe, points=np.empty((0, 3), np.float32), embedding=replace(keyframe.embedding, cloud=None))
 
 
 def _sprung_traps() -> list[Example]:

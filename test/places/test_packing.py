@@ -9,7 +9,7 @@ import pytest
 from conftest import make_keyframe, unit
 from safetensors import SafetensorError
 
-from umf_ros.frames import Embedding, Keyframe, LocalFeatures
+from umf_ros.frames import Embedding, Keyframe, LocalFeatures, ScanMotion
 from umf_ros.places.packing import pack, unpack
 
 GROUPS = ("image", "cloud", "super_image", "super_cloud")
@@ -59,6 +59,15 @@ def test_stamps_and_poses_keep_every_bit() -> None:
     np.testing.assert_array_equal(found.body_T_camera, pose.T)  # not contiguous when it was packed
     np.testing.assert_array_equal(found.body_T_lidar, pose)
     assert astuple(found.camera) == astuple(keyframe.camera) and isinstance(found.camera.width, int)
+
+
+def test_the_motion_during_the_scan_is_kept() -> None:
+    rng = np.random.default_rng(3)
+    motion = ScanMotion(rng.random(20).astype(np.float32), rng.random(6), rng.random(6))
+    found = unpack(pack(replace(make_keyframe(0), motion=motion))).motion
+    assert found is not None and unpack(pack(make_keyframe(0))).motion is None
+    for item in fields(ScanMotion):
+        np.testing.assert_array_equal(getattr(found, item.name), getattr(motion, item.name))
 
 
 def test_a_scan_without_points_is_kept() -> None:
