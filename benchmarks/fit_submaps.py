@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import pickle
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,11 +20,12 @@ import typer
 from rich.console import Console
 from rich.progress import track
 from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from umf_ros.config import Database, KeyframePolicy, Loop, Verification
 from umf_ros.frames import Embedding, Frame, Keyframe, StereoCamera
-from umf_ros.geometry import Array, relative
+from umf_ros.geometry import Array, make_pose, relative
 from umf_ros.keyframes import KeyframeSelector, is_past
 from umf_ros.lab.simulation.presets import find_preset
 from umf_ros.lab.simulation.simulator import Simulator
@@ -34,7 +35,8 @@ from umf_ros.runs.honesty import normalised_errors, pose_error, share_inside
 from umf_ros.runs.truth import POSE_TOLERANCE_DEG, POSE_TOLERANCE_M, find_revisits
 from umf_ros.submaps import SubmapFinder
 from umf_ros.submaps.finder import Tested
-from umf_ros.submaps.judgement import SubmapAcceptance, scores
+from umf_ros.submaps.judgement import OdometryError, SubmapAcceptance, scores
+from umf_ros.submaps.proposals import Proposal
 from umf_ros.verification import Measurement
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import Logistic
@@ -42,7 +44,9 @@ from umf_ros.verification.thinning import thin_scan
 
 Truth = dict[int, Array]
 NO_CAMERA = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)
-LIMITS = np.log([[1.0, 1e-4, 1e-3], [1e4, 0.1, 1.0]])
+START = np.log([20.0, 2e-3, 5e-4, 1e-3, 8e-3])  # inflation, then the error of odometry per metre
+LIMITS = np.log([[1.0, 1e-4, 1e-5, 1e-4, 1e-4], [1e4, 0.1, 0.1, 1.0, 1.0]])
+MOST = 500  # examples that a covariance is fitted to
 DRIVES = [
     ("mapping", 10111, "etna", 0.3),
     ("mapping", 10112, "etna", 1.0),
@@ -51,13 +55,10 @@ DRIVES = [
     ("mapping", 10115, "canyon", 1.0),
     ("mapping", 10116, "terrain", 1.0),
     ("mapping", 10117, "mesa", 1.0),
-    ("mapping", 10118, "mounds", 1.0),
-    ("traverse_1", 10119, "etna", 1.0),
-    ("traverse_2", 10120, "dunes", 0.3),
-    ("landmarks", 10121, "etna", 1.0),
+    ("traverse_2", 10118, "mounds", 1.0),
 ]
-WRONG_FROM_M = 15.0  # stops further away than this from the truth are what a wrong answer may be drawn from
-EVERY = 3  # keyframes, for wrong answers
+ANYWHERE, BESIDE_M = 3, 4.0  # wrong answers per keyframe at any stop, and how far beside the right ones
+EVERY = 10  # keyframes, for wrong answers
 DEFAULT_OUT = Path(__file__).parent.parent / "config" / "verification" / "submaps.json"
 
 
@@ -142,16 +143,30 @@ def _found_by_scan(drive: Drive) -> dict[int, list[tuple[Keyframe, Array]]]:
 
 
 def _wrong_answers(number: int, truth: Truth, finder: SubmapFinder, query: Keyframe) -> Iterator[Example]:
-    """What looks alike and is another place."""
+    """What looks alike and is another place, poses beside the right ones, and poses anywhere."""
     if query.travelled_m < const.SUBMAP_BEFORE_M:
         return
-    for proposal in finder.lookalikes(query):
-        stop = finder.trail.stops[proposal.row]
-        if np.linalg.norm(relative(truth[stop.stamp_ns], truth[query.stamp_ns])[:3, 3]) < WRONG_FROM_M:
-            continue
+    rng = np.random.default_rng([number, query.stamp_ns % 2**32])
+    rows = rng.permutation(len(finder.trail.stops))[:ANYWHERE].tolist()
+    proposals = finder.lookalikes(query) + [Proposal(row, _anywhere(rng), planar=True) for row in rows]
+    here, way_m = truth[query.stamp_ns], query.travelled_m - const.SUBMAP_BEFORE_M
+    right = {row: relative(truth[stop.stamp_ns], here) for row, stop in enumerate(finder.trail.stops)}
+    near = [row for row, pose in right.items() if np.linalg.norm(pose[:3, 3]) < BESIDE_M]
+    near = [row for row in near if finder.trail.stops[row].travelled_m < way_m]
+    proposals += [Proposal(row, _beside(rng) @ right[row]) for row in rng.permutation(near)[:1].tolist()]
+    for proposal in proposals:
         tested = finder.test(query, proposal)
         if tested is not None:
             yield _example(number, truth, tested)
+
+
+def _anywhere(rng: np.random.Generator) -> Array:
+    return make_pose(Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)]).as_matrix(), [*rng.uniform(-5, 5, 2), 0])
+
+
+def _beside(rng: np.random.Generator) -> Array:
+    turn = Rotation.from_rotvec([0, 0, rng.normal(0, 0.15)]).as_matrix()
+    return make_pose(turn, [*rng.normal(0, BESIDE_M / 2, 2), 0])
 
 
 def _example(number: int, truth: Truth, tested: Tested) -> Example:
@@ -170,23 +185,29 @@ def fit(examples: list[Example]) -> SubmapAcceptance:
     return SubmapAcceptance(model, *fit_covariance([one for one in examples if one.right]))
 
 
-def fit_covariance(examples: list[Example]) -> tuple[float, float, float]:
-    """Inflation, drift and drift of the rotation under which the errors are most likely, half of them at the median."""
+def fit_covariance(examples: list[Example]) -> tuple[float, OdometryError]:
+    """Inflation and error of the odometry under which the errors are most likely, 95 % of them inside."""
+    examples = examples[:: max(len(examples) // MOST, 1)]
     errors = np.stack([one.error for one in examples])
 
+    def model(logarithms: Array) -> SubmapAcceptance:
+        inflation, *odometry = np.exp(np.clip(logarithms, *LIMITS))
+        return SubmapAcceptance(Logistic(0.0, {}), float(inflation), OdometryError(*map(float, odometry)))
+
     def covariances(logarithms: Array) -> Array:
-        model = SubmapAcceptance(Logistic(0.0, {}), *np.exp(np.clip(logarithms, *LIMITS)))
-        return np.stack([model.covariance(one.information, one.way_m) for one in examples])
+        guess = model(logarithms)
+        return np.stack([guess.covariance(one.information, one.way_m) for one in examples])
 
     def surprise(logarithms: Array) -> float:
         found = covariances(logarithms)
         # a heavy tail, so that a few bad fits do not widen all others
         return float(np.mean(np.linalg.slogdet(found)[1] + 16 * np.log1p(normalised_errors(errors, found) / 10)))
 
-    best = minimize(surprise, np.log([20.0, 2e-3, 6e-3]), method="Nelder-Mead", options={"maxiter": 200}).x
-    inflation, drift, drift_deg_m = np.exp(np.clip(best, *LIMITS))
+    options = {"maxiter": 400, "maxfev": 400}
+    best = minimize(surprise, START, method="Nelder-Mead", options=options).x
     variance = np.quantile(normalised_errors(errors, covariances(best)), 0.95) / chi2.ppf(0.95, 6)
-    return float(inflation * variance), float(drift * variance**0.5), float(drift_deg_m * variance**0.5)
+    found = model(best + np.log(variance) * np.array([1.0, 0.5, 0.5, 0.5, 0.5]))
+    return found.inflation, found.odometry
 
 
 def results(examples: list[Example], model: SubmapAcceptance, threshold: float) -> dict[str, float]:
@@ -223,7 +244,8 @@ def main(
         "results": found,
         "bias": model.model.bias,
         "weights": model.model.weights,
-        "covariance": {"inflation": model.inflation, "drift": model.drift, "drift_deg_m": model.drift_deg_m},
+        "inflation": model.inflation,
+        "odometry": asdict(model.odometry),
     }
     out.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 

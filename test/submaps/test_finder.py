@@ -37,6 +37,12 @@ def test_a_way_driven_back_is_recognised_with_the_right_pose(outing: Drive, data
     assert len(closed & set(back)) > 0.8 * len(back)
 
 
+def test_a_limit_on_the_turn_is_kept(outing: Drive, database: PlaceDatabase) -> None:
+    verdicts = [verdict for _, found in replay(outing, database, max_turn_deg=90.0) for verdict in found]
+    assert not any(verdict.closure for verdict in verdicts)
+    assert any(verdict.reason.startswith("turned by 1") for verdict in verdicts)
+
+
 def test_what_never_was_seen_is_not_recognised(outing: Drive, database: PlaceDatabase) -> None:
     elsewhere = drive(rough_ground(6))
     half = len(outing.keyframes) // 2

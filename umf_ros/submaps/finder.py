@@ -153,11 +153,14 @@ class SubmapFinder:
 
     def _objection(self, tested: Tested, probability: float) -> str:
         """Why a hypothesis is no closure; empty when it is one."""
-        shift_m = float(np.linalg.norm(tested.alignment.pose[:3, 3]))
+        pose = tested.alignment.pose
+        shift_m, turn_deg = float(np.linalg.norm(pose[:3, 3])), abs(np.degrees(heading(pose)))
         if probability < self._settings.min_probability:
             return f"probability {probability:.2f} is below {self._settings.min_probability:g}"
         if tested.common < const.MIN_COMMON:
             return f"only {tested.common:.0%} of the submap in common"
+        if 0 < self._settings.max_turn_deg < turn_deg:
+            return f"turned by {turn_deg:.0f} deg, more than {self._settings.max_turn_deg:g}"
         if shift_m > self._settings.max_shift_m:
             return f"{shift_m:.1f} m apart, more than {self._settings.max_shift_m:g}"
         return ""

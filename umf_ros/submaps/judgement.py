@@ -43,20 +43,41 @@ def _log_ratio(above: float, below: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
+class OdometryError:
+    """What odometry adds inside the submaps; standard deviations per metre of their way together, fitted.
+
+    Attributes:
+        shift: to both horizontal positions, m.
+        lift: to the height, m.
+        tilt_deg: to roll and pitch, deg.
+        turn_deg: to the heading, deg.
+    """
+
+    shift: float
+    lift: float
+    tilt_deg: float
+    turn_deg: float
+
+    def covariance(self, way_m: float) -> Array:
+        """Covariance (6, 6) in ROS order, m^2 and rad^2."""
+        tilt, turn = np.radians([self.tilt_deg, self.turn_deg])
+        found: Array = np.diag((np.array([self.shift, self.shift, self.lift, tilt, tilt, turn]) * way_m) ** 2)
+        return found
+
+
+@dataclass(frozen=True, slots=True)
 class SubmapAcceptance:
     """What was fitted.
 
     Attributes:
         model: from scores to a probability.
         inflation: of the covariance of the residuals.
-        drift: what odometry adds inside the submaps, m per metre of their way.
-        drift_deg_m: likewise to the rotation, deg per metre.
+        odometry: what it adds to that.
     """
 
     model: Logistic
     inflation: float
-    drift: float
-    drift_deg_m: float
+    odometry: OdometryError
 
     def probability(self, measurement: Measurement) -> float:
         """Probability that the closure with this measurement is right."""
@@ -64,8 +85,8 @@ class SubmapAcceptance:
 
     def covariance(self, information: Array, way_m: float) -> Array:
         """Covariance (6, 6) in ROS order, match axes, of submaps of a way together, m."""
-        model = CovarianceModel(self.inflation, self.drift * way_m, self.drift_deg_m * way_m)
-        return covariance_of(information, model)
+        residuals = covariance_of(information, CovarianceModel(self.inflation, 0.0, 0.0))
+        return residuals + self.odometry.covariance(way_m)
 
 
 def scores(measurement: Measurement) -> dict[str, float]:
@@ -84,7 +105,8 @@ def load_submap_acceptance() -> SubmapAcceptance:
         content = json.loads(file.read_text(encoding="utf-8"))
         weights = {name: float(content["weights"][name]) for name in CRITERIA}
         model = Logistic(float(content["bias"]), weights)
-        return SubmapAcceptance(model, **{name: float(value) for name, value in content["covariance"].items()})
+        odometry = OdometryError(**{name: float(value) for name, value in content["odometry"].items()})
+        return SubmapAcceptance(model, float(content["inflation"]), odometry)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{file}: not an acceptance model of this version ({error!r})") from None
 
