@@ -129,7 +129,8 @@ def main(
     for name, value in results.items():
         console.print(f"{name:32} {value:.4g}")
     shipped, before = load_acceptance(str(out)), json.loads(out.read_text(encoding="utf-8"))
-    whole = AcceptanceModel(shipped.models | model.models, shipped.covariances | model.covariances)
+    models, covariances = shipped.models | model.models, shipped.covariances | model.covariances
+    whole = replace(shipped, models=models, covariances=covariances)
     scans_only = {name: value for name, value in before["results"].items() if not name.startswith("image_")}
     told = f"{before['fitted_with'].split(VIEWS)[0]}{VIEWS} {len(bags)} recordings without scans"
     save_acceptance(whole, out, told, scans_only | results)

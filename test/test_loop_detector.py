@@ -13,7 +13,8 @@ from umf_ros.config import Settings, load_settings
 from umf_ros.errors import OutputError
 from umf_ros.frames import Embedding, Frame
 from umf_ros.geometry import heading, invert, make_pose, relative, rotation_angle, transform
-from umf_ros.loop_detector import Detection, LoopDetector
+from umf_ros.loop_detector import NOTHING_METRIC, Detection, LoopDetector
+from umf_ros.verification import NO_DEPTH
 
 LAP_S = 40
 RADIUS_M = 8.0
@@ -197,3 +198,15 @@ def test_either_modality_may_be_missing(frames: list[Frame], image: np.ndarray) 
     for frame in (camera_only, lidar_only, blind):
         assert found.process(frame).keyframe is not None
     assert len(found.database) == 3
+
+
+def test_one_camera_without_a_scan_says_once_why_nothing_becomes_metric(
+    frames: list[Frame], image: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = detector()
+    mono = [replace(frame, left=image, points=None, intensity=None) for frame in frames[:50]]
+    detections = [found.process(frame) for frame in mono]
+    verdicts = [verdict for detection in detections for verdict in detection.verdicts]
+    assert len(verdicts) > 10 and not any(detection.closures for detection in detections)
+    assert {verdict.reason for verdict in verdicts} <= {NO_DEPTH, "less promising than others"}
+    assert [record.message for record in caplog.records].count(f"{NOTHING_METRIC}: {NO_DEPTH}") == 1

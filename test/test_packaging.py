@@ -54,6 +54,8 @@ def test_everything_is_installed_to_share(install: Path) -> None:
         "models/umf_light.json",
         "models/umf_resnet50.safetensors",
         "models/umf_resnet50.json",
+        "models/xfeat.safetensors",
+        "models/xfeat.json",
     ):
         assert (share / path).is_file(), path
     assert (install / "share" / "ament_index" / "resource_index" / "packages" / "umf_ros").is_file()

@@ -184,6 +184,12 @@ class Keyframe:
     body_T_lidar: Array = field(default_factory=lambda: np.eye(4))
     motion: ScanMotion | None = None
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether any distance was measured, by a scan or a stereo pair: two keyframes without make no metric pose."""
+        image = self.embedding.image
+        return len(self.points) > 0 or (image is not None and bool(np.isfinite(image.points).any()))
+
 
 @dataclass(frozen=True, slots=True)
 class Candidate:

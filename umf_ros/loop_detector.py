@@ -17,9 +17,10 @@ from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure
 from umf_ros.keyframes import KeyframeSelector
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
-from umf_ros.verification import Verdict, Verifier, thin_frame
+from umf_ros.verification import NO_DEPTH, Verdict, Verifier, thin_frame
 
 logger = logging.getLogger(__name__)
+NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +70,7 @@ class LoopDetector:
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
         self._first_session = self.database.next_session
         self._session = 0
+        self._depth_told = False
 
     @property
     def embedder_name(self) -> str:
@@ -111,7 +113,9 @@ class LoopDetector:
 
     def verify(self, keyframe: Keyframe, candidates: Sequence[Candidate]) -> list[Verdict]:
         """Test the candidates geometrically."""
-        return self._verifier.verify(keyframe, [(found, self.database[found.index]) for found in candidates])
+        verdicts = self._verifier.verify(keyframe, [(found, self.database[found.index]) for found in candidates])
+        self._tell_depthless(verdicts)
+        return verdicts
 
     def look_around(self, keyframe: Keyframe, verdicts: list[Verdict]) -> list[Verdict]:
         """The verdicts, accepted ones first, with those about what a narrow sensor saw before from another side."""
@@ -138,6 +142,12 @@ class LoopDetector:
         self._selector.reset()
         self._verifier.reset()
         self._submaps.reset()
+
+    def _tell_depthless(self, verdicts: Sequence[Verdict]) -> None:
+        """Say, once, why nothing becomes metric: one camera without a LiDAR recognises places, no more."""
+        if not self._depth_told and any(verdict.reason == NO_DEPTH for verdict in verdicts):
+            self._depth_told = True
+            logger.warning("%s: %s", NOTHING_METRIC, NO_DEPTH)
 
     def _start_session(self, frame: Frame) -> None:
         """A new way begins; where the clock was set back, what was recorded from here on lies in the future now."""

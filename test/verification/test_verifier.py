@@ -13,7 +13,7 @@ from scenes import landscape, pose_at, take, without_image, without_scan, yard_s
 from umf_ros.config import Verification
 from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array, make_pose, relative, rotation_angle
-from umf_ros.verification import Verdict, Verifier
+from umf_ros.verification import NO_DEPTH, Verdict, Verifier
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
@@ -88,6 +88,18 @@ def test_camera_alone_gives_a_pose_and_says_how_sure_it_is(verifier: Verifier) -
     wrong = take(landscape(21), pose_at(landscape(21), -15, 0, 0), 10.0)
     rejected = verifier.verify(query, [candidate(without_scan(wrong))])[0]
     assert rejected.closure is None
+
+
+def test_without_depths_on_either_side_the_reason_says_so(verifier: Verifier) -> None:
+    def flat(keyframe: Keyframe) -> Keyframe:
+        image = keyframe.embedding.image
+        assert image is not None
+        unknown = replace(image, points=np.full_like(image.points, np.nan))
+        return replace(without_scan(keyframe), embedding=replace(keyframe.embedding, image=unknown, cloud=None))
+
+    query, match = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
+    assert verifier.verify(flat(query), [candidate(flat(match))])[0].reason == NO_DEPTH
+    assert verifier.verify(flat(query), [candidate(without_scan(match))])[0].reason != NO_DEPTH
 
 
 def test_no_candidates_no_verdicts(verifier: Verifier) -> None:

@@ -2,6 +2,6 @@
 
 from umf_ros.verification.measurement import Measurement
 from umf_ros.verification.thinning import thin_frame, thin_scan
-from umf_ros.verification.verifier import Verdict, Verifier
+from umf_ros.verification.verifier import NO_DEPTH, Verdict, Verifier
 
-__all__ = ["Measurement", "Verdict", "Verifier", "thin_frame", "thin_scan"]
+__all__ = ["NO_DEPTH", "Measurement", "Verdict", "Verifier", "thin_frame", "thin_scan"]

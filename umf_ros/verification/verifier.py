@@ -23,6 +23,10 @@ from umf_ros.verification.measurement import AlignedHypothesis, Measurement, bes
 from umf_ros.verification.registration import ScanCache, align_scans
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
+UNTESTED, NO_POSE = "less promising than others", "no pose fits, or others fit better"
+NO_DEPTH = "no depth: neither a scan nor a stereo pair"
+"""Why there is nothing to judge about a candidate."""
+
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
@@ -105,7 +109,7 @@ class Verifier:
         judged, tested = self._test(query, ranked)
         found = [(one.aligned.match, one.aligned.pose, one.probability >= self._threshold) for one in judged]
         self._memory.remember(query, found)
-        verdicts = self._decide(ranked, judged, tested)
+        verdicts = self._decide(query, ranked, judged, tested)
         self.latency_ms = {"rerank": 1e3 * (reranked - start), "refine": 1e3 * (time.perf_counter() - reranked)}
         return verdicts
 
@@ -169,7 +173,9 @@ class Verifier:
             compared.append(JudgedHypothesis(one.aligned, measurement, self._acceptance.probability(measurement)))
         return compared
 
-    def _decide(self, ranked: list[RankedCandidate], judged: list[JudgedHypothesis], tested: set[int]) -> list[Verdict]:
+    def _decide(
+        self, query: Keyframe, ranked: list[RankedCandidate], judged: list[JudgedHypothesis], tested: set[int]
+    ) -> list[Verdict]:
         best: dict[int, JudgedHypothesis] = {}
         for one in judged:
             known = best.get(one.match_stamp_ns)
@@ -181,7 +187,8 @@ class Verifier:
             if stamp in best:
                 verdicts.append(self._verdict(item, best[stamp]))
             else:
-                reason = "no pose fits, or others fit better" if stamp in tested else "less promising than others"
+                metric = query.has_depth or item.keyframe.has_depth
+                reason = (NO_POSE if metric else NO_DEPTH) if stamp in tested else UNTESTED
                 verdicts.append(Verdict(item.candidate, reason, measure_candidate(item)))
         return sorted(verdicts, key=lambda verdict: verdict.closure is None)
 
