@@ -49,6 +49,10 @@ def test_a_checkout_uses_its_own_files(relative: str) -> None:
     assert find(relative).exists()
 
 
+def test_the_models_together_stay_small_enough_to_ship() -> None:
+    assert sum(path.stat().st_size for path in find("models").iterdir()) < 60_000_000
+
+
 def test_what_is_not_there_is_one_clear_line() -> None:
     with pytest.raises(UmfError) as caught:
         find("config/nothing.yaml")

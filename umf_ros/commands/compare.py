@@ -43,8 +43,9 @@ def command(
 ) -> None:
     """Tell whether two views show the same place, and how the second lies in the first.
 
-    A view is a scan, an image (left, and right for its depth), or both; or a frame of a recording at a stamp in ns or
-    at seconds from its start. Without --calibration a scan is in the body frame: x forward, y left, z up.
+    A view is a scan, an image (left, and right for its depth), or both; or a frame of a recording, BAG@STAMP.
+    STAMP is in ns, or in seconds from the recording's start.
+    Without --calibration a scan is in the body frame: x forward, y left, z up.
     """
     from rich.console import Console
 

@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """Features of one image, row by row those of the other view.
 
     Attributes:
@@ -43,7 +43,7 @@ class View:
     measured: Array
 
     @classmethod
-    def of(cls, keyframe: Keyframe, features: LocalFeatures, rows: NDArray[np.intp], noise: float) -> View:
+    def of(cls, keyframe: Keyframe, features: LocalFeatures, rows: NDArray[np.intp], noise: float) -> CameraView:
         """The view of a keyframe with some of its features, whose places are known to `noise` of the width."""
         points = features.points[rows].astype(float)
         disparity = _disparity(keyframe.camera, keyframe.camera.project(points, keyframe.body_T_camera)[1])
@@ -56,9 +56,9 @@ class View:
         """(N,) whose depths are known."""
         return np.asarray(np.isfinite(self.points).all(axis=1))
 
-    def only(self, rows: Mask) -> View:
+    def only(self, rows: Mask) -> CameraView:
         """The same with fewer features."""
-        return View(self.camera, self.noise, self.body_T_camera, self.points[rows], self.measured[rows])
+        return CameraView(self.camera, self.noise, self.body_T_camera, self.points[rows], self.measured[rows])
 
     def predict(self, points: Array) -> tuple[Array, Array, Mask]:
         """Where this view should measure points (N, 3) of its body frame.
@@ -138,8 +138,8 @@ class ViewAlignment:
 class PairedViews:
     """A query's and a match's view, row by row features that look alike."""
 
-    query: View
-    match: View
+    query: CameraView
+    match: CameraView
 
     @classmethod
     def of(cls, query: Keyframe, match: Keyframe, noise: float) -> PairedViews | None:
@@ -156,7 +156,7 @@ class PairedViews:
         pairs = mutual_neighbours(similarities(ours.descriptors, theirs.descriptors))
         if len(pairs) < const.MIN_PIXELS:
             return None
-        return cls(View.of(query, ours, pairs[:, 0], noise), View.of(match, theirs, pairs[:, 1], noise))
+        return cls(CameraView.of(query, ours, pairs[:, 0], noise), CameraView.of(match, theirs, pairs[:, 1], noise))
 
     @cached_property
     def poses(self) -> tuple[Array | None, Array | None]:
@@ -252,7 +252,9 @@ class _Fit:
         return self.usable & ((self.residuals**2).sum(axis=1) < const.VIEW_NEAR)
 
 
-def _carry(source: View, target: View, pose: Array, arms: Array, inverse: bool = False) -> tuple[Array, Array, Mask]:
+def _carry(
+    source: CameraView, target: CameraView, pose: Array, arms: Array, inverse: bool = False
+) -> tuple[Array, Array, Mask]:
     """Residuals of the source's points in the target's measurements, `pose` being `target_T_source`.
 
     Args:
@@ -279,7 +281,7 @@ def _carry(source: View, target: View, pose: Array, arms: Array, inverse: bool =
     return residual, whiten @ derivative @ motion, usable
 
 
-def _locate(source: View, target: View) -> Array | None:
+def _locate(source: CameraView, target: CameraView) -> Array | None:
     """`target_T_source` of the bodies from the source's points in the target's image (P3P in RANSAC), or None."""
     known = source.lifted
     if known.sum() < const.MIN_PIXELS:

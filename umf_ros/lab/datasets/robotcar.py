@@ -45,8 +45,8 @@ class TrainingTuple:
 
 
 @dataclass(frozen=True, slots=True)
-class Submap:
-    """One submap.
+class SubmapFile:
+    """A submap of the benchmark, and where it is.
 
     Attributes:
         path: of its file, relative to the root.
@@ -81,7 +81,7 @@ def read_training(root: Path, images: Path | None, name: str = "training_queries
     """
     tuples = load_pickle(root / name, {"TrainingTuple": TrainingTuple})
     try:
-        submaps = [Submap(item.rel_scan_filepath, *map(float, item.position)) for item in tuples.values()]
+        submaps = [SubmapFile(item.rel_scan_filepath, *map(float, item.position)) for item in tuples.values()]
     except (AttributeError, TypeError, ValueError) as error:
         raise UmfError(f"{root / name} holds no training tuples: {error}") from None
     return _sequence(Path(name).stem, root, images, submaps)
@@ -97,13 +97,13 @@ def read_evaluation(root: Path, images: Path | None, part: str = "query") -> Rec
     runs = load_pickle(path)
     try:
         entries = [entry for run in runs for _, entry in sorted(run.items())]
-        submaps = [Submap(entry["query"], float(entry["northing"]), float(entry["easting"])) for entry in entries]
+        submaps = [SubmapFile(entry["query"], float(entry["northing"]), float(entry["easting"])) for entry in entries]
     except (AttributeError, TypeError, KeyError, ValueError) as error:
         raise UmfError(f"{path} holds no evaluation set: {error!r}") from None
     return _sequence(path.stem, root, images, submaps)
 
 
-def _sequence(name: str, root: Path, images: Path | None, submaps: list[Submap]) -> RecordedSequence:
+def _sequence(name: str, root: Path, images: Path | None, submaps: list[SubmapFile]) -> RecordedSequence:
     linked = load_pickle(images / "lidar2image_ndx.pickle") if images is not None else {}
     poses = _poses(submaps)
     traversals = {traversal: number for number, traversal in enumerate(sorted({item.traversal for item in submaps}))}
@@ -117,7 +117,7 @@ def _sequence(name: str, root: Path, images: Path | None, submaps: list[Submap])
     return RecordedSequence(name, "oxford", poses, passes, load)
 
 
-def _poses(submaps: list[Submap]) -> Array:
+def _poses(submaps: list[SubmapFile]) -> Array:
     """East, north, level; the heading is the course along the submap's own traversal."""
     positions = np.array([[item.easting, item.northing, 0.0] for item in submaps]).reshape(-1, 3)
     rotations = np.tile(np.eye(3), (len(submaps), 1, 1))
@@ -139,7 +139,7 @@ def _read_points(path: Path) -> Points:
     return (points + np.array([CENTRE_M, 0, 0])).astype(np.float32)
 
 
-def _read_image(submap: Submap, images: Path, linked: dict[int, list[int]]) -> Image | None:
+def _read_image(submap: SubmapFile, images: Path, linked: dict[int, list[int]]) -> Image | None:
     """The image nearest in time; None where the submap has none."""
     for stamp in linked.get(submap.stamp, [])[:1]:
         path = images / submap.traversal / f"{stamp}.png"
