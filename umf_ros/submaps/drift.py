@@ -37,7 +37,7 @@ class DriftMeter:
         self._before = keyframe, scan
 
     def over(self, way_m: float) -> tuple[float, float]:
-        """Expected error of position, m, and heading, rad, that odometry gains on a way; infinite before it is known."""
+        """Expected error of position, m, and heading, rad, that odometry gains on a way; infinite if unknown."""
         if len(self._steps) < const.DRIFT_KNOWN:
             return math.inf, math.inf
         ways = np.array(self._steps)
