@@ -88,3 +88,19 @@ def test_results_do_not_depend_on_what_is_in_memory(outing: Drive, database: Pla
     small = PlaceDatabase(Database(cached_keyframes=20), "none", 2)
     for (_, one), (_, other) in zip(replay(outing, database), replay(outing, small), strict=True):
         assert [v.reason for v in one] == [v.reason for v in other]
+
+
+def test_odometry_that_drifts_far_gives_no_closure(outing: Drive, database: PlaceDatabase) -> None:
+    slow = [
+        replace(one, odom_T_body=None if one.odom_T_body is None else _stretched(one.odom_T_body))
+        for one in outing.keyframes
+    ]
+    verdicts = [verdict for _, found in replay(Drive(slow, outing.truth), database) for verdict in found]
+    assert not any(verdict.closure for verdict in verdicts)
+
+
+def _stretched(pose: np.ndarray) -> np.ndarray:
+    """Odometry of wheels that slip by a twentieth."""
+    stretched = pose.copy()
+    stretched[:3, 3] *= 1.05
+    return stretched

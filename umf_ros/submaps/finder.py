@@ -11,6 +11,7 @@ from umf_ros.config import Loop, Verification
 from umf_ros.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.geometry import Array, heading, make_pose
 from umf_ros.places.database import PlaceDatabase
+from umf_ros.submaps.drift import DriftMeter
 from umf_ros.submaps.judgement import load_submap_acceptance, measure_submaps
 from umf_ros.submaps.proposals import Expectation, Found, Lookalikes, Proposal
 from umf_ros.submaps.submap import Submap
@@ -66,6 +67,7 @@ class SubmapFinder:
         self._settings, self._rules = settings, rules
         self._acceptance = load_submap_acceptance()
         self.trail = Trail(database)
+        self._drift = DriftMeter()
         self._lookalikes = Lookalikes(self.trail, rules)
         self.reset()
 
@@ -74,6 +76,7 @@ class SubmapFinder:
         self._lookalikes.forget(self.trail.forget())
         self._expectation = Expectation(self.trail, self._rules)
         self._memory = TemporalMemory()
+        self._drift.reset()
         self._asked_m = -np.inf
 
     def find(self, query: Keyframe, closures: Sequence[tuple[Keyframe, Array]]) -> list[Verdict]:
@@ -129,6 +132,8 @@ class SubmapFinder:
         """Take up a keyframe that was added to the database."""
         if self.trail.add(keyframe):
             self._lookalikes.describe()
+            if _narrow(keyframe):
+                self._drift.add(keyframe)
 
     def _propose(self, query: Keyframe) -> list[Proposal]:
         expected = self._expectation.propose(query)
@@ -159,6 +164,11 @@ class SubmapFinder:
             return f"probability {probability:.2f} is below {self._settings.min_probability:g}"
         if tested.measurement.terrain_correlation < const.MIN_TERRAIN:
             return "the terrain does not fit"
+        drift_m, drift_rad = self._drift.over(tested.way_m)
+        if not np.isfinite(drift_m):
+            return "nobody knows yet how far odometry drifts"
+        if drift_m > const.MAX_DRIFT_M or drift_rad > const.MAX_DRIFT_RAD:
+            return f"odometry drifts by {drift_m:.1f} m and {np.degrees(drift_rad):.0f} deg inside the submaps"
         if tested.common < const.MIN_COMMON:
             return f"only {tested.common:.0%} of the submap in common"
         if 0 < self._settings.max_turn_deg < turn_deg:

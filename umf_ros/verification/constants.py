@@ -144,6 +144,10 @@ MIN_TERRAIN = 0.3  # by hand: correlation of the terrain without which nothing e
 SUBMAP_CELL_M = 0.3  # by hand: coarser than a scan, for odometry drifts inside
 SUBMAP_STEP_M = 1.5  # measured: between the scans that are merged; 1 and 2 m are as good
 SUBMAP_NEAR_M = 8.0  # by hand: of an expected stop; further apart, two submaps share too little
+# by hand: steps that the drift of odometry is judged by, at least and at most, and scans that tell it
+DRIFT_KNOWN, DRIFT_STEPS, DRIFT_OVERLAP = 6, 24, 0.7
+# by hand: over the way inside two submaps; half of it is a closure that nobody wants
+MAX_DRIFT_M, MAX_DRIFT_RAD = 1.2, 0.09
 SUBMAPS_KEPT = 12  # prepared submaps in memory: bounds it, changes no result
 ODOMETRY_ALONE_M = 80.0  # by hand: way over which odometry without a closure is worth a look
 ASKED_EVERY_M = 2.0  # by hand: way between two searches for what looks alike; bounds the time
