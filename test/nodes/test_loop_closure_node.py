@@ -17,8 +17,8 @@ from recordings import POINT
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_srvs.srv import SetBool, Trigger
 
-from umf_ros.config import Database
-from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.config import Database, Settings
+from umf_ros.loop_detector import make_detector_embedder
 from umf_ros.nodes.conversions import to_time
 from umf_ros.places.database import PlaceDatabase
 
@@ -167,9 +167,9 @@ def test_services_pause_save_and_forget(rig: Rig, node: Process, tmp_path: Path)
     assert rig.until(lambda: rig.count("places") >= 3)
     saved = rig.call(Trigger, "save", Trigger.Request())
     assert saved.success and saved.message.endswith(f"places saved to {tmp_path / 'map.saved.sqlite'}")
-    thumbnails = ThumbnailEmbedder()
+    embedder = make_detector_embedder(Settings.model_validate({"embedding": {"method": "thumbnail"}}))
     settings = Database(path=str(tmp_path / "map.saved.sqlite"))
-    copy = PlaceDatabase(settings, thumbnails.name, thumbnails.dimension)
+    copy = PlaceDatabase(settings, embedder.name, embedder.dimension)
     assert len(copy) == int(saved.message.split()[0]) >= 3
     copy.close()
     assert rig.call(SetBool, "pause", SetBool.Request(data=True)).message == "paused"

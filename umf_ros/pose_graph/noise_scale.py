@@ -21,7 +21,7 @@ Rows = NDArray[np.int64]
 _GRID = np.exp(np.linspace(np.log(1 / 64), np.log(64), 33))
 # what a loop with a wrong closure misses by: aliases close by, and anything at all
 _ALIAS_SIGMAS = np.array([[0.5] * 3 + [5.0] * 3, [1.5] * 3 + [50.0] * 3])
-_IN_PLANE = np.array([2, 3, 4])
+_IN_PLANE, _OUT_OF_PLANE = np.array([2, 3, 4]), np.array([0, 1, 5])
 _OUTLIERS = 0.5
 # loops share closures and odometry, so that together they say less than their sum: to trust odometry more than
 # stated takes more than to trust it less
@@ -94,6 +94,35 @@ def _walk(endpoints: Endpoints, a: Rows, b: Rows, at: Rows) -> Array:
 
 
 class NoiseScaleEstimator:
+    """Finds both factors from loops as they come.
+
+    Odometry is trusted more than stated only as far as heading and position in the plane bear it out: gravity holds
+    roll and pitch, so that loops fit there whatever the heading drifts by.
+    """
+
+    def __init__(self) -> None:
+        self._whole, self._in_plane = _ScaleLikelihood(), _ScaleLikelihood()
+
+    def add(self, loops: LoopResiduals, place: int) -> None:
+        """Take in N loops of one place, to which others may have been added before."""
+        if len(loops.residuals):
+            self._whole.add(_likelihoods(_of_what_varies(loops)), place)
+            self._in_plane.add(_likelihoods(_in_plane(loops)), place)
+
+    @property
+    def loops(self) -> int:
+        """How many were taken in."""
+        return self._whole.loops
+
+    @property
+    def scale(self) -> NoiseScale:
+        """The factors, exactly 1 unless the loops contradict the stated covariances clearly."""
+        whole, in_plane = self._whole.scale, self._in_plane.scale
+        overrated = whole.odometry < 1 and _unless_small(in_plane.odometry / whole.odometry) > 1
+        return in_plane if overrated else whole
+
+
+class _ScaleLikelihood:
     """Adds up the likelihood of both factors on a grid, loop by loop and place by place."""
 
     def __init__(self) -> None:
@@ -103,14 +132,12 @@ class NoiseScaleEstimator:
         self._of_place: dict[int, Array] = {}
         self.loops = 0
 
-    def add(self, loops: LoopResiduals, place: int) -> None:
-        """Take in N loops of one place, to which others may have been added before."""
-        if not len(loops.residuals):
-            return
-        new = _likelihoods(_in_plane(loops)).sum(axis=0)
+    def add(self, likelihoods: Array, place: int) -> None:
+        """Take in the (N, G, G) likelihoods of the loops of one place."""
+        new = likelihoods.sum(axis=0)
         self._of_place[place] = self._of_place.get(place, 0.0) + new
         self._likelihood = self._likelihood + new
-        self.loops += len(loops.residuals)
+        self.loops += len(likelihoods)
 
     @property
     def scale(self) -> NoiseScale:
@@ -151,11 +178,13 @@ def _unless_small(factor: float) -> float:
     return factor if abs(np.log(factor)) > _TOLERANCE else 1.0
 
 
-def _in_plane(loops: LoopResiduals) -> LoopResiduals:
-    """Without height, roll and pitch, which gravity or a flat world holds: that they fit says nothing of the others.
+def _of_what_varies(loops: LoopResiduals) -> LoopResiduals:
+    """Without height, roll and pitch where all is flat (a 2-D graph): that they fit exactly says nothing."""
+    return loops if np.abs(loops.residuals[:, _OUT_OF_PLANE]).max() > 1e-9 else _in_plane(loops)
 
-    Odometry that is stated one for all would else be trusted for its tilt where it drifts in heading.
-    """
+
+def _in_plane(loops: LoopResiduals) -> LoopResiduals:
+    """Without height, roll and pitch."""
     kept = np.ix_(np.arange(len(loops.residuals)), _IN_PLANE, _IN_PLANE)
     return LoopResiduals(loops.residuals[:, _IN_PLANE], loops.odometry_noise[kept], loops.closure_noise[kept])
 
@@ -171,7 +200,7 @@ def _likelihoods(loops: LoopResiduals) -> Array:
     determinant = 2 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
     inlier = -0.5 * ((turned[..., 0] ** 2)[:, None, None, :] / spread + np.log(spread)).sum(axis=-1)
     inlier -= 0.5 * determinant[:, None, None]
-    aliases = _ALIAS_SIGMAS[:, _IN_PLANE]
+    aliases = _ALIAS_SIGMAS if loops.residuals.shape[1] == 6 else _ALIAS_SIGMAS[:, _IN_PLANE]
     deviations = loops.residuals[:, None, :] / aliases
     outlier = np.logaddexp.reduce(-0.5 * (deviations**2).sum(axis=-1) - np.log(aliases).sum(axis=-1), axis=-1)
     return np.logaddexp(np.log(1 - _OUTLIERS) + inlier, np.log(_OUTLIERS / 2) + outlier[:, None, None])
