@@ -117,7 +117,8 @@ def _facts(summary: Summary) -> list[tuple[str, str]]:
         facts["revisits"] = _revisits(truth)
         facts["stated errors"] = _honesty(truth)
     if latency["total"]["p50"] is not None:
-        stages = ", ".join(f"{stage} {times['p50']:.0f}" for stage, times in latency.items() if stage != "total")
+        medians = {stage: times["p50"] for stage, times in latency.items() if stage != "total"}
+        stages = ", ".join(f"{stage} {median:.0f}" for stage, median in medians.items() if median is not None)
         facts["latency"] = f"{latency['total']['p50']:.0f} ms per keyframe, median ({stages})"
     facts["dropped"] = ", ".join(f"{name} {count}" for name, count in summary["drops"].items())
     facts["memory"] = f"{summary['peak_rss_mb']:.0f} MB at most"

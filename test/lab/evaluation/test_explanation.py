@@ -27,7 +27,7 @@ def test_same_place_is_explained_by_contributions_that_add_up() -> None:
     assert found.verdict.startswith("accepted")
     odds = sum(found.contributions.values())
     assert found.best is not None and found.best.probability == pytest.approx(1 / (1 + np.exp(-odds)))
-    assert found.contributions["bias"] < 0 < found.contributions["residual_like_noise"]
+    assert found.contributions["bias"] < 0 < found.contributions["terrain_score"]
     assert len(found.pixels) > 10
 
 
