@@ -147,7 +147,7 @@ SUBMAP_NEAR_M = 8.0  # by hand: of an expected stop; further apart, two submaps 
 # by hand: steps that the drift of odometry is judged by, at least and at most, and scans that tell it
 DRIFT_KNOWN, DRIFT_STEPS, DRIFT_OVERLAP = 6, 24, 0.7
 # by hand: over the way inside two submaps; half of it is a closure that nobody wants
-MAX_DRIFT_M, MAX_DRIFT_RAD = 1.2, 0.09
+MAX_DRIFT_M, MAX_DRIFT_RAD = 0.8, 0.09
 SUBMAPS_KEPT = 12  # prepared submaps in memory: bounds it, changes no result
 ODOMETRY_ALONE_M = 80.0  # by hand: way over which odometry without a closure is worth a look
 ASKED_EVERY_M = 2.0  # by hand: way between two searches for what looks alike; bounds the time
