@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -103,3 +105,20 @@ def test_new_weights_and_other_outputs_are_kept_apart(tmp_path, monkeypatch):
     assert len(paths) == 3 and {path.parent for path in paths} == {tmp_path / "cache" / "umf_ros"}
     other.write_bytes(b"one")
     assert cached(other, False) == cached(one, False)  # the content counts, not the name
+
+
+def test_ctrl_c_after_networks_came_and_went_is_survived() -> None:
+    script = """
+import gc, os, signal
+import openvino, torch
+from umf_ros.embedding import runtimes
+for _ in range(2):
+    model = openvino.convert_model(torch.nn.Linear(4, 4), example_input=torch.zeros(1, 4))
+    compiled = runtimes._compiled(model, 1)
+    del compiled, model
+    gc.collect()
+signal.signal(signal.SIGINT, lambda *_: print("alive"))
+os.kill(os.getpid(), signal.SIGINT)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "alive\n"), done.stderr

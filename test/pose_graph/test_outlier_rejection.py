@@ -227,8 +227,8 @@ def test_a_looped_recording_closes_its_loops_in_every_lap() -> None:
         graph.add_odometry(k * PERIOD_NS, pose)
     assert len(graph.add_closures([world.message(row) for row in range(4)])) == 4
     assert graph.verdict_counts() == {State.ACCEPTED: 8} and not graph.counts["closure twice"]
-    # as far as the first lap's closures have improved what is thought of the odometry
-    np.testing.assert_allclose(graph.map_T_odom(), once, atol=0.02)
+    # as far as the laps' own noise lets them: four closures of 5 cm do not improve what is thought of the odometry
+    np.testing.assert_allclose(graph.map_T_odom(), once, atol=0.05)
     assert np.linalg.norm(once[:3, 3]) > 0.5
 
 

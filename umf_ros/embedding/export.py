@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -47,13 +48,23 @@ def save(model: Any, path: Path) -> None:
         raise OutputError(f"cannot write {path}: {' '.join(str(error).split())[:200]}") from None
 
 
-def kept_or_made(path: Path, make: Callable[[], Any]) -> Any:
-    """The model kept at `path`; where there is none, or a damaged one, a new one, which is then kept there."""
+@cache
+def openvino_core() -> Any:
+    """OpenVINO's core: one for the whole process, and never destroyed.
+
+    Its CPU plugin gives the thread a stack for signals and takes it back when it is unloaded; whoever gets Ctrl-C
+    after a second core came and went dies of it.
+    """
     import openvino
 
+    return openvino.Core()
+
+
+def kept_or_made(path: Path, make: Callable[[], Any]) -> Any:
+    """The model kept at `path`; where there is none, or a damaged one, a new one, which is then kept there."""
     if path.is_file():
         with suppress(RuntimeError):
-            return openvino.Core().read_model(path)
+            return openvino_core().read_model(path)
     model = make()
     with suppress(OutputError):  # a read-only home only costs time
         save(model, path)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.export import cached, convert, kept_or_made
+from umf_ros.embedding.export import cached, convert, kept_or_made, openvino_core
 from umf_ros.embedding.inputs import blank_input
 from umf_ros.errors import ConfigError
 from umf_ros.frames import Points
@@ -166,12 +166,10 @@ def _wants_openvino(runtime: str, device: str) -> bool:
 
 
 def _compiled(model: Any, threads: int) -> Any:
-    import openvino
-
     # single precision: half of it moves similarities by more than a threshold can bear
     options: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": threads}
     options |= {"NUM_STREAMS": 1, "PERFORMANCE_HINT": "LATENCY"}
-    return openvino.Core().compile_model(model, "CPU", options)
+    return openvino_core().compile_model(model, "CPU", options)
 
 
 def _named(values: list[NDArray[np.float32]]) -> Outputs:
