@@ -213,3 +213,14 @@ def test_a_view_all_around_may_be_turned_as_far_as_the_user_lets_it() -> None:
         verdict = Verifier(settings).verify(query, [candidate(match)])[0]
         assert (verdict.closure is not None) == accepted, verdict.reason
         assert accepted or "turned by 180 deg, more than 90" in verdict.reason
+
+
+def test_surfaces_that_do_not_coincide_are_no_closure_however_probable() -> None:
+    query = take(GROUND, HERE, 100.0)
+    bent = query.points + np.column_stack(
+        [np.zeros((len(query.points), 2)), 0.15 * np.sin(1.5 * query.points[:, 0])]
+    ).astype(np.float32)
+    pair = [candidate(take(GROUND, THERE, 10.0))]
+    verdict = Verifier(Verification(min_probability=0.0)).verify(replace(query, points=bent), pair)[0]
+    assert verdict.closure is None and "times their noise apart" in verdict.reason
+    assert Verifier(Verification(min_probability=0.0)).verify(query, pair)[0].closure is not None

@@ -109,6 +109,11 @@ class Measurement:
     runner_up: float = measured(SCAN)
 
     @property
+    def misfit(self) -> float:
+        """How many times their noise the surfaces of two scans are apart in the median; NaN without scans."""
+        return self.residual_m / self.noise_m
+
+    @property
     def missing(self) -> float:
         """Share of what stands, or where nothing does of all, that should have a counterpart and has none."""
         known = self.upright_counterparts

@@ -208,6 +208,8 @@ class Verifier:
         if judged.probability < self._threshold:
             below = f"probability {judged.probability:.2f} is below {self._threshold:g}"
             return ": ".join(filter(None, (below, judged.measurement.discord)))
+        if judged.measurement.misfit > const.MAX_MISFIT:
+            return f"surfaces are {judged.measurement.misfit:.0f} times their noise apart"
         if strange := self._acceptance.unlike(judged.measurement):
             return f"unlike anything the decision was fitted on: {strange}"
         if judged.measurement.runner_up < const.MIN_RUNNER_UP:
