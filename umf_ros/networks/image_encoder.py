@@ -102,7 +102,8 @@ class ImageEncoder(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.backbone = Backbone(config.backbone, config.width)
+        lite = config.backbone == "efficientnet_lite0"
+        self.backbone = EfficientNetLite0() if lite else Backbone(config.backbone, config.width)
         self.pyramid = FeaturePyramid(self.backbone.channels, config.pyramid, config.tokens, config.local)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:

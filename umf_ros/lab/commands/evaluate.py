@@ -34,7 +34,8 @@ def command(
     data: Annotated[
         Path | None,
         typer.Argument(
-            help="Recording with ground truth: mcap, db3 folder or .bag; or a YAML file that lists sequences."
+            help="Recording with ground truth: mcap, db3 folder or .bag; or a YAML file that lists sequences or "
+            "sets of still images and scans (docs/evaluation.md)."
         ),
     ] = None,
     worlds: Annotated[str | None, Optional(help="Instead of a recording: test or validation worlds.")] = None,
@@ -60,6 +61,7 @@ def command(
     test worlds are never trained or tuned on.
     """
     from umf_ros.lab.datasets.listed import is_list
+    from umf_ros.lab.evaluation.places import lists_place_sets
 
     if (data is None) == (worlds is None):
         raise ConfigError("expected either a recording or --worlds test|validation")
@@ -72,6 +74,10 @@ def command(
     if data is None:
         _refuse("simulated worlds", of_lists | of_recordings)
         figures = _on_worlds(str(worlds), seed, quick, methods == "all", weights, out)
+    elif is_list(data) and lists_place_sets(data):
+        others = {name: value for name, value in of_recordings.items() if name != "--embedder"}
+        _refuse("a list of place sets", of_worlds | of_lists | others)
+        figures = _on_places(data, embedder, weights, out)
     elif is_list(data):
         _refuse("a list of sequences", of_worlds | of_recordings)
         figures = _on_sequences(data, rule, weights, out)
@@ -201,6 +207,20 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     report.write(folder)
     report.show(console, folder)
     return report.figures
+
+
+def _on_places(listing: Path, embedder: str | None, weights: Path | None, out: Path) -> dict[str, float | int | None]:
+    from rich.console import Console
+
+    from umf_ros.lab.evaluation.markdown import print_table
+    from umf_ros.lab.evaluation.places_run import TITLE, run_place_sets
+
+    console = Console()
+    with console.status("embedding") as status:
+        results, shown, folder = run_place_sets(listing, embedder, weights, out, status.update)
+    print_table(console, TITLE, shown)
+    console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
+    return results
 
 
 def _bar(console: Console) -> Progress:
