@@ -1,4 +1,4 @@
-"""EfficientNet-Lite0 (Tan and Le 2019, and its "lite" release of 2020) as an image trunk that has seen real photographs.
+"""EfficientNet-Lite0 (Tan and Le 2019, and its "lite" release of 2020), an image trunk that has seen photographs.
 
 The lite networks leave out squeeze-and-excitation and clip their activations at six. Batch normalisation is
 folded into the convolutions: what was learned on millions of photographs is not to drift with a batch of one world.
@@ -98,7 +98,9 @@ class EfficientNetLite0(nn.Module):
             inputs = channels
         self.channels = [STAGES[end].channels for end in ENDS if end < depth]
         for module in self.modules():
-            if isinstance(module, nn.Conv2d):  # without normalisation the usual start would let the signal fade
+            if (
+                isinstance(module, nn.Conv2d) and module.bias is not None
+            ):  # without normalisation the usual start would let the signal fade
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(module.bias)
 

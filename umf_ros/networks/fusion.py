@@ -104,7 +104,6 @@ class Fusion(nn.Module):
         half = config.descriptor // 2
         self.image_head, self.cloud_head = nn.Linear(config.tokens, half), nn.Linear(config.tokens, half)
         self.weigh = nn.Linear(2 * config.tokens, 2)
-        self.scene_weight = nn.Parameter(torch.ones(())) if config.scene else None
 
     def forward(self, image: Tokens, cloud: Tokens, image_present: Tensor, cloud_present: Tensor) -> Fused:
         """Fuse tokens of which the absent rows (present: (B,) bool) hold the learned token alone."""
@@ -114,9 +113,8 @@ class Fusion(nn.Module):
         felt = self.cloud_pool(Tokens(self.cloud_norm(cloud.values), cloud.mask))
         with torch.autocast(seen.device.type, enabled=False):
             image_half = nn.functional.normalize(self.image_head(seen.float()), dim=-1)
-            if self.scene_weight is not None and scene is not None:
-                both = torch.cat([image_half, self.scene_weight * scene.float()], dim=-1)
-                image_half = nn.functional.normalize(both, dim=-1)
+            if scene is not None:
+                image_half = nn.functional.normalize(torch.cat([image_half, scene.float()], dim=-1), dim=-1)
             cloud_half = nn.functional.normalize(self.cloud_head(felt.float()), dim=-1)
             scores = self.weigh(torch.cat([seen, felt], dim=-1).float())
             present = torch.stack([image_present, cloud_present], dim=-1)

@@ -2,6 +2,9 @@
 
 Maps of an image classifier, averaged over a coarse grid, tell places apart that no simulation resembles. What all
 cells of a view have in common is light and surface rather than place: it is taken away before the projection.
+
+The result has no unit length. Its projection whitens what simulated views have in common, so that a view unlike all
+of them comes out long: there it outweighs the part of the descriptor that has seen nothing but simulations.
 """
 
 from __future__ import annotations
@@ -33,5 +36,5 @@ class SceneDescriptor(nn.Module):
         return cells - cells.mean(dim=(2, 3), keepdim=True)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 1, H, W) to (B, length), L2-normalised."""
-        return F.normalize(self.projection(self.pool(image).flatten(1).float()), dim=-1)
+        """(B, 1, H, W) to (B, length), of length about one where the view resembles those it was fitted to."""
+        return self.projection(self.pool(image).flatten(1))

@@ -52,7 +52,7 @@ class Features:
         image, cloud: tokens for fusion, positions included.
         fine_image: (B, C, H/4, W/4).
         fine_cloud: (B, V, C).
-        scene: (B, S) L2-normalised, or None where the network has no such part.
+        scene: (B, S), longer where the view is a strange one, or None where the network has no such part.
     """
 
     image: Tokens

@@ -35,7 +35,7 @@ def command(
         Path | None,
         typer.Argument(
             help="Recording with ground truth: mcap, db3 folder or .bag; or a YAML file that lists sequences or "
-            "sets of still images and scans (docs/evaluation.md)."
+            "sets of still images and scans (docs/training.md)."
         ),
     ] = None,
     worlds: Annotated[str | None, Optional(help="Instead of a recording: test or validation worlds.")] = None,

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -84,7 +83,9 @@ class PlaceScores(NamedTuple):
         figures = ("recall1", "recall5", "auc_pr", "recall_at_precision1")
         values = {name: getattr(self.plain, name) for name in figures}
         values["recall1_reranked"] = self.reranked.recall1 if self.reranked else float("nan")
-        return {f"{self.name}.{name}": round(value, 4) if np.isfinite(value) else None for name, value in values.items()}
+        return {
+            f"{self.name}.{name}": round(value, 4) if np.isfinite(value) else None for name, value in values.items()
+        }
 
 
 def read_place_sets(listing: Path) -> list[PlaceSet]:
@@ -205,10 +206,10 @@ def _task(positive: Mask) -> Task:
 
 
 def _image_frame(file: Path, number: int, calibration: Calibration | None) -> Frame:
-    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    if image is None:
+    read = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if read is None:
         raise UmfError(f"{file} cannot be read as an image")
-    image = np.asarray(image, np.uint8)
+    image: Image = read.astype(np.uint8)
     return _frame(number, _plane(image), calibration, left=_rectified(image, calibration))
 
 
@@ -239,13 +240,8 @@ def _frame(
     points: Points | None = None,
     intensity: Points | None = None,
 ) -> Frame:
-    known = calibration is not None
-    return Frame(
-        stamp_ns=number,
-        camera=calibration.camera if known and left is not None else camera,
-        body_T_camera=calibration.body_T_camera if known else np.eye(4),
-        body_T_lidar=calibration.body_T_lidar if known else np.eye(4),
-        left=left,
-        points=points,
-        intensity=intensity,
-    )
+    if calibration is None:
+        return Frame(number, camera, np.eye(4), np.eye(4), left=left, points=points, intensity=intensity)
+    mounting = calibration.body_T_camera, calibration.body_T_lidar
+    known = camera if left is None else calibration.camera
+    return Frame(number, known, *mounting, left=left, points=points, intensity=intensity)

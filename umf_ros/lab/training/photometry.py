@@ -70,7 +70,7 @@ def draw_look(rng: np.random.Generator) -> CameraLook:
         vignetting=float(rng.choice([0.0, rng.uniform(0.1, 0.6)])),
         blur_px=float(rng.choice([0.0, rng.uniform(0.4, 1.6)])),
         noise=float(rng.uniform(0.0, 0.04)),
-        quality=int(rng.choice([100, rng.integers(25, 90)])),
+        quality=100 if rng.random() < 0.5 else int(rng.integers(25, 90)),
         zoom=float(rng.choice([1.0, rng.uniform(0.6, 1.0)])),
         exposure=float(rng.uniform(0.05, 0.25)),
     )
