@@ -16,11 +16,12 @@ import torch
 
 from umf_ros.lab.datasets.labels import Places
 from umf_ros.lab.datasets.simulated import SimulatedWorld
+from umf_ros.lab.training.networks import read_card, save_weights
 from umf_ros.lab.training.scene_fit import PooledWorld, SceneFit, fit_scene, pool_world, with_scene
 from umf_ros.networks.efficientnet import pretrained_trunk
 from umf_ros.networks.scene import DEPTH
 from umf_ros.networks.umf import UMF, count_parameters
-from umf_ros.networks.weights import load_weights, locate_weights, read_card, save_weights
+from umf_ros.networks.weights import load_weights, locate_weights
 
 VIEWS = ("plain", "mirrored")
 ORIGIN = {

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 from umf_ros.errors import WeightsError
 
-Backbone = Literal["resnet18", "resnet34", "resnet50"]
+Backbone = Literal["resnet18", "resnet34", "resnet50", "efficientnet_lite0"]
 
 
 @dataclass(frozen=True)

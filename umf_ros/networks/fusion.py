@@ -105,8 +105,18 @@ class Fusion(nn.Module):
         self.image_head, self.cloud_head = nn.Linear(config.tokens, half), nn.Linear(config.tokens, half)
         self.weigh = nn.Linear(2 * config.tokens, 2)
 
-    def forward(self, image: Tokens, cloud: Tokens, image_present: Tensor, cloud_present: Tensor) -> Fused:
-        """Fuse tokens of which the absent rows (present: (B,) bool) hold the learned token alone."""
+    def forward(
+        self, image: Tokens, cloud: Tokens, image_present: Tensor, cloud_present: Tensor, scene: Tensor | None = None
+    ) -> Fused:
+        """Fuse tokens of which the absent rows (present: (B,) bool) hold the learned token alone.
+
+        Args:
+            image: its tokens.
+            cloud: its tokens.
+            image_present: (B,) bool.
+            cloud_present: (B,) bool.
+            scene: (B, S), of a network that has such a part; its length is its weight beside the image's half.
+        """
         for layer in self.layers:
             image, cloud = layer(image, cloud)
         seen = self.image_pool(Tokens(self.image_norm(image.values), image.mask))

@@ -13,6 +13,7 @@ from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.fusion import AbsentToken, Fused, Fusion, Tokens
 from umf_ros.networks.image_encoder import ImageEncoder
 from umf_ros.networks.local_features import CloudLocal, ImageLocal, IterativeAttention, LocalMap, SuperMap
+from umf_ros.networks.scene import SceneDescriptor
 from umf_ros.networks.voxel_encoder import CELLS, VoxelEncoder
 
 Branch = Literal["both", "image", "cloud"]

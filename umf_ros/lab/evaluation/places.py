@@ -28,7 +28,7 @@ from umf_ros.geometry import transform
 from umf_ros.lab.datasets.scan_files import SCANS, read_scan
 from umf_ros.lab.evaluation.embedded import PlaceCollection
 from umf_ros.lab.evaluation.markdown import Table
-from umf_ros.lab.evaluation.protocol import Task
+from umf_ros.lab.evaluation.protocol import RetrievalTask
 from umf_ros.lab.evaluation.reranking import gather_evidence
 from umf_ros.lab.evaluation.retrieval import Mask, rank
 from umf_ros.lab.evaluation.scores import Scores, score
@@ -197,12 +197,12 @@ def _below(base: Path, places: PlaceSet) -> PlaceSet:
     return places.model_copy(update=paths)
 
 
-def _task(positive: Mask) -> Task:
+def _task(positive: Mask) -> RetrievalTask:
     """Sets say what is true, and nothing of distance and heading."""
     queries, references = (np.arange(count) for count in positive.shape)
     everything, unknown = np.ones_like(positive), np.zeros(positive.shape)
     neutral = np.zeros_like(positive)
-    return Task(queries, references, everything, positive, positive, neutral, unknown, unknown)
+    return RetrievalTask(queries, references, everything, positive, positive, neutral, unknown, unknown)
 
 
 def _image_frame(file: Path, number: int, calibration: Calibration | None) -> Frame:

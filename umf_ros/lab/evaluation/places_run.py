@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from umf_ros.config import Embedding, Verification
+from umf_ros.config import EmbeddingSettings, Verification
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.evaluation.markdown import Table, to_markdown
 from umf_ros.lab.evaluation.places import read_place_sets, score_places, table_of
@@ -35,7 +35,7 @@ def run_place_sets(
         UmfError: something of a set is missing or damaged.
     """
     sets = read_place_sets(listing)
-    settings = Embedding(method=method or "umf", weights=str(weights) if weights else "")
+    settings = EmbeddingSettings(method=method or "umf", weights=str(weights) if weights else "")
     embedder = make_embedder(settings, super_features=True)
     results = []
     for places in sets:
