@@ -267,10 +267,10 @@ def test_the_thumbnail_is_blind_to_exposure_and_not_to_the_view():
 
 
 def test_the_untrained_trunk_needs_its_published_weights_and_sees_the_image_alone(tmp_path):
-    with pytest.raises(ConfigError, match=r"lite0-cells: embedding\.weights must name"):
-        make_embedder(EmbeddingSettings(method="lite0-cells"))
+    with pytest.raises(ConfigError, match=r"lite0: embedding\.weights must name"):
+        make_embedder(EmbeddingSettings(method="lite0"))
     torch.save(published_tensors(), tmp_path / "lite0.pth")
-    for method, length in (("lite0-mean", 320), ("lite0-cells", 320 * 49)):
+    for method, length in (("lite0_mean", 320), ("lite0", 320 * 49)):
         embedder = make_embedder(EmbeddingSettings(method=method, weights=str(tmp_path / "lite0.pth")))
         here, again, there = (embedder.embed(some_frame(seed)).descriptor for seed in (0, 0, 1))
         assert here.shape == (embedder.dimension,) == (length,)

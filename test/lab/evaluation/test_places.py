@@ -11,7 +11,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from umf_ros.config import Embedding, Verification
+from umf_ros.config import EmbeddingSettings, Verification
 from umf_ros.embedding import make_embedder
 from umf_ros.errors import ConfigError, UmfError
 from umf_ros.lab.commands import evaluate
@@ -58,10 +58,10 @@ def folder(tmp_path: Path) -> Path:
 
 def test_every_place_is_found_by_methods_that_see_it(folder: Path) -> None:
     images, scans = read_place_sets(folder / "places.yaml")
-    thumbnail = score_places(images, make_embedder(Embedding(method="thumbnail")), Verification())
-    context = score_places(scans, make_embedder(Embedding(method="scan_context")), Verification())
+    thumbnail = score_places(images, make_embedder(EmbeddingSettings(method="thumbnail")), Verification())
+    context = score_places(scans, make_embedder(EmbeddingSettings(method="scan_context")), Verification())
     for found, name in ((thumbnail, "walls"), (context, "sheets")):
-        assert found.flat() == {
+        assert found.flat == {
             f"{name}.recall1": 1.0,
             f"{name}.recall5": 1.0,
             f"{name}.auc_pr": 1.0,
@@ -74,7 +74,7 @@ def test_every_place_is_found_by_methods_that_see_it(folder: Path) -> None:
 def test_a_wrong_truth_lowers_the_figures(folder: Path) -> None:
     (folder / "truth.csv").write_text("0,2\n1,3,0\n2,0\n\n3,1\n")
     images, _ = read_place_sets(folder / "places.yaml")
-    found = score_places(images, make_embedder(Embedding(method="thumbnail")), Verification()).flat()
+    found = score_places(images, make_embedder(EmbeddingSettings(method="thumbnail")), Verification()).flat
     assert found["walls.recall1"] == 0.5
     assert found["walls.recall5"] >= found["walls.recall1"]
 

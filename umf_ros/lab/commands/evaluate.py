@@ -47,7 +47,7 @@ def command(
     out: RunsFolder = Path("results"),
     config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording.")] = None,
     dataset: DatasetName = "auto",
-    embedder: Annotated[str | None, Optional(help=f"How the places of a recording are embedded: {CHOICES}.")] = None,
+    embedder: Annotated[str | None, Optional(help=f"How places are embedded: {CHOICES}.")] = None,
     odometry: OdometryPath = None,
     odometry_frame: OdometryFrame = "body",
     ground_truth: TruthPath = None,
@@ -209,18 +209,20 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     return report.figures
 
 
-def _on_places(listing: Path, embedder: str | None, weights: Path | None, out: Path) -> dict[str, float | int | None]:
+def _on_places(listing: Path, embedder: str | None, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
-    from umf_ros.lab.evaluation.markdown import print_table
-    from umf_ros.lab.evaluation.places_run import TITLE, run_place_sets
+    from umf_ros.embedding import DEFAULT
+    from umf_ros.lab.evaluation.places_run import evaluate_place_sets
+    from umf_ros.runs.folder import create_run_folder
 
     console = Console()
     with console.status("embedding") as status:
-        results, shown, folder = run_place_sets(listing, embedder, weights, out, status.update)
-    print_table(console, TITLE, shown)
-    console.print(f"report: {folder}/evaluation.md", markup=False, soft_wrap=True)
-    return results
+        report = evaluate_place_sets(listing, embedder or DEFAULT, weights, status.update)
+    folder = create_run_folder(out)
+    report.write(folder)
+    report.show(console, folder)
+    return report.figures
 
 
 def _bar(console: Console) -> Progress:

@@ -26,13 +26,10 @@ from umf_ros.errors import ConfigError, UmfError
 from umf_ros.frames import Frame, Image, Points, StereoCamera
 from umf_ros.geometry import transform
 from umf_ros.lab.datasets.scan_files import SCANS, read_scan
-from umf_ros.lab.evaluation.embedded import PlaceCollection
-from umf_ros.lab.evaluation.markdown import Table
 from umf_ros.lab.evaluation.protocol import RetrievalTask
-from umf_ros.lab.evaluation.reranking import gather_evidence
-from umf_ros.lab.evaluation.retrieval import Mask, rank
+from umf_ros.lab.evaluation.results import Figures, TextTable, percent, rounded
+from umf_ros.lab.evaluation.retrieval import Mask, PlaceCollection, rank, rerank_all
 from umf_ros.lab.evaluation.scores import Scores, score
-from umf_ros.lab.evaluation.summary import percent
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
 IMAGES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
@@ -78,14 +75,13 @@ class PlaceScores(NamedTuple):
     plain: Scores
     reranked: Scores | None
 
-    def flat(self) -> dict[str, float | int | None]:
+    @property
+    def flat(self) -> Figures:
         """The figures by their published names; None for what could not be measured."""
         figures = ("recall1", "recall5", "auc_pr", "recall_at_precision1")
         values = {name: getattr(self.plain, name) for name in figures}
         values["recall1_reranked"] = self.reranked.recall1 if self.reranked else float("nan")
-        return {
-            f"{self.name}.{name}": round(value, 4) if np.isfinite(value) else None for name, value in values.items()
-        }
+        return rounded({f"{self.name}.{name}": value for name, value in values.items()})
 
 
 def read_place_sets(listing: Path) -> list[PlaceSet]:
@@ -147,8 +143,8 @@ def score_places(
     if not any(keyframe.embedding.image or keyframe.embedding.cloud for keyframe in found.keyframes):
         return PlaceScores(places.name, len(references), plain, None)
     ours, theirs = found.keyframes[:asked], found.keyframes[asked:]
-    evidence = gather_evidence(ours, theirs, ranking, similarity, settings, report)
-    return PlaceScores(places.name, len(references), plain, score(task, evidence.ranking(ranking, RERANKER)))
+    reranking = rerank_all(ours, theirs, ranking, similarity, settings, report)
+    return PlaceScores(places.name, len(references), plain, score(task, reranking.after(RERANKER)))
 
 
 def read_truth(path: Path, queries: int, references: int) -> Mask:
@@ -177,7 +173,7 @@ def read_truth(path: Path, queries: int, references: int) -> Mask:
     return positive
 
 
-def table_of(results: Sequence[PlaceScores]) -> Table:
+def table_of(results: Sequence[PlaceScores]) -> TextTable:
     """A row per set."""
     head = ["set", "queries", "references", "R@1 %", "R@5 %", "R@1 % reranked", "AUC-PR %", "R@100 % P"]
     rows = []
@@ -201,8 +197,7 @@ def _task(positive: Mask) -> RetrievalTask:
     """Sets say what is true, and nothing of distance and heading."""
     queries, references = (np.arange(count) for count in positive.shape)
     everything, unknown = np.ones_like(positive), np.zeros(positive.shape)
-    neutral = np.zeros_like(positive)
-    return RetrievalTask(queries, references, everything, positive, positive, neutral, unknown, unknown)
+    return RetrievalTask(queries, references, everything, positive, positive, unknown, unknown)
 
 
 def _image_frame(file: Path, number: int, calibration: Calibration | None) -> Frame:

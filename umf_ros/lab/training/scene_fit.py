@@ -19,12 +19,12 @@ from torch import Tensor
 
 from umf_ros.lab.datasets.labels import Places, Rule, places_of
 from umf_ros.lab.datasets.sample import Sample, SampleSequence
+from umf_ros.lab.datasets.views import Augmentation, ViewMaker
 from umf_ros.lab.evaluation.protocol import NEAR_M
 from umf_ros.lab.training.batches import stack_views
 from umf_ros.lab.training.losses import neighbourhood_components
 from umf_ros.lab.training.metric_loss import Bank, Relations, relate
 from umf_ros.lab.training.photometry import CameraLook, draw_look
-from umf_ros.lab.training.views import Augmentation, ViewMaker
 from umf_ros.networks.efficientnet import EfficientNetLite0
 from umf_ros.networks.umf import UMF, channels_last
 

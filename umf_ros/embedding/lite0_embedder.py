@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 
-from umf_ros.embedding.images import shrink, standardise
+from umf_ros.config import EmbeddingSettings
+from umf_ros.embedding.inputs import shrink, standardise
+from umf_ros.errors import ConfigError
 from umf_ros.frames import Embedding, Frame, Image, Points
 from umf_ros.networks.efficientnet import STAGES, pretrained_trunk
 
@@ -20,16 +21,16 @@ class Lite0Embedder:
 
     Args:
         checkpoint: published weights, `efficientnet-lite0-57934424.pth`.
-        pooling: "cells" keeps where something is; "mean" averages it away.
+        mean: averages away where something is.
 
     Raises:
         WeightsError: the weights cannot be used.
     """
 
-    def __init__(self, checkpoint: Path, pooling: Literal["cells", "mean"] = "cells") -> None:
-        self.name = f"lite0-{pooling}"
+    def __init__(self, checkpoint: Path, mean: bool = False) -> None:
+        self.name = "lite0_mean" if mean else "lite0"
         self._trunk = pretrained_trunk(checkpoint)
-        self._mean = pooling == "mean"
+        self._mean = mean
         channels = STAGES[-1].channels
         self.dimension = channels if self._mean else channels * (SIDE // 32) ** 2
 
@@ -45,3 +46,14 @@ class Lite0Embedder:
             cells = self._trunk(values)[-1]
         found = (cells.mean(dim=(2, 3)) if self._mean else cells).flatten().numpy()
         return (found / np.linalg.norm(found)).astype(np.float32)
+
+
+def make(settings: EmbeddingSettings, super_features: bool, mean: bool = False) -> Lite0Embedder:
+    """With the published weights that the settings name.
+
+    Raises:
+        ConfigError: they name none.
+    """
+    if not settings.weights:
+        raise ConfigError(f"embedding.method {settings.method}: embedding.weights must name the published weights")
+    return Lite0Embedder(Path(settings.weights), mean)
