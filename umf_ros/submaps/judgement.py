@@ -17,7 +17,7 @@ from umf_ros.geometry import Array, make_pose
 from umf_ros.resources import find
 from umf_ros.submaps.submap import Submap
 from umf_ros.verification import constants as const
-from umf_ros.verification.acceptance import Criterion, Logistic
+from umf_ros.verification.acceptance import Criterion, Logistic, log_ratio
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import TemporalMemory, prior_sigmas
 from umf_ros.verification.measurement import SUBMAP, Measurement
@@ -32,14 +32,10 @@ CRITERIA: dict[str, Criterion] = {
     "terrain_unique": Criterion(lambda m: m.terrain_correlation - m.terrain_rival, 0.0, 0.6),
     "overlap": Criterion(lambda m: m.overlap, 0.6, 0.95),
     "position_known": Criterion(lambda m: math.log(m.position_std_m), math.log(1.0), math.log(0.1)),
-    "relief_explained": Criterion(lambda m: _log_ratio(m.relief_m, m.residual_m), math.log(1.5), math.log(6)),
+    "relief_explained": Criterion(lambda m: log_ratio(m.relief_m, m.residual_m), math.log(1.5), math.log(6)),
     "odometry_prior": Criterion(lambda m: m.prior_sigmas, 4.0, 1.0, missing=0.7),
     "support": Criterion(lambda m: m.support, 0.0, 2.0),
 }
-
-
-def _log_ratio(above: float, below: float) -> float:
-    return math.log(max(above, 1e-6) / max(below, 1e-6))
 
 
 @dataclass(frozen=True, slots=True)

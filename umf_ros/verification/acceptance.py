@@ -49,7 +49,8 @@ class Criterion:
         return min(max((value - self.worst) / (self.best - self.worst), 0.0), 1.0)
 
 
-def _log_ratio(above: float, below: float) -> float:
+def log_ratio(above: float, below: float) -> float:
+    """Logarithm of a ratio of two sizes, finite where one of them is 0."""
     return math.log(max(above, 1e-6) / max(below, 1e-6))
 
 
@@ -59,10 +60,10 @@ def _log(share: float) -> float:
 
 # every range is by hand: wide enough for right poses, beyond the reach of most wrong ones
 CRITERIA: dict[str, Criterion] = {
-    "residual_like_noise": Criterion(lambda m: _log_ratio(m.noise_m, m.residual_m), math.log(0.5), math.log(2.0)),
-    "tail_like_noise": Criterion(lambda m: _log_ratio(m.noise_m, m.residual_p90_m), math.log(0.15), math.log(0.6)),
-    "relief_explained": Criterion(lambda m: _log_ratio(m.relief_m, m.residual_m), math.log(1.5), math.log(12)),
-    "relief_present": Criterion(lambda m: _log_ratio(m.relief_m, m.noise_m), math.log(1.2), math.log(5.0)),
+    "residual_like_noise": Criterion(lambda m: log_ratio(m.noise_m, m.residual_m), math.log(0.5), math.log(2.0)),
+    "tail_like_noise": Criterion(lambda m: log_ratio(m.noise_m, m.residual_p90_m), math.log(0.15), math.log(0.6)),
+    "relief_explained": Criterion(lambda m: log_ratio(m.relief_m, m.residual_m), math.log(1.5), math.log(12)),
+    "relief_present": Criterion(lambda m: log_ratio(m.relief_m, m.noise_m), math.log(1.2), math.log(5.0)),
     "terrain_correlation": Criterion(lambda m: m.terrain_correlation, 0.2, 0.9),
     "terrain_score": Criterion(lambda m: m.terrain_score, 3.0, 15.0),
     "overlap": Criterion(lambda m: m.overlap, 0.4, 0.95),

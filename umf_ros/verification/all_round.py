@@ -13,14 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-import small_gicp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from umf_ros.geometry import Array, make_pose, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate
-from umf_ros.verification.registration import PreparedScan
+from umf_ros.verification.registration import PreparedScan, draw
 from umf_ros.verification.surroundings import SIDE, Spectra, Surroundings
 
 
@@ -90,17 +89,7 @@ def search(match: PreparedScan, turned: TurnedSurroundings) -> list[Fit]:
 def scout(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
     """Draw a pose to the match by a few points, and see how many of them find a counterpart."""
     cell_m = _cell_for(query)
-    result = small_gicp.align(
-        match.cloud,
-        query.scouts_cloud,
-        match.tree,
-        guess,
-        registration_type="GICP",
-        max_correspondence_distance=const.SCOUT_REACH * cell_m,
-        num_threads=1,
-        max_iterations=const.SCOUT_STEPS,
-    )
-    pose = np.asarray(result.T_target_source)
+    pose = draw(match, query.scouts_cloud, guess, const.SCOUT_REACH * cell_m, const.SCOUT_STEPS)
     squared = match.nearest(transform(pose, query.scouts))[1]
     near = squared < (const.SCOUT_NEAR * cell_m) ** 2
     terrain = evaluate(match.elevation, query.elevation, pose).score

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from umf_ros.geometry import Array, invert, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.free_space import Sight, visible
-from umf_ros.verification.registration import PreparedScan
+from umf_ros.verification.registration import SEARCHED, PreparedScan
 
 Mask = NDArray[np.bool_]
 
@@ -107,8 +107,7 @@ def _misfits(scan: PreparedScan, other: PreparedScan, moved: Array, shifts: Arra
 
 def _least_known(information: Array) -> Array:
     """(3,) the horizontal direction in which the position is known least."""
-    ridge = np.diag([const.SEARCH_M**-2] * 3 + [const.SEARCH_RAD**-2] * 3)
-    across = np.linalg.eigh(np.linalg.inv(information + ridge)[:2, :2])[1][:, -1]
+    across = np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1]
     return np.append(across, 0.0)
 
 

@@ -80,9 +80,7 @@ class PreparedScan:
     @cached_property
     def scouts_cloud(self) -> small_gicp.PointCloud:
         """The few with covariances of their own."""
-        cloud = small_gicp.PointCloud(self.scouts)
-        small_gicp.estimate_normals_covariances(cloud, None, const.NORMAL_NEIGHBOURS, 1)
-        return cloud
+        return _cloud_of(self.scouts)
 
     def _picks(self, count: int) -> NDArray[np.intp]:
         return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(np.intp)
@@ -90,9 +88,7 @@ class PreparedScan:
     @cached_property
     def cloud(self) -> small_gicp.PointCloud:
         """Points, normals and covariances."""
-        cloud = small_gicp.PointCloud(self.points)
-        small_gicp.estimate_normals_covariances(cloud, self.tree, const.NORMAL_NEIGHBOURS, 1)
-        return cloud
+        return _cloud_of(self.points, self.tree)
 
     @cached_property
     def range_image(self) -> RangeImage:
@@ -122,9 +118,7 @@ class PreparedScan:
     @cached_property
     def sample_cloud(self) -> small_gicp.PointCloud:
         """The sample with covariances of its own."""
-        cloud = small_gicp.PointCloud(self.sample)
-        small_gicp.estimate_normals_covariances(cloud, None, const.NORMAL_NEIGHBOURS, 1)
-        return cloud
+        return _cloud_of(self.sample)
 
     @cached_property
     def tree(self) -> small_gicp.KdTree:
@@ -149,6 +143,13 @@ class PreparedScan:
         """Index (N,) of the nearest point to each of (N, 3), and its squared distance, m^2."""
         index, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
         return np.asarray(index, np.intp), np.asarray(squared)
+
+
+def _cloud_of(points: Array, tree: small_gicp.KdTree | None = None) -> small_gicp.PointCloud:
+    """Points (N, 3) with normals and covariances of their own."""
+    cloud = small_gicp.PointCloud(points)
+    small_gicp.estimate_normals_covariances(cloud, tree, const.NORMAL_NEIGHBOURS, 1)
+    return cloud
 
 
 class ScanCache:
@@ -208,6 +209,8 @@ def _diagonal(metres: float, degrees: float) -> Array:
     return np.diag([metres**2] * 3 + [np.radians(degrees) ** 2] * 3)
 
 
+# information (6, 6) of the search itself: nothing is less known than that
+SEARCHED = np.diag([const.SEARCH_M**-2] * 3 + [const.SEARCH_RAD**-2] * 3)
 # a fixed yardstick of what a pose is known to: refitting the covariance must not move the decision
 NOMINAL = CovarianceModel(const.NOMINAL_INFLATION, const.NOMINAL_FLOOR_M, const.NOMINAL_FLOOR_DEG)
 
@@ -252,18 +255,23 @@ def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Align
     """Generalised ICP (Segal, RSS 2009) from the pose `guess`, first far-sighted, then near-sighted."""
     pose = guess
     for reach, steps in ((const.COARSE_REACH_M, const.COARSE_STEPS), (const.FINE_REACH_M, const.FINE_STEPS)):
-        result = small_gicp.align(
-            match.cloud,
-            query.sample_cloud,
-            match.tree,
-            pose,
-            registration_type="GICP",
-            max_correspondence_distance=reach,
-            num_threads=1,
-            max_iterations=steps,
-        )
-        pose = np.asarray(result.T_target_source)
+        pose = draw(match, query.sample_cloud, pose, reach, steps)
     return inspect(match, query, pose)
+
+
+def draw(match: PreparedScan, query: small_gicp.PointCloud, guess: Array, reach_m: float, steps: int) -> Array:
+    """`match_T_query` after some steps of generalised ICP from a guess; counterparts are nearer than `reach_m`."""
+    result = small_gicp.align(
+        match.cloud,
+        query,
+        match.tree,
+        guess,
+        registration_type="GICP",
+        max_correspondence_distance=reach_m,
+        num_threads=1,
+        max_iterations=steps,
+    )
+    return np.asarray(result.T_target_source)
 
 
 def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
@@ -292,7 +300,6 @@ def covariance_of(found: Array, model: CovarianceModel, overlap: float | Array =
         model: what they do not say.
         overlap: (...) of the alignment.
     """
-    known = np.diag([const.SEARCH_M**-2] * 3 + [const.SEARCH_RAD**-2] * 3)
     inflation = np.asarray(model.inflation * np.exp(model.disorder * (1.0 - np.asarray(overlap, float))))
-    covariance = np.linalg.inv(known + found / inflation[..., None, None]) + model.floor
+    covariance = np.linalg.inv(SEARCHED + found / inflation[..., None, None]) + model.floor
     return (covariance + covariance.swapaxes(-1, -2)) / 2

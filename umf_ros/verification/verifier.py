@@ -14,11 +14,7 @@ from umf_ros.geometry import heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance
 from umf_ros.verification.all_round import TurnedSurroundings
-from umf_ros.verification.hypotheses import (
-    Hypothesis,
-    TemporalMemory,
-    find_hypotheses,
-)
+from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, find_hypotheses
 from umf_ros.verification.measurement import AlignedHypothesis, Measurement, beside, measure, measure_candidate
 from umf_ros.verification.registration import ScanCache, align_scans
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
@@ -198,8 +194,7 @@ class Verifier:
         objection = self._objection(judged)
         if objection:
             return Verdict(ranked.candidate, objection, measurement, None, pixels, probability)
-        model = self._acceptance.covariances[measurement.kind]
-        covariance = aligned.covariance(model)
+        covariance = aligned.covariance(self._acceptance.covariances[measurement.kind])
         closure = LoopClosure(aligned.query.stamp_ns, ranked.candidate.stamp_ns, aligned.pose, covariance, probability)
         return Verdict(ranked.candidate, "accepted", measurement, closure, pixels, probability)
 
