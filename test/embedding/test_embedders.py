@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import CAMERA
+from published import published_tensors
 from tiny_worlds import TINY, some_scan
 
 from umf_ros import embedding
@@ -263,3 +264,18 @@ def test_the_thumbnail_is_blind_to_exposure_and_not_to_the_view():
     codes = [ThumbnailEmbedder().embed(some_frame(left=left)).descriptor for left in (image, image * 2, image[:, ::-1])]
     assert codes[0] @ codes[1] > 0.99
     assert codes[0] @ codes[2] < 0.6
+
+
+def test_the_untrained_trunk_needs_its_published_weights_and_sees_the_image_alone(tmp_path):
+    with pytest.raises(ConfigError, match=r"lite0: embedding\.weights must name"):
+        make_embedder(EmbeddingSettings(method="lite0"))
+    torch.save(published_tensors(), tmp_path / "lite0.pth")
+    for method, length in (("lite0_mean", 320), ("lite0", 320 * 49)):
+        embedder = make_embedder(EmbeddingSettings(method=method, weights=str(tmp_path / "lite0.pth")))
+        here, again, there = (embedder.embed(some_frame(seed)).descriptor for seed in (0, 0, 1))
+        assert here.shape == (embedder.dimension,) == (length,)
+        np.testing.assert_array_equal(here, again)
+        assert float(here @ here) == pytest.approx(1, abs=1e-4)
+        assert float(here @ there) < 0.9999
+        np.testing.assert_array_equal(embedder.embed(some_frame(0, points=None)).descriptor, here)
+        assert embedder.embed(some_frame(0, left=None)).descriptor[0] == 1

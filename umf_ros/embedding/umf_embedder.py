@@ -51,7 +51,7 @@ class UmfEmbedder:
         # descriptors of other weights are another language: the name tells them apart
         self.name = f"{path.stem}-{hashlib.sha256(path.read_bytes()).hexdigest()[:8]}"
         self._config = network.config
-        self.dimension = network.config.descriptor
+        self.dimension = network.config.length
         self._super_features = super_features
         rows, columns = (side // 4 for side in network.config.image_size)
         self._regions = cell_regions(rows, columns)
