@@ -120,7 +120,7 @@ def test_shipped_weights_load():
     """The default network reads its own weights and knows a frame from another."""
     embedder = make_embedder(EmbeddingSettings(runtime="torch", threads=1))
     one, two = embedder.embed(some_frame(0)), embedder.embed(some_frame(1))
-    assert embedder.dimension == 256
+    assert embedder.dimension == 768
     assert one.descriptor @ two.descriptor < 0.99
 
 
