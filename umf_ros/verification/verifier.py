@@ -16,7 +16,7 @@ from umf_ros.verification.acceptance import load_acceptance
 from umf_ros.verification.all_round import TurnedSurroundings
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, find_hypotheses
 from umf_ros.verification.measurement import AlignedHypothesis, Measurement, beside, measure, measure_candidate
-from umf_ros.verification.registration import ScanCache, align_scans
+from umf_ros.verification.registration import ScanCache, align_scans, levelled
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
 UNTESTED, NO_POSE = "less promising than others", "no pose fits, or others fit better"
@@ -226,5 +226,5 @@ def _shared_view(aligned: AlignedHypothesis) -> float:
     if aligned.scans is None:
         return 1.0 - abs(heading(aligned.pose)) / min(one.camera.width_rad for one in (aligned.query, aligned.match))
     match, query = aligned.scans
-    turn = heading(match.up @ aligned.pose[:3, :3] @ query.up.T)
+    turn = heading(levelled(match, query, aligned.pose))
     return float(match.view.overlap(query.view, np.array([turn]))[0])

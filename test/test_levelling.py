@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.verification.upright import upright
+from umf_ros.levelling import upright
 
 
 def normals(ground: int, walls: int, seed: int = 0) -> np.ndarray:
