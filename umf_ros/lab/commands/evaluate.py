@@ -155,7 +155,7 @@ def _on_recording(
     if truth is None:
         raise ConfigError(f"{bag} holds no ground truth; name a file with --ground-truth")
     frames = open_frames(recording, settings, console, odometry, odometry_frame)
-    evaluation = BagEvaluation(settings, make_embedder(settings.embedding, super_features=True))
+    evaluation = BagEvaluation(settings, make_embedder(settings.embedding, True, settings.verification.features))
     folder = create_run_folder(out)
     with _bar(console) as bar:
         task = bar.add_task("embedding", total=recording.duration_s)

@@ -29,11 +29,13 @@ def evaluate_place_sets(
         UmfError: something of a set is missing or damaged.
     """
     sets = read_place_sets(listing)
-    embedder = make_embedder(EmbeddingSettings(method=method, weights=str(weights or "")), super_features=True)
+    settings = Verification()
+    wanted = EmbeddingSettings(method=method, weights=str(weights or ""))
+    embedder = make_embedder(wanted, super_features=True, features=settings.features)
     results = []
     for places in sets:
         report(places.name)
-        results.append(score_places(places, embedder, Verification()))
+        results.append(score_places(places, embedder, settings))
     figures = {name: value for found in results for name, value in found.flat.items()}
     notes = [f"{listing}, embedded by {embedder.name}. A match is true where the set says so."]
     return EvaluationReport(TITLE, notes, figures, {TITLE: table_of(results)})

@@ -12,7 +12,6 @@ from umf_ros.config import EmbeddingSettings, Verification
 from umf_ros.embedding import DEFAULT, make_embedder
 from umf_ros.embedding import METHODS as EMBEDDERS
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.embedding.umf_embedder import UmfEmbedder
 from umf_ros.errors import ConfigError
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array
@@ -172,7 +171,9 @@ class WorldsRun:
     ) -> None:
         self._weights = locate_weights(weights)
         self._worlds, self._repeats, self._report = worlds, repeats, report
-        self._embedder = UmfEmbedder(self._weights, super_features=True)
+        self._settings = Verification()
+        wanted = EmbeddingSettings(weights=str(self._weights))
+        self._embedder = make_embedder(wanted, super_features=True, features=self._settings.features)
         self._others = _untrained() if others else {}
 
     def run(self) -> WorldsSummary:
@@ -180,7 +181,7 @@ class WorldsRun:
         results: list[WorldResult] = []
         baselines: dict[str, list[Scores]] = {name: [] for name in self._others}
         for world in self._worlds:
-            evaluation = WorldEvaluation(world, self._embedder, Verification(), lambda: self._report(world.name, 1))  # noqa: B023
+            evaluation = WorldEvaluation(world, self._embedder, self._settings, lambda: self._report(world.name, 1))  # noqa: B023
             results.append(evaluation.run())
             for name, embedder in self._others.items():
                 baselines[name].append(evaluation.compare(embedder))
