@@ -20,7 +20,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from domain_examples import kept_examples
+from domain_examples import is_right, kept_examples
 from domains import EXAMPLES
 from drives import Drive, embedded, kept, worlds
 from rich.console import Console
@@ -44,7 +44,6 @@ from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
 from umf_ros.verification.measurement import SCAN
 
-RIGHT_M, RIGHT_DEG = 0.4, 3.0
 EXAMINED = 5  # candidates per query: what retrieval offers first
 EVERY, CONSECUTIVE = 12, 3  # of so many keyframes, the first few are queries
 THRESHOLD = Verification().min_probability
@@ -134,8 +133,9 @@ def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Example]:
             pairs = [(one, _degraded(database[one.index], strength, rng)) for one in chosen]
             for one in verifier.examine(_degraded(keyframe, strength, rng), pairs):
                 metres, degrees = drive.error(query, one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose)
-                right = metres < RIGHT_M and degrees < RIGHT_DEG
-                yield Example(one.measurement, right, f"drive {drive.seed}")
+                right = is_right(metres, degrees)
+                if right is not None:
+                    yield Example(one.measurement, right, f"drive {drive.seed}")
         database.add(keyframe)
     database.close()
 
