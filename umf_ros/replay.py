@@ -52,6 +52,11 @@ class Replay:
             if detection.fault is not None:
                 raise detection.fault
 
+    def graph_counts(self) -> dict[str, int]:
+        """How many closures the graph has in which state so far; none without odometry."""
+        counts = self._graph.verdict_counts() if self._has_odometry else {}
+        return {state.value: count for state, count in counts.items()}
+
     def finish(self, drops: Mapping[str, int]) -> bool:
         """Write the summary, and trajectories and graph where there was odometry; returns whether there was."""
         self._recorder.write_summary(drops)

@@ -17,6 +17,7 @@ from umf_ros.commands.recordings import (
     RunsFolder,
     TruthPath,
     WeightsPath,
+    check_odometry_options,
     open_frames,
     open_recording,
 )
@@ -34,18 +35,21 @@ def command(
     embedder: EmbedderName = None,
     weights: WeightsPath = None,
     odometry: OdometryPath = None,
-    odometry_frame: OdometryFrame = "body",
+    odometry_frame: OdometryFrame = "",
     ground_truth: TruthPath = None,
     min_probability: MinProbability = None,
 ) -> None:
     """Find loop closures in a recording as fast as the machine goes.
 
     Needs no ROS. Writes closures, trajectories, the pose graph and a report to a new folder.
-    Ctrl-C ends the run early and keeps what was found.
+    Ctrl-C ends the run early and keeps what was found. Ends with 3 where the inputs could give nothing.
     """
+    odometry_frame = check_odometry_options(odometry, odometry_frame)
+
     from rich.console import Console
 
     from umf_ros.bags.trajectories import read_ground_truth
+    from umf_ros.commands.inputs import InputConsole
     from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
     from umf_ros.loop_detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
@@ -57,13 +61,15 @@ def command(
     recording, settings = open_recording(
         bag, config, dataset, embedder, weights, verification__min_probability=min_probability
     )
-    reader = open_frames(recording, settings, console, odometry, odometry_frame)
+    inputs = InputConsole(console, recording)
+    reader = open_frames(recording, settings, inputs.warn, odometry, odometry_frame)
     if ground_truth is not None:
         read_ground_truth(recording, ground_truth)  # what is wrong with it is said now, not after the run
     detector = LoopDetector(settings, make_detector_embedder(settings))
     folder = create_run_folder(out)
+    inputs.tell_absent(settings, odometry is not None)
     replay = Replay(folder, settings, detector)
-    with stop_on_interrupt() as interrupted, FrameProgress(console) as progress:
+    with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress:
         for detection in replay.run(reader.stream()):
             progress.show(reader.progress, detection)
             if interrupted():
@@ -71,6 +77,7 @@ def command(
     if interrupted():
         console.print("[yellow]Interrupted: the results cover what was done so far.")
     with undisturbed():
-        if not replay.finish(count_drops(reader.counters)):
-            console.print("No odometry: closures only, the pose graph is skipped (--odometry FILE.tum supplies it).")
-        finish_run(folder, recording, console, ground_truth)
+        replay.finish(count_drops(reader.counters))
+        inputs.remember(folder, reader.counters, interrupted(), odometry, odometry_frame)
+        verdict = finish_run(folder, recording, console, ground_truth, inputs.told)
+    raise typer.Exit(verdict.exit_code)

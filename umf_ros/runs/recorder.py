@@ -7,6 +7,7 @@ import resource
 import time
 from array import array
 from collections.abc import Mapping
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,8 @@ import numpy as np
 
 from umf_ros import __version__
 from umf_ros.config import Settings, dump_settings
-from umf_ros.errors import UmfError
-from umf_ros.frames import Frame
+from umf_ros.errors import UmfError, writing
+from umf_ros.frames import Frame, Points
 from umf_ros.loop_detector import Detection
 from umf_ros.runs import tables
 from umf_ros.runs.folder import write_atomically
@@ -23,6 +24,7 @@ from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
 COUNTS = ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected")
+DESCRIPTORS = "descriptors.f16"
 STAGES = ("embed", "query", "verify", "submaps", "total")
 
 
@@ -46,7 +48,10 @@ class RunRecorder:
         self._closures = tables.CsvTable(folder / "closures.csv", tables.CLOSURES)
         self._candidates = tables.CsvTable(folder / "candidates.csv", tables.CANDIDATES)
         self._keyframes = tables.CsvTable(folder / "keyframes.csv", tables.KEYFRAMES)
+        self._latencies = tables.CsvTable(folder / "latencies.csv", ["stamp_ns", *STAGES])
         self._inliers = tables.CsvTable(folder / "inliers.csv", tables.INLIERS)
+        with writing(folder / DESCRIPTORS):
+            self._descriptors = (folder / DESCRIPTORS).open("wb")
         self._latency = {stage: array("f") for stage in STAGES}
         self._counts = dict.fromkeys(COUNTS, 0)
         self._started = time.monotonic()
@@ -62,6 +67,10 @@ class RunRecorder:
         self._counts["keyframes"] += 1
         self._counts["queries"] += bool(detection.verdicts)
         self._keyframes.append([[keyframe.stamp_ns, keyframe.session, f"{keyframe.travelled_m:.4f}"]])
+        times = [f"{detection.latency_ms.get(stage, nan):.1f}" for stage in STAGES]
+        self._latencies.append([[keyframe.stamp_ns, *times]])
+        with writing(self.folder / DESCRIPTORS):
+            self._descriptors.write(keyframe.embedding.descriptor.astype("<f2").tobytes())
         self._candidates.append([tables.candidate_row(keyframe.stamp_ns, verdict) for verdict in detection.verdicts])
         for verdict in detection.verdicts:
             if verdict.closure is None:
@@ -94,8 +103,10 @@ class RunRecorder:
 
     def close(self) -> None:
         """Close the tables."""
-        for table in (self._closures, self._candidates, self._keyframes, self._inliers):
+        for table in (self._closures, self._candidates, self._keyframes, self._latencies, self._inliers):
             table.close()
+        with writing(self.folder / DESCRIPTORS):
+            self._descriptors.close()
 
     def _count_frame(self, frame: Frame) -> None:
         self._counts["frames"] += 1
@@ -132,6 +143,15 @@ def read_summary(folder: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or "closures_published" not in content:
         raise UmfError(f"{path} is not the summary of a run")
     return content
+
+
+def read_descriptors(folder: Path, count: int) -> Points | None:
+    """Descriptors (N, D) of the first `count` keyframes; None where an older version wrote none."""
+    path = folder / DESCRIPTORS
+    content = np.fromfile(path, "<f2") if path.is_file() else np.empty(0)
+    if not count or not len(content) or len(content) % count:
+        return None
+    return content.reshape(count, -1).astype(np.float32)
 
 
 def _percentiles(values: array[float]) -> dict[str, float | None]:
