@@ -84,12 +84,18 @@ def faults(settings: Settings) -> list[Planted]:
             message.p = projection
         return message
 
+    def late_clouds(topic: str, message: Any) -> Any:
+        if topic == topics.cloud:
+            late = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec + round(CLOCK_OFF_S * 1e9)
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(late, 10**9)
+        return message
+
     return [
         Planted("none", ()),
         Planted("no cloud", ("no scans on", topics.cloud), without_clouds),
         Planted("wrong intensity", ("min_intensity",), weak_intensity),
         Planted("wrong extrinsics", ("LiDAR's mounting is off by", "deg"), calibration=_turned),
-        Planted("clock offset", ("LiDAR's clock is", "s off"), calibration=_late),
+        Planted("clock offset", ("LiDAR's clock is about +", "s off"), late_clouds),
         Planted("gap rules", ("gap rules exclude every pair",), settings={"loop": {"min_time_gap_s": 3600.0}}),
         Planted("wrong odometry frame", ("odometry is not of the body",), options=_camera_poses),
         Planted("empty right image", ("right images are empty",), empty_right),
@@ -105,10 +111,6 @@ def _turned(calibration: dict[str, Any]) -> None:
     turn = from_quaternion((0, 0, 0), (0, 0, np.sin(half), np.cos(half)))
     wrong = turn @ from_quaternion((0, 0, 0), pose["quaternion"])
     pose["quaternion"] = [float(value) for value in to_quaternion(wrong)]
-
-
-def _late(calibration: dict[str, Any]) -> None:
-    calibration["lidar_time_offset_s"] += CLOCK_OFF_S
 
 
 def _long(calibration: dict[str, Any]) -> None:

@@ -10,9 +10,8 @@ from rich.console import Console
 from umf_ros.bags.reader import Bag
 from umf_ros.commands.progress import WARNING
 from umf_ros.config import Settings
-from umf_ros.runs.finished_run import describe_recording
+from umf_ros.runs.finished_run import remember_recording
 from umf_ros.runs.inputs import absent_inputs, input_counts
-from umf_ros.runs.recorder import read_summary, write_summary
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
@@ -51,13 +50,12 @@ class InputConsole:
         """Keep in the summary what the report needs to know of the inputs."""
         source = {"path": str(odometry.resolve()), "frame": odometry_frame} if odometry else None
         known = {
-            "recording": describe_recording(self._bag),
             "inputs": input_counts(counters),
             "warnings": self._warnings,
             "interrupted": interrupted,
             "odometry_file": source,
         }
-        write_summary(folder, read_summary(folder) | known)
+        remember_recording(folder, self._bag, **known)
 
     def _tell(self, text: str) -> None:
         if text not in self.told:

@@ -15,7 +15,7 @@ from umf_ros.config import Settings, load_settings
 from umf_ros.errors import UmfError
 from umf_ros.frames import LoopClosure, Points
 from umf_ros.runs import tables
-from umf_ros.runs.recorder import read_descriptors, read_summary
+from umf_ros.runs.recorder import read_descriptors, read_summary, write_summary
 from umf_ros.trajectory import Trajectory
 
 CLOCK_SLACK_NS = 5_000_000_000
@@ -96,6 +96,15 @@ def describe_recording(bag: Bag) -> dict[str, Any]:
         "end_ns": bag.end_ns,
         "messages": {topic: info.count for topic, info in bag.topics.items()},
     }
+
+
+def remember_recording(folder: Path, bag: Bag, **more: Any) -> None:
+    """Write into the summary of a run which recording it was made on, and what else is known of it.
+
+    Raises:
+        UmfError: the folder holds no run.
+    """
+    write_summary(folder, read_summary(folder) | {"recording": describe_recording(bag)} | more)
 
 
 def _check_recording(run: FinishedRun, bag: Bag) -> None:

@@ -31,7 +31,7 @@ MUCH_LOST = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Advice:
     """Something a person should know.
 
     Attributes:
@@ -50,22 +50,22 @@ class Finding:
         return f"{self.what}; {self.remedy}" if self.remedy else self.what
 
 
-def absent_inputs(bag: Bag, settings: Settings, odometry_from_file: bool = False) -> list[Finding]:
+def absent_inputs(bag: Bag, settings: Settings, odometry_from_file: bool = False) -> list[Advice]:
     """Inputs that the settings name and the recording lacks."""
-    found: list[Finding] = []
+    found: list[Advice] = []
     topics = topics_of(settings).model_dump()
     for name, (severity, text) in _ABSENT.items():
         topic = topics[name]
         if (name == "odometry" and odometry_from_file) or (topic in bag.topics and bag.topics[topic].count):
             continue
         if topic:
-            found.append(Finding(_severity(name, severity, found), text.format(topic=topic), _remedy(name, bag)))
+            found.append(Advice(_severity(name, severity, found), text.format(topic=topic), _remedy(name, bag)))
         elif name == "odometry":
-            found.append(Finding("note", "no odometry: closures only, the pose graph is skipped", _remedy(name, bag)))
+            found.append(Advice("note", "no odometry: closures only, the pose graph is skipped", _remedy(name, bag)))
     return found
 
 
-def _severity(name: str, usual: str, others: list[Finding]) -> Severity:
+def _severity(name: str, usual: str, others: list[Advice]) -> Severity:
     if name == "cloud" and any("right images" in other.what for other in others):
         return "fault"  # neither a scan nor a second image: no depth at all
     return usual  # type: ignore[return-value]
@@ -88,7 +88,7 @@ def input_counts(counters: Mapping[Input, InputCounter]) -> dict[str, Any]:
     }
 
 
-def useless_inputs(inputs: Mapping[str, Any]) -> list[Finding]:
+def useless_inputs(inputs: Mapping[str, Any]) -> list[Advice]:
     """Inputs whose messages came and could not be used, all or many of them."""
     found = []
     for name, count in inputs.items():
@@ -98,7 +98,7 @@ def useless_inputs(inputs: Mapping[str, Any]) -> list[Finding]:
             continue
         reasons = ", ".join(f"{reason} {number}" for reason, number in sorted(lost.items(), key=lambda one: -one[1]))
         what = f"{total} of {count['received']} messages of the {_NAMES.get(name, name)} could not be used ({reasons})"
-        found.append(Finding("warning" if count["used"] else "fault", what, _help(lost)))
+        found.append(Advice("warning" if count["used"] else "fault", what, _help(lost)))
     return found
 
 

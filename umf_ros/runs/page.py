@@ -9,17 +9,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table as Grid
 
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import rotation_angle
 from umf_ros.pose_graph.closures import State
-from umf_ros.runs.findings import Judgement
+from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.folder import write_atomically
 from umf_ros.runs.honesty import MEDIAN_EXPECTED, in_words
-from umf_ros.runs.inputs import Finding
+from umf_ros.runs.inputs import Advice
 from umf_ros.runs.truth import JudgedClosure, endpoints
 from umf_ros.runs.verdict import RunVerdict
 
@@ -40,7 +40,7 @@ class ClosureRow(NamedTuple):
     mark: str
 
 
-def write_page(about: Judgement, verdict: RunVerdict, findings: Sequence[Finding], scene: Mapping[str, Any]) -> None:
+def write_page(about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advice], scene: Mapping[str, Any]) -> None:
     """Write report.html.
 
     Raises:
@@ -63,7 +63,7 @@ def write_page(about: Judgement, verdict: RunVerdict, findings: Sequence[Finding
         facts=_facts(run.summary),
         closures=closure_rows(about),
         scene=_inside_a_script(scene),
-        plotly=Markup(_plotly()),
+        plotly=_plotly(),
         version=run.summary["version"],
         weights=run.summary["weights"],
         seed=run.summary["seed"],
@@ -72,7 +72,7 @@ def write_page(about: Judgement, verdict: RunVerdict, findings: Sequence[Finding
 
 
 def print_summary(
-    console: Console, about: Judgement, verdict: RunVerdict, findings: Sequence[Finding], told: frozenset[str]
+    console: Console, about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advice], told: frozenset[str]
 ) -> None:
     """Print what a person wants to know first: figures, what became of the closures, and the verdict.
 
@@ -86,7 +86,7 @@ def print_summary(
     plain: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
     grid = Grid(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in _facts(about.run.summary):
-        grid.add_row(name, value)
+        grid.add_row(name, escape(value))
     console.print(grid)
     for line in final_verdicts(about):
         console.print(line, **plain)
@@ -97,7 +97,7 @@ def print_summary(
     console.print(f"Report: {about.run.folder / 'report.html'}", **plain)
 
 
-def final_verdicts(about: Judgement) -> list[str]:
+def final_verdicts(about: ExaminedRun) -> list[str]:
     """A line for each closure, by its number, that the graph did not accept in the end."""
     lines = []
     for number, closure in enumerate(about.run.closures, 1):
@@ -120,7 +120,7 @@ def describe(closure: LoopClosure, inliers: int, judged: JudgedClosure | None) -
     return f"{text}   {'true' if judged.is_true else 'FALSE'}, {judged.translation_error_m:.2f} m off"
 
 
-def closure_rows(about: Judgement) -> list[ClosureRow]:
+def closure_rows(about: ExaminedRun) -> list[ClosureRow]:
     """The page's table: seconds since the first keyframe, figures, the graph's verdict and the truth's."""
     known = about.judged.by_endpoints()
     start = int(about.run.stamps[0]) if len(about.run.stamps) else 0
@@ -139,10 +139,10 @@ def closure_rows(about: Judgement) -> list[ClosureRow]:
     return rows
 
 
-def _inside_a_script(scene: Mapping[str, Any]) -> Markup:
+def _inside_a_script(scene: Mapping[str, Any]) -> str:
     """The scene as JSON that no parser of HTML takes for the end of its script."""
     text = json.dumps(scene, separators=(",", ":"), allow_nan=False)
-    return Markup(text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
 def _plotly() -> str:

@@ -15,8 +15,8 @@ from umf_ros.bags.trajectories import read_odometry
 from umf_ros.errors import UmfError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array
-from umf_ros.runs.findings import Judgement, look_first
-from umf_ros.runs.finished_run import FinishedRun, describe_recording, read_run
+from umf_ros.runs.findings import ExaminedRun, look_first
+from umf_ros.runs.finished_run import FinishedRun, read_run
 from umf_ros.runs.gallery import Gallery, walk
 from umf_ros.runs.page import MAX_PICTURES, describe, print_summary, write_page
 from umf_ros.runs.plots import ODOMETRY, OPTIMISED, TRUTH, draw_match, plot_trajectories
@@ -72,7 +72,7 @@ def finish_run(
     return verdict
 
 
-def judge(run: FinishedRun, bag: Bag | None = None) -> Judgement:
+def judge(run: FinishedRun, bag: Bag | None = None) -> ExaminedRun:
     """Hold the run against the truth, if there is one, and fill in the `ground_truth` of its summary.
 
     Raises:
@@ -88,11 +88,9 @@ def judge(run: FinishedRun, bag: Bag | None = None) -> Judgement:
                 "judged before, nothing was written"
             )
         run.summary["ground_truth"] = judged.summary() if covered or not total else None
-    if bag is not None:
-        run.summary.setdefault("recording", describe_recording(bag))
     write_summary(run.folder, run.summary)
     places = TruePlaces(run)
-    return Judgement(run, judged, places, GateKeeper(run, places), bag)
+    return ExaminedRun(run, judged, places, GateKeeper(run, places), bag)
 
 
 def draw_trajectory(run: FinishedRun, judged: JudgedRun) -> None:
@@ -107,7 +105,7 @@ def draw_trajectory(run: FinishedRun, judged: JudgedRun) -> None:
 
 
 def _draw_matches(
-    about: Judgement, chosen: list[LoopClosure], gallery: Gallery, inliers: dict[Endpoints, Array]
+    about: ExaminedRun, chosen: list[LoopClosure], gallery: Gallery, inliers: dict[Endpoints, Array]
 ) -> None:
     """Write matches/*.png for closures spread over the run."""
     target = about.run.folder / "matches"

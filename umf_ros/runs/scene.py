@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from umf_ros.geometry import Array, align
-from umf_ros.runs.findings import Judgement
+from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.gallery import SCAN_UNIT_M, Gallery, encode_scans
 from umf_ros.runs.scene_pairs import Pair, by_need, describe
 from umf_ros.runs.tables import Endpoints
@@ -24,7 +24,7 @@ MEDIA_BYTES = 3_600_000
 MAX_INLIERS = 60
 
 
-def drawn_trajectory(about: Judgement) -> Trajectory | None:
+def drawn_trajectory(about: ExaminedRun) -> Trajectory | None:
     """The best trajectory that a run has, in the frame that everything is drawn in."""
     run = about.run
     best = run.optimized or run.odometry
@@ -43,7 +43,7 @@ def _rigid(poses: Array, positions: Array) -> Array:
 
 
 def build_scene(
-    about: Judgement, pairs: list[Pair], gallery: Gallery, inliers: dict[Endpoints, Array]
+    about: ExaminedRun, pairs: list[Pair], gallery: Gallery, inliers: dict[Endpoints, Array]
 ) -> dict[str, Any]:
     """The scene: curves, keyframes, pairs with their pictures, matrix, threshold, errors and map."""
     media = _media(pairs, gallery)
@@ -89,7 +89,7 @@ def _media(pairs: list[Pair], gallery: Gallery) -> dict[str, dict[str, Any]]:
     return {"photographs": photographs, "scans": scans}
 
 
-def _curves(about: Judgement) -> list[dict[str, Any]]:
+def _curves(about: ExaminedRun) -> list[dict[str, Any]]:
     run = about.run
     curves = []
     if run.truth is not None:
@@ -100,7 +100,7 @@ def _curves(about: Judgement) -> list[dict[str, Any]]:
     return [{"name": name, "xyz": _rounded(_thin(positions)).T.tolist()} for name, positions in curves]
 
 
-def _keyframes(about: Judgement) -> dict[str, Any]:
+def _keyframes(about: ExaminedRun) -> dict[str, Any]:
     run, places = about.run, about.places
     start = int(places.stamps[0]) if len(places.stamps) else 0
     best: dict[int, float] = {}
@@ -115,7 +115,7 @@ def _keyframes(about: Judgement) -> dict[str, Any]:
     }
 
 
-def _positions(about: Judgement) -> Array:
+def _positions(about: ExaminedRun) -> Array:
     """(N, 2) of the keyframes where they are drawn; on a circle where no one knows their poses."""
     stamps, drawn = about.places.stamps, drawn_trajectory(about)
     if drawn is not None:
@@ -130,7 +130,7 @@ def _positions(about: Judgement) -> Array:
     return 10 * np.column_stack([np.sin(angle), np.cos(angle)])[: len(stamps)]
 
 
-def _similarity(about: Judgement) -> dict[str, Any] | None:
+def _similarity(about: ExaminedRun) -> dict[str, Any] | None:
     descriptors = about.run.descriptors
     if descriptors is None or not len(descriptors):
         return None
@@ -139,10 +139,10 @@ def _similarity(about: Judgement) -> dict[str, Any] | None:
     return {"rows": rows.tolist(), "data": base64.b64encode(matrix.tobytes()).decode("ascii")}
 
 
-def _sweep(about: Judgement) -> list[list[float | int]]:
+def _sweep(about: ExaminedRun) -> list[list[float | int]]:
     """Per keyframe with candidates: best probability, 1 or 0 for the same place or not and -1 for unknown, revisit."""
     rows: list[list[float | int]] = []
-    revisits = set(about.judged.missed) | {one.closure.query_stamp_ns for one in about.judged.closures if one.is_true}
+    revisits = set(about.judged.missed) | {one.closure.query_stamp_ns for one in about.judged.closures}
     right = {one.closure.query_stamp_ns: one.is_true for one in about.judged.closures}
     for stamp in map(int, about.places.stamps):
         best = about.gates.most_probable(stamp)
@@ -157,7 +157,7 @@ def _sweep(about: Judgement) -> list[list[float | int]]:
     return rows
 
 
-def _errors(about: Judgement) -> dict[str, Any] | None:
+def _errors(about: ExaminedRun) -> dict[str, Any] | None:
     """Distance from the truth over the way driven, of odometry and optimised trajectory."""
     run, truth = about.run, about.run.truth
     if truth is None or not about.judged.covered[0]:

@@ -11,7 +11,7 @@ import numpy as np
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, relative, rotation_angle
 from umf_ros.pose_graph.closures import State
-from umf_ros.runs.findings import PENDING, Judgement
+from umf_ros.runs.findings import PENDING, ExaminedRun
 from umf_ros.runs.tables import Endpoints, TestedCandidate
 from umf_ros.runs.truth import JudgedClosure
 from umf_ros.runs.why import Why
@@ -46,7 +46,7 @@ class Pair:
     why: Why | None = None
 
 
-def pairs_of(about: Judgement) -> list[Pair]:
+def pairs_of(about: ExaminedRun) -> list[Pair]:
     """Every closure, the missed revisits, and the most promising of what was rejected before it became one."""
     run, judged = about.run, about.judged.by_endpoints()
     tested = {one.endpoints: one for one in run.candidates}
@@ -77,7 +77,7 @@ def _spread(count: int, most: int) -> Iterable[int]:
     return list(dict.fromkeys(kept[i] for stride in strides for i in range(0, len(kept), stride)))
 
 
-def _kind(about: Judgement, key: Endpoints, judged: JudgedClosure | None) -> Kind:
+def _kind(about: ExaminedRun, key: Endpoints, judged: JudgedClosure | None) -> Kind:
     if judged is not None and not judged.is_true:
         return "false"
     verdict = about.run.verdicts.get(key)
@@ -86,7 +86,7 @@ def _kind(about: Judgement, key: Endpoints, judged: JudgedClosure | None) -> Kin
     return "pending" if verdict.state in PENDING else "rejected"
 
 
-def _missed(about: Judgement, tested: dict[Endpoints, TestedCandidate]) -> list[Pair]:
+def _missed(about: ExaminedRun, tested: dict[Endpoints, TestedCandidate]) -> list[Pair]:
     pairs = []
     for why in about.missed():
         if why.match_stamp_ns is None:
@@ -97,7 +97,7 @@ def _missed(about: Judgement, tested: dict[Endpoints, TestedCandidate]) -> list[
     return pairs
 
 
-def _nearly(about: Judgement, shown: set[Endpoints], found: set[int]) -> list[Pair]:
+def _nearly(about: ExaminedRun, shown: set[Endpoints], found: set[int]) -> list[Pair]:
     """The most probable candidates of keyframes without a closure."""
     best: dict[int, TestedCandidate] = {}
     for one in about.run.candidates:
@@ -116,7 +116,7 @@ def _nearly(about: Judgement, shown: set[Endpoints], found: set[int]) -> list[Pa
     return pairs
 
 
-def _pose(about: Judgement, key: Endpoints) -> tuple[Array | None, str]:
+def _pose(about: ExaminedRun, key: Endpoints) -> tuple[Array | None, str]:
     """Where the two stood by the truth, else by the optimised trajectory: the run keeps no pose of what it rejected."""
     run = about.run
     with_turns = run.truth if run.truth is not None and run.truth.has_orientation else None
@@ -129,7 +129,7 @@ def _pose(about: Judgement, key: Endpoints) -> tuple[Array | None, str]:
     return None, "no one"
 
 
-def describe(about: Judgement, pair: Pair, full: bool) -> dict[str, Any]:
+def describe(about: ExaminedRun, pair: Pair, full: bool) -> dict[str, Any]:
     """What the page gets of a pair; the bars and the pose only in full."""
     rows = [about.places.row(stamp) for stamp in pair.endpoints]
     told: dict[str, Any] = {"kind": pair.kind, "number": pair.number, "q": rows[0], "m": rows[1]}
@@ -161,7 +161,7 @@ def _probability(pair: Pair) -> float | None:
     return None if pair.candidate is None else pair.candidate.probability
 
 
-def _graph_words(about: Judgement, pair: Pair) -> str:
+def _graph_words(about: ExaminedRun, pair: Pair) -> str:
     verdict = about.run.verdicts.get(pair.endpoints)
     if verdict is None:
         return ""

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from umf_ros.config import Settings
-from umf_ros.runs.inputs import Finding
+from umf_ros.runs.inputs import Advice
 from umf_ros.runs.sensor_check import SensorReport
 from umf_ros.runs.sensor_motion import Disagreement
 
@@ -27,7 +27,7 @@ ACROSS = 0.5
 """Of the way, by hand: a body drives along its x, or its y where it can."""
 
 
-def about_sensors(seen: SensorReport, settings: Settings) -> Iterator[Finding]:
+def about_sensors(seen: SensorReport, settings: Settings) -> Iterator[Advice]:
     """Findings about light, returns, baseline, clocks and mountings."""
     yield from _images(seen)
     yield from _scans(seen)
@@ -37,63 +37,65 @@ def about_sensors(seen: SensorReport, settings: Settings) -> Iterator[Finding]:
     yield from _baseline(seen)
 
 
-def _images(seen: SensorReport) -> Iterator[Finding]:
+def _images(seen: SensorReport) -> Iterator[Advice]:
     for name, contrast in (("left", seen.left_contrast), ("right", seen.right_contrast)):
         if contrast < BLANK:
-            yield Finding(
+            yield Advice(
                 "fault",
                 f"the {name} images are empty: their grey values vary by {contrast:.1f} in the median",
                 "is the camera covered, or the topic another one's? topics." + name + "_image",
             )
         elif contrast < DIM:
-            yield Finding(
+            yield Advice(
                 "warning",
                 f"the {name} images show little: their grey values vary by {contrast:.1f} in the median",
                 "exposure and gain of the camera",
             )
 
 
-def _scans(seen: SensorReport) -> Iterator[Finding]:
+def _scans(seen: SensorReport) -> Iterator[Advice]:
     if seen.returns < FEW_RETURNS:
-        yield Finding(
+        yield Advice(
             "warning",
             f"scans have {seen.returns:.0f} returns in the median",
             "places take a few thousand: merge scans, or see min_intensity and max_height_m of the calibration",
         )
     if seen.intensity_max == 0:
-        yield Finding("warning", "all intensities are 0: the descriptor does without them", "a field named intensity")
+        yield Advice("warning", "all intensities are 0: the descriptor does without them", "a field named intensity")
 
 
-def _odometry_frame(seen: SensorReport) -> Iterator[Finding]:
+def _odometry_frame(seen: SensorReport) -> Iterator[Advice]:
     if seen.forward is None or abs(seen.forward[2]) < ACROSS or abs(seen.forward[2]) < np.abs(seen.forward[:2]).max():
         return
-    yield Finding(
+    yield Advice(
         "fault",
         "the odometry is not of the body: by its poses the way goes along the body's z axis, and z is up",
         "--odometry-frame camera, imu or lidar says whose poses the file holds (of the camera z looks ahead)",
     )
 
 
-def _clocks(seen: SensorReport) -> Iterator[Finding]:
+def _clocks(seen: SensorReport) -> Iterator[Advice]:
     lags = {name: one.lag_s for name, one in _known(seen).items()}
     if not lags or max(map(abs, lags.values())) < LAG_S:
         return
     if len(lags) == 2 and abs(lags["lidar"] - lags["camera"]) < LAG_S:
-        what = f"the odometry's clock is {-lags['lidar']:+.2f} s off those of camera and LiDAR"
-        yield Finding("fault", what, "correct its stamps: closures and scans are placed by it")
+        what = f"the odometry's clock is about {lags['lidar']:+.1f} s off those of camera and LiDAR"
+        yield Advice("fault", what, "correct its stamps: closures and scans are placed by it")
         return
     for name, lag in lags.items():
         if abs(lag) >= LAG_S:
-            cure = {"lidar": f"lidar_time_offset_s of the calibration: {lag:+.2f} s more", "camera": "its driver"}[name]
             sensor = {"lidar": "LiDAR", "camera": "camera"}[name]
-            yield Finding("fault", f"the {sensor}'s clock is {-lag:+.2f} s off the odometry's, by its motion", cure)
+            cure = "the stamps of its driver (PTP, or a constant): no parameter corrects them"
+            yield Advice(
+                "fault", f"the {sensor}'s clock is about {-lag:+.1f} s off the odometry's, by its motion", cure
+            )
 
 
-def _mountings(seen: SensorReport) -> Iterator[Finding]:
+def _mountings(seen: SensorReport) -> Iterator[Advice]:
     known = {name: one.mounting_deg for name, one in _known(seen).items() if one.mounting_deg is not None}
     off = {name: turn for name, turn in known.items() if np.linalg.norm(turn) > MOUNTING_DEG}
     if len(off) == 2 and np.linalg.norm(off["lidar"] - off["camera"]) < SAME_DEG:
-        yield Finding(
+        yield Advice(
             "fault",
             f"the odometry is not of the body frame: camera and LiDAR both say it is turned by {_turn(off['lidar'])}",
             "--odometry-frame camera, imu or lidar says whose poses the file holds; a topic must be of the body",
@@ -101,16 +103,16 @@ def _mountings(seen: SensorReport) -> Iterator[Finding]:
         return
     for name, turn in off.items():
         sensor = {"lidar": "LiDAR", "camera": "camera"}[name]
-        yield Finding(
+        yield Advice(
             "fault",
             f"the {sensor}'s mounting is off by {_turn(turn)}: so its motion says, held against the odometry's",
             f"body_T_{name} of the calibration",
         )
 
 
-def _baseline(seen: SensorReport) -> Iterator[Finding]:
+def _baseline(seen: SensorReport) -> Iterator[Advice]:
     if abs(seen.stereo_scale - 1) > SCALE:
-        yield Finding(
+        yield Advice(
             "fault",
             f"stereo sees everything {seen.stereo_scale:.2f} times as far as the LiDAR: the baseline is wrong by that "
             "factor",

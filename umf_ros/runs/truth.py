@@ -58,7 +58,7 @@ class JudgedRun:
         ate_optimized_m: error of the optimised trajectory, or None.
         any_heading: keyframes that were near an earlier place again, and those of them with a true closure.
         covered: keyframes whose pose the truth knows, and keyframes in all.
-        missed: stamps of keyframes that saw a place again and have no true closure.
+        missed: stamps of keyframes that saw a place again and have no closure.
     """
 
     closures: list[JudgedClosure] = field(default_factory=list)
@@ -118,6 +118,7 @@ def judge_run(
     judged = _judge_closures(closures, truth)
     again = find_revisits(stamps, poses, travelled, rules, same_view=False)
     same_view = find_revisits(stamps, poses, travelled, rules, truth.has_orientation)
+    published = {closure.query_stamp_ns for closure in closures}
     true_queries = {one.closure.query_stamp_ns for one in judged if one.is_true}
     closed = np.isin(stamps[again], list(true_queries))
     return JudgedRun(
@@ -125,7 +126,7 @@ def judge_run(
         revisits=int(same_view.sum()),
         any_heading=(int(again.sum()), int(closed.sum())),
         covered=(len(stamps), len(rows)),
-        missed=[int(stamp) for stamp in stamps[same_view] if stamp not in true_queries],
+        missed=[int(stamp) for stamp in stamps[same_view] if stamp not in published],
         ate_odometry_m=trajectory_error(odometry, truth),
         ate_optimized_m=trajectory_error(optimized, truth),
     )

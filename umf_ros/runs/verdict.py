@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from umf_ros.pose_graph.closures import State
-from umf_ros.runs.findings import PENDING, Judgement
-from umf_ros.runs.inputs import Finding
+from umf_ros.runs.findings import PENDING, ExaminedRun
+from umf_ros.runs.inputs import Advice
 
 Mark = Literal["good", "warn", "bad"]
 USELESS = 3
@@ -23,7 +23,7 @@ class RunVerdict:
     exit_code: int = 0
 
 
-def conclude(about: Judgement, findings: list[Finding]) -> RunVerdict:
+def conclude(about: ExaminedRun, findings: list[Advice]) -> RunVerdict:
     """Green only when something was found, or when there was nothing to find."""
     sentence = ", ".join(filter(None, (_found(about), _used(about)))) + _errors(about) + "."
     warnings = [finding for finding in findings if finding.severity != "note"]
@@ -39,16 +39,16 @@ def conclude(about: Judgement, findings: list[Finding]) -> RunVerdict:
     return RunVerdict(sentence, "warn")
 
 
-def _found(about: Judgement) -> str:
+def _found(about: ExaminedRun) -> str:
     judged, count = about.judged, len(about.run.closures)
-    if about.run.truth is None or not judged.covered[0]:
+    if about.run.truth is None or (judged.covered[1] and not judged.covered[0]):
         reason = "there is no ground truth" if about.run.truth is None else "no ground truth of this time"
         return f"{count} loop closures; {reason} to judge them by"
     true = sum(one.is_true for one in judged.closures)
     return f"{true} true and {len(judged.closures) - true} false loop closures at {judged.revisits} revisits"
 
 
-def _used(about: Judgement) -> str:
+def _used(about: ExaminedRun) -> str:
     """What the graph made of them: pending is not rejected."""
     states = about.states()
     total = sum(states.values())
@@ -61,7 +61,7 @@ def _used(about: Judgement) -> str:
     return f"the graph used {used}" + (f" ({', '.join(rest)})" if rest else "")
 
 
-def _errors(about: Judgement) -> str:
+def _errors(about: ExaminedRun) -> str:
     before, after = about.judged.ate_odometry_m, about.judged.ate_optimized_m
     if before is None or after is None:
         return ""
@@ -69,4 +69,6 @@ def _errors(about: Judgement) -> str:
 
 
 def _capital(text: str) -> str:
+    if "_" in text.split(" ", 1)[0]:  # the name of a parameter
+        return text
     return text[:1].upper() + text[1:]
