@@ -23,6 +23,7 @@ COMMANDS = {
     "play": "umf_ros.lab.commands.play",
     "report": "umf_ros.lab.commands.report",
     "evaluate": "umf_ros.lab.commands.evaluate",
+    "why": "umf_ros.commands.why",
     "explain": "umf_ros.lab.commands.explain",
     "train": "umf_ros.lab.commands.train",
     "export": "umf_ros.lab.commands.export",

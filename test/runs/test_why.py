@@ -67,7 +67,7 @@ def test_without_a_truth_the_most_promising_candidate_is_explained(tmp_path: Pat
     turned = candidate(50, 10, "turned by 90 deg, more than 28", 0.3, probability=0.95)
     tested = [candidate(50, 30, NO_POSE, 0.9), turned]
     found = why(examined(tmp_path, candidates=tested), 50)
-    assert (found.gate, found.parameter) == ("objection", "verification.max_turn_deg")
+    assert (found.gate, found.parameter) == ("objection", "verification.max_turn_deg: a wider limit")
     assert why(examined(tmp_path, candidates=tested[:1]), 50).gate == "pose"
 
 

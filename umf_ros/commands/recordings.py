@@ -40,6 +40,20 @@ TruthPath = Annotated[Path | None, typer.Option("--ground-truth", help="Truth as
 RunsFolder = Annotated[Path, typer.Option("--out", help="Where results/<timestamp> goes.")]
 
 
+def check_files(bag: Path, *others: Path | None) -> None:
+    """Say what is not there before anything that takes time to import.
+
+    Raises:
+        BagError: there is no such recording.
+        ConfigError: one of the other files is not there.
+    """
+    if not bag.exists():
+        raise BagError(f"there is no recording {bag}")
+    for path in others:
+        if path is not None and not path.exists():
+            raise ConfigError(f"cannot read {path}: No such file or directory")
+
+
 def open_recording(
     bag: Path,
     config: Path | None = None,
@@ -62,13 +76,7 @@ def open_recording(
         BagError: it cannot be opened, or its data set is not known.
         ConfigError: the file cannot be read, or a name, type or value is wrong.
     """
-    for path, what in ((bag, "recording"), (config, "parameter file")):
-        if path is not None and not path.exists():  # before anything that takes time to import
-            raise (
-                BagError(f"there is no {what} {path}")
-                if path is bag
-                else ConfigError(f"cannot read {path}: no such file")
-            )
+    check_files(bag, config)
 
     from umf_ros.bags.presets import settings_for
     from umf_ros.bags.reader import open_bag

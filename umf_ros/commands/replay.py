@@ -17,6 +17,7 @@ from umf_ros.commands.recordings import (
     RunsFolder,
     TruthPath,
     WeightsPath,
+    check_files,
     check_odometry_options,
     open_frames,
     open_recording,
@@ -44,6 +45,7 @@ def command(
     Needs no ROS. Writes closures, trajectories, the pose graph and a report to a new folder.
     Ctrl-C ends the run early and keeps what was found. Ends with 3 where the inputs could give nothing.
     """
+    check_files(bag, config, odometry, ground_truth)
     odometry_frame = check_odometry_options(odometry, odometry_frame)
 
     from rich.console import Console

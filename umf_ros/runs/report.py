@@ -72,8 +72,8 @@ def finish_run(
     return verdict
 
 
-def judge(run: FinishedRun, bag: Bag | None = None) -> ExaminedRun:
-    """Hold the run against the truth, if there is one, and fill in the `ground_truth` of its summary.
+def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> ExaminedRun:
+    """Hold the run against the truth, if there is one, and fill in the `ground_truth` of its summary, to keep or not.
 
     Raises:
         UmfError: the truth covers nothing of a run that was judged before.
@@ -88,7 +88,8 @@ def judge(run: FinishedRun, bag: Bag | None = None) -> ExaminedRun:
                 "judged before, nothing was written"
             )
         run.summary["ground_truth"] = judged.summary() if covered or not total else None
-    write_summary(run.folder, run.summary)
+    if keep:
+        write_summary(run.folder, run.summary)
     places = TruePlaces(run)
     return ExaminedRun(run, judged, places, GateKeeper(run, places), bag)
 

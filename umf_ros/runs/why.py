@@ -165,7 +165,8 @@ class GateKeeper:
         if reason.startswith(BELOW):
             return self._probability(best)
         remedies = {"turned": "verification.max_turn_deg", "apart": "verification.max_shift_m"}
-        return "objection", reason, next((name for word, name in remedies.items() if word in reason), "")
+        limits = [name for word, name in remedies.items() if word in reason and "more than" in reason]
+        return "objection", reason, f"{limits[0]}: a wider limit" if limits else ""
 
     def _probability(self, best: TestedCandidate) -> tuple[Gate, str, str]:
         chosen, probability = self._run.settings.verification, best.probability or 0.0
