@@ -23,7 +23,7 @@ TRAINED_SCALE = 4095.0
 
 @dataclass(frozen=True, slots=True)
 class VoxelScan:
-    """A voxelised scan: a box 0..40 m ahead, 20 m to either side, 6 m up and down the body frame.
+    """A voxelised scan: a box 0..40 m ahead, 20 m to either side, 6 m up and down.
 
     Attributes:
         grid: (20, 20, 20, 48) float32 features of the voxels, folded two by two by two into the last axis
@@ -34,7 +34,7 @@ class VoxelScan:
         coarse_mask: (T,) bool, False for padding.
         fine_index: (V,) int64 flat indices of the occupied voxels, padded with 0.
         fine_mask: (V,) bool.
-        centroids: (V, 3) float32 mean of the points in each of those voxels, metres, body frame.
+        centroids: (V, 3) float32 mean of the points in each of those voxels, metres, in the frame of the points.
     """
 
     grid: NDArray[np.float32]
@@ -51,7 +51,7 @@ def voxelise(points: Points, intensity: Points | None, coarse_limit: int, fine_l
     When more cells are occupied than fit, those with most points are kept, ties by index.
 
     Args:
-        points: (N, 3) metres, body frame; rows that are not finite are ignored.
+        points: (N, 3) metres, upright on the ground, x ahead (`levelling.level`); rows that are not finite are ignored.
         intensity: (N,) in the sensor's unit, or None.
         coarse_limit: T, cells of the 10^3 grid.
         fine_limit: V, voxels of the 40^3 grid.

@@ -57,8 +57,6 @@ MIN_CELLS = 50  # by hand: cells below which a fit means nothing
 MIN_NEIGHBOURHOOD = 0.25  # by hand: weight of the occupied cells around one, of all, below which it has no relief
 
 # search over all headings
-UPRIGHT_CONES = np.radians([32.0, 24.0, 16.0, 12.0])  # measured: rights LiDARs tilted by 28 deg to 1 or 2
-MIN_UPRIGHT = 10  # by hand: normals of ground that a direction is worth
 SECTORS = 72  # of 5 deg, by hand
 MIN_SECTOR_SHARE = 1e-3  # by hand: of all points; fewer are strays
 AROUND_CELLS, AROUND_RADIUS, AROUND_SHIFT = 64, 26, 12  # geometry: 26 + 26 + 12 cells come round to themselves no more
@@ -72,6 +70,7 @@ SEARCHED_OVERLAP = 0.45  # by hand: a view of 70 deg is looked for within 38
 PEAKS = (3, 4)  # by hand: of relief alone, of relief and structure
 SETTLE_MEDIANS, SETTLE_M = 2.5, 0.05  # by hand: cells that a plane between two maps is fitted to lie so near to it
 MAX_SLOPE = 0.3  # by hand: of one map against the other, rad
+ALTERNATIVES = (2, 2)  # by hand: as PEAKS, at one heading
 SCOUTS, SCOUT_STEPS = 300, 5  # by hand: points and steps that draw a peak to the match
 SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells; geometry: a peak is off by less than a cell and half a heading
 TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain in the open
@@ -122,7 +121,7 @@ MIN_RESIDUAL_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanne
 
 # measurement: every test of a hypothesis
 NO_FIT_M = 0.3  # stands for the residual where nothing overlaps
-MIN_SURFACE_NOISE_M = 0.003  # synthetic scans have none
+MIN_SURFACE_NOISE_M = 0.01  # synthetic scans have less, and no scanner is better
 AGREEMENT_PIXELS = 0.04  # of the image's width, around the place where a feature should reappear; by hand
 AGREEMENT_ROWS = 0.1  # of the image's height: features are compared with their like: sky, horizon, foreground; by hand
 AGREEMENT_M = 1.0  # geometry: a voxel

@@ -11,13 +11,13 @@ import small_gicp
 from numpy.typing import NDArray
 
 from umf_ros.frames import Keyframe, Points
-from umf_ros.geometry import Array, invert, transform
+from umf_ros.geometry import Array, invert, make_pose, transform
+from umf_ros.levelling import upright
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import ElevationMap
 from umf_ros.verification.field_of_view import FieldOfView
 from umf_ros.verification.free_space import RangeImage
 from umf_ros.verification.surroundings import Surroundings
-from umf_ros.verification.upright import upright
 
 
 class PreparedScan:
@@ -30,7 +30,6 @@ class PreparedScan:
             points: (M, 3) m, body frame, thinned.
             body_T_lidar: where they were seen from; without it the origin.
         """
-        self._thinned = points
         self._lidar_T_body = np.eye(4) if body_T_lidar is None else invert(body_T_lidar)
         self.points: Array = points.astype(float)
         self._around: dict[float, Surroundings] = {}
@@ -42,8 +41,8 @@ class PreparedScan:
 
     @cached_property
     def elevation(self) -> ElevationMap:
-        """Heights and relief, for the search."""
-        return ElevationMap(self._thinned)
+        """Heights and relief, upright."""
+        return ElevationMap(self.upright_points)
 
     @cached_property
     def up(self) -> Array:
@@ -150,6 +149,20 @@ def _cloud_of(points: Array, tree: small_gicp.KdTree | None = None) -> small_gic
     cloud = small_gicp.PointCloud(points)
     small_gicp.estimate_normals_covariances(cloud, tree, const.NORMAL_NEIGHBOURS, 1)
     return cloud
+
+
+def levelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
+    """The pose `match_T_query` (4, 4) between the upright frames of two scans."""
+    to_match, from_query = make_pose(match.up, np.zeros(3)), make_pose(query.up.T, np.zeros(3))
+    found: Array = to_match @ pose @ from_query
+    return found
+
+
+def unlevelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
+    """The pose `match_T_query` (4, 4) that is this one between the upright frames of two scans."""
+    from_match, to_query = make_pose(match.up.T, np.zeros(3)), make_pose(query.up, np.zeros(3))
+    found: Array = from_match @ pose @ to_query
+    return found
 
 
 class ScanCache:
