@@ -159,8 +159,8 @@ class LoopClosureNode(BaseNode):
 
     def _reset(self, _: Any) -> str:
         with self._lock:
-            self._detector.reset()
-        return "all places forgotten"
+            self._detector.end_session()
+        return "a new session begins with the next frame; all places are kept (umf places deletes)"
 
     def _pause(self, request: Any) -> str:
         self._paused = request.data

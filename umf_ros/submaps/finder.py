@@ -72,8 +72,7 @@ class SubmapFinder:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was found lately, and every place that the database has forgotten."""
-        self._lookalikes.forget(self.trail.forget())
+        """Forget what was found lately; the places stay."""
         self._expectation = Expectation(self.trail, self._rules)
         self._memory = TemporalMemory()
         self._drift.reset()

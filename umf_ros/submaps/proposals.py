@@ -96,12 +96,6 @@ class Lookalikes:
             self._index.add(find_keypoints(submap.scan.elevation.relief))
             self._rows = np.append(self._rows, row)
 
-    def forget(self, kept: np.ndarray) -> None:
-        """Forget all stops but those of some rows, which get new ones in their order."""
-        known = np.isin(self._rows, kept)
-        self._index.keep(known)
-        self._rows = np.searchsorted(kept, self._rows[known])
-
     def propose(self, query: Submap) -> list[Proposal]:
         """The most alike, best first."""
         stops = [self._trail.stops[row] for row in self._rows]
