@@ -143,13 +143,18 @@ class LoopDetector:
             self.database.add(keyframe)
         self._submaps.remember(keyframe)
 
-    def resume(self, frame: Frame) -> None:
-        """Take note of a frame that an earlier run over the same store has dealt with: nothing is looked for."""
+    def resume(self, frame: Frame) -> bool:
+        """Take note of a frame that an earlier run over the same store has dealt with: nothing is looked for.
+
+        Returns:
+            Whether it had become a keyframe.
+        """
         if not self.select(frame):
-            return
+            return False
         known = self.database.newest_at(frame.stamp_ns)
         if known is not None:
             self._submaps.remember(self._go_on_from(frame, known))
+        return True
 
     def end_session(self) -> None:
         """End the session: the next frame begins a new one; every place is kept."""

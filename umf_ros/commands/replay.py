@@ -24,6 +24,9 @@ from umf_ros.commands.recordings import (
 MinProbability = Annotated[
     float | None, typer.Option("--min-probability", min=0, max=1, help="Publish closures from here on.")
 ]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Go on with the newest replay of this recording in --out that was cut off.")
+]
 
 
 def command(
@@ -37,11 +40,12 @@ def command(
     odometry_frame: OdometryFrame = "body",
     ground_truth: TruthPath = None,
     min_probability: MinProbability = None,
+    resume: Resume = False,
 ) -> None:
     """Find loop closures in a recording as fast as the machine goes.
 
     Needs no ROS. Writes closures, trajectories, the pose graph and a report to a new folder.
-    Ctrl-C ends the run early and keeps what was found.
+    Ctrl-C ends the run early and keeps what was found; --resume goes on from there, or after a crash.
     """
     from rich.console import Console
 
@@ -49,9 +53,9 @@ def command(
     from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
     from umf_ros.loop_detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
-    from umf_ros.runs.folder import create_run_folder
     from umf_ros.runs.recorder import count_drops
     from umf_ros.runs.report import finish_run
+    from umf_ros.runs.resumption import ReplayFolder
 
     console = Console()
     recording, settings = open_recording(
@@ -60,17 +64,22 @@ def command(
     reader = open_frames(recording, settings, console, odometry, odometry_frame)
     if ground_truth is not None:
         read_ground_truth(recording, ground_truth)  # what is wrong with it is said now, not after the run
-    detector = LoopDetector(settings, make_detector_embedder(settings))
-    folder = create_run_folder(out)
-    replay = Replay(folder, settings, detector)
+    network = make_detector_embedder(settings)
+    # a store that cannot be used is told before there is a folder
+    detector = LoopDetector(settings, network) if settings.database.path else None
+    folder = (ReplayFolder.resume if resume else ReplayFolder.create)(out, bag, settings)
+    detector = detector or LoopDetector(folder.working_settings, network)
+    replay = Replay(folder.path, settings, detector, folder.resumed)
     with stop_on_interrupt() as interrupted, FrameProgress(console) as progress:
         for detection in replay.run(reader.stream()):
             progress.show(reader.progress, detection)
             if interrupted():
                 break
     if interrupted():
-        console.print("[yellow]Interrupted: the results cover what was done so far.")
+        console.print("[yellow]Interrupted: the results cover what was done so far; --resume goes on from here.")
     with undisturbed():
         if not replay.finish(count_drops(reader.counters)):
             console.print("No odometry: closures only, the pose graph is skipped (--odometry FILE.tum supplies it).")
-        finish_run(folder, recording, console, ground_truth)
+        if not interrupted():
+            folder.finish()
+        finish_run(folder.path, recording, console, ground_truth)
