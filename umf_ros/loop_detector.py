@@ -74,6 +74,12 @@ class LoopDetector:
         self._ahead_m = 0.0
         self._depth_told = False
 
+    def retune(self, settings: Settings) -> None:
+        """Search and verify by other settings from the next frame on."""
+        self._rules = settings.loop
+        self._verifier.retune(settings.verification)
+        self._submaps.retune(settings.verification, settings.loop)
+
     @property
     def embedder_name(self) -> str:
         """Name of the network."""

@@ -17,7 +17,7 @@ from safetensors import SafetensorError
 
 from umf_ros.errors import UmfError, writing
 from umf_ros.frames import Keyframe
-from umf_ros.places.lock import FileLock
+from umf_ros.locks import FileLock
 from umf_ros.places.packing import pack, unpack
 
 SCHEMA_VERSION = 3

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from umf_ros.errors import UmfError
-from umf_ros.places.lock import FileLock
+from umf_ros.locks import FileLock
 
 
 @dataclass(frozen=True, slots=True)
