@@ -30,6 +30,7 @@ COMMANDS = {
     "doctor": "umf_ros.commands.doctor",
     "pretrain": "umf_ros.lab.commands.pretrain",
     "graph": "umf_ros.lab.commands.graph",
+    "places": "umf_ros.commands.places",
 }
 """The module of every subcommand, by name: those of the lab are known here by their names alone."""
 

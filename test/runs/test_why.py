@@ -8,10 +8,17 @@ import numpy as np
 from finished_runs import BELOW, candidate, closure, examined, stamp, trajectory
 
 from umf_ros.config import load_settings
+from umf_ros.runs.descriptors import DescriptorFile
 from umf_ros.runs.findings import ExaminedRun
-from umf_ros.runs.recorder import DESCRIPTORS
 from umf_ros.runs.why import Why
 from umf_ros.verification.verifier import NO_POSE, UNTESTED
+
+
+def write_descriptors(folder: Path, descriptors: np.ndarray) -> None:
+    file = DescriptorFile(folder)
+    for number, descriptor in enumerate(descriptors):
+        file.append(stamp(2 * number), descriptor)
+    file.close()
 
 
 def why(about: ExaminedRun, second: float) -> Why:
@@ -32,7 +39,7 @@ def test_a_place_that_was_not_returned_comes_with_its_rank(tmp_path: Path) -> No
     descriptors[:20, 0], descriptors[:20, 1] = np.linspace(0.9, 0.5, 20), 0.3
     descriptors[5, 0] = 0.7  # the place of 50 s, seen at 10 s
     descriptors[[4, 6, 3, 7, 2, 8, 1, 9, 0, 10], 0] = 0.2  # what else is within 12 m
-    (tmp_path / DESCRIPTORS).write_bytes(descriptors.tobytes())
+    write_descriptors(tmp_path, descriptors)
     about = examined(tmp_path, candidates=[candidate(50, 30, "probability 0.1 is below 0.9")], truth=trajectory())
     found = why(about, 50)
     assert found.gate == "retrieval" and found.match_stamp_ns == stamp(10) and found.distance_m == 0
@@ -80,6 +87,6 @@ def test_candidates_below_the_least_similarity_name_that_parameter(tmp_path: Pat
     settings = load_settings(None, loop__min_similarity=0.9)
     descriptors = np.zeros((40, 4), "<f2")
     descriptors[:, 0] = 0.5
-    (tmp_path / DESCRIPTORS).write_bytes(descriptors.tobytes())
+    write_descriptors(tmp_path, descriptors)
     found = why(examined(tmp_path, truth=trajectory(), settings=settings), 50)
     assert found.parameter == "loop.min_similarity: 0.25 (now 0.9)"

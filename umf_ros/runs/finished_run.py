@@ -15,7 +15,8 @@ from umf_ros.config import Settings, load_settings
 from umf_ros.errors import UmfError
 from umf_ros.frames import LoopClosure, Points
 from umf_ros.runs import tables
-from umf_ros.runs.recorder import read_descriptors, read_summary, write_summary
+from umf_ros.runs.descriptors import read_descriptors
+from umf_ros.runs.recorder import read_summary, write_summary
 from umf_ros.trajectory import Trajectory
 
 CLOCK_SLACK_NS = 5_000_000_000
@@ -57,7 +58,7 @@ class FinishedRun:
     @cached_property
     def descriptors(self) -> Points | None:
         """(N, D) of the keyframes; None where an older version wrote none."""
-        return read_descriptors(self.folder, len(self.keyframes))
+        return read_descriptors(self.folder, [row.stamp_ns for row in self.keyframes])
 
     @cached_property
     def latencies_ms(self) -> dict[int, float]:

@@ -6,6 +6,7 @@ import csv
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
@@ -25,6 +26,8 @@ COVARIANCE = "covariance"
 CLOSURES = ["query_stamp_ns", "match_stamp_ns", *POSE, *SIGMA, "probability", "similarity", COVARIANCE]
 CANDIDATES = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "numbers"]
 KEYFRAMES = ["stamp_ns", "session", "travelled_m"]
+STAGES = ("embed", "query", "verify", "submaps", "total")
+LATENCIES = ["stamp_ns", *STAGES]
 _KEYFRAME = tuple(zip((int, int, float), KEYFRAMES, strict=True))
 INLIERS = ["query_stamp_ns", "match_stamp_ns", "query_u", "query_v", "match_u", "match_v"]
 Row = TypeVar("Row")
@@ -88,14 +91,29 @@ class KeyframeRow:
 
 
 class CsvTable:
-    """A CSV file with a header, flushed after every block of rows."""
+    """A CSV file with a header, flushed after every block of rows.
 
-    def __init__(self, path: Path, columns: list[str]) -> None:
-        with writing(path):
-            self._file: TextIO = path.open("w", newline="", encoding="utf-8")
+    Rows that are there already stay, less the last line where it was not finished; a table of other columns, as of an
+    older version, gets out of the way by its name.
+
+    Args:
+        path: the file.
+        columns: its columns.
+        keep: which of the rows that are there stay; None: all.
+
+    Attributes:
+        rows: those that were there, as text by column.
+    """
+
+    def __init__(self, path: Path, columns: list[str], keep: Callable[[dict[str, str]], bool] | None = None) -> None:
         self._path = path
+        with writing(path):
+            self.rows = _taken_up(path, columns, keep)
+            fresh = not path.exists()
+            self._file: TextIO = path.open("a", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file)
-        self.append([columns])
+        if fresh:
+            self.append([columns])
 
     def append(self, rows: list[Any]) -> None:
         """Write rows and hand them to the operating system."""
@@ -105,7 +123,28 @@ class CsvTable:
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        with writing(self._path):
+            self._file.close()
+
+
+def _taken_up(path: Path, columns: list[str], keep: Callable[[dict[str, str]], bool] | None) -> list[dict[str, str]]:
+    """The rows of a table that an earlier run left; nothing but them and the header is in the file then."""
+    if not path.exists():
+        return []
+    with path.open("rb") as file:
+        lines = file.read().decode("utf-8", "replace").splitlines(keepends=True)
+    whole = [line for line in lines if line.endswith("\n") and "\0" not in line]
+    if not whole or next(csv.reader(whole[:1])) != columns:
+        older = next(name for i in count(1) if not (name := path.with_suffix(f".{i}{path.suffix}")).exists())
+        path.rename(older)
+        return []
+    table = [(line, dict(zip(columns, row, strict=False))) for line, row in zip(whole, csv.reader(whole), strict=True)]
+    kept = table[:1] + [(line, row) for line, row in table[1:] if len(row) == len(columns) and (not keep or keep(row))]
+    if len(kept) != len(lines):
+        part = path.with_name(path.name + ".part")
+        part.write_text("".join(line for line, _ in kept), encoding="utf-8", newline="")
+        part.replace(path)
+    return [row for _, row in kept[1:]]
 
 
 def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:
@@ -209,10 +248,11 @@ def read_closures(path: Path) -> list[LoopClosure]:
     Raises:
         UmfError: the file cannot be read; names the line that is damaged.
     """
-    return read_table(path, _closure)
+    return read_table(path, parse_closure)
 
 
-def _closure(row: dict[str, str]) -> LoopClosure:
+def parse_closure(row: dict[str, str]) -> LoopClosure:
+    """The closure in a row of `closures.csv`."""
     numbers = [float(row[name]) for name in CLOSURES[2:16]]
     return LoopClosure(
         query_stamp_ns=int(row["query_stamp_ns"]),
