@@ -84,7 +84,7 @@ def main(
     model, results = fit([example for survey in surveyed for example in examine(*survey)] + elsewhere)
     for name, value in results.items():
         console.print(f"{name:32} {value:.4g}")
-    save_acceptance(model, out, f"python benchmarks/fit_verification.py --worlds {count}", results)
+    save_acceptance(model, out, {SCAN: f"python benchmarks/fit_verification.py --worlds {count}"}, results)
     console.print(f"wrote {out}")
 
 
