@@ -24,7 +24,8 @@ class Process:
     """A node that runs while a test does."""
 
     def __init__(self, module: str, log: Path, *parameters: str, command: list[str] | None = None) -> None:
-        arguments = ["--ros-args", *(word for parameter in parameters for word in ("-p", parameter))]
+        flags = [("-r" if parameter.startswith("__") else "-p", parameter) for parameter in parameters]
+        arguments = ["--ros-args", *(word for flag in flags for word in flag)]
         self._log = log
         self._file = log.open("w")
         self._process = subprocess.Popen(

@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -146,18 +147,59 @@ def test_a_standing_rover_makes_no_keyframes(frames: list[Frame]) -> None:
     assert [found.process(frame).keyframe is not None for frame in still] == [True] + [False] * 19
 
 
-def test_a_clock_that_jumps_back_forgets_the_future(frames: list[Frame]) -> None:
+def test_a_clock_that_jumps_back_deletes_nothing(frames: list[Frame]) -> None:
     found = detector()
-    for frame in frames[:30]:
+    for frame in frames[10:40]:
         found.process(frame)
-    assert len(found.database) == 30
-    restarted = found.process(replace(frames[10], session=1))
-    assert len(found.database) == 11
-    # what the first session knew of the time before is another session's, near along the path or not
-    assert restarted.keyframe is not None and restarted.keyframe.session == 1
-    assert not restarted.verdicts
-    later = replace(frames[len(frames) - 1], session=1)
-    assert len(found.process(later).verdicts) > 2
+    stray = found.process(replace(frames[2], session=1)).keyframe
+    assert stray is not None and stray.session == 1
+    later = found.process(replace(frames[59], session=1))
+    assert later.keyframe is not None and later.keyframe.session == 1
+    assert {verdict.candidate.stamp_ns for verdict in later.verdicts} >= {frames[20].stamp_ns}
+    assert [found.database[row].stamp_ns for row in range(30)] == [frame.stamp_ns for frame in frames[10:40]]
+
+
+def pairs(detections: list[Detection]) -> set[tuple[int, int]]:
+    return {(c.match_stamp_ns, c.query_stamp_ns) for detection in detections for c in detection.closures}
+
+
+def test_a_recording_replayed_over_one_store_adds_nothing_and_closes_the_same_loops(
+    frames: list[Frame], detections: list[Detection], tmp_path: Path
+) -> None:
+    for _ in range(3):
+        found = detector(load_settings(database__path=str(tmp_path / "map.sqlite")))
+        again = [found.process(frame) for frame in frames]
+        assert len(found.database) == len(frames) and pairs(again) == pairs(detections)
+        found.database.close()
+
+
+def test_a_recording_that_loops_adds_nothing(frames: list[Frame], detections: list[Detection]) -> None:
+    found = detector()
+    for lap in range(3):
+        again = [found.process(replace(frame, session=lap)) for frame in frames]
+        assert len(found.database) == len(frames)
+        assert {one.keyframe.session for one in again if one.keyframe} == {0}
+        assert pairs(again) <= pairs(detections) and len(pairs(again)) >= 0.9 * len(pairs(detections))
+
+
+def test_a_drive_that_was_interrupted_goes_on_in_its_session(
+    frames: list[Frame], detections: list[Detection], tmp_path: Path
+) -> None:
+    settings = load_settings(database__path=str(tmp_path / "map.sqlite"))
+    first = detector(settings)
+    for frame in frames[:35]:
+        first.process(frame)
+    first.database.close()
+    second = detector(settings)
+    for frame in frames[:30]:
+        second.resume(frame)
+    rest = [second.process(frame) for frame in frames[30:]]
+    assert len(second.database) == len(frames)
+    last, before = rest[-1].keyframe, detections[-1].keyframe
+    assert last is not None and before is not None
+    assert (last.session, last.travelled_m) == (before.session, pytest.approx(before.travelled_m))
+    for one, other in zip(rest, detections[30:], strict=True):
+        assert [c.match_stamp_ns for c in one.closures] == [c.match_stamp_ns for c in other.closures]
 
 
 def test_a_full_disk_costs_the_memory_and_not_the_closures(
@@ -177,13 +219,14 @@ def test_a_full_disk_costs_the_memory_and_not_the_closures(
     assert len(now.closures) == len(before.closures) > 0 and str(now.fault) == "no space left on device"
 
 
-def test_reset_forgets_everything(frames: list[Frame]) -> None:
+def test_a_session_that_is_ended_keeps_its_places(frames: list[Frame]) -> None:
     found = detector()
     for frame in frames[:5]:
         found.process(frame)
-    found.reset()
-    assert len(found.database) == 0
-    assert found.process(frames[6]).verdicts == []
+    found.end_session()
+    later = found.process(frames[6]).keyframe
+    assert later is not None and (later.session, later.travelled_m) == (1, 0.0)
+    assert len(found.database) == 6
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from recordings import small_settings, traverse, write_mcap
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_tum
-from umf_ros.config import Settings, load_settings
+from umf_ros.config import Database, Settings, load_settings
 from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.errors import OutputError
 from umf_ros.frames import Frame
@@ -23,7 +23,8 @@ from umf_ros.places.database import PlaceDatabase
 from umf_ros.replay import Replay
 from umf_ros.sensors.messages import OdometrySample
 
-TABLES = ["candidates.csv", "closures.csv", "config.yaml", "inliers.csv", "keyframes.csv", "summary.json"]
+TABLES = "candidates.csv closures.csv config.yaml descriptors.f16 inliers.csv keyframes.csv".split()
+TABLES += ["latencies.csv", "summary.json"]
 GRAPH = ["graph.g2o", "graph_verdicts.csv", "trajectory_odometry.tum", "trajectory_optimized.tum"]
 
 
@@ -136,14 +137,41 @@ def test_odometry_that_jumps_begins_a_chain_of_its_own_as_it_does_live(
     assert len(vertices) - len(edges) == 2
 
 
-def test_a_recording_that_starts_over_is_another_session(folder: Path, settings: Settings, stream: Stream) -> None:
+def test_a_recording_that_starts_over_is_written_down_once(folder: Path, settings: Settings, stream: Stream) -> None:
     replay = replay_of(folder, settings)
     again = [replace(item, session=1) if isinstance(item, Frame) else item for item in stream]
     list(replay.run([*stream, *again]))
     assert replay.finish({}) is True
-    rows = keyframes_in(folder)
-    first, second = ([row["stamp_ns"] for row in rows if row["session"] == session] for session in ("0", "1"))
-    assert first == second and len(first) > 3
+    stamps = [row["stamp_ns"] for row in keyframes_in(folder)]
+    assert len(stamps) == len(set(stamps)) > 3
+    assert {row["session"] for row in keyframes_in(folder)} == {"0"}
+
+
+@pytest.mark.parametrize("frames_done", [1, 8, 15, 19])
+def test_a_replay_that_was_cut_off_ends_like_one_that_was_not(
+    tmp_path: Path, settings: Settings, stream: Stream, frames_done: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("umf_ros.replay.WARM_UP", 2)
+    settings = settings.model_copy(update={"database": Database(path=str(tmp_path / "places.sqlite"))})
+    for name in ("whole", "cut"):
+        (tmp_path / name).mkdir()
+    cut = replay_of(tmp_path / "cut", settings)
+    for count, _ in enumerate(cut.run(stream), 1):
+        if count == frames_done:
+            break
+    cut._detector.database.close()  # the lock goes with the process, and nothing else is left of it
+    resumed = Replay(tmp_path / "cut", settings, LoopDetector(settings, ThumbnailEmbedder()), resume=True)
+    list(resumed.run(stream))
+    resumed.finish({})
+    settings = settings.model_copy(update={"database": Database()})
+    replay = replay_of(tmp_path / "whole", settings)
+    list(replay.run(stream))
+    replay.finish({})
+    for table in [name for name in TABLES + GRAPH if name.endswith((".csv", ".tum", ".g2o"))]:
+        assert (tmp_path / "cut" / table).read_text() == (tmp_path / "whole" / table).read_text(), table
+    counts = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("cut", "whole")]
+    for key in ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected"):
+        assert counts[0][key] == counts[1][key], key
 
 
 def test_a_run_of_no_frames_is_a_run(folder: Path, settings: Settings) -> None:
@@ -159,7 +187,7 @@ def test_the_same_frames_give_the_same_tables(tmp_path: Path, settings: Settings
         replay = replay_of(tmp_path / name, settings)
         list(replay.run(stream))
         replay.finish({})
-    for table in [name for name in TABLES + GRAPH if name != "summary.json"]:
+    for table in set(TABLES + GRAPH) - {"summary.json", "latencies.csv"}:
         assert (tmp_path / "one" / table).read_bytes() == (tmp_path / "two" / table).read_bytes(), table
 
 
@@ -185,16 +213,17 @@ def test_places_are_kept_from_run_to_run_when_a_file_is_named(tmp_path: Path, st
     assert np.isfinite(float(keyframes_in(tmp_path / "second")[-1]["travelled_m"]))
 
 
-def test_a_recording_played_twice_finds_no_keyframe_again_in_itself(tmp_path: Path, stream: Stream) -> None:
+def test_a_recording_replayed_over_one_store_tests_the_same_pairs(tmp_path: Path, stream: Stream) -> None:
     database = {"path": str(tmp_path / "places.sqlite")}
-    settings = small_settings(tmp_path, database=database, loop__min_time_gap_s=1.0)
-    for name in ("first", "second"):
+    settings = small_settings(tmp_path, database=database, loop__min_time_gap_s=1.0, loop__min_travel_m=0.3)
+    tested = []
+    for name in ("first", "second", "third"):
         (tmp_path / name).mkdir()
         replay = replay_of(tmp_path / name, settings)
-        verdicts = [(d.frame_stamp_ns, v.candidate.stamp_ns) for d in replay.run(stream) for v in d.verdicts]
+        tested.append([(d.frame_stamp_ns, v.candidate.stamp_ns) for d in replay.run(stream) for v in d.verdicts])
         replay.finish({})
-        assert all(query - match >= 10**9 for query, match in verdicts)
-    assert verdicts
+    assert tested[0] and tested[0] == tested[1] == tested[2]
+    assert all(query - match >= 10**9 for query, match in tested[0])
 
 
 def test_a_full_disk_ends_the_replay_after_what_was_found_is_kept(

@@ -23,6 +23,7 @@ COMMANDS = {
     "play": "umf_ros.lab.commands.play",
     "report": "umf_ros.lab.commands.report",
     "evaluate": "umf_ros.lab.commands.evaluate",
+    "why": "umf_ros.commands.why",
     "explain": "umf_ros.lab.commands.explain",
     "train": "umf_ros.lab.commands.train",
     "adapt": "umf_ros.lab.commands.adapt",
@@ -30,6 +31,7 @@ COMMANDS = {
     "doctor": "umf_ros.commands.doctor",
     "pretrain": "umf_ros.lab.commands.pretrain",
     "graph": "umf_ros.lab.commands.graph",
+    "places": "umf_ros.commands.places",
 }
 """The module of every subcommand, by name: those of the lab are known here by their names alone."""
 

@@ -182,8 +182,13 @@ class Frames(Group):
     """Names of the coordinate frames (REP-105)."""
 
     map: str = Field("map", description="map frame")
-    odom: str = Field("odom", description="odometry frame")
-    base: str = Field("base_link", description="body frame")
+    odom: str = Field("odom", description="odometry frame, where the odometry's messages name none")
+    base: str = Field("base_link", description="body frame: what calibration, transforms and closures are about")
+    extrinsics: Literal["tf", "calibration"] = Field(
+        "tf",
+        description="where camera and LiDAR are on the body: /tf_static, as far as it says so, or the file alone; "
+        "a data set that is named keeps its own",
+    )
     publish_tf: bool = Field(False, description="publish map -> odom on /tf when tf2_ros is installed")
 
 
@@ -327,7 +332,7 @@ def _node_parameters(content: dict[str, Any], path: str | Path) -> dict[str, Any
     return nest(flat)
 
 
-NODE_ONLY = frozenset({"use_sim_time", "results_dir"})
+NODE_ONLY = frozenset({"use_sim_time", "results_dir", "autostart"})
 
 
 def problems(error: ValidationError) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -68,9 +69,16 @@ class LoopDetector:
         self._verifier = Verifier(settings.verification)
         self.database = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
-        self._first_session = self.database.next_session
-        self._session = 0
+        self._session: int | None = None
+        self._stored_session = self.database.next_session
+        self._ahead_m = 0.0
         self._depth_told = False
+
+    def retune(self, settings: Settings) -> None:
+        """Search and verify by other settings from the next frame on."""
+        self._rules = settings.loop
+        self._verifier.retune(settings.verification)
+        self._submaps.retune(settings.verification, settings.loop)
 
     @property
     def embedder_name(self) -> str:
@@ -84,6 +92,9 @@ class LoopDetector:
         latency = Stopwatch()
         with latency.measure("embed"):
             keyframe = self.embed(frame)
+        known = self.database.recognise(keyframe)
+        if known is not None:
+            keyframe = self._go_on_from(frame, known)
         with latency.measure("query"):
             candidates = self.query(keyframe)
         with latency.measure("verify"):
@@ -92,7 +103,7 @@ class LoopDetector:
             verdicts = self.look_around(keyframe, verdicts)
         fault = None
         try:
-            self.remember(keyframe)
+            self.remember(keyframe, known is not None)
         except OutputError as error:
             fault = error
         return Detection(frame.stamp_ns, keyframe, verdicts, latency.milliseconds, fault)
@@ -105,7 +116,8 @@ class LoopDetector:
 
     def embed(self, frame: Frame) -> Keyframe:
         """The keyframe that the frame selected last becomes."""
-        return make_keyframe(frame, self._embedder, self._selector.travelled_m(frame), self._first_session)
+        travelled_m = self._selector.travelled_m(frame) + self._ahead_m
+        return make_keyframe(frame, self._embedder, travelled_m, self._stored_session)
 
     def query(self, keyframe: Keyframe) -> list[Candidate]:
         """Remembered places that look like a keyframe, best first."""
@@ -127,21 +139,32 @@ class LoopDetector:
         found = self._submaps.find(keyframe, accepted)
         return sorted(verdicts + found, key=lambda verdict: verdict.closure is None)
 
-    def remember(self, keyframe: Keyframe) -> None:
-        """Make a keyframe a place that later ones may find.
+    def remember(self, keyframe: Keyframe, stored: bool = False) -> None:
+        """Make a keyframe, unless it is stored already, a place that later ones may find.
 
         Raises:
             OutputError: the disk is full.
         """
-        self.database.add(keyframe)
+        if not stored:
+            self.database.add(keyframe)
         self._submaps.remember(keyframe)
 
-    def reset(self) -> None:
-        """Forget all places."""
-        self.database.forget_from(-(2**62))
-        self._selector.reset()
-        self._verifier.reset()
-        self._submaps.reset()
+    def resume(self, frame: Frame) -> bool:
+        """Take note of a frame that an earlier run over the same store has dealt with: nothing is looked for.
+
+        Returns:
+            Whether it had become a keyframe.
+        """
+        if not self.select(frame):
+            return False
+        known = self.database.newest_at(frame.stamp_ns)
+        if known is not None:
+            self._submaps.remember(self._go_on_from(frame, known))
+        return True
+
+    def end_session(self) -> None:
+        """End the session: the next frame begins a new one; every place is kept."""
+        self._session = None
 
     def _tell_depthless(self, verdicts: Sequence[Verdict]) -> None:
         """Say, once, why nothing becomes metric: one camera without a LiDAR recognises places, no more."""
@@ -150,25 +173,32 @@ class LoopDetector:
             logger.warning("%s: %s", NOTHING_METRIC, NO_DEPTH)
 
     def _start_session(self, frame: Frame) -> None:
-        """A new way begins; where the clock was set back, what was recorded from here on lies in the future now."""
+        """A new way begins; where the clock was set back, what was stored later than now waits for its time."""
         self._session = frame.session
-        forgotten = self.database.forget_from(frame.stamp_ns, self._first_session)
-        logger.warning("a new session begins, %d places are forgotten", forgotten)
+        self._stored_session, self._ahead_m = self.database.next_session, 0.0
+        if len(self.database):
+            logger.warning("a new session begins; the %d places known so far are kept", len(self.database))
         self._selector.reset()
         self._verifier.reset()
         self._submaps.reset()
 
+    def _go_on_from(self, frame: Frame, known: int) -> Keyframe:
+        """The stored keyframe that a frame became before; what follows belongs to its session, and to its way."""
+        keyframe = self.database[known]
+        self._stored_session = keyframe.session
+        ahead_m = keyframe.travelled_m - self._selector.travelled_m(frame)
+        self._ahead_m = 0.0 if math.isnan(ahead_m) else ahead_m
+        return keyframe
 
-def make_keyframe(
-    frame: Frame, embedder: Embedder, travelled_m: float = float("nan"), first_session: int = 0
-) -> Keyframe:
+
+def make_keyframe(frame: Frame, embedder: Embedder, travelled_m: float = float("nan"), session: int = 0) -> Keyframe:
     """The keyframe that a frame becomes: embedded, its features lifted to 3-D, its scan thinned.
 
     Args:
         frame: synchronised measurements.
         embedder: the network.
         travelled_m: metres driven since the start of the session, NaN when unknown.
-        first_session: number of the session that the frame counts as 0.
+        session: number of the session among all that are stored.
     """
     points, motion = thin_frame(frame)
     return Keyframe(
@@ -179,7 +209,7 @@ def make_keyframe(
         points=points,
         odom_T_body=frame.odom_T_body,
         travelled_m=travelled_m,
-        session=first_session + frame.session,
+        session=session,
         body_T_lidar=frame.body_T_lidar,
         motion=motion,
     )

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from umf_ros.config import Settings
-from umf_ros.frames import Frame
+from umf_ros.frames import Frame, LoopClosure
 from umf_ros.loop_detector import Detection, LoopDetector
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.runs.recorder import RunRecorder
 from umf_ros.sensors.messages import OdometrySample
 from umf_ros.sensors.odometry_feed import OdometryFeed
+
+WARM_UP = 12
+"""So many of the last keyframes before an interruption are looked at again: twice what verification remembers."""
 
 
 class Replay:
@@ -22,16 +26,21 @@ class Replay:
     Args:
         folder: run folder.
         settings: all settings.
-        detector: made with these settings.
+        detector: made with these settings, or over the store of the run that is resumed.
+        resume: go on where an earlier replay of the same recording into this folder was cut off.
     """
 
-    def __init__(self, folder: Path, settings: Settings, detector: LoopDetector) -> None:
+    def __init__(self, folder: Path, settings: Settings, detector: LoopDetector, resume: bool = False) -> None:
         self._folder = folder
         self._detector = detector
         self._graph = PoseGraph(settings.pose_graph)
-        self._recorder = RunRecorder(folder, settings, detector.embedder_name)
+        self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometryFeed(self._graph)
         self._has_odometry = False
+        self._done = len(self._recorder.recorded) if resume else 0
+        self._earlier: dict[int, list[LoopClosure]] = defaultdict(list)
+        for closure in self._recorder.earlier_closures() if resume else ():
+            self._earlier[closure.query_stamp_ns].append(closure)
 
     def run(self, stream: Iterable[Frame | OdometrySample]) -> Iterator[Detection]:
         """Process a recording's stream, yielding what became of each frame; stop iterating to stop the run.
@@ -44,13 +53,32 @@ class Replay:
                 self._has_odometry = True
                 self._feed.take(item.stamp_ns, item.odom_T_body)
                 continue
+            if self._done > WARM_UP:
+                yield self._pass_over(item)
+                continue
             detection = self._detector.process(item)
+            if detection.keyframe is not None and self._done:
+                self._done -= 1
             self._recorder.record(item, detection)
             for closure in detection.closures:
                 self._graph.add_closure(closure)
             yield detection
             if detection.fault is not None:
                 raise detection.fault
+
+    def graph_counts(self) -> dict[str, int]:
+        """How many closures the graph has in which state so far; none without odometry."""
+        counts = self._graph.verdict_counts() if self._has_odometry else {}
+        return {state.value: count for state, count in counts.items()}
+
+    def _pass_over(self, frame: Frame) -> Detection:
+        """Take note of a frame that was dealt with before, and of its closures."""
+        self._recorder.count(frame)
+        if self._detector.resume(frame):
+            self._done -= 1
+            for closure in self._earlier.get(frame.stamp_ns, ()):
+                self._graph.add_closure(closure)
+        return Detection(frame.stamp_ns)
 
     def finish(self, drops: Mapping[str, int]) -> bool:
         """Write the summary, and trajectories and graph where there was odometry; returns whether there was."""

@@ -200,9 +200,9 @@ def test_markers_keep_the_latest_lines_only(talk: Talk) -> None:
 @pytest.mark.parametrize(
     ("topic", "durability"),
     [
-        ("/loop_closures", QoSDurabilityPolicy.VOLATILE),
+        ("/loop_closures", QoSDurabilityPolicy.TRANSIENT_LOCAL),
         ("/front_end/candidates", QoSDurabilityPolicy.VOLATILE),
-        ("/front_end/keyframes", QoSDurabilityPolicy.VOLATILE),
+        ("/front_end/keyframes", QoSDurabilityPolicy.TRANSIENT_LOCAL),
         ("/front_end/markers", QoSDurabilityPolicy.TRANSIENT_LOCAL),
     ],
 )
@@ -230,3 +230,12 @@ def test_a_best_effort_listener_hears_closures_too(talk: Talk) -> None:
         talk.spin()
 
     assert wait_until(lambda: bool(heard), spin=again)
+
+
+def test_who_joins_late_hears_every_closure(talk: Talk) -> None:
+    for number in range(1, 151):
+        talk.announcer.announce(detection([accepted(number)]), {})
+    late: list[Odometry] = []
+    talk.listener.create_subscription(Odometry, "/loop_closures", late.append, CLOSURES_QOS)
+    assert wait_until(lambda: len(late) >= 150, spin=talk.spin)
+    assert [message.header.frame_id for message in late] == [f"keyframe/{number}" for number in range(1, 151)]

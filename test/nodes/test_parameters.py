@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 
 from umf_ros.config import Settings, load_settings
 from umf_ros.errors import ConfigError
-from umf_ros.nodes.parameters import declare
+from umf_ros.nodes.parameters import CHANGEABLE, changed_settings, declare
 
 made: list[tuple[Node, Context]] = []
 
@@ -43,6 +43,10 @@ def test_without_overrides_every_setting_is_declared_with_its_default() -> None:
     assert node.get_parameter("loop.top_k").value == 20
     descriptor = node.describe_parameter("keyframe.min_translation_m")
     assert "motion" in descriptor.description and descriptor.read_only
+    assert node.describe_parameter("qos.reliability").additional_constraints == "one of: best_effort, reliable"
+    (limits,) = node.describe_parameter("loop.top_k").integer_range
+    assert (limits.from_value, limits.to_value) == (1, 200)
+    assert node.describe_parameter("keyframe.max_period_s").additional_constraints == "> 0"
 
 
 def test_overrides_win_and_whole_numbers_pass_for_floats() -> None:
@@ -93,11 +97,13 @@ def test_everything_that_is_wrong_is_named_at_once() -> None:
     assert "loop.top_k: " in told and "\n" not in told
 
 
-def test_every_parameter_is_described_typed_and_read_only() -> None:
+def test_every_parameter_is_described_typed_and_as_a_rule_read_only() -> None:
     node = make_node("verification.max_shift_m:=11", "pose_graph.max_gap_s:=3")
     declare(node, results_dir="where results go")
     described = {name: node.describe_parameter(name) for name in documented_names()}
-    assert [name for name, found in described.items() if not found.description or not found.read_only] == []
+    assert [name for name, found in described.items() if not found.description] == []
+    changing = [name for name, found in described.items() if not found.read_only]
+    assert "loop.top_k" in changing and all(name.startswith(CHANGEABLE) for name in changing)
     doubles = ["verification.max_shift_m", "pose_graph.max_gap_s", "loop.min_travel_m"]
     assert [described[name].type for name in doubles] == [ParameterType.PARAMETER_DOUBLE] * 3
     assert described["loop.top_k"].type == ParameterType.PARAMETER_INTEGER
@@ -115,9 +121,9 @@ def documented_names() -> list[str]:
 def test_a_running_node_keeps_its_parameters() -> None:
     node = make_node()
     declare(node)
-    (answer,) = node.set_parameters([Parameter("loop.top_k", value=3)])
+    (answer,) = node.set_parameters([Parameter("embedding.threads", value=3)])
     assert not answer.successful and "read-only" in answer.reason
-    assert node.get_parameter("loop.top_k").value == 20
+    assert node.get_parameter("embedding.threads").value == 0
 
 
 def test_a_topic_can_be_switched_off_with_an_empty_name() -> None:
@@ -136,3 +142,28 @@ def test_a_node_has_parameters_of_its_own() -> None:
     assert own == {"results_dir": "/somewhere"}
     assert node.get_parameter("results_dir").value == "/somewhere"
     assert node.get_parameter("use_sim_time").value is True
+
+
+def test_changes_are_checked_like_overrides() -> None:
+    changed = changed_settings(Settings(), [Parameter("loop.top_k", value=3), Parameter("use_sim_time", value=True)])
+    assert changed.loop.top_k == 3
+    with pytest.raises(ConfigError, match=r"loop\.top_k: "):
+        changed_settings(Settings(), [Parameter("loop.top_k", value=0)])
+    assert changed_settings(changed, [Parameter("elsewhere", value=1)]) is changed
+
+
+def test_ros_itself_refuses_what_is_out_of_range() -> None:
+    node = make_node()
+    declare(node)
+    (answer,) = node.set_parameters([Parameter("verification.min_probability", value=1.5)])
+    assert not answer.successful
+    (answer,) = node.set_parameters([Parameter("verification.min_probability", value=0.97)])
+    assert answer.successful
+
+
+def test_autostart_is_true_or_false() -> None:
+    node = make_node("autostart:=false")
+    declare(node)
+    assert node.get_parameter("autostart").value is False
+    with pytest.raises(ConfigError, match="autostart: expected true or false, got 3"):
+        declare(make_node("autostart:=3"))

@@ -11,10 +11,14 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from processes import Process, wait_until
+from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -194,6 +198,109 @@ def test_bad_messages_are_counted_and_the_node_goes_on(rig: Rig, process: Proces
     rig.until(lambda: sum(name.startswith("closure refused") for name in rig.values) == 2)
     rig.until(lambda: rig.taken >= 95)
     assert "a new session" not in process.output
+
+
+def test_no_message_ends_the_node(rig: Rig, process: Process) -> None:
+    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    endless = closure_to_message(rig.world.message(0))
+    endless.header.frame_id = "keyframe/" + "9" * 5000
+    beyond = closure_to_message(rig.world.message(0))
+    beyond.child_frame_id = "keyframe/" + "9" * 19
+    infinite = closure_to_message(rig.world.message(0))
+    infinite.pose.covariance = np.full(36, 1e308)
+    for message in (endless, beyond, infinite):
+        rig.closures.publish(message)
+    for text in (
+        "keyframe/" + "9" * 5000 + " keyframe/1",
+        "keyframe/" + "9" * 19 + " keyframe/1",
+        "keyframe/1 keyframe/2",
+    ):
+        rig.reject.publish(String(data=text))
+    rig.until(lambda: rig.values.get("closure_frame") == "2" and rig.values.get("reject_edge") == "2")
+    rig.until(lambda: rig.values.get("GraphError") == "1")
+    assert process.exit_code is None and "Traceback" not in process.output
+    assert max(map(len, process.output.splitlines())) < 500
+
+
+def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Path) -> None:
+    parameters = f"results_dir:={tmp_path / 'results'}", "pose_graph.max_gap_s:=3"
+    process = Process(MODULE, tmp_path / "one.log", *parameters)
+    process.wait_for("ready")
+    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    rig.drive(0, len(rig.world.truth))
+    for row in range(len(rig.world.closures)):
+        rig.closures.publish(closure_to_message(rig.world.message(row)))
+    rig.until(lambda: len(verdicts(rig)) == len(rig.world.closures))
+    rig.values.clear()
+    rig.until(lambda: rig.values.get("accepted"))
+    before, odometry_before = rig.values["accepted"], rig.taken
+    process.kill()
+    rig.values.clear()
+    again = Process(MODULE, tmp_path / "two.log", *parameters)
+    again.wait_for("ready")
+    assert f"taken up: {odometry_before} odometry messages" in again.output and "differ" not in again.output
+    rig.until(lambda: rig.values.get("accepted") == before)
+    second = Process(MODULE, tmp_path / "three.log", *parameters)
+    wait_until(lambda: second.exit_code is not None, 60.0)
+    assert second.exit_code == 1 and "is in use by another process" in second.output
+    assert len(second.output.strip().splitlines()) == 1
+    for one in (again, second):
+        one.kill()
+
+
+def test_a_namespace_is_a_robot(rig: Rig, process: Process, tmp_path: Path) -> None:
+    other = Process(MODULE, tmp_path / "other.log", "__ns:=/other")
+    other.wait_for("ready")
+    rig.until(lambda: rig.closures.get_subscription_count() and "other/pose_graph_node: pose graph" in rig.inputs)
+    assert {name for name, _ in rig.get_topic_names_and_types()} >= {"/other/loop_closures", "/other/odom"}
+    assert rig.count_subscribers("/loop_closures") == rig.count_subscribers("/other/loop_closures") == 1
+    rig.drive(0, 20)
+    rig.until(lambda: rig.taken >= 15)
+    assert other.interrupt() == 0
+    other.kill()
+
+
+def test_without_autostart_it_waits_for_its_life_cycle(rig: Rig, tmp_path: Path) -> None:
+    process = Process(MODULE, tmp_path / "node.log", "autostart:=false")
+    change = rig.create_client(ChangeState, "/pose_graph_node/change_state")
+    assert change.wait_for_service(60.0)
+    assert rig.count_subscribers("/loop_closures") == 0
+
+    def step(number: int) -> None:
+        future = change.call_async(ChangeState.Request(transition=Transition(id=number)))
+        rig.until(future.done)
+        assert future.result().success, process.output
+
+    step(Transition.TRANSITION_CONFIGURE)
+    step(Transition.TRANSITION_ACTIVATE)
+    rig.until(lambda: rig.odometry.get_subscription_count())
+    rig.drive(0, 20)
+    rig.until(lambda: rig.taken >= 15)
+    step(Transition.TRANSITION_DEACTIVATE)
+    step(Transition.TRANSITION_CLEANUP)
+    assert process.interrupt() == 0, process.output
+    process.kill()
+
+
+def test_without_a_clock_it_says_so(rig: Rig, tmp_path: Path) -> None:
+    process = Process(MODULE, tmp_path / "node.log", "use_sim_time:=true")
+    process.wait_for("nothing comes on /clock")
+    rig.until(lambda: "pose_graph_node: pose graph" in rig.inputs)
+    process.kill()
+
+
+def test_a_gate_changes_while_the_node_runs(rig: Rig, process: Process) -> None:
+    client = rig.create_client(SetParameters, "/pose_graph_node/set_parameters")
+    assert client.wait_for_service(20.0)
+    wanted = Parameter("pose_graph.max_closure_m", value=0.001).to_parameter_msg()
+    wrong = Parameter("pose_graph.gate_chi2", value=-1.0).to_parameter_msg()
+    fixed = Parameter("pose_graph.max_gap_s", value=9.0).to_parameter_msg()
+    future = client.call_async(SetParameters.Request(parameters=[wanted, wrong, fixed]))
+    rig.until(future.done)
+    assert [result.successful for result in future.result().results] == [True, False, False]
+    rig.until(lambda: rig.closures.get_subscription_count())
+    rig.closures.publish(closure_to_message(rig.world.message(0)))
+    rig.until(lambda: any("absurd translation" in name for name in rig.values))
 
 
 def test_a_rover_without_odometry_is_no_fault(rig: Rig, tmp_path: Path) -> None:

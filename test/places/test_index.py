@@ -46,14 +46,6 @@ def test_growth_keeps_every_descriptor(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(index.descriptors, rows)
 
 
-def test_keep_renumbers_rows(rng: np.random.Generator) -> None:
-    index = filled(rng, 10)
-    before = index.descriptors.copy()
-    mask = np.array([True, False] * 5)
-    index.keep(mask)
-    np.testing.assert_array_equal(index.descriptors, before[mask])
-
-
 def test_wrong_dimension_is_refused() -> None:
     with pytest.raises(ValueError, match="expected \\(4,\\)"):
         DescriptorIndex(4).add(np.zeros(5, np.float32))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
+import subprocess
+import sys
 import threading
 import weakref
 from pathlib import Path
@@ -91,14 +94,6 @@ def test_places_added_after_reopening_come_after_the_old_ones(tmp_path: Path) ->
     assert again.next_session == 3
 
 
-def test_what_was_forgotten_stays_forgotten(tmp_path: Path) -> None:
-    path = filled(tmp_path / "map.sqlite")
-    places = database(path)
-    assert places.forget_from(3 * 10**9) == 2
-    places.close()
-    assert [keyframe.stamp_ns for keyframe in map(database(path).__getitem__, range(3))] == [0, 10**9, 2 * 10**9]
-
-
 def test_the_keyframe_used_longest_ago_leaves_the_memory_first() -> None:
     opened = store(cached=3)
     alive: list[weakref.ref[np.ndarray]] = []
@@ -113,13 +108,58 @@ def test_the_keyframe_used_longest_ago_leaves_the_memory_first() -> None:
     assert opened[1].stamp_ns == 10**9
 
 
-def test_a_temporary_file_is_gone_after_closing() -> None:
-    opened = store()
-    opened.add(make_keyframe(1))
-    folder = opened.path.parent
-    assert opened.path.is_file()
-    opened.close()
-    assert not folder.exists()
+def run(script: str, *arguments: Path, **environment: str) -> subprocess.Popen[str]:
+    """A process that fills a store without end, once it has said that it began."""
+    body = "from conftest import make_keyframe; from umf_ros.places.store import KeyframeStore;" + script
+    process = subprocess.Popen(
+        [sys.executable, "-c", body, *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None and process.stdout.readline() == "begun\n"
+    return process
+
+
+FILL = """
+import sys
+from pathlib import Path
+path = Path(sys.argv[1]) if len(sys.argv) > 1 else None
+store = KeyframeStore(path, {"embedder": "test", "dimension": "16"}, 20)
+for i in range(10**6):
+    store.add(make_keyframe(i, seed=i))
+    if i == 20:
+        print("begun", flush=True)
+"""
+
+
+def test_a_killed_process_leaves_no_temporary_file(tmp_path: Path) -> None:
+    process = run(FILL, TMPDIR=str(tmp_path), SQLITE_TMPDIR=str(tmp_path))
+    process.kill()
+    process.wait()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_killed_process_loses_no_keyframe_and_holds_no_lock(tmp_path: Path) -> None:
+    process = run(FILL, tmp_path / "map.sqlite")
+    with pytest.raises(UmfError, match=rf"map\.sqlite is in use by another process \({process.pid}\)") as caught:
+        database(tmp_path / "map.sqlite")
+    assert "\n" not in str(caught.value)
+    reader = sqlite3.connect(tmp_path / "map.sqlite")
+    assert reader.execute("SELECT count(*) FROM keyframe").fetchone()[0] > 20  # readers are welcome
+    reader.close()
+    process.kill()
+    process.wait()
+    places = database(tmp_path / "map.sqlite")
+    assert [places[i].stamp_ns for i in range(len(places))] == [i * 10**9 for i in range(len(places))]
+    assert len(places) > 20
+
+
+def test_a_file_that_was_refused_can_be_opened_later(tmp_path: Path) -> None:
+    path = filled(tmp_path / "map.sqlite")
+    with pytest.raises(UmfError, match="made with"):
+        KeyframeStore(path, IDENTITY | {"dimension": "99"}, 20)
+    assert len(database(path)) == 5
 
 
 def test_several_threads_read_while_one_writes() -> None:
@@ -167,7 +207,9 @@ def test_somebody_elses_database_is_refused_and_left_alone(tmp_path: Path) -> No
 def test_an_empty_file_becomes_a_database(tmp_path: Path) -> None:
     path = tmp_path / "new.sqlite"
     path.touch()
-    assert len(database(path)) == 0
+    places = database(path)
+    assert len(places) == 0
+    places.close()
     filled(path, 2)
     assert len(database(path)) == 2
 

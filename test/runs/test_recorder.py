@@ -171,3 +171,47 @@ def test_the_summary_can_be_written_while_the_run_goes_on_in_another_thread(tmp_
     finally:
         sys.setswitchinterval(interval)
     assert errors == [] and recorder.summary({})["keyframes"] == 1500
+
+
+def lines(path: Path) -> list[str]:
+    return path.read_text().splitlines()
+
+
+def test_a_folder_with_results_is_never_cut_short(tmp_path: Path) -> None:
+    record_a_little(tmp_path).write_summary({})
+    before = {name: lines(tmp_path / f"{name}.csv") for name in ("closures", "candidates", "keyframes", "inliers")}
+    again = RunRecorder(tmp_path, Settings(), "w")
+    assert [again.summary({})[key] for key in COUNTS] == [3, 1, 2, 1, 1, 1]
+    again.record(make_frame(40), detection(40, [accepted(40, 2)]))  # played again: there already
+    again.record(make_frame(90), detection(90, [accepted(90, 2)]))
+    for name, rows in before.items():
+        now = lines(tmp_path / f"{name}.csv")
+        assert now[: len(rows)] == rows and len(now) == len(rows) + (2 if name == "inliers" else 1)
+    assert again.summary({})["closures_published"] == 2 and again.summary({})["frames"] == 5
+
+
+def test_a_line_that_was_not_finished_goes_and_the_others_stay(tmp_path: Path) -> None:
+    record_a_little(tmp_path)
+    path = tmp_path / "candidates.csv"
+    whole = path.read_text()
+    path.write_text(whole + "50,12,0.4")
+    RunRecorder(tmp_path, Settings(), "w")
+    assert path.read_text() == whole
+
+
+def test_what_a_killed_replay_did_not_finish_is_done_again(tmp_path: Path) -> None:
+    record_a_little(tmp_path)
+    keyframes = lines(tmp_path / "keyframes.csv")
+    (tmp_path / "keyframes.csv").write_text("\n".join(keyframes[:2]) + "\n")
+    resumed = RunRecorder(tmp_path, Settings(), "w", resume=True)
+    assert resumed.recorded == {(2 * 10**9, 0)} and resumed.earlier_closures() == []
+    resumed.record(make_frame(40), detection(40, [accepted(40, 2)]))
+    assert lines(tmp_path / "keyframes.csv") == keyframes
+    assert [closure.query_stamp_ns for closure in read_closures(tmp_path / "closures.csv")] == [40]
+
+
+def test_a_table_of_an_older_version_is_set_aside(tmp_path: Path) -> None:
+    (tmp_path / "closures.csv").write_text("a,b\n1,2\n")
+    record_a_little(tmp_path)
+    assert (tmp_path / "closures.1.csv").read_text() == "a,b\n1,2\n"
+    assert len(read_closures(tmp_path / "closures.csv")) == 1

@@ -74,16 +74,6 @@ def test_a_place_that_a_scan_has_found_is_not_looked_for(outing: Drive, database
     assert finder.find(outing.keyframes[-1], [(outing.keyframes[0], np.eye(4))]) == []
 
 
-def test_what_the_database_forgot_is_not_found(outing: Drive, database: PlaceDatabase) -> None:
-    finder = SubmapFinder(Verification(), Loop(), database)
-    for keyframe in outing.keyframes[:-1]:
-        database.add(keyframe)
-        finder.remember(keyframe)
-    database.forget_from(0)
-    finder.reset()
-    assert not finder.trail.stops and not finder.examine(outing.keyframes[-1])
-
-
 def test_results_do_not_depend_on_what_is_in_memory(outing: Drive, database: PlaceDatabase) -> None:
     small = PlaceDatabase(Database(cached_keyframes=20), "none", 2)
     for (_, one), (_, other) in zip(replay(outing, database), replay(outing, small), strict=True):

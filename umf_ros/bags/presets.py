@@ -8,7 +8,7 @@ from typing import Any
 from umf_ros.bags.reader import Bag
 from umf_ros.config import DatasetPreset, Settings, Topics, load_preset, load_settings
 from umf_ros.errors import BagError
-from umf_ros.resources import dataset_names
+from umf_ros.resources import DEFAULT_DATASET, dataset_names
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
 GROUND_TRUTH_TOPIC = "/ground_truth/pose"
@@ -71,3 +71,8 @@ def calibration_of(settings: Settings) -> Calibration:
         CalibrationError: the file cannot be read, or a key is missing, unknown or wrong.
     """
     return load_calibration(settings.calibration or settings.dataset)
+
+
+def uses_transforms(settings: Settings) -> bool:
+    """Whether `/tf_static` says where the sensors are: a data set that was chosen has a calibration of its own."""
+    return settings.frames.extrinsics == "tf" and settings.dataset == DEFAULT_DATASET

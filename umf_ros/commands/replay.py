@@ -17,12 +17,17 @@ from umf_ros.commands.recordings import (
     RunsFolder,
     TruthPath,
     WeightsPath,
+    check_files,
+    check_odometry_options,
     open_frames,
     open_recording,
 )
 
 MinProbability = Annotated[
     float | None, typer.Option("--min-probability", min=0, max=1, help="Publish closures from here on.")
+]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Go on with the newest replay of this recording in --out that was cut off.")
 ]
 
 
@@ -34,43 +39,57 @@ def command(
     embedder: EmbedderName = None,
     weights: WeightsPath = None,
     odometry: OdometryPath = None,
-    odometry_frame: OdometryFrame = "body",
+    odometry_frame: OdometryFrame = "",
     ground_truth: TruthPath = None,
     min_probability: MinProbability = None,
+    resume: Resume = False,
 ) -> None:
     """Find loop closures in a recording as fast as the machine goes.
 
     Needs no ROS. Writes closures, trajectories, the pose graph and a report to a new folder.
-    Ctrl-C ends the run early and keeps what was found.
+    Ctrl-C ends the run early and keeps what was found; --resume goes on from there, or after a crash. Ends with 3 where
+    the inputs could give nothing.
     """
+    check_files(bag, config, odometry, ground_truth)
+    odometry_frame = check_odometry_options(odometry, odometry_frame)
+
     from rich.console import Console
 
     from umf_ros.bags.trajectories import read_ground_truth
+    from umf_ros.commands.inputs import InputConsole
     from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
     from umf_ros.loop_detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
-    from umf_ros.runs.folder import create_run_folder
     from umf_ros.runs.recorder import count_drops
     from umf_ros.runs.report import finish_run
+    from umf_ros.runs.resumption import ReplayFolder
 
     console = Console()
     recording, settings = open_recording(
         bag, config, dataset, embedder, weights, verification__min_probability=min_probability
     )
-    reader = open_frames(recording, settings, console, odometry, odometry_frame)
+    inputs = InputConsole(console, recording)
+    reader = open_frames(recording, settings, inputs.warn, odometry, odometry_frame)
     if ground_truth is not None:
         read_ground_truth(recording, ground_truth)  # what is wrong with it is said now, not after the run
-    detector = LoopDetector(settings, make_detector_embedder(settings))
-    folder = create_run_folder(out)
-    replay = Replay(folder, settings, detector)
-    with stop_on_interrupt() as interrupted, FrameProgress(console) as progress:
+    network = make_detector_embedder(settings)
+    # a store that cannot be used is told before there is a folder
+    detector = LoopDetector(settings, network) if settings.database.path else None
+    folder = (ReplayFolder.resume if resume else ReplayFolder.create)(out, bag, settings)
+    detector = detector or LoopDetector(folder.working_settings, network)
+    inputs.tell_absent(settings, odometry is not None)
+    replay = Replay(folder.path, settings, detector, folder.resumed)
+    with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress:
         for detection in replay.run(reader.stream()):
             progress.show(reader.progress, detection)
             if interrupted():
                 break
     if interrupted():
-        console.print("[yellow]Interrupted: the results cover what was done so far.")
+        console.print("[yellow]Interrupted: the results cover what was done so far; --resume goes on from here.")
     with undisturbed():
-        if not replay.finish(count_drops(reader.counters)):
-            console.print("No odometry: closures only, the pose graph is skipped (--odometry FILE.tum supplies it).")
-        finish_run(folder, recording, console, ground_truth)
+        replay.finish(count_drops(reader.counters))
+        if not interrupted():
+            folder.finish()
+        inputs.remember(folder.path, reader.counters, interrupted(), odometry, odometry_frame)
+        verdict = finish_run(folder.path, recording, console, ground_truth, inputs.told)
+    raise typer.Exit(verdict.exit_code)

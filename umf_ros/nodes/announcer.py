@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
@@ -25,14 +27,17 @@ MAX_LINES = 500
 class Announcer:
     """Loop closures, keyframes, tested candidates and markers of one node.
 
-    `/loop_closures` carries verified closures only; `~/candidates` everything that was tested.
+    `loop_closures` carries verified closures only; `~/candidates` everything that was tested.
+
+    Attributes:
+        odom: name of the odometry's frame.
     """
 
     def __init__(self, node: Node, frames: Frames) -> None:
         self._node = node
-        self._frames = frames
-        self._closures = node.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS)
-        self._keyframes = node.create_publisher(PoseStamped, "~/keyframes", 10)
+        self.odom = frames.odom
+        self._closures = node.create_publisher(Odometry, "loop_closures", CLOSURES_QOS)
+        self._keyframes = node.create_publisher(PoseStamped, "~/keyframes", CLOSURES_QOS)
         self._candidates = node.create_publisher(DiagnosticArray, "~/candidates", 10)
         self._markers = node.create_publisher(MarkerArray, "~/markers", LATCHED_QOS)
         self._accepted: deque[list] = deque(maxlen=MAX_LINES)
@@ -50,14 +55,22 @@ class Announcer:
             return
         for closure in detection.closures:
             self._closures.publish(conversions.closure_to_message(closure))
-        if keyframe.odom_T_body is not None:
-            pose = conversions.to_pose_stamped(keyframe.stamp_ns, self._frames.odom, keyframe.odom_T_body)
-            self._keyframes.publish(pose)
+        self._keyframes.publish(self._pose_of(keyframe))
         if detection.verdicts:
             report = DiagnosticArray(status=[_describe(keyframe, verdict) for verdict in detection.verdicts])
             report.header.stamp = conversions.to_time(keyframe.stamp_ns)
             self._candidates.publish(report)
             self._draw(keyframe, detection.verdicts, matches)
+
+    def wait_until_heard(self) -> None:
+        """Wait until whoever listens has the last closures, as far as they answer soon."""
+        self._closures.wait_for_all_acked(Duration(seconds=1))
+
+    def _pose_of(self, keyframe: Keyframe) -> PoseStamped:
+        """The keyframe's odometry; without one it is where it is: at the origin of its own frame."""
+        if keyframe.odom_T_body is not None:
+            return conversions.to_pose_stamped(keyframe.stamp_ns, self.odom, keyframe.odom_T_body)
+        return conversions.to_pose_stamped(keyframe.stamp_ns, conversions.keyframe_frame(keyframe.stamp_ns), np.eye(4))
 
     def _draw(self, keyframe: Keyframe, verdicts: list[Verdict], matches: dict[int, Keyframe]) -> None:
         if keyframe.odom_T_body is None:
@@ -69,7 +82,7 @@ class Announcer:
                 continue
             lines = self._rejected if verdict.closure is None else self._accepted
             lines.append([conversions.to_point(match.odom_T_body[:3, 3]), here])
-        header = conversions.to_header(keyframe.stamp_ns, self._frames.odom)
+        header = conversions.to_header(keyframe.stamp_ns, self.odom)
         chosen = {"accepted": self._accepted, "rejected": self._rejected}
         self._markers.publish(MarkerArray(markers=[conversions.to_lines(*item, header) for item in chosen.items()]))
 

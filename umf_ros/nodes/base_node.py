@@ -1,29 +1,45 @@
-"""What every node of ours does alike: parameters, watched inputs, diagnostics and answers to services."""
+"""What every node of ours does alike: life cycle, parameters, watched inputs, diagnostics, surviving every fault."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
-from umf_ros.errors import UmfError
+from umf_ros.config import Settings, Topics
+from umf_ros.errors import MessageError, OutputError, UmfError
 from umf_ros.nodes.conversions import from_time
-from umf_ros.nodes.diagnostics import InputWatch
-from umf_ros.nodes.parameters import declare
+from umf_ros.nodes.diagnostics import WARN, Heartbeat, InputWatch, Throttle
+from umf_ros.nodes.parameters import changed_settings, declare
 from umf_ros.runs.folder import check_writable
 
+WATCH_S = 1.0
+HEARTBEAT_S = 0.05
+SIM_TIME_SILENT = "use_sim_time is set, but nothing comes on /clock: stamps of messages count, the pose's age does not"
 
-class BaseNode(Node):
-    """A node with the package's settings as its parameters, and a folder for results.
+
+class BaseNode(LifecycleNode):
+    """A managed node with the package's settings as its parameters, and a folder for results.
+
+    What a node does it sets up in `_open` and ends in `_finish`. With `autostart`, the default, it is configured and
+    activated at once; without, it waits for its life cycle's services. While it is inactive it takes no messages.
+
+    No exception in a callback ends it: every one is counted, told, and shows in the diagnostics.
 
     Raises:
         ConfigError: a parameter is unknown, of the wrong type or out of range.
         OutputError: the folder for results cannot be written.
+        UmfError: it cannot be configured, with `autostart`.
     """
 
     def __init__(self, name: str, results: str) -> None:
@@ -31,33 +47,162 @@ class BaseNode(Node):
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
         self._settings, own = declare(self, results_dir=results)
         self._results = own["results_dir"]
+        self._watches: list[InputWatch] = []
+        self._faults: Counter[str] = Counter()
+        self._last_fault = ""
+        self._throttle = Throttle()
+        self._active = self._opened = False
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._use_parameters)
+        self._wall = Clock(clock_type=ClockType.STEADY_TIME)
+        # the machine's clock: a watch that stands still with /clock watches nothing
+        self._heartbeat = Heartbeat(HEARTBEAT_S)
+        self.create_timer(HEARTBEAT_S, self._heartbeat.beat, clock=self._wall)
+        self.create_timer(WATCH_S, self._guarded("watch", lambda: self._watch()), clock=self._wall)
+        if self.get_parameter("autostart").value:
+            self._configure()
+            self.trigger_configure()
+            self.trigger_activate()
+            self.get_logger().info("ready")
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Make everything; a fault of the user is one line and a failure."""
+        if not self._opened:
+            try:
+                self._configure()
+            except UmfError as error:
+                self.get_logger().error(str(error))
+                return TransitionCallbackReturn.FAILURE
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take messages."""
+        self._active = True
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take no messages; what is in hand is finished."""
+        self._active = False
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Write the results and let go of everything."""
+        return self._end(super().on_cleanup(state))
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Write the results and let go of everything."""
+        return self._end(super().on_shutdown(state))
+
+    def close(self) -> None:
+        """Finish what is in hand and write the results.
+
+        Raises:
+            OutputError: they cannot be written.
+        """
+        if self._active and rclpy.ok(context=self.context):
+            self.trigger_deactivate()  # who waits for our last words hears that they are being written
+        self._close()
+
+    def _close(self) -> None:
+        self._active = False
+        if self._opened:
+            self._opened = False
+            self._finish()
+
+    def ready_to_close(self) -> bool:
+        """Whether nothing more is to be waited for after Ctrl-C."""
+        return True
+
+    def _open(self) -> None:
+        """Make everything that the node needs."""
+        raise NotImplementedError
+
+    def _finish(self) -> None:
+        """Finish the work in hand, write the results, let go of everything."""
+        raise NotImplementedError
+
+    def _retune(self, settings: Settings) -> None:
+        """Take over settings that may change while the node runs."""
+        raise NotImplementedError
+
+    def _tick(self) -> None:
+        """Once per second of the machine's clock."""
+        raise NotImplementedError
+
+    def _configure(self) -> None:
         if self._results:
             check_writable(Path(self._results))
-        self._watches: list[InputWatch] = []
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._open()
+        self._opened = True
+
+    def _end(self, result: TransitionCallbackReturn) -> TransitionCallbackReturn:
+        try:
+            self._close()
+        except UmfError as error:
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        for entity in [*self.subscriptions]:
+            self.destroy_subscription(entity)
+        self._watches.clear()
+        return result
+
+    def _watch(self) -> None:
+        if not self._opened:
+            return
+        self._tick()
+        for watch in self._watches:
+            if watch.warning and self._throttle.lets_pass(f"input {watch.name}", 30.0):
+                self.get_logger().warning(watch.warning)
+        if self._lacks_clock() and self._throttle.lets_pass("clock", 30.0):
+            self.get_logger().warning(SIM_TIME_SILENT)
+
+    def _lacks_clock(self) -> bool:
+        return bool(self.get_parameter("use_sim_time").value) and self.get_clock().now().nanoseconds == 0
+
+    def _own_topic(self, name: str, topics: Topics) -> str:
+        """The name to subscribe to: that of a data set is relative, so that a namespace is a robot."""
+        topic = str(getattr(topics, name))
+        named = getattr(self._settings.topics, name) != getattr(Topics(), name)
+        return topic if named else topic.removeprefix("/")
+
+    def _guarded(self, what: str, take: Callable[..., Any]) -> Callable[..., Any]:
+        """`take`, so that no exception leaves it."""
+
+        def call(*arguments: Any) -> Any:
+            try:
+                return take(*arguments)
+            except Exception as error:
+                self._complain(error, what)
+                return None
+
+        return call
 
     def _subscribe(self, name: str, kind: type, topic: str, take: Callable[[Any], None], qos: QoSProfile) -> None:
         """Hear an input of messages with a header, and watch it."""
-        watch = InputWatch(self, name, topic)
-        self._watches.append(watch)
 
         def receive(message: Any) -> None:
             watch.saw(from_time(message.header.stamp))
-            take(message)
+            if self._active:
+                take(message)
 
         def lose(event: Any) -> None:
             watch.lost += event.total_count_change
 
         events = SubscriptionEventCallbacks(message_lost=lose)
-        self.create_subscription(kind, topic, receive, qos, event_callbacks=events)
+        subscription = self.create_subscription(kind, topic, self._guarded(name, receive), qos, event_callbacks=events)
+        watch = InputWatch(self, name, subscription.topic_name, kind)
+        self._watches.append(watch)
 
     def _offer(self, kind: type, name: str, action: Callable[[Any], str]) -> None:
-        """Offer a service that answers what `action` makes of the request; a `UmfError` is a refusal."""
+        """Offer a service that answers what `action` makes of the request; any fault is a refusal."""
 
         def answer(request: Any, response: Any) -> Any:
             try:
                 response.success, response.message = True, action(request)
-            except UmfError as error:
+            except Exception as error:
+                if not isinstance(error, UmfError):
+                    self._complain(error, name)
                 response.success, response.message = False, str(error)
             return response
 
@@ -65,11 +210,55 @@ class BaseNode(Node):
 
     def _diagnose(self, own: DiagnosticStatus) -> None:
         """Publish the node's own health and that of its inputs."""
+        if self._lacks_clock():
+            own.level, own.message = max(own.level, WARN), f"{own.message}; {SIM_TIME_SILENT}"
         report = DiagnosticArray(status=[own, *(watch.status() for watch in self._watches)])
         report.header.stamp = self.get_clock().now().to_msg()
+        name = self.get_fully_qualified_name().removeprefix("/")
         for line in report.status:
-            line.name = f"{self.get_name()}: {line.name}"
+            line.name = f"{name}: {line.name}"
+            line.hardware_id = self.get_namespace().strip("/") or "rover"
         self._diagnostics.publish(report)
 
-    def _complain(self, error: Exception) -> None:
-        self.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=10.0)
+    def _judge(self, own: DiagnosticStatus) -> DiagnosticStatus:
+        """The node's own status, worse where an input is silent or a fault came lately."""
+        silent = [watch.warning for watch in self._watches if watch.warning]
+        if silent:
+            own.level, own.message = max(own.level, WARN), f"{own.message}; {'; '.join(silent)}"
+        if self._last_fault:
+            own.level, own.message = max(own.level, WARN), f"{own.message}; last fault: {self._last_fault}"
+        if not self._active:
+            own.level, own.message = max(own.level, WARN), "inactive"
+        return own
+
+    def _complain(self, error: Exception, what: str = "") -> None:
+        """Count a fault; the first of each kind is told at once, the others now and then."""
+        kind = error.kind if isinstance(error, MessageError) else type(error).__name__
+        self._faults[kind] += 1
+        where = f"{what}: " if what else ""
+        if isinstance(error, MessageError):
+            if self._faults[kind] == 1:
+                self.get_logger().warning(f"skipped: {error}")
+            return
+        text = " ".join(str(error).split())[:300]
+        self._last_fault = text if isinstance(error, OutputError) else f"{where}{kind}: {text}"
+        if self._throttle.lets_pass(f"fault {what} {kind}", 10.0):
+            self.get_logger().error(f"{where}{kind}: {text} ({self._faults[kind]} so far); the node goes on")
+
+    @property
+    def _cannot_write(self) -> bool:
+        return self._faults["OutputError"] > 0 and "write" in self._last_fault
+
+    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            changed_settings(self._settings, parameters)
+        except UmfError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _use_parameters(self, parameters: list[Parameter]) -> None:
+        settings = changed_settings(self._settings, parameters)
+        if settings != self._settings:
+            self._settings = settings
+            if self._opened:
+                self._retune(settings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 
@@ -19,7 +20,9 @@ from umf_ros.sensors.messages import decode_pose
 
 GREEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.5)
-KEYFRAME_FRAME = re.compile(r"keyframe/(\d+)")
+LAST_STAMP_NS = 2**31 * 10**9
+"""What a stamp with seconds of 32 bits stays below."""
+KEYFRAME_FRAME = re.compile(r"keyframe/([0-9]{1,19})")
 
 
 def to_time(stamp_ns: int) -> Time:
@@ -74,32 +77,58 @@ def closure_to_message(closure: LoopClosure) -> Odometry:
     """A loop closure as odometry between two keyframes that are not consecutive.
 
     `header.frame_id` is the match, `child_frame_id` the query, `pose` is `match_T_query`, its
-    covariance is in ROS order about the axes of the match body. The twist is unused.
+    covariance is in ROS order about the axes of the match body. There is no twist, as `twist.covariance[0] = -1` says;
+    `twist.covariance[1]` is the probability.
     """
     message = Odometry(child_frame_id=keyframe_frame(closure.query_stamp_ns))
     message.header = to_header(closure.query_stamp_ns, keyframe_frame(closure.match_stamp_ns))
     message.pose.pose = to_pose(closure.match_T_query)
     message.pose.covariance = np.asarray(closure.covariance, dtype=float).ravel()
     message.twist.covariance[0] = -1.0
+    if not math.isnan(closure.probability):
+        message.twist.covariance[1] = closure.probability
     return message
 
 
 def closure_from_message(message: Odometry) -> LoopClosure:
-    """The loop closure in a message of `/loop_closures`; its probability does not travel there and is unknown.
+    """The loop closure in a message of `loop_closures`; without a probability where the sender gives none.
 
     Raises:
         MessageError: the frames name no keyframes, or the pose is no pose.
     """
+    probability = float(message.twist.covariance[1])
     return LoopClosure(
         query_stamp_ns=_keyframe_stamp(message.child_frame_id),
         match_stamp_ns=_keyframe_stamp(message.header.frame_id),
         match_T_query=decode_pose(message.pose.pose),
         covariance=np.asarray(message.pose.covariance, dtype=float).reshape(6, 6),
+        probability=probability if 0 < probability <= 1 else math.nan,
     )
 
 
-def _keyframe_stamp(frame: str) -> int:
+def parse_pair(text: str) -> tuple[int, int]:
+    """Stamps of match and query in `keyframe/<match ns> keyframe/<query ns>`.
+
+    Raises:
+        MessageError: of kind "reject_edge" when it names no keyframes.
+    """
+    frames = text.split() if len(text) < 200 else []
+    stamps = [stamp for stamp in map(_stamp_in, frames) if stamp is not None]
+    if len(frames) != 2 or len(stamps) != 2:
+        expected = "expected 'keyframe/<match ns> keyframe/<query ns>'"
+        raise MessageError("reject_edge", f"{text[:80]!r} on ~/reject_edge, {expected}")
+    return stamps[0], stamps[1]
+
+
+def _stamp_in(frame: str) -> int | None:
+    """The stamp, as far as there is one that a message can carry."""
     found = KEYFRAME_FRAME.fullmatch(frame)
-    if found is None:
-        raise MessageError("closure_frame", f"loop closure with frame '{frame}', expected keyframe/<stamp in ns>")
-    return int(found[1])
+    stamp_ns = int(found[1]) if found is not None else -1
+    return stamp_ns if 0 <= stamp_ns < LAST_STAMP_NS else None
+
+
+def _keyframe_stamp(frame: str) -> int:
+    stamp_ns = _stamp_in(frame)
+    if stamp_ns is None:
+        raise MessageError("closure_frame", f"loop closure with frame {frame[:80]!r}, expected keyframe/<stamp in ns>")
+    return stamp_ns

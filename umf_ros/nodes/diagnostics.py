@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import resource
 import time
 from collections.abc import Mapping
@@ -10,6 +11,7 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.qos import QoSReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -26,11 +28,57 @@ def memory_mb() -> float:
     return pages * resource.getpagesize() / 2**20
 
 
-class InputWatch:
-    """Counts the messages of one input topic and says why none arrive."""
+class Throttle:
+    """Lets each of many lines pass now and then, whoever else speaks."""
 
-    def __init__(self, node: Node, name: str, topic: str, silent_after_s: float = 5.0) -> None:
+    def __init__(self) -> None:
+        self._passed_s: dict[str, float] = {}
+
+    def lets_pass(self, line: str, every_s: float) -> bool:
+        """Whether a line is due again."""
+        now_s = time.monotonic()
+        if now_s - self._passed_s.get(line, -math.inf) < every_s:
+            return False
+        self._passed_s[line] = now_s
+        return True
+
+
+class Heartbeat:
+    """How long the executor was kept from answering.
+
+    Args:
+        period_s: `beat` is due this often.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._last_s: float | None = None
+        self.longest_ms = 0.0
+
+    def beat(self) -> None:
+        """Answer."""
+        now_s = time.monotonic()
+        if self._last_s is not None:
+            self.longest_ms = max(self.longest_ms, 1e3 * (now_s - self._last_s - self._period_s))
+        self._last_s = now_s
+
+
+class InputWatch:
+    """Counts the messages of one input topic and says why none arrive.
+
+    Args:
+        node: asks who publishes.
+        name: of the input.
+        topic: as it is subscribed, after remapping.
+        kind: message class; None where any will do.
+        silent_after_s: silence that is worth a word, by the machine's clock.
+    """
+
+    def __init__(
+        self, node: Node, name: str, topic: str, kind: type | None = None, silent_after_s: float = 5.0
+    ) -> None:
         self._node = node
+        self._type = type_name(kind) if kind is not None else ""
         self._silent_after_s = silent_after_s
         self.name = name
         self.topic = topic
@@ -71,21 +119,37 @@ class InputWatch:
             "reliable" if info.qos_profile.reliability == QoSReliabilityPolicy.RELIABLE else "best effort"
             for info in publishers
         )
-        reason = self._reason(len(publishers), silent_s)
+        reason = self._reason(publishers, silent_s)
         if now_s - self._born_s > self._silent_after_s:
             self.warning = f"{self.name}: {reason}"
         return status(WARN, f"input {self.name}", reason, values)
 
-    def _reason(self, publishers: int, silent_s: float | None) -> str:
-        if publishers == 0:
-            return f"nothing received: no publisher on {self.topic}"
+    def _reason(self, publishers: list[TopicEndpointInfo], silent_s: float | None) -> str:
+        foreign = sorted({info.topic_type for info in publishers} - {self._type})
+        if publishers and self._type and len(foreign) == len({info.topic_type for info in publishers}):
+            return f"nothing received: {self.topic} carries {', '.join(foreign)}, expected {self._type}"
+        if not publishers:
+            others = self._others()
+            hint = f"; {', '.join(others)} {'is' if len(others) == 1 else 'are'} of that type" if others else ""
+            return f"nothing received: no publisher on {self.topic}{hint}"
         if silent_s is None:
-            return f"nothing received from {publishers} publisher(s) on {self.topic}: see their QoS"
-        return f"silent for {silent_s:.0f} s: {publishers} publisher(s) on {self.topic}"
+            return f"nothing received from {len(publishers)} publisher(s) on {self.topic}: see their QoS"
+        return f"silent for {silent_s:.0f} s: {len(publishers)} publisher(s) on {self.topic}"
+
+    def _others(self) -> list[str]:
+        """Topics of the same type that somebody publishes: the sensor may be there under another name."""
+        names = [name for name, types in self._node.get_topic_names_and_types() if self._type in types]
+        return [name for name in names if name != self.topic and self._node.count_publishers(name)][:5]
 
     def _now_s(self) -> float:
         # the machine's clock, not the bag's: silence is silence even when /clock stands still
         return time.monotonic()
+
+
+def type_name(kind: type) -> str:
+    """Name of a message class on the graph, as in `sensor_msgs/msg/Image`."""
+    package, middle, *_ = kind.__module__.split(".")
+    return f"{package}/{middle}/{kind.__name__}"
 
 
 def _text(value: object) -> str:

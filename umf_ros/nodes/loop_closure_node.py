@@ -14,19 +14,21 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
-from umf_ros.bags.presets import calibration_of, topics_of
-from umf_ros.errors import OutputError
+from umf_ros.bags.presets import calibration_of, topics_of, uses_transforms
+from umf_ros.config import Settings
 from umf_ros.frames import Frame, LoopClosure
 from umf_ros.geometry import rotation_angle
 from umf_ros.loop_detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.nodes.announcer import Announcer
 from umf_ros.nodes.base_node import BaseNode
-from umf_ros.nodes.diagnostics import OK, WARN, memory_mb, status
+from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
 from umf_ros.nodes.process import run
 from umf_ros.nodes.qos import sensor_qos
+from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.nodes.worker import Worker
 from umf_ros.runs.recorder import RunRecorder, count_drops
 from umf_ros.sensors.intake import Intake, wanted_inputs
+from umf_ros.sensors.static_transforms import Mounting, OdometryFrames, StaticTransforms
 from umf_ros.sensors.synchronizer import Synchronizer
 
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
@@ -50,45 +52,54 @@ class LoopClosureNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__("loop_closure_node", "folder for closures and summary; empty: none")
-        embedder = make_detector_embedder(self._settings)
-        self._detector = LoopDetector(self._settings, embedder)
-        calibration = calibration_of(self._settings)
-        topics = topics_of(self._settings)
-        warn = self.get_logger().warning
-        self._synchronizer = Synchronizer(self._settings.sync, calibration, wanted_inputs(topics), warn)
-        self._intake = Intake(self._synchronizer, topics, warn)
+
+    def _open(self) -> None:
+        settings, warn = self._settings, self.get_logger().warning
+        embedder = make_detector_embedder(settings)
+        calibration, topics = calibration_of(settings), topics_of(settings)
+        self._detector = LoopDetector(settings, embedder)
+        self._synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(topics), warn)
+        transforms = StaticTransforms()
+        self._odometry_frames = OdometryFrames(settings.frames, transforms, warn)
+        mounting = Mounting(calibration, transforms, settings.frames.base, warn) if uses_transforms(settings) else None
+        frames = self._odometry_frames
+        self._intake = Intake(self._synchronizer, topics, warn, mounting=mounting, odometry_frames=frames)
         folder = Path(self._results)
-        self._recorder = RunRecorder(folder, self._settings, embedder.name) if self._results else None
-        self._announcer = Announcer(self, self._settings.frames)
+        self._recorder = RunRecorder(folder, settings, embedder.name) if self._results else None
+        self._announcer = Announcer(self, settings.frames)
         self._lock = threading.Lock()
         self._paused = False
         self._closures = 0
         self._last: Detection | None = None
-        self._last_error = ""
-        self._worker: Worker[Frame] = Worker(self._detect, self._complain, self._settings.worker.queue_size)
+        self._worker: Worker[Frame] = Worker(self._detect, self._complain, settings.worker.queue_size)
         self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._complain, INTAKE_QUEUE)
+        hear_static_transforms(self, transforms)
         for name, topic in topics.model_dump().items():
             if topic:
-                qos = sensor_qos(self._settings.qos)
-                self._subscribe(name, MESSAGE_TYPES[name], topic, partial(self._enqueue, topic), qos)
-        self.create_timer(1.0, self._tick)
+                take = partial(self._enqueue, topic)
+                qos = sensor_qos(settings.qos)
+                self._subscribe(name, MESSAGE_TYPES[name], self._own_topic(name, topics), take, qos)
         self._offer(Trigger, "~/save", self._save)
         self._offer(Trigger, "~/reset", self._reset)
         self._offer(SetBool, "~/pause", self._pause)
-        self.get_logger().info("ready")
 
-    def close(self) -> None:
+    def _finish(self) -> None:
         """Finish every frame in hand and write the results."""
         self._decoder.close()
         for frame in self._synchronizer.flush():
             self._worker.submit(frame)
         self._worker.close(timeout_s=30.0)
+        self._announcer.wait_until_heard()
         try:
             if self._recorder is not None:
                 self._recorder.write_summary(self._drops())
                 self._recorder.close()
         finally:
             self._detector.database.close()
+
+    def _retune(self, settings: Settings) -> None:
+        with self._lock:
+            self._detector.retune(settings)
 
     def _enqueue(self, topic: str, message: Any) -> None:
         if not self._paused:
@@ -105,6 +116,7 @@ class LoopClosureNode(BaseNode):
             # before anybody forgets them
             matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
         self._last = detection
+        self._announcer.odom = self._odometry_frames.odom
         self._announcer.announce(detection, matches)
         for closure in detection.closures:
             self._closures += 1
@@ -114,23 +126,14 @@ class LoopClosureNode(BaseNode):
         if self._recorder is not None:
             self._recorder.record(frame, detection)
 
-    def _complain(self, error: Exception) -> None:
-        self._last_error = f"{type(error).__name__}: {error}"
-        super()._complain(error)
-
     def _drops(self) -> dict[str, int]:
         return count_drops(self._synchronizer.counters, self._worker.dropped + self._decoder.dropped)
 
     def _tick(self) -> None:
-        self._diagnose(self._own_status())
-        for watch in self._watches:
-            if watch.warning:
-                self.get_logger().warning(watch.warning, throttle_duration_sec=30.0)
+        own = self._own_status()
+        self._diagnose(own if self._paused else self._judge(own))
         if self._recorder is not None:
-            try:
-                self._recorder.write_summary(self._drops())
-            except OutputError as error:  # closures matter more than the tally
-                self._complain(error)
+            self._recorder.write_summary(self._drops())
 
     def _own_status(self) -> DiagnosticStatus:
         latency = self._last.latency_ms.get("total", 0.0) if self._last else 0.0
@@ -142,15 +145,20 @@ class LoopClosureNode(BaseNode):
             "last_latency_ms": latency,
             "lag_s": lag_s,
             "memory_mb": memory_mb(),
-            "last_error": self._last_error or "none",
+            "last_error": self._last_fault or "none",
+            "executor_stall_max_ms": self._heartbeat.longest_ms,
+            **{f"fault_{kind}": count for kind, count in self._faults.items()},
             **{f"dropped_{name}": count for name, count in self._drops().items()},
             **_counts(self._synchronizer),
         }
+        text = f"{self._closures} closures among {len(self._detector.database)} places"
         if self._paused:
             return status(WARN, "detector", "paused", values)
+        if self._cannot_write:
+            return status(ERROR, "detector", text, values)
         if self._worker.dropped or self._decoder.dropped:
             return status(WARN, "detector", "too slow: messages are being dropped", values)
-        return status(OK, "detector", f"{self._closures} closures among {len(self._detector.database)} places", values)
+        return status(OK, "detector", text, values)
 
     def _save(self, _: Any) -> str:
         path = Path(self._settings.database.path or "places.sqlite").with_suffix(".saved.sqlite").resolve()
@@ -159,8 +167,8 @@ class LoopClosureNode(BaseNode):
 
     def _reset(self, _: Any) -> str:
         with self._lock:
-            self._detector.reset()
-        return "all places forgotten"
+            self._detector.end_session()
+        return "a new session begins with the next frame; all places are kept (umf places deletes)"
 
     def _pause(self, request: Any) -> str:
         self._paused = request.data

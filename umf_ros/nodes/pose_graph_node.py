@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import threading
-from collections import Counter
+import time
 from collections.abc import Callable
+from itertools import count
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from lifecycle_msgs.msg import TransitionEvent
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
@@ -20,74 +22,91 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from umf_ros.bags.presets import topics_of
-from umf_ros.errors import MessageError, UmfError
+from umf_ros.config import Settings
+from umf_ros.errors import UmfError
 from umf_ros.geometry import Array
 from umf_ros.nodes import pose_graph_messages as messages
 from umf_ros.nodes.base_node import BaseNode
-from umf_ros.nodes.conversions import closure_from_message
-from umf_ros.nodes.diagnostics import OK, WARN, status
+from umf_ros.nodes.conversions import closure_from_message, parse_pair
+from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import run
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
+from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.nodes.worker import Worker
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.sensors.durable_graph import DurableGraph
 from umf_ros.sensors.messages import OdometrySample, decode_odometry
-from umf_ros.sensors.odometry_feed import OdometryFeed
+from umf_ros.sensors.static_transforms import OdometryFrames, StaticTransforms
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works
 QUEUE = 100_000
-REJECT = re.compile(r"\s*keyframe/(\d+)\s+keyframe/(\d+)\s*")
+JOURNAL = "pose_graph.sqlite"
+FRONT_END = "loop_closure_node"
+GRACE_S = 1.0
+"""A front-end that was asked to end together with us says so within this."""
 
 
 class PoseGraphNode(BaseNode):
     """Keeps a pose graph in a thread of its own and publishes the pose in the map at the odometry's rate."""
 
     def __init__(self) -> None:
+        self._front_end_busy = False
+        self._asked_s: float | None = None
         super().__init__("pose_graph_node", "folder for trajectories, graph and verdicts; empty: none")
-        self._frames = self._settings.frames
+
+    def _open(self) -> None:
+        settings = self._settings
+        self._frames = settings.frames
         self._lock = threading.Lock()
-        self._begin()
-        self._make_publishers()
-        self._worker: Worker[Callable[[], None]] = Worker(self._run, self._complain, QUEUE)
-        odometry_topic = topics_of(self._settings).odometry
-        if odometry_topic:
-            qos = sensor_qos(self._settings.qos, ODOMETRY_DEPTH)
-            self._subscribe("odometry", Odometry, odometry_topic, self._guarded(self._on_odometry), qos)
-        self._subscribe("closures", Odometry, "/loop_closures", self._guarded(self._on_closure), CLOSURES_QOS)
-        self.create_subscription(String, "~/reject_edge", self._guarded(self._on_reject), 10)
-        self._offer(Trigger, "~/reject_last", self._reject_last)
-        self._offer(Trigger, "~/save", self._save)
-        self._offer(Trigger, "~/reset", self._reset)
-        self.create_timer(1.0, self._tick)
-        self.get_logger().info("ready")
-
-    def close(self) -> None:
-        """Take in what is queued, settle the graph and write the results."""
-        self._worker.close(timeout_s=60.0)
-        if self._results:
-            self._graph.write_results(self._results)
-
-    def _guarded(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
-        """`take`, with messages that cannot be used counted and the first of each kind told."""
-
-        def receive(message: Any) -> None:
-            try:
-                take(message)
-            except MessageError as error:
-                self._refused[error.kind] += 1
-                if self._refused[error.kind] == 1:
-                    self.get_logger().warning(f"skipped: {error}")
-
-        return receive
-
-    def _begin(self) -> None:
-        self._graph = PoseGraph(self._settings.pose_graph)
-        self._feed = OdometryFeed(self._graph)
-        self._refused: Counter[str] = Counter()
+        journal = Path(self._results) / JOURNAL if self._results else None
+        self._durable = DurableGraph(settings.pose_graph, journal, self._complain)
         self._map_T_odom: Array = np.eye(4)
         self._covariance: Array = np.zeros((6, 6))
         self._drawn = -1
+        self._make_publishers()
+        if self._durable.taken_up or self._durable.feed.newest_ns >= 0:
+            self.get_logger().info(_taken_up(self._durable))
+            self._announce(self._durable.graph.closures())
+        self._worker: Worker[Callable[[], None]] = Worker(self._run, self._complain, QUEUE)
+        topics, transforms = topics_of(settings), StaticTransforms()
+        self._odometry_frames = OdometryFrames(settings.frames, transforms, self.get_logger().warning)
+        hear_static_transforms(self, transforms)
+        if topics.odometry:
+            qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
+            self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
+        self._subscribe("closures", Odometry, "loop_closures", self._on_closure, CLOSURES_QOS)
+        self.create_subscription(String, "~/reject_edge", self._guarded("reject_edge", self._on_reject), 10)
+        hear = self._guarded("front-end", self._on_front_end)
+        self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", hear, 10)
+        self._offer(Trigger, "~/reject_last", self._reject_last)
+        self._offer(Trigger, "~/save", self._save)
+        self._offer(Trigger, "~/reset", self._reset)
+
+    def _finish(self) -> None:
+        """Take in what is queued, settle the graph and write the results."""
+        self._worker.close(timeout_s=60.0)
+        try:
+            if self._results:
+                self._durable.graph.write_results(self._results)
+        finally:
+            self._durable.close()
+
+    def ready_to_close(self) -> bool:
+        """Whether the front-end, if it was asked to end as well, has said its last words."""
+        now_s = time.monotonic()
+        if self._asked_s is None:
+            self._asked_s = now_s
+        if not self._opened or not self.count_publishers("loop_closures"):
+            return True
+        return not self._front_end_busy and now_s - self._asked_s > GRACE_S
+
+    def _retune(self, settings: Settings) -> None:
+        with self._lock:
+            self._durable.graph.retune(settings.pose_graph)
+
+    def _on_front_end(self, event: TransitionEvent) -> None:
+        self._front_end_busy = event.goal_state.label in ("deactivating", "inactive", "shuttingdown")
 
     def _make_publishers(self) -> None:
         self._path_publisher = self.create_publisher(PathMessage, "~/path", LATCHED_QOS)
@@ -99,6 +118,9 @@ class PoseGraphNode(BaseNode):
 
     def _on_odometry(self, message: Odometry) -> None:
         sample = decode_odometry(message)
+        sample = OdometrySample(sample.stamp_ns, self._odometry_frames.to_body(message, sample.odom_T_body))
+        if self._odometry_frames.odom != self._frames.odom:
+            self._frames = self._frames.model_copy(update={"odom": self._odometry_frames.odom})
         self._worker.submit(lambda: self._add_odometry(sample))
         # the newest correction, not the next: the pose never waits for the optimiser
         map_T_odom = self._map_T_odom
@@ -111,22 +133,18 @@ class PoseGraphNode(BaseNode):
 
     def _on_closure(self, message: Odometry) -> None:
         closure = closure_from_message(message)
-        self._worker.submit(lambda: self._announce(self._graph.add_closure(closure)))
+        self._worker.submit(lambda: self._announce(self._durable.add_closure(closure)))
 
     def _on_reject(self, message: String) -> None:
-        found = REJECT.fullmatch(message.data)
-        if found is None:
-            text = f"'{message.data}' on ~/reject_edge, expected 'keyframe/<match ns> keyframe/<query ns>'"
-            raise MessageError("reject_edge", text)
-        match, query = int(found[1]), int(found[2])
-        self._worker.submit(lambda: self._announce(self._graph.revoke(match, query)))
+        match, query = parse_pair(message.data)
+        self._worker.submit(lambda: self._announce(self._durable.revoke(match, query)))
 
     def _run(self, step: Callable[[], None]) -> None:
         with self._lock:
             step()
 
     def _add_odometry(self, sample: OdometrySample) -> None:
-        reset = self._feed.take(sample.stamp_ns, sample.odom_T_body)
+        reset = self._durable.take_odometry(sample.stamp_ns, sample.odom_T_body)
         if reset is not None:
             self.get_logger().warning(f"{reset.reason}: a new session begins")
 
@@ -135,9 +153,9 @@ class PoseGraphNode(BaseNode):
             return
         self._correct()
         for verdict in verdicts:
-            # what is accepted the front-end has told already, what is undecided will be
-            quiet = verdict.state in (State.ACCEPTED, State.UNDECIDED, State.WAITING)
-            log = self.get_logger().debug if quiet else self.get_logger().info
+            # a verdict may change until the graph is settled: only what is refused is so for good
+            final = verdict.state is State.REFUSED
+            log = self.get_logger().info if final else self.get_logger().debug
             log(describe(verdict))
         report = DiagnosticArray(status=[_as_status(verdict) for verdict in verdicts])
         report.header.stamp = self.get_clock().now().to_msg()
@@ -145,54 +163,63 @@ class PoseGraphNode(BaseNode):
         self._draw()
 
     def _correct(self) -> None:
-        self._map_T_odom = self._graph.map_T_odom()
-        self._covariance = self._graph.covariance()
+        self._map_T_odom = self._durable.graph.map_T_odom()
+        self._covariance = self._durable.graph.covariance()
 
     def _draw(self) -> None:
-        stamps, poses = self._graph.trajectory()
+        stamps, poses = self._durable.graph.trajectory()
         self._drawn = len(stamps)
         self._path_publisher.publish(messages.path(stamps, poses, self._frames))
-        verdicts, lines = self._graph.closure_lines()
-        self._marker_publisher.publish(messages.markers(verdicts, lines, max(self._feed.newest_ns, 0), self._frames))
+        verdicts, lines = self._durable.graph.closure_lines()
+        newest_ns = max(self._durable.feed.newest_ns, 0)
+        self._marker_publisher.publish(messages.markers(verdicts, lines, newest_ns, self._frames))
 
     def _tick(self) -> None:
         self._worker.submit(self._keep_up)
-        self._diagnose(self._own_status())
+        self._diagnose(self._judge(self._own_status()))
 
     def _keep_up(self) -> None:
         """Decide about closures that waited for odometry, and show what has grown."""
-        self._announce(self._graph.update())
+        self._announce(self._durable.update())
         self._correct()
-        if len(self._graph.trajectory()[0]) != self._drawn:
+        if len(self._durable.graph.trajectory()[0]) != self._drawn:
             self._draw()
 
     def _own_status(self) -> DiagnosticStatus:
-        values: dict[str, object] = {**self._graph.counts, **self._refused, "queue_dropped": self._worker.dropped}
-        values["odometry_out_of_line"] = self._feed.dropped
-        values |= {state.value: count for state, count in self._graph.verdict_counts().items()}
-        trouble = self._worker.dropped or any(name.startswith("optimiser") for name in self._graph.counts)
-        level = WARN if trouble or self._refused else OK
-        return status(level, "pose graph", f"{values.get('accepted', 0)} closures accepted", values)
+        graph = self._durable.graph
+        values: dict[str, object] = {**graph.counts, **self._faults, "queue_dropped": self._worker.dropped}
+        values["odometry_out_of_line"] = self._durable.feed.dropped
+        values["executor_stall_max_ms"] = self._heartbeat.longest_ms
+        values |= {state.value: count for state, count in graph.verdict_counts().items()}
+        trouble = self._worker.dropped or any(name.startswith("optimiser") for name in graph.counts)
+        text = f"{values.get('accepted', 0)} closures accepted"
+        if values.get("waiting") and self._durable.feed.newest_ns < 0:
+            trouble, text = True, f"{values['waiting']} closures wait for odometry, of which none has come"
+        level = ERROR if self._cannot_write else WARN if trouble or self._faults else OK
+        return status(level, "pose graph", text, values)
 
     def _reject_last(self, _: Any) -> str:
         with self._lock:
-            accepted = [v.closure for v in self._graph.closures() if v.state is State.ACCEPTED]
+            accepted = [v.closure for v in self._durable.graph.closures() if v.state is State.ACCEPTED]
             if not accepted:
                 raise UmfError("no closure is accepted")
-            self._announce(self._graph.revoke(accepted[-1].match_stamp_ns, accepted[-1].query_stamp_ns))
+            self._announce(self._durable.revoke(accepted[-1].match_stamp_ns, accepted[-1].query_stamp_ns))
         return f"closure {_name(accepted[-1])} revoked"
 
     def _save(self, _: Any) -> str:
         folder = self._results or "pose_graph_results"
         self._worker.drain(10.0)
         with self._lock:
-            self._graph.write_results(folder)
+            self._durable.graph.write_results(folder)
         return f"results written to {folder}"
 
     def _reset(self, _: Any) -> str:
         with self._lock:
-            self._begin()
-        return "graph forgotten"
+            if self._results:
+                self._durable.graph.write_results(_numbered(Path(self._results)))
+            kept = self._durable.end()
+        self._map_T_odom, self._drawn = np.eye(4), -1
+        return "a new graph begins" + (f"; the old one is kept in {kept}" if kept else "")
 
 
 def describe(verdict: ClosureVerdict) -> str:
@@ -200,6 +227,18 @@ def describe(verdict: ClosureVerdict) -> str:
     numbers = "" if np.isnan(verdict.residual) else f" ({verdict.residual:.1f} sigma, {verdict.residual_m:.2f} m)"
     seconds = (verdict.closure.query_stamp_ns - verdict.closure.match_stamp_ns) * 1e-9
     return f"graph: closure {seconds:.1f} s back {verdict.state.value}: {verdict.reason}{numbers}"
+
+
+def _numbered(results: Path) -> Path:
+    """A new folder for the results of a graph that was ended."""
+    return next(folder for i in count(1) if not (folder := results / f"graph_{i}").exists())
+
+
+def _taken_up(durable: DurableGraph) -> str:
+    counts = durable.graph.verdict_counts()
+    verdicts = ", ".join(f"{number} {state.value}" for state, number in sorted(counts.items()))
+    differing = f"; {durable.changed} verdicts differ from before" if durable.changed else ""
+    return f"taken up: {durable.graph.counts['odometry']} odometry messages, closures: {verdicts or 'none'}{differing}"
 
 
 def _as_status(verdict: ClosureVerdict) -> DiagnosticStatus:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
 from collections.abc import Callable
 
 import rclpy
@@ -13,18 +14,22 @@ from rclpy.signals import SignalHandlerOptions
 
 from umf_ros.errors import UmfError
 
+LONGEST_WAIT_S = 60.0
+"""So long a node that was asked to end may wait for those that it hears."""
+
 
 def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> int:
     """Spin one node until Ctrl-C, then let it finish; returns the exit status.
 
     A `UmfError` while the node starts or finishes is one line on stderr and status 1. The first SIGINT or
-    SIGTERM ends the spinning; while the node writes its results further ones are ignored.
+    SIGTERM ends the spinning, as soon as the node is ready to close; a second one ends it at once. While the node
+    writes its results further ones are ignored.
     """
-    # our own handlers: rclpy's would shut the context down before the node has published its last words
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     asked: list[int] = []
+    # our own handlers, before anything else: rclpy's would shut the context down before the node's last words
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: asked.append(number))
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = make_node()
     except UmfError as error:
@@ -37,6 +42,7 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     try:
         while not asked and rclpy.ok():
             executor.spin_once(timeout_sec=0.2)
+        _wait_until_ready(node, executor, asked)
     except ExternalShutdownException:
         pass
     finally:
@@ -49,6 +55,13 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
         node.destroy_node()
         rclpy.try_shutdown()
     return status
+
+
+def _wait_until_ready(node: Node, executor: SingleThreadedExecutor, asked: list[int]) -> None:
+    ready: Callable[[], bool] = getattr(node, "ready_to_close", lambda: True)
+    deadline, first = time.monotonic() + LONGEST_WAIT_S, len(asked)
+    while not ready() and len(asked) == first and time.monotonic() < deadline and rclpy.ok():
+        executor.spin_once(timeout_sec=0.05)
 
 
 def complain(error: UmfError) -> None:

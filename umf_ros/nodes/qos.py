@@ -6,7 +6,10 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
 from umf_ros.config import Qos
 
-CLOSURES_QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE)
+# with their history: a SLAM system that joins late gets every closure and verdict of the run
+CLOSURES_QOS = QoSProfile(
+    depth=5000, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+)
 # maps and markers: whoever joins late gets the last one (REP-2003)
 LATCHED_QOS = QoSProfile(
     depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL

@@ -9,12 +9,23 @@ import numpy as np
 from umf_ros.config import Database, Loop
 from umf_ros.frames import Candidate, Keyframe
 from umf_ros.keyframes import is_past
+from umf_ros.places.columns import Columns
 from umf_ros.places.index import DescriptorIndex, Mask
 from umf_ros.places.store import KeyframeStore, PlaceEntry
+
+SAME_KEYFRAME = 0.98
+"""Two keyframes of one stamp whose descriptors are this similar are one measurement read twice (*by hand*: runtimes of
+the network differ by less than 0.001; clocks that begin at 0 give the same stamps to scans of anything)."""
+VISITS = 4
+"""A place is handed on from at most so many sessions (*by hand*): as many as get a metric pose."""
+WIDER = 10
+"""So many times the candidates asked for are looked through for diverse ones (*by hand*)."""
 
 
 class PlaceDatabase:
     """Keyframes by index: descriptors in memory for exact search, everything else on disk.
+
+    Nothing is ever deleted here: sessions end and new ones begin.
 
     Args:
         settings: where to keep the keyframes.
@@ -22,7 +33,7 @@ class PlaceDatabase:
         dimension: numbers per descriptor.
 
     Raises:
-        UmfError: the file is no place database, or belongs to another embedder.
+        UmfError: the file is no place database, belongs to another embedder, or is in use.
     """
 
     def __init__(self, settings: Database, embedder: str, dimension: int) -> None:
@@ -30,10 +41,8 @@ class PlaceDatabase:
         identity = {"embedder": embedder, "dimension": str(dimension)}
         self._store = KeyframeStore(path, identity, settings.cached_keyframes)
         self._index = DescriptorIndex(dimension)
-        self._stamps: list[int] = []
-        self._travelled: list[float] = []
-        self._sessions: list[int] = []
-        self._by_key: dict[tuple[int, int], int] = {}
+        self._columns = Columns(stamp=np.int64, session=np.int64, travelled=np.float64)
+        self._by_stamp: dict[int, tuple[int, ...]] = {}
         for entry in self._store.entries():
             self._register(entry)
 
@@ -44,13 +53,26 @@ class PlaceDatabase:
         return self._store[index]
 
     def index_of(self, stamp_ns: int, session: int) -> int | None:
-        """Index of a keyframe by its key; None when it is not, or no longer, there."""
-        return self._by_key.get((session, stamp_ns))
+        """Index of a keyframe by its key; None when it is not there."""
+        rows = self._by_stamp.get(stamp_ns, ())
+        return next((row for row in reversed(rows) if self._columns["session"][row] == session), None)
+
+    def newest_at(self, stamp_ns: int) -> int | None:
+        """Index of the newest keyframe of a stamp; None when there is none."""
+        return next(reversed(self._by_stamp.get(stamp_ns, ())), None)
+
+    def recognise(self, keyframe: Keyframe) -> int | None:
+        """Index of the same measurement, stored before, as when a recording is played again; or None."""
+        rows = self._by_stamp.get(keyframe.stamp_ns, ())
+        descriptor = keyframe.embedding.descriptor
+        similarity = {row: float(self._index.descriptors[row] @ descriptor) for row in rows}
+        best = max(similarity, key=lambda row: similarity[row], default=None)
+        return best if best is not None and similarity[best] >= SAME_KEYFRAME else None
 
     @property
     def next_session(self) -> int:
         """A session number no stored keyframe has."""
-        return max(self._sessions, default=-1) + 1
+        return int(self._columns["session"].max(initial=-1)) + 1
 
     def add(self, keyframe: Keyframe) -> int:
         """Remember a keyframe and return its index."""
@@ -61,32 +83,15 @@ class PlaceDatabase:
         """The most similar earlier places, best first, by exhaustive search.
 
         Keyframes must be older than `min_time_gap_s`, and those of the same session further back along
-        the path than `min_travel_m`; where either path length is unknown, time alone decides.
+        the path than `min_travel_m`; where either path length is unknown, time alone decides. A place that was
+        visited in many sessions does not crowd out the others.
         """
-        found = self._index.search(keyframe.embedding.descriptor, rules.top_k, self._admissible(keyframe, rules))
-        return [
-            Candidate(i, self._stamps[i], similarity) for i, similarity in found if similarity >= rules.min_similarity
-        ]
-
-    def forget_from(self, stamp_ns: int, first_session: int = 0) -> int:
-        """Forget keyframes from `stamp_ns` on, as when a recording starts over; returns how many.
-
-        Args:
-            stamp_ns: the first that is forgotten.
-            first_session: earlier sessions (of earlier runs) are kept whatever their stamps.
-        """
-        earlier = np.array(self._sessions, np.int64) < first_session
-        keep = earlier | (np.array(self._stamps, np.int64) < stamp_ns)
-        kept = np.flatnonzero(keep).tolist()
-        forgotten = len(self) - len(kept)
-        if forgotten:
-            self._store.keep(kept)
-            self._index.keep(keep)
-            self._stamps = [self._stamps[i] for i in kept]
-            self._travelled = [self._travelled[i] for i in kept]
-            self._sessions = [self._sessions[i] for i in kept]
-            self._by_key = {key: i for i, key in enumerate(zip(self._sessions, self._stamps, strict=True))}
-        return forgotten
+        descriptor, wanted = keyframe.embedding.descriptor, rules.top_k * WIDER
+        found = self._index.search(descriptor, wanted, self._admissible(keyframe, rules))
+        similar = [(row, similarity) for row, similarity in found if similarity >= rules.min_similarity]
+        stamps = self._columns["stamp"]
+        chosen = self._diverse(similar, rules.top_k)
+        return [Candidate(row, int(stamps[row]), similarity) for row, similarity in chosen]
 
     def save(self, path: Path) -> None:
         """Write a copy of the database to `path`."""
@@ -96,14 +101,32 @@ class PlaceDatabase:
         """Release the file."""
         self._store.close()
 
+    def _diverse(self, found: list[tuple[int, float]], count: int) -> list[tuple[int, float]]:
+        """The best `count`, but of one place those of `VISITS` sessions only.
+
+        Two keyframes of different sessions show one place when they are more like each other than like the query.
+        """
+        sessions = self._columns["session"]
+        if len(found) <= count or len({int(sessions[row]) for row, _ in found}) <= VISITS:
+            return found[:count]
+        chosen: list[tuple[int, float]] = []
+        for row, similarity in found:
+            rows = np.array([one for one, _ in chosen], np.intp)
+            alike = self._index.descriptors[rows] @ self._index.descriptors[row] > similarity
+            visits = set(sessions[rows[alike]].tolist())
+            if len(visits) < VISITS or int(sessions[row]) in visits:
+                chosen.append((row, similarity))
+            if len(chosen) == count:
+                break
+        return chosen
+
     def _register(self, entry: PlaceEntry) -> int:
-        self._stamps.append(entry.stamp_ns)
-        self._travelled.append(entry.travelled_m)
-        self._sessions.append(entry.session)
-        self._by_key[entry.session, entry.stamp_ns] = len(self._index)
-        return self._index.add(entry.descriptor)
+        row = self._index.add(entry.descriptor)
+        self._columns.append(stamp=entry.stamp_ns, session=entry.session, travelled=entry.travelled_m)
+        self._by_stamp[entry.stamp_ns] = (*self._by_stamp.get(entry.stamp_ns, ()), row)
+        return row
 
     def _admissible(self, keyframe: Keyframe, rules: Loop) -> Mask:
-        age_ns = keyframe.stamp_ns - np.array(self._stamps, np.int64)
-        way_m = keyframe.travelled_m - np.array(self._travelled, np.float64)
-        return is_past(age_ns, way_m, rules, np.array(self._sessions, np.int64) == keyframe.session)
+        age_ns = keyframe.stamp_ns - self._columns["stamp"]
+        way_m = keyframe.travelled_m - self._columns["travelled"]
+        return is_past(age_ns, way_m, rules, self._columns["session"] == keyframe.session)

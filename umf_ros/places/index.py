@@ -46,12 +46,6 @@ class DescriptorIndex:
         self._size += 1
         return self._size - 1
 
-    def keep(self, rows: Mask) -> None:
-        """Forget every descriptor whose row is False in the (N,) mask."""
-        kept = self.descriptors[rows].copy()
-        self._size = len(kept)
-        self._table[: self._size] = kept
-
     def search(self, descriptor: Array, top_k: int, admissible: Mask) -> list[tuple[int, float]]:
         """The best rows with their cosine similarity, best first; equal ones in order of row.
 

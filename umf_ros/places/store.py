@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sqlite3
-import tempfile
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ from safetensors import SafetensorError
 
 from umf_ros.errors import UmfError, writing
 from umf_ros.frames import Keyframe
+from umf_ros.locks import FileLock
 from umf_ros.places.packing import pack, unpack
 
 SCHEMA_VERSION = 3
@@ -55,15 +55,17 @@ class KeyframeStore:
     """A table of keyframes in SQLite, in the order they were added, with a bounded cache in front.
 
     A rover that drives for days collects more local features than fit in memory; every keyframe is
-    written when it is added, so a crash loses none.
+    written when it is added, so a crash loses none. What is written is never deleted here. One process at a time has a
+    file; the others may read it.
 
     Args:
-        path: database file, opened when it exists; None keeps a temporary one.
+        path: database file, opened when it exists; None keeps a temporary one, which no end of the process leaves
+            behind.
         identity: what must agree with a stored file, such as the embedder's name and dimension.
         cached: keyframes kept in memory.
 
     Raises:
-        UmfError: the file is no place database or belongs to another embedder.
+        UmfError: the file is no place database, belongs to another embedder, or is in use.
         OutputError: the file cannot be written.
     """
 
@@ -71,10 +73,18 @@ class KeyframeStore:
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, Keyframe] = OrderedDict()
         self._cached = cached
-        self._folder = tempfile.TemporaryDirectory(prefix="umf_places_") if path is None else None
-        self.path = path if path is not None else Path(self._folder.name) / "places.sqlite"  # type: ignore[union-attr]
+        self.path = path
         self._rows: list[int] = []
-        self._connection = self._open({"schema": str(SCHEMA_VERSION), **identity})
+        self._file_lock: FileLock | None = None
+        try:
+            self._connection = self._open({"schema": str(SCHEMA_VERSION), **identity})
+        except BaseException:
+            self._unlock()
+            raise
+
+    @property
+    def _name(self) -> str:
+        return str(self.path or "temporary place database")
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -105,7 +115,7 @@ class KeyframeStore:
                 metres = float("nan") if travelled_m is None else travelled_m
                 yield PlaceEntry(stamp_ns, session, metres, np.frombuffer(descriptor, np.float32))
         except sqlite3.Error as error:
-            raise UmfError(f"{self.path} is damaged: {error}") from None
+            raise UmfError(f"{self._name} is damaged: {error}") from None
 
     def add(self, keyframe: Keyframe) -> int:
         """Append a keyframe and return its index.
@@ -118,26 +128,11 @@ class KeyframeStore:
             entry = PlaceEntry.of(keyframe)
             descriptor = np.ascontiguousarray(entry.descriptor, np.float32).tobytes()
             values = (row, entry.stamp_ns, entry.session, entry.travelled_m, descriptor, pack(keyframe))
-            with writing(self.path, sqlite3.Error), self._connection:
+            with writing(self._name, sqlite3.Error), self._connection:
                 self._connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?, ?)", values)
             self._rows.append(row)
             self._remember(row, keyframe)
             return len(self._rows) - 1
-
-    def keep(self, indices: list[int]) -> None:
-        """Forget every keyframe whose index is not listed.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        with self._lock:
-            kept = [self._rows[index] for index in indices]
-            gone = set(self._rows) - set(kept)
-            with writing(self.path, sqlite3.Error), self._connection:
-                self._connection.executemany("DELETE FROM keyframe WHERE id = ?", [(row,) for row in gone])
-            self._rows = kept
-            for row in gone:
-                self._cache.pop(row, None)
 
     def save(self, path: Path) -> None:
         """Write a copy to `path` while the store stays in use.
@@ -159,8 +154,12 @@ class KeyframeStore:
         """Close the file; a temporary one is deleted."""
         with self._lock:
             self._connection.close()
-            if self._folder is not None:
-                self._folder.cleanup()
+            self._unlock()
+
+    def _unlock(self) -> None:
+        if self._file_lock is not None:
+            self._file_lock.release()
+            self._file_lock = None
 
     def _remember(self, row: int, keyframe: Keyframe) -> None:
         self._cache[row] = keyframe
@@ -172,12 +171,14 @@ class KeyframeStore:
             (blob,) = self._connection.execute("SELECT data FROM keyframe WHERE id = ?", (row,)).fetchone()
             return unpack(blob)
         except (sqlite3.Error, SafetensorError) as error:
-            raise UmfError(f"{self.path} is damaged at its keyframe {row}: {error}") from None
+            raise UmfError(f"{self._name} is damaged at its keyframe {row}: {error}") from None
 
     def _open(self, identity: dict[str, str]) -> sqlite3.Connection:
-        with writing(self.path, sqlite3.Error):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            connection = sqlite3.connect(self.path, check_same_thread=False)
+        with writing(self._name, sqlite3.Error):
+            if self.path is not None:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+            # without a name SQLite keeps a file that no folder lists
+            connection = sqlite3.connect(self.path or "", check_same_thread=False)
         try:
             self._prepare(connection, identity)
             self._rows = [row for (row,) in connection.execute("SELECT id FROM keyframe ORDER BY id")]
@@ -186,20 +187,19 @@ class KeyframeStore:
             raise
         except sqlite3.Error as error:
             connection.close()
-            raise UmfError(f"{self.path} cannot be used as a place database: {error}") from None
+            raise UmfError(f"{self._name} cannot be used as a place database: {error}") from None
         return connection
 
     def _prepare(self, connection: sqlite3.Connection, identity: dict[str, str]) -> None:
         """Make an empty file a place database, and look at what others are before anything is changed."""
-        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if tables:
-            if not {"about", "keyframe"} <= tables:
-                raise UmfError(f"{self.path} is no place database, but another one with {', '.join(sorted(tables))}")
+        if _tables(connection):
             self._check_identity(connection, identity)
+        if self.path is not None:
+            self._file_lock = FileLock(self.path)
         # WAL without a sync per keyframe: safe against a crash of the process
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
-        if not tables:
+        if not _tables(connection):
             with connection:
                 connection.execute("BEGIN")
                 for table in _TABLES:
@@ -207,12 +207,19 @@ class KeyframeStore:
                 connection.execute("INSERT INTO about VALUES (?)", (json.dumps(identity),))
 
     def _check_identity(self, connection: sqlite3.Connection, identity: dict[str, str]) -> None:
+        tables = _tables(connection)
+        if not {"about", "keyframe"} <= tables:
+            raise UmfError(f"{self._name} is no place database, but another one with {', '.join(sorted(tables))}")
         about = connection.execute("SELECT content FROM about").fetchone()
         stored = json.loads(about[0]) if about else {}
         if stored.get("schema") != identity["schema"]:
-            raise UmfError(f"{self.path} was written by another version of umf_ros; name a new file (database.path)")
+            raise UmfError(f"{self._name} was written by another version of umf_ros; name a new file (database.path)")
         wrong = [
             f"{name} {stored.get(name)}, not {value}" for name, value in identity.items() if stored.get(name) != value
         ]
         if wrong:
-            raise UmfError(f"{self.path} was made with {'; '.join(wrong)}")
+            raise UmfError(f"{self._name} was made with {'; '.join(wrong)}")
+
+
+def _tables(connection: sqlite3.Connection) -> set[str]:
+    return {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}

@@ -71,6 +71,10 @@ class ConsistencyGraph:
         self._inconsistent: list[set[int]] = []
         self.place_of: list[int] = []
 
+    def retune(self, settings: PoseGraphSettings) -> None:
+        """Compare by other gates from now on."""
+        self._settings = settings
+
     def add(self, row: int, scale: NoiseScale) -> LoopResiduals:
         """Compare the newest closure with all near ones; returns the loops it makes with them."""
         assert row == len(self._consistent)

@@ -91,6 +91,11 @@ class OdometryChain:
         """Stamp of the last message, None without one."""
         return int(self._messages["stamp"][-1]) if len(self._messages) else None
 
+    @property
+    def oldest_ns(self) -> int | None:
+        """Stamp of the first message, None without one."""
+        return int(self._messages["stamp"][0]) if len(self._messages) else None
+
     def add(self, stamp_ns: int, pose: Array, covariance: Array | None = None) -> None:
         """Remember a message; see `PoseGraph.add_odometry`."""
         self._arrived.append((stamp_ns, pose))

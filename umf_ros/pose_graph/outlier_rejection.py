@@ -91,6 +91,11 @@ class OutlierRejection:
         self.scale = NoiseScale()
         self.closures: list[TrackedClosure] = []
 
+    def retune(self, settings: PoseGraphSettings) -> None:
+        """Judge by other gates from now on."""
+        self._settings = settings
+        self._consistency.retune(settings)
+
     def consider(self, arrived: list[TrackedClosure]) -> list[ClosureVerdict]:
         """Take closures in; returns the verdicts that are new or changed.
 

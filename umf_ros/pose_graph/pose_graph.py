@@ -31,6 +31,7 @@ from umf_ros.trajectory import Trajectory, write_tum
 
 logger = logging.getLogger(__name__)
 _NO_ODOMETRY_YET = "its odometry has not arrived"
+_BEFORE_ODOMETRY = "no odometry at its keyframes: it began later"
 
 
 @dataclass
@@ -61,8 +62,14 @@ class PoseGraph:
         self._rejection = OutlierRejection(self._settings, self._sessions)
         self._waiting: list[_Waiting] = []
         self._seen: set[tuple[int, int, bytes]] = set()
+        self._placed: set[tuple[int, int, int, int, bytes]] = set()
         self._refused: list[ClosureVerdict] = []
         self.counts: Counter[str] = Counter()
+
+    def retune(self, settings: PoseGraphSettings) -> None:
+        """Judge by other gates from now on; the model of the odometry's noise stays."""
+        self._settings = settings
+        self._rejection.retune(settings)
 
     def begin_session(self) -> None:
         """Start a new odometry chain with its own gauge; later odometry belongs to it."""
@@ -172,7 +179,10 @@ class PoseGraph:
             tracked = self._locate(entry)
             waited_ns = entry.waited_ns(newest_ns)
             if tracked is not None:
-                arrived.append(tracked)
+                if self._is_new(tracked):
+                    arrived.append(tracked)
+            elif waited_ns > self._settings.max_gap_s * 1e9 and self._precedes_all(entry.closure):
+                verdicts.append(self._refuse(entry.closure, _BEFORE_ODOMETRY))
             elif waited_ns > self._settings.max_pending_s * 1e9:
                 verdicts.append(self._refuse(entry.closure, "no odometry at its keyframes"))
             else:
@@ -182,6 +192,22 @@ class PoseGraph:
                 waiting.append(entry)
         self._waiting = waiting
         return verdicts, arrived
+
+    def _is_new(self, tracked: TrackedClosure) -> bool:
+        """Whether no closure like this joins the same sessions: a latched topic tells its history again."""
+        closure = tracked.closure
+        stamps = closure.match_stamp_ns, closure.query_stamp_ns
+        key = tracked.match, tracked.query, *stamps, closure.match_T_query.tobytes()
+        if key in self._placed:
+            self.counts["closure twice"] += 1
+            return False
+        self._placed.add(key)
+        return True
+
+    def _precedes_all(self, closure: LoopClosure) -> bool:
+        """Whether a keyframe is older than all odometry: this graph began later, and hears of that no more."""
+        oldest_ns = self._sessions.oldest_ns
+        return oldest_ns is not None and min(closure.match_stamp_ns, closure.query_stamp_ns) < oldest_ns
 
     def _locate(self, entry: _Waiting) -> TrackedClosure | None:
         query = self._sessions.find(entry.closure.query_stamp_ns)

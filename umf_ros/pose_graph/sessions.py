@@ -107,6 +107,11 @@ class Sessions:
         return max((chain.newest_ns for chain in self.chains if chain.newest_ns is not None), default=None)
 
     @property
+    def oldest_ns(self) -> int | None:
+        """Stamp of the oldest odometry of all sessions; None without."""
+        return min((chain.oldest_ns for chain in self.chains if chain.oldest_ns is not None), default=None)
+
+    @property
     def outgrown(self) -> bool:
         """Whether a session has odometry but no pose in the last solution."""
         if self.solution is None:

@@ -7,6 +7,8 @@ import resource
 import time
 from array import array
 from collections.abc import Mapping
+from contextlib import suppress
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -15,63 +17,102 @@ import numpy as np
 from umf_ros import __version__
 from umf_ros.config import Settings, dump_settings
 from umf_ros.errors import UmfError
-from umf_ros.frames import Frame
+from umf_ros.frames import Frame, LoopClosure
 from umf_ros.loop_detector import Detection
 from umf_ros.runs import tables
+from umf_ros.runs.descriptors import DescriptorFile
 from umf_ros.runs.folder import write_atomically
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
 COUNTS = ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected")
-STAGES = ("embed", "query", "verify", "submaps", "total")
+STAGES = tables.STAGES
 
 
 class RunRecorder:
     """Fills a run folder: `config.yaml` at once, tables row by row, `summary.json` on `write_summary`.
 
+    What an earlier process left in the folder is never cut short: tables are appended to, counts go on. A keyframe
+    that is there already, as when a recording is played again, is not written twice.
+
     Args:
         folder: an existing, writable folder.
         settings: the effective settings.
         weights: name of the network's weights, for the summary.
+        resume: what was not finished of a recording is done again: rows of a keyframe that is not there whole go.
+
+    Attributes:
+        recorded: stamps and sessions of the keyframes in the folder.
 
     Raises:
         OutputError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, settings: Settings, weights: str) -> None:
+    def __init__(self, folder: Path, settings: Settings, weights: str, resume: bool = False) -> None:
         self.folder = folder
         self._settings = settings
         self._weights = weights
         write_atomically(folder / "config.yaml", dump_settings(settings))
-        self._closures = tables.CsvTable(folder / "closures.csv", tables.CLOSURES)
-        self._candidates = tables.CsvTable(folder / "candidates.csv", tables.CANDIDATES)
         self._keyframes = tables.CsvTable(folder / "keyframes.csv", tables.KEYFRAMES)
-        self._inliers = tables.CsvTable(folder / "inliers.csv", tables.INLIERS)
+        self._latencies = tables.CsvTable(folder / "latencies.csv", tables.LATENCIES)
+        self._descriptors = DescriptorFile(folder)
+        self.recorded = {(int(row["stamp_ns"]), int(row["session"])) for row in self._keyframes.rows}
+        whole = {row["stamp_ns"] for row in self._keyframes.rows}
+
+        def table(name: str, columns: list[str]) -> tables.CsvTable:
+            keep = (lambda row: row["query_stamp_ns"] in whole) if resume else None
+            return tables.CsvTable(folder / f"{name}.csv", columns, keep)
+
+        self._closures = table("closures", tables.CLOSURES)
+        self._candidates = table("candidates", tables.CANDIDATES)
+        self._inliers = table("inliers", tables.INLIERS)
+        self._pairs = {(int(row["query_stamp_ns"]), int(row["match_stamp_ns"])) for row in self._closures.rows}
         self._latency = {stage: array("f") for stage in STAGES}
-        self._counts = dict.fromkeys(COUNTS, 0)
+        self._counts = self._earlier_counts(resume)
         self._started = time.monotonic()
         self._recorded_ns = 0
         self._last_stamp_ns: int | None = None
 
     def record(self, frame: Frame, detection: Detection) -> None:
         """Write down what became of one frame."""
-        self._count_frame(frame)
+        self.count(frame)
+        if self._last_stamp_ns is not None:
+            self._recorded_ns += max(0, frame.stamp_ns - self._last_stamp_ns)
+        self._last_stamp_ns = frame.stamp_ns
         keyframe = detection.keyframe
-        if keyframe is None:
+        if keyframe is None or (keyframe.stamp_ns, keyframe.session) in self.recorded:
             return
         self._counts["keyframes"] += 1
         self._counts["queries"] += bool(detection.verdicts)
-        self._keyframes.append([[keyframe.stamp_ns, keyframe.session, f"{keyframe.travelled_m:.4f}"]])
+        times = [f"{detection.latency_ms.get(stage, nan):.1f}" for stage in STAGES]
+        self._latencies.append([[keyframe.stamp_ns, *times]])
+        self._descriptors.append(keyframe.stamp_ns, keyframe.embedding.descriptor)
         self._candidates.append([tables.candidate_row(keyframe.stamp_ns, verdict) for verdict in detection.verdicts])
         for verdict in detection.verdicts:
             if verdict.closure is None:
                 self._counts["closures_rejected"] += 1
                 continue
+            pair = keyframe.stamp_ns, verdict.candidate.stamp_ns
+            if pair in self._pairs:
+                continue
+            self._pairs.add(pair)
             self._counts["closures_published"] += 1
             self._closures.append([tables.closure_row(verdict.closure, verdict.candidate.similarity)])
             self._inliers.append(tables.inlier_rows(keyframe.stamp_ns, verdict))
+        # last: a keyframe that is there is there with all that was found for it
+        self._keyframes.append([[keyframe.stamp_ns, keyframe.session, f"{keyframe.travelled_m:.4f}"]])
+        self.recorded.add((keyframe.stamp_ns, keyframe.session))
         for stage, milliseconds in detection.latency_ms.items():
             self._latency[stage].append(milliseconds)
+
+    def count(self, frame: Frame) -> None:
+        """Count a frame, also one that was dealt with before."""
+        self._counts["frames"] += 1
+        self._counts["pairs"] += frame.left is not None and frame.points is not None
+
+    def earlier_closures(self) -> list[LoopClosure]:
+        """The closures that were in the folder before."""
+        return [tables.parse_closure(row) for row in self._closures.rows]
 
     def summary(self, drops: Mapping[str, int]) -> dict[str, Any]:
         """What `summary.json` holds; `ground_truth` is filled in by the report."""
@@ -94,15 +135,22 @@ class RunRecorder:
 
     def close(self) -> None:
         """Close the tables."""
-        for table in (self._closures, self._candidates, self._keyframes, self._inliers):
+        for table in (self._closures, self._candidates, self._keyframes, self._latencies, self._inliers):
             table.close()
+        self._descriptors.close()
 
-    def _count_frame(self, frame: Frame) -> None:
-        self._counts["frames"] += 1
-        self._counts["pairs"] += frame.left is not None and frame.points is not None
-        if self._last_stamp_ns is not None:
-            self._recorded_ns += max(0, frame.stamp_ns - self._last_stamp_ns)
-        self._last_stamp_ns = frame.stamp_ns
+    def _earlier_counts(self, resume: bool) -> dict[str, int]:
+        """Counts of what the folder holds; of a recording that is resumed, all frames come by again."""
+        counts = dict.fromkeys(COUNTS, 0)
+        if not resume and (self.folder / "summary.json").exists():
+            with suppress(UmfError):
+                earlier = read_summary(self.folder)
+                counts |= {name: int(earlier[name]) for name in ("frames", "pairs") if name in earlier}
+        counts["keyframes"] = len(self.recorded)
+        counts["queries"] = len({row["query_stamp_ns"] for row in self._candidates.rows})
+        counts["closures_published"] = len(self._closures.rows)
+        counts["closures_rejected"] = len(self._candidates.rows) - len(self._closures.rows)
+        return counts
 
 
 def count_drops(counters: Mapping[Input, InputCounter], worker: int = 0) -> dict[str, int]:

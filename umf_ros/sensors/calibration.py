@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -45,6 +46,15 @@ class Calibration:
     def image_size(self) -> tuple[int, int]:
         """Width and height of the images that arrive."""
         return self.rectifier.raw_size if self.rectifier else (self.camera.width, self.camera.height)
+
+    def with_poses(self, poses: Mapping[str, Array]) -> Calibration:
+        """Return this calibration with other poses of the sensors, `body_T_camera` or `body_T_lidar` by name."""
+        camera, lidar = (poses.get(f"body_T_{name}") for name in ("camera", "lidar"))
+        return replace(
+            self,
+            body_T_camera=self.body_T_camera if camera is None else camera,
+            body_T_lidar=self.body_T_lidar if lidar is None else lidar,
+        )
 
     def with_camera(self, camera: StereoCamera) -> Calibration:
         """Return this calibration with the intrinsics of a camera_info.

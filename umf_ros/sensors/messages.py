@@ -36,6 +36,14 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
 # sensor_msgs/PointField.datatype
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
+FURTHEST_M = 1e7
+"""No odometry is further from its origin: a quarter of the earth."""
+NARROWEST_RAD, WIDEST_RAD = 0.02, 3.1
+"""Angles of view that a rectified camera can have."""
+LARGEST_IMAGE = 20_000
+"""Pixels of a side."""
+LARGEST_RECORD = 4096
+"""Bytes of a point; drivers have some dozens."""
 NO_RETURN_RANGE_M = 1.0
 """Range at which the Blickfeld driver puts the pulses that came back from nowhere, with intensity 0."""
 
@@ -151,6 +159,8 @@ def _cloud_records(message: Any) -> NDArray[Any]:
     if missing:
         raise MessageError("fields", f"cloud has no field {', '.join(missing)}")
     count = message.width * message.height
+    if message.point_step > LARGEST_RECORD:
+        raise MessageError("step", f"cloud point step is {message.point_step} bytes")
     if count == 0:
         return np.empty(0, [("x", "f4"), ("y", "f4"), ("z", "f4")])
     dtype = _record_type(list(fields.values()), message.point_step, ">" if message.is_bigendian else "<")
@@ -203,6 +213,8 @@ def decode_pose(pose: Any) -> Array:
     translation = np.array([position.x, position.y, position.z], dtype=float)
     if not np.isfinite(translation).all():
         raise MessageError("pose", "pose with a position that is not finite")
+    if np.abs(translation).max() > FURTHEST_M:
+        raise MessageError("pose", f"pose with a position {np.abs(translation).max():.3g} m from the origin")
     try:
         return from_quaternion(translation, (turn.x, turn.y, turn.z, turn.w))
     except ValueError as error:
@@ -228,9 +240,22 @@ def decode_camera_info(left: Any, right: Any | None = None) -> StereoCamera:
 
 def _projection(info: Any, name: str) -> Array:
     """(3, 4) projection of the rectified image; from K where the driver leaves P empty."""
+    if max(info.width, info.height) > LARGEST_IMAGE:
+        raise MessageError("camera_info", f"{name} camera_info for {info.width} x {info.height} pixels")
     matrix = np.array(info.p, dtype=float).reshape(3, 4)
     if not matrix.any():
         matrix[:, :3] = np.array(info.k, dtype=float).reshape(3, 3)
     if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0 and info.width > 0 and info.height > 0):
         raise MessageError("camera_info", f"{name} camera_info is not calibrated")
+    _check_pinhole(matrix, info, name)
     return matrix
+
+
+def _check_pinhole(matrix: Array, info: Any, name: str) -> None:
+    """Refuse a camera that nobody can build."""
+    width, height, fx, fy = float(info.width), float(info.height), matrix[0, 0], matrix[1, 1]
+    views = [2 * np.arctan2(size / 2, focal) for size, focal in ((width, fx), (height, fy))]
+    centre = 0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height
+    if not (all(NARROWEST_RAD < view < WIDEST_RAD for view in views) and 0.5 < fx / fy < 2 and centre):
+        numbers = f"{width:.0f} x {height:.0f} pixels, fx {fx:.3g}, fy {fy:.3g}, centre {matrix[0, 2]:.3g}"
+        raise MessageError("camera_info", f"{name} camera_info of no real camera: {numbers}, {matrix[1, 2]:.3g}")

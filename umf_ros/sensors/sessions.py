@@ -93,6 +93,11 @@ class SessionClock:
         """Time since the first stamp on this clock."""
         return 0 if self._now_ns is None else self._now_ns - self._start_ns
 
+    @property
+    def start_ns(self) -> int:
+        """First stamp on this clock."""
+        return self._start_ns
+
     def newest_ns(self, *names: Input) -> int | None:
         """Latest stamp of some inputs on this clock, or None before their first."""
         return max((self._newest[name].stamp_ns for name in names if name in self._newest), default=None)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from umf_ros.config import Sync
 from umf_ros.errors import MessageError
 from umf_ros.frames import Frame, Image, StereoCamera
+from umf_ros.geometry import Array
 from umf_ros.sensors.assembly import Anchor, assemble
 from umf_ros.sensors.buffers import ImageBuffer, InputCounter, OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
@@ -88,6 +89,10 @@ class Synchronizer:
         self._calibration = self._calibration.with_camera(camera)
         self._absent.add("camera_info")  # comes no second time
 
+    def use_mounting(self, poses: Mapping[str, Array]) -> None:
+        """Replace poses of the sensors, `body_T_camera` or `body_T_lidar` by name."""
+        self._calibration = self._calibration.with_poses(poses)
+
     def add(self, name: Input, stamp_ns: int, value: Any) -> None:
         """Add a measurement.
 
@@ -155,7 +160,7 @@ class Synchronizer:
         else:
             buffer = self._left if name == "left" else self._right
             buffer.add(stamp_ns, value, late=stamp_ns <= self._given_up_ns)
-            if name == "left" and "cloud" not in self._inputs:
+            if name == "left" and ("cloud" not in self._inputs or self._is_silent("cloud", stamp_ns)):
                 self._anchors.append(Anchor(stamp_ns, stamp_ns))
 
     def _check_size(self, image: Image) -> None:
@@ -216,9 +221,17 @@ class Synchronizer:
         return name in self._inputs and name not in self._absent
 
     def _note_absent(self) -> None:
-        """Wait no longer for inputs that have been silent since the start, until they speak."""
-        if self._clock.elapsed_ns > SILENCE_NS:
-            self._absent |= {name for name in self._inputs if not self._clock.has_heard(name)}
+        """Wait no longer for inputs that have been silent for long, until they speak."""
+        now_ns = self._sensed_ns
+        if now_ns is not None:
+            silent = {name for name in self._inputs if name != "camera_info" and self._is_silent(name, now_ns)}
+            never = {name for name in self._inputs if not self._clock.has_heard(name)}
+            self._absent |= silent | (never if self._clock.elapsed_ns > SILENCE_NS else set())
+
+    def _is_silent(self, name: Input, now_ns: int) -> bool:
+        """Whether an input has said nothing for long, by the stamps of the others."""
+        newest_ns = self._clock.newest_ns(name)
+        return now_ns - (self._clock.start_ns if newest_ns is None else newest_ns) > SILENCE_NS
 
     def _complete(self, anchor: Anchor) -> None:
         left = self._left.nearest(anchor.stamp_ns, self._slop_ns)

@@ -71,9 +71,13 @@ class SubmapFinder:
         self._lookalikes = Lookalikes(self.trail, rules)
         self.reset()
 
+    def retune(self, settings: Verification, rules: Loop) -> None:
+        """Look for and judge submaps by other settings from now on."""
+        self._settings, self._rules = settings, rules
+        self._lookalikes.rules = self._expectation.rules = rules
+
     def reset(self) -> None:
-        """Forget what was found lately, and every place that the database has forgotten."""
-        self._lookalikes.forget(self.trail.forget())
+        """Forget what was found lately; the places stay."""
         self._expectation = Expectation(self.trail, self._rules)
         self._memory = TemporalMemory()
         self._drift.reset()

@@ -51,13 +51,6 @@ class KeypointIndex:
         self._owner = np.append(self._owner, np.full(len(keypoints), len(self._submaps), np.intp))
         self._submaps.append(keypoints)
 
-    def keep(self, rows: NDArray[np.bool_]) -> None:
-        """Forget every submap whose row is False in the (N,) mask."""
-        kept = [submap for submap, stays in zip(self._submaps, rows, strict=True) if stays]
-        self._submaps, self._owner = [], np.empty(0, np.intp)
-        for submap in kept:
-            self.add(submap)
-
     def search(self, query: Keypoints, admissible: NDArray[np.bool_]) -> list[Guess]:
         """The stored submaps that share most keypoints, best first.
 

@@ -45,14 +45,14 @@ class Expectation:
     """Where odometry puts the rover: from the latest closure on, and over a short way alone."""
 
     def __init__(self, trail: Trail, rules: Loop) -> None:
-        self._trail, self._rules = trail, rules
+        self._trail, self.rules = trail, rules
         self.latest: Found | None = None
 
     def propose(self, query: Keyframe) -> Proposal | None:
         """The nearest stop where the rover should be again, if there is one."""
         for session, odom_T_query, first_m, last_m in self._predictions(query):
             rows = self._trail.rows(session, first_m, last_m)
-            rows = rows[self._trail.past(query, rows, self._rules)]
+            rows = rows[self._trail.past(query, rows, self.rules)]
             poses = [relative(self._trail.stops[row].odom_T_body, odom_T_query) for row in rows]
             away = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
             if away and min(away) < const.SUBMAP_NEAR_M:
@@ -80,7 +80,7 @@ class Lookalikes:
     """Stops whose submaps show the same keypoints of the ground, whatever the heading."""
 
     def __init__(self, trail: Trail, rules: Loop) -> None:
-        self._trail, self._rules = trail, rules
+        self._trail, self.rules = trail, rules
         self._index = KeypointIndex()
         self._rows = np.empty(0, np.intp)
 
@@ -96,16 +96,10 @@ class Lookalikes:
             self._index.add(find_keypoints(submap.scan.elevation.relief))
             self._rows = np.append(self._rows, row)
 
-    def forget(self, kept: np.ndarray) -> None:
-        """Forget all stops but those of some rows, which get new ones in their order."""
-        known = np.isin(self._rows, kept)
-        self._index.keep(known)
-        self._rows = np.searchsorted(kept, self._rows[known])
-
     def propose(self, query: Submap) -> list[Proposal]:
         """The most alike, best first."""
         stops = [self._trail.stops[row] for row in self._rows]
-        admissible = self._trail.past(query.keyframe, self._rows, self._rules)
+        admissible = self._trail.past(query.keyframe, self._rows, self.rules)
         # scans that both submaps hold are alike for no other reason
         apart = [
             stop.session != query.keyframe.session or stop.travelled_m + const.SUBMAP_AFTER_M < query.first_m

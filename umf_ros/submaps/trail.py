@@ -59,21 +59,16 @@ class Trail:
         if keyframe.odom_T_body is None:
             return False
         last = self.stops[-1] if self.stops else None
+        if last is not None and keyframe.session < last.session:  # an old recording, played again
+            return False
         same_way = last is not None and last.session == keyframe.session
         if last is not None and same_way and keyframe.travelled_m - last.travelled_m < const.SUBMAP_STEP_M:
             return False
         self.stops.append(Stop(keyframe.stamp_ns, keyframe.session, keyframe.travelled_m, keyframe.odom_T_body))
         return True
 
-    def forget(self) -> NDArray[np.intp]:
-        """Forget what the database has forgotten, and return the rows that stay."""
-        kept = [row for row, stop in enumerate(self.stops) if self.index_of(stop) is not None]
-        self.stops = [self.stops[row] for row in kept]
-        self._submaps.clear()
-        return np.array(kept, np.intp)
-
     def index_of(self, stop: Stop) -> int | None:
-        """Its index in the database; None when it was forgotten."""
+        """Its index in the database; None when it is not there."""
         return self.database.index_of(stop.stamp_ns, stop.session)
 
     def past(self, query: Keyframe, rows: NDArray[np.intp], rules: Loop) -> NDArray[np.bool_]:

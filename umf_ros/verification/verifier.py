@@ -87,6 +87,10 @@ class Verifier:
         self._scans = ScanCache()
         self.latency_ms: dict[str, float] = {}
 
+    def retune(self, settings: Verification) -> None:
+        """Verify by other settings from now on; the acceptance model stays."""
+        self._settings, self._threshold = settings, settings.min_probability
+
     def reset(self) -> None:
         """Forget earlier keyframes, as after a jump of the clock."""
         self._memory.reset()

@@ -15,6 +15,7 @@ from umf_ros.commands.recordings import (
     RunsFolder,
     TruthPath,
     WeightsPath,
+    check_odometry_options,
     open_frames,
     open_recording,
 )
@@ -49,7 +50,7 @@ def command(
     dataset: DatasetName = "auto",
     embedder: Annotated[str | None, Optional(help=f"How places are embedded: {CHOICES}.")] = None,
     odometry: OdometryPath = None,
-    odometry_frame: OdometryFrame = "body",
+    odometry_frame: OdometryFrame = "",
     ground_truth: TruthPath = None,
     rule: Annotated[str, Optional(help="What is the same place in listed sequences: s3li or robotcar.")] = "s3li",
 ) -> None:
@@ -143,7 +144,10 @@ def _on_recording(
 ) -> Figures:
     from rich.console import Console
 
+    frame_of_odometry = check_odometry_options(odometry, odometry_frame)
+
     from umf_ros.bags.trajectories import read_ground_truth
+    from umf_ros.commands.progress import WARNING
     from umf_ros.embedding import make_embedder
     from umf_ros.frames import Frame
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
@@ -154,7 +158,7 @@ def _on_recording(
     truth = read_ground_truth(recording, ground_truth)
     if truth is None:
         raise ConfigError(f"{bag} holds no ground truth; name a file with --ground-truth")
-    frames = open_frames(recording, settings, console, odometry, odometry_frame)
+    frames = open_frames(recording, settings, lambda text: console.print(text, **WARNING), odometry, frame_of_odometry)
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, True, settings.verification.features))
     folder = create_run_folder(out)
     with _bar(console) as bar:

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from conftest import make_keyframe
+from typer.testing import CliRunner
+
+from umf_ros.commands.places import app
+from umf_ros.config import Database
+from umf_ros.errors import UmfError
+from umf_ros.places.database import PlaceDatabase
+from umf_ros.places.upkeep import StoredSession, delete_sessions, stored_sessions
+
+
+def database(path: Path) -> PlaceDatabase:
+    return PlaceDatabase(Database(path=str(path)), "test", 16)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    places = database(tmp_path / "map.sqlite")
+    for i in range(6):
+        places.add(make_keyframe(i, seed=i, session=i // 2))
+    places.close()
+    return tmp_path / "map.sqlite"
+
+
+def test_sessions_are_counted(path: Path) -> None:
+    assert stored_sessions(path)[1] == StoredSession(1, 2, 2 * 10**9, 3 * 10**9)
+
+
+def test_only_the_named_sessions_are_deleted(path: Path) -> None:
+    assert delete_sessions(path, [0, 2]) == 4
+    places = database(path)
+    assert [places[i].stamp_ns for i in range(len(places))] == [2 * 10**9, 3 * 10**9]
+
+
+def test_nothing_is_deleted_from_a_store_in_use_or_by_a_wrong_number(path: Path) -> None:
+    with pytest.raises(UmfError, match="has no session 7"):
+        delete_sessions(path, [0, 7])
+    places = database(path)
+    with pytest.raises(UmfError, match="is in use"):
+        delete_sessions(path, [0])
+    assert sum(session.keyframes for session in stored_sessions(path)) == len(places) == 6
+
+
+def test_the_command_asks_first(path: Path) -> None:
+    run = CliRunner().invoke
+    assert run(app, ["delete", str(path), "--session", "1"], input="n\n").exit_code == 1
+    assert len(stored_sessions(path)) == 3
+    assert "session 1: 2 keyframes, 1970-01-01 00:00:02" in run(app, ["list", str(path)]).output
+    assert run(app, ["delete", str(path), "--session", "1"], input="y\n").exit_code == 0
+    assert [session.number for session in stored_sessions(path)] == [0, 2]
+
+
+def test_what_is_no_store_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "text").write_text("nothing of the kind")
+    for name in ("text", "missing"):
+        with pytest.raises(UmfError) as caught:
+            stored_sessions(tmp_path / name)
+        assert "\n" not in str(caught.value)

@@ -1,0 +1,140 @@
+"""A graph that is killed and taken up is the graph that was."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from umf_ros.config import PoseGraphSettings
+from umf_ros.errors import OutputError, UmfError
+from umf_ros.frames import LoopClosure
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
+from umf_ros.sensors.durable_graph import DurableGraph
+
+SETTINGS = PoseGraphSettings(max_gap_s=3)
+
+
+@pytest.fixture(scope="module")
+def world() -> GraphWorld:
+    return with_wrong_closures(rover_loops(300, 10003), 0.3, "groups", 1)
+
+
+def made(path: Path | None, faults: list[OutputError] | None = None) -> DurableGraph:
+    return DurableGraph(SETTINGS, path, (faults if faults is not None else []).append)
+
+
+def drive(graph: DurableGraph, world: GraphWorld, first: int, last: int) -> None:
+    """The part of the drive between two poses, with the closures that end there."""
+    for k in range(first, last):
+        graph.take_odometry((k + 1) * PERIOD_NS, world.odometry[k])
+        for row, (_, query, *_) in enumerate(world.closures):
+            if query == k:
+                message = world.message(row)
+                stamps = message.query_stamp_ns + PERIOD_NS, message.match_stamp_ns + PERIOD_NS
+                graph.add_closure(LoopClosure(*stamps, message.match_T_query, message.covariance))
+        graph.update()
+
+
+def states(graph: DurableGraph) -> list[tuple[int, int, str]]:
+    return [(v.closure.match_stamp_ns, v.closure.query_stamp_ns, v.state.value) for v in graph.graph.closures()]
+
+
+def test_a_graph_that_was_killed_is_taken_up_as_it_was(world: GraphWorld, tmp_path: Path) -> None:
+    whole, path = made(None), tmp_path / "pose_graph.sqlite"
+    drive(whole, world, 0, len(world.truth))
+    for first, last in ((0, 120), (120, 220), (220, len(world.truth))):
+        graph = made(path)
+        assert graph.changed == 0 and graph.taken_up == len([c for c in world.closures if c[1] < first])
+        drive(graph, world, first, last)
+        graph._journal._lock.release()  # type: ignore[union-attr]  # as a kill does: nothing is closed
+    last_one = made(path)
+    assert states(last_one) == states(whole) and last_one.changed == 0
+    np.testing.assert_allclose(last_one.graph.trajectory()[1], whole.graph.trajectory()[1], atol=1e-6)
+    assert "accepted" in {state for *_, state in states(whole)}
+
+
+def test_a_revoked_closure_stays_revoked(world: GraphWorld, tmp_path: Path) -> None:
+    graph = made(tmp_path / "graph.sqlite")
+    drive(graph, world, 0, len(world.truth))
+    match, query, _ = next(one for one in states(graph) if one[2] == "accepted")
+    graph.revoke(match, query)
+    graph.close()
+    again = made(tmp_path / "graph.sqlite")
+    assert (match, query, "rejected") in states(again) and states(again) == states(graph)
+
+
+@pytest.mark.parametrize(
+    ("pause_s", "moved_m", "sessions"), [(10, 1.0, 1), (10, 300.0, 2), (3600, 1.0, 2), (-50, 0, 2)]
+)
+def test_odometry_goes_on_after_a_restart_only_if_it_can_be_the_same(
+    world: GraphWorld, tmp_path: Path, pause_s: int, moved_m: float, sessions: int
+) -> None:
+    graph = made(tmp_path / "graph.sqlite")
+    drive(graph, world, 0, 50)
+    graph.close()
+    again = made(tmp_path / "graph.sqlite")
+    pose = world.odometry[49].copy()
+    pose[0, 3] += moved_m
+    again.take_odometry(50 * PERIOD_NS + pause_s * 10**9, pose)
+    assert len(again.graph._sessions.chains) == sessions
+
+
+def test_odometry_that_begins_at_its_origin_is_another(world: GraphWorld, tmp_path: Path) -> None:
+    graph = made(tmp_path / "graph.sqlite")
+    drive(graph, world, 0, 3)
+    graph.close()
+    again = made(tmp_path / "graph.sqlite")
+    assert again.take_odometry(4 * PERIOD_NS, np.eye(4)) is not None
+
+
+def test_closures_that_are_told_again_after_a_restart_count_once(world: GraphWorld, tmp_path: Path) -> None:
+    graph = made(tmp_path / "graph.sqlite")
+    drive(graph, world, 0, len(world.truth))
+    graph.close()
+    again = made(tmp_path / "graph.sqlite")
+    again.take_odometry(10**18, np.eye(4))  # another session begins
+    told = [verdict.closure for verdict in graph.graph.closures()]
+    for closure in told:
+        again.add_closure(closure)
+    assert len(again.graph.closures()) == len(told) == again.graph.counts["closure twice"]
+
+
+def test_ending_a_graph_keeps_its_journal(world: GraphWorld, tmp_path: Path) -> None:
+    graph = made(tmp_path / "graph.sqlite")
+    drive(graph, world, 0, 60)
+    old = graph.end()
+    assert old is not None and sqlite3.connect(old).execute("SELECT count(*) FROM event").fetchone()[0] >= 60
+    drive(graph, world, 0, 10)
+    graph.close()
+    assert len(made(tmp_path / "graph.sqlite").graph.trajectory()[0]) <= 10
+
+
+def test_one_process_writes_and_what_is_no_journal_is_refused(tmp_path: Path) -> None:
+    first = made(tmp_path / "graph.sqlite")
+    with pytest.raises(UmfError, match="is in use by another process"):
+        made(tmp_path / "graph.sqlite")
+    first.close()
+    (tmp_path / "text.sqlite").write_text("no database, " * 100)
+    with pytest.raises(UmfError, match="cannot be used as a pose graph") as caught:
+        made(tmp_path / "text.sqlite")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_journal_that_cannot_be_written_costs_no_closure(world: GraphWorld, tmp_path: Path) -> None:
+    faults: list[OutputError] = []
+    graph = made(tmp_path / "graph.sqlite", faults)
+    graph._journal._connection.execute("PRAGMA query_only = 1")  # type: ignore[union-attr]
+    drive(graph, world, 0, 60)
+    assert len(graph.graph.trajectory()[0]) > 10 and faults and "cannot write" in str(faults[0])
+
+
+def test_a_closure_from_before_the_first_odometry_is_told_soon(world: GraphWorld) -> None:
+    graph = made(None)
+    drive(graph, world, 150, 160)
+    graph.add_closure(world.message(0))
+    drive(graph, world, 160, 175)
+    (verdict,) = [v for v in graph.graph.closures() if v.closure.match_stamp_ns == world.message(0).match_stamp_ns]
+    assert (verdict.state.value, verdict.reason) == ("refused", "no odometry at its keyframes: it began later")

@@ -1,0 +1,21 @@
+"""Hearing how the robot is built, where the messages of tf2 are installed."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+
+from umf_ros.sensors.static_transforms import TOPIC, StaticTransforms
+
+# latched by every broadcaster, each with its own part of the tree
+QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def hear_static_transforms(node: Node, transforms: StaticTransforms) -> None:
+    """Fill `transforms` from `/tf_static`; without tf2_msgs, which Jazzy from PyPI lacks, they stay empty."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
+        node.get_logger().info("tf2_msgs is not installed: the calibration file alone says where the sensors are")
+        return
+    node.create_subscription(TFMessage, TOPIC, transforms.add, QOS)

@@ -1,0 +1,67 @@
+"""What a person may do to a store of places that no process uses: look at its sessions, and delete some."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Collection, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from umf_ros.errors import UmfError
+from umf_ros.locks import FileLock
+
+
+@dataclass(frozen=True, slots=True)
+class StoredSession:
+    """One session of a store.
+
+    Attributes:
+        number: of the session.
+        keyframes: how many it has.
+        first_ns, last_ns: their first and last stamp.
+    """
+
+    number: int
+    keyframes: int
+    first_ns: int
+    last_ns: int
+
+
+def stored_sessions(path: Path) -> list[StoredSession]:
+    """The sessions of a store, also of one in use.
+
+    Raises:
+        UmfError: the file is missing or no place database.
+    """
+    if not path.is_file():
+        raise UmfError(f"there is no place database {path}")
+    with _told(path), closing(sqlite3.connect(path)) as connection:
+        columns = "SELECT session, count(*), min(stamp_ns), max(stamp_ns) FROM keyframe GROUP BY session"
+        return [StoredSession(*row) for row in connection.execute(columns)]
+
+
+def delete_sessions(path: Path, numbers: Collection[int]) -> int:
+    """Delete whole sessions for good; returns how many keyframes that were.
+
+    Raises:
+        UmfError: the file is no place database, is in use, or lacks one of the sessions.
+    """
+    unknown = set(numbers) - {session.number for session in stored_sessions(path)}
+    if unknown:
+        raise UmfError(f"{path} has no session {', '.join(map(str, sorted(unknown)))}")
+    lock = FileLock(path)
+    try:
+        with _told(path), closing(sqlite3.connect(path)) as connection, connection:
+            statement = "DELETE FROM keyframe WHERE session = ?"
+            return sum(connection.execute(statement, (number,)).rowcount for number in set(numbers))
+    finally:
+        lock.release()
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise UmfError(f"{path} cannot be used as a place database: {error}") from None

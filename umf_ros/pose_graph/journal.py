@@ -1,0 +1,154 @@
+"""What came to the pose graph, on disk as it comes: whoever starts again has the same graph."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+
+from umf_ros.errors import UmfError, writing
+from umf_ros.frames import LoopClosure
+from umf_ros.geometry import Array
+from umf_ros.locks import FileLock
+from umf_ros.pose_graph.closures import ClosureVerdict
+
+_TABLES = (
+    "CREATE TABLE event (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, first_ns INTEGER, second_ns INTEGER, data BLOB)",
+    "CREATE TABLE verdict (match_ns INTEGER, query_ns INTEGER, state TEXT, reason TEXT, residual REAL, "
+    "residual_m REAL, PRIMARY KEY (match_ns, query_ns))",
+)
+ODOMETRY, CLOSURE, REVOKED, DECIDED, STARTED = "odometry", "closure", "revoked", "decided", "started"
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One thing that happened to the graph.
+
+    Attributes:
+        kind: an odometry message came, a closure came, a pair of keyframes was revoked, what waited was decided, or
+            the process was started anew.
+        first_ns: stamp of the odometry, or of the match.
+        second_ns: stamp of the query.
+        data: (16,) pose of the odometry; of a closure the pose, the covariance (36,) and the probability.
+    """
+
+    kind: str
+    first_ns: int
+    second_ns: int
+    data: Array
+
+    @property
+    def closure(self) -> LoopClosure:
+        """The closure that came."""
+        pose, covariance = self.data[:16].reshape(4, 4), self.data[16:52].reshape(6, 6)
+        return LoopClosure(self.second_ns, self.first_ns, pose, covariance, float(self.data[52]))
+
+
+class GraphJournal:
+    """Events in the order in which they came to a graph, and the latest verdict about every closure.
+
+    Every event is written when it comes: a process that is killed loses none. One process at a time writes it; others
+    may read it.
+
+    Args:
+        path: the file, opened when it exists.
+
+    Raises:
+        UmfError: the file is something else, or another process writes it.
+        OutputError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = FileLock(path)
+        try:
+            self._connection = self._open()
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def events(self) -> Iterator[Event]:
+        """Everything that came so far.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        try:
+            rows = self._connection.execute("SELECT kind, first_ns, second_ns, data FROM event ORDER BY id")
+            for kind, first_ns, second_ns, data in rows:
+                yield Event(kind, first_ns, second_ns, np.frombuffer(data, np.float64))
+        except (sqlite3.Error, ValueError) as error:
+            raise UmfError(f"{self.path} is damaged: {error}") from None
+
+    def verdicts(self) -> dict[tuple[int, int], str]:
+        """The latest state of every closure, by the stamps of match and query."""
+        rows = self._connection.execute("SELECT match_ns, query_ns, state FROM verdict")
+        return {(match, query): state for match, query, state in rows}
+
+    def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
+        """Write down a message of the odometry."""
+        self._add(ODOMETRY, stamp_ns, 0, odom_T_body.ravel())
+
+    def add_closure(self, closure: LoopClosure) -> None:
+        """Write down a closure."""
+        numbers = np.concatenate([closure.match_T_query.ravel(), closure.covariance.ravel(), [closure.probability]])
+        self._add(CLOSURE, closure.match_stamp_ns, closure.query_stamp_ns, numbers)
+
+    def add(self, kind: str, match_ns: int = 0, query_ns: int = 0) -> None:
+        """Write down an event that has no numbers."""
+        self._add(kind, match_ns, query_ns, np.empty(0))
+
+    def put_verdicts(self, verdicts: list[ClosureVerdict]) -> None:
+        """Write down what was decided."""
+        rows = [
+            (v.closure.match_stamp_ns, v.closure.query_stamp_ns, v.state.value, v.reason, v.residual, v.residual_m)
+            for v in verdicts
+        ]
+        with writing(self.path, sqlite3.Error), self._connection:
+            self._connection.executemany("INSERT OR REPLACE INTO verdict VALUES (?, ?, ?, ?, ?, ?)", rows)
+
+    def set_aside(self) -> Path:
+        """Keep what there is under another name, and begin anew; returns that name."""
+        self._connection.close()
+        old = next(name for i in count(1) if not (name := self.path.with_suffix(f".{i}.sqlite")).exists())
+        with writing(self.path):
+            self.path.rename(old)
+        self._connection = self._open()
+        return old
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._connection.close()
+        self._lock.release()
+
+    def _add(self, kind: str, first_ns: int, second_ns: int, numbers: Array) -> None:
+        values = (kind, first_ns, second_ns, np.ascontiguousarray(numbers, np.float64).tobytes())
+        with writing(self.path, sqlite3.Error), self._connection:
+            self._connection.execute("INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)", values)
+
+    def _open(self) -> sqlite3.Connection:
+        with writing(self.path, sqlite3.Error):
+            connection = sqlite3.connect(self.path, check_same_thread=False)
+        try:
+            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            if tables and not {"event", "verdict"} <= tables:
+                raise UmfError(f"{self.path} holds no pose graph, but {', '.join(sorted(tables))}")
+            # WAL without a sync per event: safe against a crash of the process
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = NORMAL")
+            if not tables:
+                with connection:
+                    connection.execute("BEGIN")
+                    for table in _TABLES:
+                        connection.execute(table)
+        except UmfError:
+            connection.close()
+            raise
+        except sqlite3.Error as error:
+            connection.close()
+            raise UmfError(f"{self.path} cannot be used as a pose graph: {error}") from None
+        return connection
