@@ -73,7 +73,7 @@ def _drive(
     bag: Path, network: UMF, weights: Path, config: Path | None, dataset: str, kept_in: Path, console: Console
 ) -> Drive:
     """What one recording teaches, from the folder where it is there."""
-    from umf_ros.commands.progress import FrameProgress
+    from umf_ros.commands.progress import WARNING, FrameProgress
     from umf_ros.errors import writing
     from umf_ros.lab.training.drives import Drive, DriveReader
 
@@ -83,7 +83,7 @@ def _drive(
         console.print(f"{bag}: read before", markup=False, soft_wrap=True)
         return Drive.load(kept)
     recording, settings = open_recording(bag, config, dataset, "umf", weights)
-    frames = open_frames(recording, settings, console, None, "body")
+    frames = open_frames(recording, settings, lambda text: console.print(text, **WARNING), None, "body")
     reader = DriveReader(network, settings)
     with FrameProgress(console) as progress:
         for item in frames.stream():
