@@ -25,7 +25,7 @@ from umf_ros.networks.weights import load_weights
 
 PLACES = 60
 STEP_M = 5.0
-EAGER = Adaptation(steps=300, learning_rate=5e-3, pull=0.001)
+EAGER = Adaptation(steps=300, learning_rate=5e-3, pull=0.001, way=1.0)
 
 
 def network() -> UMF:
