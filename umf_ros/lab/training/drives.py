@@ -30,7 +30,7 @@ from umf_ros.sensors.odometry_feed import OdometryFeed
 from umf_ros.trajectory import Trajectory
 
 Mask = NDArray[np.bool_]
-SAME_M, SAME_DEG = 8.0, 30.0
+SAME_M, SAME_DEG = 8.0, 25.0
 """Views nearer and less turned show the same place; the evaluation's rule is 12 m and 30 deg."""
 OTHER_M, OTHER_DEG = 25.0, 60.0
 """Views further apart or more turned do not."""
