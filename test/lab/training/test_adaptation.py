@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 import torch
 import typer
+from recordings import small_settings, traverse, write_mcap
+from rich.console import Console
 from tiny_worlds import TINY, pose_at
 from typer.testing import CliRunner
 
+from umf_ros.config import dump_settings
 from umf_ros.errors import ConfigError, UmfError
 from umf_ros.lab.commands import adapt as command
 from umf_ros.lab.training.adaptation import Adaptation, Lesson, Recall, adapt, measure
@@ -143,3 +146,17 @@ def test_what_cannot_be_adapted_is_one_clear_line(given: Path, monkeypatch: pyte
     save_weights(UMF(TINY), given / "tiny.safetensors", {})
     with pytest.raises(ConfigError, match="only networks with a scene"):
         run(given, ["0.mcap"])
+
+
+def test_a_recording_is_read_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    weights = tmp_path / "tiny.safetensors"
+    save_weights(network(), weights, {})
+    config = tmp_path / "rover.yaml"
+    config.write_text(dump_settings(small_settings(tmp_path, database={"path": str(tmp_path / "map.sqlite")})))
+    bag = write_mcap(tmp_path / "a.mcap", traverse(4))
+    for _ in range(2):
+        found = command._drive(bag, load_weights(weights), weights, config, "auto", tmp_path / "kept", Console())
+        assert len(found.session) > 1 and found.closures.shape == (0, 2)
+    told = capsys.readouterr().out
+    assert f"{len(found.session)} keyframes, 0 closures" in told and "read before" in told
+    assert not (tmp_path / "map.sqlite").exists()  # the rover's map is not touched

@@ -34,7 +34,7 @@ def command(
     """
     from rich.console import Console
 
-    from umf_ros.lab.training.adaptation import FEWEST, Lesson, measure
+    from umf_ros.lab.training.adaptation import FEWEST, GAINED, Lesson, measure
     from umf_ros.networks.weights import load_weights, locate_weights
 
     if out.suffix != ".safetensors":
@@ -55,18 +55,12 @@ def command(
     _fit(network, lessons, console)
     after = measure(network, lessons)
     told = f"held out: {before.revisits} revisits; found before: {before.said()}; now: {after.said()}"
-    if after.gain_over(before) < _least_gain():
+    if after.gain_over(before) < GAINED:
         console.print(f"Nothing was gained, and nothing is written; the shipped weights stay. {told}", soft_wrap=True)
         return
     _write(network, out, path, bags, before.said(), after.said())
     console.print(f"Gained: {told}", soft_wrap=True)
     console.print(f"weights: {out} (embedding.weights, or --weights)", markup=False, soft_wrap=True)
-
-
-def _least_gain() -> float:
-    from umf_ros.lab.training.adaptation import GAINED
-
-    return GAINED
 
 
 def _drive(
@@ -77,7 +71,8 @@ def _drive(
     from umf_ros.errors import writing
     from umf_ros.lab.training.drives import Drive, DriveReader
 
-    digest = hashlib.sha256(f"{bag.resolve()} {config} {dataset}".encode() + weights.read_bytes()).hexdigest()[:8]
+    rules = config.read_bytes() if config and config.is_file() else b""
+    digest = hashlib.sha256(f"{bag.resolve()} {dataset}".encode() + rules + weights.read_bytes()).hexdigest()[:8]
     kept = kept_in / f"{bag.stem}_{digest}.npz"
     if kept.exists():
         console.print(f"{bag}: read before", markup=False, soft_wrap=True)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from umf_ros.config import Settings
+from umf_ros.config import Database, Settings
 from umf_ros.embedding.inputs import read_frame
 from umf_ros.errors import UmfError
 from umf_ros.frames import Frame
@@ -129,7 +129,8 @@ class DriveReader:
 
     def __init__(self, network: UMF, settings: Settings) -> None:
         self._network = network
-        self._detector = LoopDetector(settings, make_detector_embedder(settings))
+        own = settings.model_copy(update={"database": Database()})  # the rover's map is not touched
+        self._detector = LoopDetector(own, make_detector_embedder(settings))
         self._graph = PoseGraph(settings.pose_graph)
         self._feed = OdometryFeed(self._graph)
         self._stamps: list[int] = []
