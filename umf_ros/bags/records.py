@@ -10,6 +10,9 @@ from typing import Protocol
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+LARGEST_CHUNK = 2**29
+"""Bytes of a chunk after unpacking, and of any record; recorders write some megabytes."""
+
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
