@@ -1,7 +1,8 @@
 # make demo   simulate a traverse, run the real graph over DDS on it, write results/latest
 # make test   the whole test suite
 # make lint   ruff, mypy, and the contracts on who may import whom
-.PHONY: demo test lint install clean
+# make docs   the documentation as a site, build/site
+.PHONY: demo test lint docs install clean
 SHELL := /bin/bash
 
 VENV ?= .venv
@@ -21,6 +22,11 @@ lint: install
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
+
+# every page and every link, as a site in build/site
+docs: install
+	@$(BIN)/python tools/parameters_doc.py --check
+	@$(BIN)/mkdocs build --quiet --strict
 
 install: $(VENV)/.installed
 

@@ -291,6 +291,17 @@ def _set(values: dict[str, Any], path: list[str], value: Any) -> None:
     values[path[-1]] = value
 
 
+class _OnceLoader(yaml.SafeLoader):
+    """Refuses a name that is given twice: the first value would be dropped without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = [str(getattr(key, "value", "")) for key, _ in node.value]
+        twice = next((name for i, name in enumerate(names) if name in names[:i] and name != "<<"), None)
+        if twice is not None:
+            raise yaml.constructor.ConstructorError(None, None, f"{twice} is given twice", node.start_mark)
+        return dict(super().construct_mapping(node, deep))
+
+
 def read_yaml(path: Path) -> Any:
     """What a YAML file holds; None where it is empty.
 
@@ -298,7 +309,7 @@ def read_yaml(path: Path) -> Any:
         ConfigError: the file cannot be read.
     """
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.load(path.read_text(encoding="utf-8"), _OnceLoader)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
