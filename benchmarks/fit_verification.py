@@ -20,7 +20,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from domain_examples import kept_examples
+from domain_examples import is_right, kept_examples
 from domains import EXAMPLES
 from drives import Drive, embedded, kept, worlds
 from rich.console import Console
@@ -44,7 +44,6 @@ from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
 from umf_ros.verification.measurement import SCAN
 
-RIGHT_M, RIGHT_DEG = 0.4, 3.0
 EXAMINED = 5  # candidates per query: what retrieval offers first
 EVERY, CONSECUTIVE = 12, 3  # of so many keyframes, the first few are queries
 THRESHOLD = Verification().min_probability
@@ -85,7 +84,7 @@ def main(
     model, results = fit([example for survey in surveyed for example in examine(*survey)] + elsewhere)
     for name, value in results.items():
         console.print(f"{name:32} {value:.4g}")
-    save_acceptance(model, out, f"python benchmarks/fit_verification.py --worlds {count}", results)
+    save_acceptance(model, out, {SCAN: f"python benchmarks/fit_verification.py --worlds {count}"}, results)
     console.print(f"wrote {out}")
 
 
@@ -134,8 +133,9 @@ def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Example]:
             pairs = [(one, _degraded(database[one.index], strength, rng)) for one in chosen]
             for one in verifier.examine(_degraded(keyframe, strength, rng), pairs):
                 metres, degrees = drive.error(query, one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose)
-                right = metres < RIGHT_M and degrees < RIGHT_DEG
-                yield Example(one.measurement, right, f"drive {drive.seed}")
+                right = is_right(metres, degrees)
+                if right is not None:
+                    yield Example(one.measurement, right, f"drive {drive.seed}")
         database.add(keyframe)
     database.close()
 

@@ -76,7 +76,7 @@ CRITERIA: dict[str, Criterion] = {
     "wholly_explained": Criterion(lambda m: _log(m.unexplained + 0.004), math.log(0.2), math.log(0.01), missing=0.5),
     "known_along": Criterion(lambda m: m.rival_near, 0.0, 0.1),
     "well_known_along": Criterion(lambda m: m.rival_near, 0.0, 0.4),
-    "no_rival": Criterion(lambda m: m.rival_far, 0.0, 0.2),
+    "no_rival": Criterion(lambda m: m.rival_far, 0.0, 0.3),
     "no_rival_near_it": Criterion(lambda m: m.rival_far, 0.05, 0.5),
     "points": Criterion(lambda m: math.log(max(m.points, 1.0)), math.log(100), math.log(1000)),
     "position_known": Criterion(lambda m: math.log(m.position_std_m), math.log(1.0), math.log(0.05)),

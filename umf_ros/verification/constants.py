@@ -100,6 +100,7 @@ SCANS_SUPPORT, SCANS_CONTRADICT = 0.05, 0.12  # measured: right poses stay below
 # meeting of two scans
 MEETING_POINTS = 20  # by hand: of a kind, below which a share of them means nothing
 COUNTERPART_M, COUNTERPART_SPACINGS = 0.05, 0.5  # measured: .3 m and 1 spacing tell places apart less well
+BLUR_M = 0.04  # by hand: a metre per second in a scan of a tenth to a fifth of one, whose motion nobody removed
 UNEXPLAINED = 2.0  # measured: in these reaches; of all measures the most alike from one kind of place to another
 SPACING_NEIGHBOURS = 6  # by hand: the point itself and five, so that they reach the next ring
 UPRIGHT = 0.7  # geometry: surfaces steeper than 45 deg

@@ -49,7 +49,7 @@ class Measurement:
         residual_m: median point-to-plane distance of the scans; median distance of the pairs' points without scans.
         residual_sigmas: size of the errors of reprojection in standard deviations of the features' noise.
         residual_p90_m: nine of ten points are nearer than this to their counterpart's plane.
-        noise_m: how far the match's points scatter about their own planes.
+        noise_m: how far the match's points scatter about their own planes, and may be off for the scans' motion.
         overlap: share of the points seen by both that have a counterpart (of the feature pairs: that agree).
         points: points that have one.
         relief_m: standard deviation of the relief on the ground that both scans saw.
@@ -268,7 +268,7 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
         kind=SCAN,
         residual_m=float(np.median(size)),
         residual_p90_m=float(np.percentile(size, 90)),
-        noise_m=max(match.noise_m, const.MIN_SURFACE_NOISE_M),
+        noise_m=math.hypot(max(match.noise_m, const.MIN_SURFACE_NOISE_M), max(match.blur_m, query.blur_m)),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),
         relief_m=shared_relief(match.elevation, query.elevation, level),

@@ -63,7 +63,8 @@ def meet(match: PreparedScan, query: PreparedScan, pose: Array) -> tuple[Meeting
     """What the match says of the query's points under `match_T_query`, and the query of the match's."""
     moved, back = transform(pose, query.sample), transform(invert(pose), match.sample)
     ours, theirs = match.nearest(moved), query.nearest(back)
-    reach_ours, reach_theirs = _reach(query.spacing), _reach(match.spacing)
+    blur_m = max(match.blur_m, query.blur_m)
+    reach_ours, reach_theirs = _reach(query.spacing, blur_m), _reach(match.spacing, blur_m)
     return (
         Meeting(match.look_at(moved), np.sqrt(ours[1]) / reach_ours, _upright(match, ours[0])),
         Meeting(query.look_at(back), np.sqrt(theirs[1]) / reach_theirs, _upright(match, match.picks)),
@@ -118,7 +119,7 @@ def _fit(match: PreparedScan, query: PreparedScan, poses: Array) -> Array:
 def _misfits(scan: PreparedScan, other: PreparedScan, moved: Array) -> Array:
     """(K,) mean misfit of the visible ones of points (K, N, 3); as bad as can be where few are."""
     points = moved.reshape(-1, 3)
-    reach = np.tile(_reach(other.spacing[:: const.RIVAL_EVERY]), len(moved))
+    reach = np.tile(_reach(other.spacing[:: const.RIVAL_EVERY], max(scan.blur_m, other.blur_m)), len(moved))
     misfit = np.minimum(np.sqrt(scan.nearest(points)[1]) / reach, const.RIVAL_MISFIT)
     seen = visible(scan.look_at(points)).reshape(len(moved), -1)
     count = seen.sum(axis=1)
@@ -132,9 +133,9 @@ def _least_known(information: Array) -> Array:
     return np.append(across, 0.0)
 
 
-def _reach(spacing: Array) -> Array:
+def _reach(spacing: Array, blur_m: float) -> Array:
     """(N,) how far away a counterpart may be, m: scans of one surface fall between each other's points."""
-    return const.COUNTERPART_M + const.COUNTERPART_SPACINGS * spacing
+    return const.COUNTERPART_M + 2 * blur_m + const.COUNTERPART_SPACINGS * spacing
 
 
 def _upright(scan: PreparedScan, index: NDArray[np.intp]) -> Mask:

@@ -23,13 +23,15 @@ from umf_ros.verification.surroundings import Surroundings
 class PreparedScan:
     """A keyframe's scan made ready for comparison, each part when it is first asked for."""
 
-    def __init__(self, points: Points, body_T_lidar: Array | None = None) -> None:
+    def __init__(self, points: Points, body_T_lidar: Array | None = None, blur_m: float = 0.0) -> None:
         """Prepare nothing yet.
 
         Args:
             points: (M, 3) m, body frame, thinned.
             body_T_lidar: where they were seen from; without it the origin.
+            blur_m: how far points may be off because the LiDAR moved during the scan, standard deviation.
         """
+        self.blur_m = blur_m
         self._lidar_T_body = np.eye(4) if body_T_lidar is None else invert(body_T_lidar)
         self.points: Array = points.astype(float)
         self._around: dict[float, Surroundings] = {}
@@ -165,6 +167,11 @@ def unlevelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
     return found
 
 
+def prepare(keyframe: Keyframe) -> PreparedScan:
+    """The scan of a keyframe; one whose motion was not removed is blurred."""
+    return PreparedScan(keyframe.points, keyframe.body_T_lidar, const.BLUR_M if keyframe.motion is None else 0.0)
+
+
 class ScanCache:
     """The most recently used scans; a cache, so it changes no result."""
 
@@ -173,7 +180,7 @@ class ScanCache:
 
     def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
         key = (keyframe.session, keyframe.stamp_ns)
-        scan = self._scans.pop(key, None) or PreparedScan(keyframe.points, keyframe.body_T_lidar)
+        scan = self._scans.pop(key, None) or prepare(keyframe)
         self._scans[key] = scan
         if len(self._scans) > const.SCANS_KEPT:
             self._scans.popitem(last=False)
