@@ -1,8 +1,9 @@
 # make demo   simulate a traverse, run the real graph over DDS on it, write results/latest
 # make test   the whole test suite
+# make test-jazzy   the suite against what an installed Jazzy has: NumPy 1.26.4, in a venv of its own
 # make lint   ruff, mypy, and the contracts on who may import whom
 # make docs   the documentation as a site, build/site
-.PHONY: demo test lint docs install clean
+.PHONY: demo test test-jazzy lint docs install clean
 SHELL := /bin/bash
 
 VENV ?= .venv
@@ -16,6 +17,17 @@ demo: install
 
 test: install
 	@$(BIN)/python -m pytest
+
+test-jazzy: .venv-jazzy/.installed
+	@.venv-jazzy/bin/python -m pytest
+
+.venv-jazzy/.installed: requirements-jazzy.txt requirements-ros.txt requirements-dev.txt setup.py
+	@test -x .venv-jazzy/bin/python || $(PYTHON) -m venv .venv-jazzy
+	@grep -hv '^-r' requirements-dev.txt requirements-lab.txt > .venv-jazzy/tools.txt
+	@.venv-jazzy/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-jazzy.txt \
+		-r requirements-ros.txt -r .venv-jazzy/tools.txt
+	@.venv-jazzy/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
 
 lint: install
 	@$(BIN)/ruff check .

@@ -1,5 +1,6 @@
 """ament_python package: everything a Jazzy workspace or a plain venv needs."""
 
+import sys
 from glob import glob
 from pathlib import Path
 from xml.etree import ElementTree
@@ -24,6 +25,11 @@ def required(name: str) -> list[str]:
     return [*own, *(package for other in included for package in required(other))]
 
 
+def in_path() -> list[tuple[str, list[str]]]:
+    """The `umf` command, where colcon installs: its console scripts are for `ros2 run` alone. pip makes its own."""
+    return [("bin", ["tools/umf"])] if {"install", "develop", "symlink_data"} & set(sys.argv) else []
+
+
 setup(
     name=PACKAGE,
     version=ElementTree.parse("package.xml").findtext("version"),
@@ -35,6 +41,7 @@ setup(
         *shared("config"),
         *shared("launch"),
         *shared("models"),
+        *in_path(),
     ],
     python_requires=">=3.11",
     install_requires=required("requirements.txt"),

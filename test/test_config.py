@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -78,3 +79,28 @@ def test_every_setting_is_described() -> None:
         fields = getattr(group.annotation, "model_fields", {name: group})
         for key, field in fields.items():
             assert field.description, f"{name}.{key} has no description"
+
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n" for before, name in pairwise("abcdefghi")
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (BOMB, "its aliases stand for too much"),
+        ("a: &a [*a]", "contains itself"),
+        ("1: 2", "a name is text, not 1"),
+        ("loop: {3: 4}", "a name is text, not 3"),
+        ("[" * 100_000, "not valid YAML"),
+        ("a: " + "b" * 2**23, "larger than 4 MB"),
+        ("? {a: b}\n: c", "not valid YAML"),
+        ("loop: !!python/object/apply:os.system [true]", "not valid YAML"),
+    ],
+)
+def test_a_hostile_file_is_one_short_line(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_settings(tmp_path / "a.yaml")
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 500

@@ -15,7 +15,7 @@ from sources import PACKAGE, ROOT, distributions, imports, required
 
 from umf_ros.resources import LAB_PACKAGES
 
-PARTS = ["package.xml", "setup.py", "setup.cfg", "NOTICE", "umf_ros", "resource", "config", "launch", "models"]
+PARTS = ["package.xml", "setup.py", "setup.cfg", "NOTICE", "umf_ros", "resource", "config", "launch", "models", "tools"]
 PARTS += [path.name for path in ROOT.glob("requirements*.txt")]
 TEMPLATE = Path("runs", "templates", "planted.html.j2")
 

@@ -11,11 +11,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from processes import wait_until
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 
 from umf_ros.config import Qos
 from umf_ros.nodes import diagnostics
-from umf_ros.nodes.diagnostics import InputWatch, memory_mb, status
+from umf_ros.nodes.diagnostics import Heartbeat, InputWatch, Throttle, memory_mb, status
 from umf_ros.nodes.qos import sensor_qos
 
 TOPIC = "/watched/image"
@@ -153,3 +153,43 @@ def test_sensors_are_subscribed_as_the_settings_say(
 ) -> None:
     profile = sensor_qos(settings, least)
     assert (profile.depth, profile.reliability) == (depth, reliability)
+
+
+def test_another_type_on_the_topic_is_named(node: Node, clock: Clock) -> None:
+    node.create_publisher(CompressedImage, TOPIC, 1)
+    assert wait_until(lambda: len(node.get_publishers_info_by_topic(TOPIC)) == 1)
+    watch = InputWatch(node, "left_image", TOPIC, Image)
+    expected = f"nothing received: {TOPIC} carries sensor_msgs/msg/CompressedImage, expected sensor_msgs/msg/Image"
+    assert watch.status().message == expected
+    clock.now_s += 6
+    watch.status()
+    assert watch.warning == f"left_image: {expected}"
+
+
+def test_a_sensor_under_another_name_is_named(node: Node, clock: Clock) -> None:
+    node.create_publisher(Image, "/elsewhere/image", 1)
+    assert wait_until(lambda: node.count_publishers("/elsewhere/image") == 1)
+    message = InputWatch(node, "left_image", TOPIC, Image).status().message
+    assert message == f"nothing received: no publisher on {TOPIC}; /elsewhere/image is of that type"
+
+
+def test_what_is_rare_may_be_silent(node: Node, clock: Clock) -> None:
+    publish_on(node, 1)
+    watch = InputWatch(node, "closures", TOPIC, Image, rare=True)
+    clock.now_s += 60
+    assert watch.status().level == DiagnosticStatus.OK and watch.warning == ""
+
+
+def test_every_line_has_a_throttle_of_its_own(clock: Clock) -> None:
+    throttle = Throttle()
+    assert [throttle.lets_pass(line, 30) for line in ("a", "b", "a")] == [True, True, False]
+    clock.now_s += 31
+    assert throttle.lets_pass("a", 30)
+
+
+def test_the_heartbeat_tells_the_longest_stall(clock: Clock) -> None:
+    heart = Heartbeat(0.05)
+    for pause_s in (0, 0.05, 0.25, 0.05):
+        clock.now_s += pause_s
+        heart.beat()
+    assert heart.longest_ms == pytest.approx(200)

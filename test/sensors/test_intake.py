@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -83,3 +84,87 @@ def test_useless_camera_info_is_told_and_the_calibration_file_stands(synchronize
     (frame,) = synchronizer.pop()
     assert frame.camera.fx == 60
     assert len(told) == 1 and "not calibrated" in told[0]
+
+
+def take_frame(intake: Intake, synchronizer: Synchronizer, at_s: float) -> float:
+    """Focal length of the frame that a scan and an image make."""
+    stamp = START_NS + round(at_s * 1e9)
+    intake.take(CLOUD, cloud(stamp, scan(np.full((3, 3), 4.0))))
+    intake.take(LEFT, image(stamp + 100_000_000, np.zeros((48, 64), np.uint8)))
+    (frame,) = synchronizer.pop()
+    return frame.camera.fx
+
+
+def test_intrinsics_that_change_are_followed_and_one_stray_message_is_not(synchronizer: Synchronizer) -> None:
+    told: list[str] = []
+    intake = Intake(synchronizer, Topics(right_info="", right_image="", odometry=""), told.append)
+
+    def say(focal: float, at_s: float) -> None:
+        intake.take(LEFT_INFO, camera_info(START_NS + round(at_s * 1e9), focal, (64, 48)))
+
+    say(77.0, 0)
+    assert take_frame(intake, synchronizer, 0) == 77
+    say(300.0, 0.2)
+    assert take_frame(intake, synchronizer, 0.3) == 77
+    say(77.0, 0.5)
+    assert take_frame(intake, synchronizer, 0.6) == 77
+    say(81.0, 0.8)
+    say(81.0, 0.9)
+    assert take_frame(intake, synchronizer, 1.0) == 81
+
+
+@pytest.mark.parametrize("focal", [1e-300, 1e300, 0.5, float("nan")])
+def test_intrinsics_of_no_camera_are_refused_and_right_ones_used_later(
+    synchronizer: Synchronizer, focal: float
+) -> None:
+    told: list[str] = []
+    intake = Intake(synchronizer, Topics(right_info="", right_image="", odometry=""), told.append)
+    intake.take(LEFT_INFO, camera_info(START_NS, focal, (64, 48)))
+    assert take_frame(intake, synchronizer, 0) == 60 and len(told) == 1
+    for at in (1, 2):
+        intake.take(LEFT_INFO, camera_info(START_NS + at, 70.0, (64, 48)))
+    assert take_frame(intake, synchronizer, 1.0) == 70
+
+
+@pytest.mark.parametrize("step", [2**31, 2**32 - 1])
+def test_a_point_of_gigabytes_is_refused(synchronizer: Synchronizer, step: int) -> None:
+    told: list[str] = []
+    intake = Intake(synchronizer, Topics(), told.append)
+    intake.take(CLOUD, cloud(START_NS, scan(np.ones((3, 3))), point_step=step))
+    assert synchronizer.counters["cloud"].dropped == {"step": 1} and "\n" not in told[0]
+
+
+def test_odometry_from_beyond_the_earth_is_refused(synchronizer: Synchronizer) -> None:
+    intake = Intake(synchronizer, Topics(), lambda _: None)
+    for far in (1e200, -2e7):
+        matrix = np.eye(4)
+        matrix[1, 3] = far
+        intake.take("/odom", odometry(START_NS, matrix))
+    assert synchronizer.counters["odometry"].dropped == {"pose": 2}
+
+
+def test_whatever_a_message_provokes_is_counted(synchronizer: Synchronizer) -> None:
+    told: list[str] = []
+    intake = Intake(synchronizer, Topics(), told.append)
+    for _ in range(3):
+        intake.take(CLOUD, cloud(START_NS, scan(np.ones((3, 3))), fields=[None]))
+    assert synchronizer.counters["cloud"].dropped == {"unusable": 3}
+    assert len(told) == 1 and "AttributeError" in told[0]
+
+
+def test_mutated_messages_are_used_or_counted(synchronizer: Synchronizer) -> None:
+    rng = np.random.default_rng(2)
+    intake = Intake(synchronizer, Topics(), lambda _: None)
+    values = [0, 1, 2**31, 2**32 - 1, float("nan"), 1e308, -1, "", "\0", "mono16", None, [], b"", np.zeros(3)]
+    for number in range(1500):
+        topic, message = [
+            (LEFT, image(START_NS + number, np.zeros((48, 64), np.uint8))),
+            (CLOUD, cloud(START_NS + number, scan(np.ones((3, 3))))),
+            ("/odom", odometry(START_NS + number, np.eye(4))),
+            (LEFT_INFO, camera_info(START_NS + number, 60.0, (64, 48))),
+        ][number % 4]
+        names = list(message.__dataclass_fields__)
+        changes = {names[rng.integers(len(names))]: values[rng.integers(len(values))] for _ in range(2)}
+        intake.take(topic, replace(message, **{name: value for name, value in changes.items() if name != "header"}))
+    received = sum(counter.received for counter in synchronizer.counters.values())
+    assert received >= 1500 * 3 // 4 - 5

@@ -412,3 +412,24 @@ def test_frames_wait_for_the_camera_info_they_shall_use(calibration: Calibration
     synchronizer = Synchronizer(Sync(), calibration, {*INPUTS, "camera_info"})
     synchronizer.reject("camera_info", "camera_info")
     assert feed(synchronizer, in_order(streams))[0].camera == calibration.camera
+
+
+@pytest.mark.parametrize("from_start", [True, False])
+def test_without_a_lidar_that_was_expected_images_become_frames(calibration: Calibration, from_start: bool) -> None:
+    streams = rover(14.0)
+    streams["cloud"] = [item for item in streams["cloud"] if not from_start and item[1] < T0 + 3 * S]
+    synchronizer = Synchronizer(Sync(), calibration)
+    frames = feed(synchronizer, in_order(streams)) + synchronizer.flush()
+    seen = [frame for frame in frames if frame.points is None]
+    assert min(frame.stamp_ns for frame in seen) < T0 + 9 * S and len(seen) > 150
+    assert all(frame.left is not None for frame in seen)
+    check_accounts(synchronizer)
+
+
+def test_a_lidar_that_comes_back_is_what_frames_are_built_around_again(calibration: Calibration) -> None:
+    streams = rover(16.0)
+    streams["cloud"] = [item for item in streams["cloud"] if not T0 + 2 * S < item[1] < T0 + 10 * S]
+    synchronizer = Synchronizer(Sync(), calibration)
+    frames = feed(synchronizer, in_order(streams)) + synchronizer.flush()
+    late = [frame for frame in frames if frame.stamp_ns > T0 + 11 * S]
+    assert late and all(frame.points is not None for frame in late)

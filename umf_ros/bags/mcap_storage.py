@@ -11,15 +11,18 @@ from pathlib import Path
 
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
-from zstandard import ZstdError
+from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from zstandard import ZstdError, frame_content_size
 
-from umf_ros.bags.records import RawMessage, TopicInfo
+from umf_ros.bags.records import LARGEST_CHUNK, RawMessage, TopicInfo
 from umf_ros.errors import BagError
 
 # what the mcap library and the decompressors raise on damaged data
-_DAMAGE = (McapError, struct.error, ZstdError, ValueError, RuntimeError, EOFError)
+_DAMAGE = (McapError, struct.error, ZstdError, ValueError, RuntimeError, EOFError, LookupError, TypeError, MemoryError)
+
+_CHUNK_HEAD = 64
+"""Bytes at the start of a chunk's record that say how large it claims to be, compression included."""
 
 SORTING_WINDOW_NS = 1_000_000_000
 """Without an index, messages are put in order as far as they lie this close together."""
@@ -68,6 +71,7 @@ class _IndexedFile:
         if summary.channels and not channels:
             encodings = ", ".join(sorted({channel.message_encoding for channel in summary.channels.values()}))
             raise BagError(f"{path} holds messages encoded as {encodings}; only those of ROS 2 (cdr) can be read")
+        _check_chunks(path, summary.chunk_indexes)
         self.types = {channel.topic: summary.schemas[channel.schema_id].name for channel in channels.values()}
         self.counts: Counter[str] = Counter()
         for key, count in summary.statistics.channel_message_counts.items():
@@ -123,7 +127,8 @@ class _BrokenFile:
         channels: dict[int, Channel] = {}
         with self._path.open("rb") as stream:
             try:
-                for record in StreamReader(stream, record_size_limit=self._path.stat().st_size).records:
+                limit = min(self._path.stat().st_size, LARGEST_CHUNK)
+                for record in _records(StreamReader(stream, emit_chunks=True, record_size_limit=limit)):
                     if isinstance(record, Schema):
                         schemas[record.id] = record
                     elif isinstance(record, Channel):
@@ -135,3 +140,39 @@ class _BrokenFile:
                             yield RawMessage(channel.topic, record.log_time, type_name, record.data)
             except _DAMAGE as error:
                 self._fault = str(error) or type(error).__name__
+
+
+def _records(reader: StreamReader) -> Iterator[McapRecord]:
+    """Records as they lie in the file, those in chunks of a size that can be unpacked among them."""
+    for record in reader.records:
+        if isinstance(record, Chunk):
+            _check_chunk(record.uncompressed_size, record.compression, record.data[:18])
+            yield from breakup_chunk(record)
+        else:
+            yield record
+
+
+def _check_chunks(path: Path, indexes: Collection[ChunkIndex]) -> None:
+    """Look at what the chunks claim of themselves, and not only at what the index claims of them.
+
+    Raises:
+        ValueError: one lies outside of the file, or would be too large.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        for index in indexes:
+            if index.chunk_start_offset + index.chunk_length > size or index.chunk_length > LARGEST_CHUNK:
+                raise ValueError("a chunk beyond the end")
+            stream.seek(index.chunk_start_offset + 9)  # after opcode and length
+            head = stream.read(_CHUNK_HEAD)
+            (claimed,) = struct.unpack_from("<Q", head, 16)
+            (letters,) = struct.unpack_from("<I", head, 28)
+            compression = head[32 : 32 + letters].decode("ascii", "replace") if letters < 8 else "?"
+            _check_chunk(max(claimed, index.uncompressed_size), compression, head[40 + letters :])
+
+
+def _check_chunk(claimed: int, compression: str, start: bytes) -> None:
+    if compression == "zstd":  # the frame says it again, and is believed by the decompressor
+        claimed = max(claimed, frame_content_size(start))
+    if claimed > LARGEST_CHUNK:
+        raise ValueError(f"a chunk claims {claimed} bytes")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-
-from rosbags.serde import SerdeError
 
 from umf_ros.bags.records import RawMessage, Storage, message_types
 from umf_ros.bags.storages import open_storage
@@ -37,9 +35,14 @@ class Bag:
         return (self.end_ns - self.start_ns) * 1e-9
 
     def raw_messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Serialised messages of some or all topics in the order of their recording."""
+        """Serialised messages of some or all topics in the order of their recording.
+
+        Raises:
+            BagError: the recording is damaged.
+        """
         wanted = self.topics.keys() if topics is None else self.topics.keys() & set(topics)
-        return self._storage.messages(wanted)
+        with _one_line(self.path):
+            yield from self._storage.messages(wanted)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, Any]]:
         """Topic, time of recording in ns and message, in the order of their recording.
@@ -62,9 +65,22 @@ def decode(raw: RawMessage) -> Any:
     """
     try:
         return message_types().deserialize_cdr(raw.data, raw.type)
-    except (SerdeError, KeyError, ValueError, IndexError, struct.error) as error:
-        cause = " ".join(str(error).split())
+    except Exception as error:  # damaged bytes provoke anything
+        cause = " ".join(str(error).split())[:200] or type(error).__name__
         raise MessageError("undecodable", f"message is not what its type {raw.type} says ({cause})") from None
+
+
+@contextmanager
+def _one_line(path: Path) -> Iterator[None]:
+    """Tell whatever goes wrong while a recording is read as a `BagError`."""
+    try:
+        yield
+    except BagError:
+        raise
+    except OSError as error:
+        raise BagError(f"cannot read {path}: {error.strerror or error}") from None
+    except Exception as error:  # damaged bytes provoke anything
+        raise BagError(f"{path} is damaged: {' '.join(str(error).split())[:200] or type(error).__name__}") from None
 
 
 def open_bag(path: str | Path) -> Bag:
@@ -78,10 +94,8 @@ def open_bag(path: str | Path) -> Bag:
     path = Path(path)
     if not path.exists():
         raise BagError(f"there is no recording {path}")
-    try:
+    with _one_line(path):
         storage = open_storage(path)
-    except OSError as error:
-        raise BagError(f"cannot read {path}: {error.strerror or error}") from None
     if not any(topic.count for topic in storage.topics.values()):
         raise BagError(f"{path} holds no message" + (f" ({storage.warning})" if storage.warning else ""))
     return Bag(path, storage)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +16,7 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as Error2
 from rosbags.serde import SerdeError
 
-from umf_ros.bags.records import RawMessage, TopicInfo, message_types
+from umf_ros.bags.records import LARGEST_CHUNK, RawMessage, TopicInfo, message_types
 from umf_ros.errors import BagError
 
 
@@ -64,10 +65,29 @@ class RosbagsStorage:
         for path in self._paths:
             with _faults_of(path), self._reader(path) as reader:
                 wanted = [connection for connection in self._readable(reader) if connection.topic in topics]
-                for connection, log_ns, data in reader.messages(wanted) if wanted else ():
+                for connection, log_ns, data in self._limited(reader).messages(wanted) if wanted else ():
                     cdr = bytes(self._to_cdr(data, connection.msgtype)) if self._to_cdr else data
                     yield RawMessage(connection.topic, log_ns, connection.msgtype, cdr)
+
+    def _limited(self, reader: Any) -> Any:
+        """The reader, with chunks that unpack to a limit only (ROS 1; bzip2 packs a thousandfold and more)."""
+        for place, chunk in getattr(reader, "chunks", {}).items():
+            if chunk.decompressor is bz2.decompress:
+                reader.chunks[place] = chunk._replace(decompressor=_unpack_bz2)
+        return reader
 
     def _readable(self, reader: Any) -> list[Connection]:
         known = message_types().fielddefs
         return [one for one in reader.connections if self._to_cdr is None or one.msgtype in known]
+
+
+def _unpack_bz2(data: bytes) -> bytes:
+    """Contents of a chunk.
+
+    Raises:
+        AssertionError: there are more than any recorder writes.
+    """
+    unpacked = bz2.BZ2Decompressor().decompress(data, LARGEST_CHUNK + 1)
+    if len(unpacked) > LARGEST_CHUNK:
+        raise AssertionError(f"a chunk holds more than {LARGEST_CHUNK} bytes")
+    return unpacked

@@ -20,7 +20,7 @@ TIMEOUT_S = 60
 
 # module, distribution, first version known to work
 _PACKAGES = (
-    ("numpy", "numpy", "2"),
+    ("numpy", "numpy", "1.26"),
     ("scipy", "scipy", "1.11"),
     ("cv2", "opencv-python-headless", "4.10"),
     ("torch", "torch", "2.4"),

@@ -178,8 +178,10 @@ class BaseNode(LifecycleNode):
 
         return call
 
-    def _subscribe(self, name: str, kind: type, topic: str, take: Callable[[Any], None], qos: QoSProfile) -> None:
-        """Hear an input of messages with a header, and watch it."""
+    def _subscribe(
+        self, name: str, kind: type, topic: str, take: Callable[[Any], None], qos: QoSProfile, rare: bool = False
+    ) -> None:
+        """Hear an input of messages with a header, and watch it; `rare` ones may be silent."""
 
         def receive(message: Any) -> None:
             watch.saw(from_time(message.header.stamp))
@@ -191,7 +193,7 @@ class BaseNode(LifecycleNode):
 
         events = SubscriptionEventCallbacks(message_lost=lose)
         subscription = self.create_subscription(kind, topic, self._guarded(name, receive), qos, event_callbacks=events)
-        watch = InputWatch(self, name, subscription.topic_name, kind)
+        watch = InputWatch(self, name, subscription.topic_name, kind, rare)
         self._watches.append(watch)
 
     def _offer(self, kind: type, name: str, action: Callable[[Any], str]) -> None:

@@ -71,12 +71,20 @@ class InputWatch:
         name: of the input.
         topic: as it is subscribed, after remapping.
         kind: message class; None where any will do.
+        rare: its silence is no fault as long as somebody could speak.
         silent_after_s: silence that is worth a word, by the machine's clock.
     """
 
     def __init__(
-        self, node: Node, name: str, topic: str, kind: type | None = None, silent_after_s: float = 5.0
+        self,
+        node: Node,
+        name: str,
+        topic: str,
+        kind: type | None = None,
+        rare: bool = False,
+        silent_after_s: float = 5.0,
     ) -> None:
+        self._rare = rare
         self._node = node
         self._type = type_name(kind) if kind is not None else ""
         self._silent_after_s = silent_after_s
@@ -119,6 +127,8 @@ class InputWatch:
             "reliable" if info.qos_profile.reliability == QoSReliabilityPolicy.RELIABLE else "best effort"
             for info in publishers
         )
+        if self._rare and any(info.topic_type == self._type for info in publishers):
+            return status(OK, f"input {self.name}", f"{self.received} received", values)
         reason = self._reason(publishers, silent_s)
         if now_s - self._born_s > self._silent_after_s:
             self.warning = f"{self.name}: {reason}"
@@ -139,7 +149,8 @@ class InputWatch:
     def _others(self) -> list[str]:
         """Topics of the same type that somebody publishes: the sensor may be there under another name."""
         names = [name for name, types in self._node.get_topic_names_and_types() if self._type in types]
-        return [name for name in names if name != self.topic and self._node.count_publishers(name)][:5]
+        ours = self.topic, self._node.resolve_topic_name("loop_closures")
+        return [name for name in names if name not in ours and self._node.count_publishers(name)][:5]
 
     def _now_s(self) -> float:
         # the machine's clock, not the bag's: silence is silence even when /clock stands still

@@ -75,7 +75,7 @@ class PoseGraphNode(BaseNode):
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
             self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
-        self._subscribe("closures", Odometry, "loop_closures", self._on_closure, CLOSURES_QOS)
+        self._subscribe("closures", Odometry, "loop_closures", self._on_closure, CLOSURES_QOS, rare=True)
         self.create_subscription(String, "~/reject_edge", self._guarded("reject_edge", self._on_reject), 10)
         hear = self._guarded("front-end", self._on_front_end)
         self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", hear, 10)

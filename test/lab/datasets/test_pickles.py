@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy._core.multiarray import _reconstruct
 
 from umf_ros.errors import UmfError
 from umf_ros.lab.datasets.pickles import load_data_frame, load_pickle
@@ -79,3 +81,72 @@ def test_a_data_frame_is_read_without_pandas(version: int) -> None:
 def test_what_is_no_data_frame_is_said(tmp_path: Path) -> None:
     with pytest.raises(UmfError, match="holds a dict, not a pandas DataFrame"):
         load_data_frame(dump(tmp_path / "a.pkl", {"img_path": []}))
+
+
+def array_state(shape: object, kind: object, data: object) -> bytes:
+    """A pickle of an array whose state is whatever is asked for."""
+
+    class Forged:
+        def __reduce__(self):
+            return _reconstruct, (np.ndarray, (0,), b"b"), (1, shape, kind, False, data)
+
+    return pickle.dumps(Forged())
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "data"),
+    [
+        ((10**9,), np.dtype("f8"), b"\0" * 16),
+        ((-1,), np.dtype("f8"), b"\0" * 8),
+        ((2**62, 4), np.dtype("f8"), b""),
+        ((1,), np.dtype("O"), b"\x41" * 8),  # a pointer to anywhere
+        ((2,), np.dtype("O"), [1]),
+        ((1,), np.dtype([("a", "O"), ("b", "f8")]), b"\x41" * 16),
+        ((1,), np.dtype("V16"), b"\x41" * 16),
+        ((1,), np.dtype("M8[ns]"), b"\x41" * 8),
+    ],
+)
+def test_a_forged_state_is_refused_and_crashes_nothing(
+    tmp_path: Path, shape: object, kind: np.dtype, data: object
+) -> None:
+    (tmp_path / "a.pickle").write_bytes(array_state(shape, kind, data))
+    with pytest.raises(UmfError, match="cannot read the pickle") as caught:
+        load_pickle(tmp_path / "a.pickle")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_forged_type_is_refused(tmp_path: Path) -> None:
+    class Forged:
+        def __reduce__(self):
+            return np.dtype, ("f8", False, True), (3, "<", None, ("a",), {"a": (np.dtype("O"), 0)}, 8, 1, 27)
+
+    with pytest.raises(UmfError, match="composed type"):
+        load_pickle(dump(tmp_path / "a.pickle", Forged()))
+
+
+def test_a_memo_of_two_thousand_million_entries_costs_no_memory(tmp_path: Path) -> None:
+    (tmp_path / "a.pickle").write_bytes(b"\x80\x04Nr\xff\xff\xff\x7f.")
+    assert load_pickle(tmp_path / "a.pickle") is None
+
+
+def test_what_numpy_writes_comes_back_whatever_its_order(tmp_path: Path) -> None:
+    nested = np.empty(2, object)
+    nested[:] = [np.arange(3, dtype=">i4"), {"x": np.array(["ab", "c"])}]
+    content = [np.zeros((0, 3)), np.asfortranarray(np.arange(6.0).reshape(2, 3)), nested, np.array(True), np.float32(2)]
+    for protocol in (2, 5):
+        found = load_pickle(dump(tmp_path / "a.pickle", content, protocol))
+        assert found[0].shape == (0, 3) and np.array_equal(found[1], content[1])
+        assert found[2][0].tolist() == [0, 1, 2] and found[2][1]["x"].tolist() == ["ab", "c"]
+        assert found[3] == np.array(True) and found[4] == 2
+
+
+def test_mutated_pickles_are_read_or_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    whole = pickle.dumps({"a": [np.arange(50.0), "text", np.float64(1)], "b": np.array([None, "x"], object)}, 4)
+    for _ in range(300):
+        mutated = bytearray(whole)
+        for place in rng.integers(0, len(whole), rng.integers(1, 6)):
+            mutated[place] = rng.integers(0, 256)
+        (tmp_path / "a.pickle").write_bytes(mutated)
+        with contextlib.suppress(UmfError):
+            load_pickle(tmp_path / "a.pickle")

@@ -1,38 +1,102 @@
 """Pickles of other people's data sets, read without running what they may contain.
 
-Only the few names that such a file needs are known; every other one is refused. Data frames
-are read without pandas.
+Only the few names that such a file needs are known, and what stands for them is our own: NumPy's arrays and types are
+put together here from plain numbers, for NumPy itself believes whatever state a pickle gives it. Data frames are read
+without pandas.
 """
 
 from __future__ import annotations
 
-import codecs
+import math
 import pickle
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy._core.numeric as _numeric
-from numpy._core.multiarray import _reconstruct, scalar
 from numpy.typing import NDArray
 
 from umf_ros.errors import UmfError
 
 Names = Mapping[str, Callable[..., Any]]
 
+_PLAIN = re.compile(r"(?:[fiuc](?:1|2|4|8|16)|b1|O8?|[US][0-9]{1,5})")
+
+
+class _DataType:
+    """Stands for a `numpy.dtype`: numbers, truth values, text and objects, nothing composed."""
+
+    def __init__(self, name: str, *_: Any) -> None:
+        if not isinstance(name, str) or not _PLAIN.fullmatch(name):
+            raise pickle.UnpicklingError(f"it holds an array of type {str(name)[:40]!r}")
+        self.value = np.dtype(name)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, order, *composed = state
+        if order not in ("<", ">", "=", "|") or any(part is not None for part in composed[:3]):
+            raise pickle.UnpicklingError("it holds an array of a composed type")
+        self.value = self.value.newbyteorder(order)
+
+
+class _Array:
+    """Stands for a `numpy.ndarray` until all of its state has come."""
+
+    def __init__(self, *_: Any) -> None:
+        self.value: NDArray[Any] = np.empty(0)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, shape, kind, by_column, data = state
+        self.value = _from_data(data, kind, shape, "F" if by_column else "C")
+
+
+def _from_data(data: Any, kind: Any, shape: Any, order: str) -> NDArray[Any]:
+    if not isinstance(kind, _DataType) or not isinstance(shape, tuple) or order not in ("C", "F"):
+        raise pickle.UnpicklingError("it holds an array of no type or shape")
+    if not all(type(size) is int and size >= 0 for size in shape) or len(shape) > 8:
+        raise pickle.UnpicklingError("it holds an array of no shape")
+    count = math.prod(shape)
+    if kind.value.hasobject:
+        if not isinstance(data, list) or len(data) != count:
+            raise pickle.UnpicklingError("it holds an array whose objects do not fit its shape")
+        objects = np.empty(count, object)
+        objects[:] = data if count != 1 else [data[0]]
+        return objects.reshape(shape, order="F" if order == "F" else "C")
+    if not isinstance(data, bytes | bytearray) or len(data) != count * kind.value.itemsize:
+        raise pickle.UnpicklingError("it holds an array whose bytes do not fit its shape")
+    return np.frombuffer(bytes(data), kind.value).reshape(shape, order="F" if order == "F" else "C").copy(order="K")
+
+
+def _frombuffer(data: Any, kind: Any, shape: Any, order: str, *_: Any) -> NDArray[Any]:
+    return _from_data(data, kind, shape, order)
+
+
+def _scalar(kind: Any, data: Any) -> Any:
+    return _from_data([data] if kind.value.hasobject else data, kind, (), "C")[()]
+
+
+def _latin1(text: str, encoding: str) -> bytes:
+    """How bytes are written by protocols that know none."""
+    if encoding != "latin1":
+        raise pickle.UnpicklingError(f"it asks for the encoding {encoding[:40]!r}")
+    return text.encode("latin1")
+
+
 _NUMPY: dict[str, Callable[..., Any]] = {
-    "numpy.ndarray": np.ndarray,
-    "numpy.dtype": np.dtype,
+    "numpy.ndarray": _Array,
+    "numpy.dtype": _DataType,
     "builtins.slice": slice,
-    "_codecs.encode": codecs.encode,
+    "_codecs.encode": _latin1,
+    "__builtin__.bytes": lambda: b"",
 }
 for _package in ("numpy.core", "numpy._core"):
-    _NUMPY |= {f"{_package}.multiarray._reconstruct": _reconstruct, f"{_package}.multiarray.scalar": scalar}
-    _NUMPY[f"{_package}.numeric._frombuffer"] = _numeric._frombuffer  # type: ignore[attr-defined]
+    _NUMPY |= {f"{_package}.multiarray._reconstruct": _Array, f"{_package}.multiarray.scalar": _scalar}
+    _NUMPY[f"{_package}.numeric._frombuffer"] = _frombuffer
 
 
-class _Unpickler(pickle.Unpickler):
+class _Unpickler(pickle._Unpickler):
+    """The one written in Python: that in C takes the memory that a hostile file names."""
+
     def __init__(self, stream: Any, known: Names) -> None:
         super().__init__(stream)
         self._known = known
@@ -43,6 +107,34 @@ class _Unpickler(pickle.Unpickler):
         if found is None:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which has no business there")
         return found
+
+
+def _plain(value: Any) -> Any:
+    """The array, where something stands for one."""
+    return value.value if isinstance(value, _Array) else value
+
+
+def _settled(value: Any, done: dict[int, Any]) -> Any:
+    """`value` with arrays in place of what stood for them, however deep."""
+    if id(value) in done:
+        return done[id(value)]
+    if isinstance(value, _Array):
+        done[id(value)] = value.value
+        return _settled(value.value, done)
+    done[id(value)] = value
+    if isinstance(value, np.ndarray):
+        if value.dtype.hasobject:
+            for index, item in enumerate(value.flat):
+                value.flat[index] = _settled(item, done)
+    elif isinstance(value, list):
+        value[:] = [_settled(item, done) for item in value]
+    elif isinstance(value, dict):
+        value.update({key: _settled(item, done) for key, item in value.items()})
+    elif type(value) is tuple:
+        done[id(value)] = tuple(_settled(item, done) for item in value)
+    elif hasattr(value, "__dict__") and not callable(value):
+        vars(value).update({name: _settled(item, done) for name, item in vars(value).items()})
+    return done[id(value)]
 
 
 def load_pickle(path: Path, known: Names | None = None) -> Any:
@@ -57,7 +149,7 @@ def load_pickle(path: Path, known: Names | None = None) -> Any:
     """
     try:
         with path.open("rb") as stream:
-            return _Unpickler(stream, _NUMPY | dict(known or {})).load()
+            return _settled(_Unpickler(stream, _NUMPY | dict(known or {})).load(), {})
     except OSError as error:
         raise UmfError(f"cannot read {path}: {error.strerror}") from None
     except Exception as error:  # damaged bytes provoke anything
@@ -87,11 +179,11 @@ class _Strings:
         self.values = np.empty(0, object)
 
     def __setstate__(self, state: tuple[Any, NDArray[Any], Any]) -> None:
-        self.values = state[1]
+        self.values = _plain(state[1])
 
 
 def _index(_: Any, content: dict[str, Any]) -> list[Any]:
-    data = content.get("data", ())
+    data = _plain(content.get("data", ()))
     return list(data.values if isinstance(data, _Strings) else data)
 
 
