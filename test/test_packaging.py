@@ -15,11 +15,7 @@ from sources import PACKAGE, ROOT, distributions, imports, required
 
 from umf_ros.resources import LAB_PACKAGES
 
-<<<<<<< HEAD
-PARTS = ["package.xml", "setup.py", "setup.cfg", "NOTICE", "umf_ros", "resource", "config", "launch", "models"]
-=======
-PARTS = ["package.xml", "setup.py", "setup.cfg", "umf_ros", "resource", "config", "launch", "models", "tools"]
->>>>>>> survive18
+PARTS = ["package.xml", "setup.py", "setup.cfg", "NOTICE", "umf_ros", "resource", "config", "launch", "models", "tools"]
 PARTS += [path.name for path in ROOT.glob("requirements*.txt")]
 TEMPLATE = Path("runs", "templates", "planted.html.j2")
 

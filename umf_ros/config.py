@@ -295,6 +295,17 @@ def _set(values: dict[str, Any], path: list[str], value: Any) -> None:
     values[path[-1]] = value
 
 
+class _OnceLoader(yaml.SafeLoader):
+    """Refuses a name that is given twice: the first value would be dropped without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = [str(getattr(key, "value", "")) for key, _ in node.value]
+        twice = next((name for i, name in enumerate(names) if name in names[:i] and name != "<<"), None)
+        if twice is not None:
+            raise yaml.constructor.ConstructorError(None, None, f"{twice} is given twice", node.start_mark)
+        return dict(super().construct_mapping(node, deep))
+
+
 def read_yaml(path: Path) -> Any:
     """What a YAML file holds; None where it is empty.
 
@@ -306,7 +317,7 @@ def read_yaml(path: Path) -> Any:
             raise ConfigError(f"{path} is not valid YAML: larger than {LARGEST_YAML >> 20} MB")
         text = path.read_text(encoding="utf-8")
         _count_nodes(yaml.compose(text, yaml.SafeLoader), {})
-        return yaml.safe_load(text)
+        return yaml.load(text, _OnceLoader)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
     except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:
