@@ -37,7 +37,7 @@ setup(
     package_data={PACKAGE: [f"**/*.{suffix}" for suffix in ("j2", "html", "css", "js")]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
-        (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}", ["package.xml", "NOTICE"]),
         *shared("config"),
         *shared("launch"),
         *shared("models"),

@@ -161,7 +161,7 @@ def _without(domain: Domain) -> Verifier:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "acceptance.json"
         model = AcceptanceModel(shipped.models | {SCAN: decision}, shipped.covariances, bounds)
-        save_acceptance(model, path, f"without {domain.name}", {})
+        save_acceptance(model, path, {SCAN: f"without {domain.name}"}, {})
         return Verifier(Verification(calibration=str(path)))
 
 

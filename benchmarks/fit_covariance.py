@@ -69,6 +69,7 @@ def main(
         console.print(f"left out {bag.stem:19} nees {{:5.1f}}  inside {{:.3f}}".format(*figures))
     content = json.loads(out.read_text(encoding="utf-8"))
     content["covariance"][SCAN] = {name: float(f"{value:.4g}") for name, value in asdict(model).items()}
+    content["fitted_with"]["covariance of scans"] = f"python benchmarks/fit_covariance.py on {len(bags)} recordings"
     out.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     console.print(f"{content['covariance'][SCAN]}\nwrote {out}")
 

@@ -20,7 +20,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from domain_examples import kept_examples
+from domain_examples import is_right, kept_examples
 from domains import EXAMPLES
 from drives import Drive, embedded, kept, worlds
 from rich.console import Console
@@ -37,6 +37,7 @@ from umf_ros.lab.training.acceptance_examples import Example, save_examples
 from umf_ros.lab.training.acceptance_fit import (
     bounds_of,
     fit_decision,
+    refused_anyway,
     save_acceptance,
 )
 from umf_ros.places.database import PlaceDatabase
@@ -44,7 +45,6 @@ from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
 from umf_ros.verification.measurement import SCAN
 
-RIGHT_M, RIGHT_DEG = 0.4, 3.0
 EXAMINED = 5  # candidates per query: what retrieval offers first
 EVERY, CONSECUTIVE = 12, 3  # of so many keyframes, the first few are queries
 THRESHOLD = Verification().min_probability
@@ -85,7 +85,7 @@ def main(
     model, results = fit([example for survey in surveyed for example in examine(*survey)] + elsewhere)
     for name, value in results.items():
         console.print(f"{name:32} {value:.4g}")
-    save_acceptance(model, out, f"python benchmarks/fit_verification.py --worlds {count}", results)
+    save_acceptance(model, out, {SCAN: f"python benchmarks/fit_verification.py --worlds {count}"}, results)
     console.print(f"wrote {out}")
 
 
@@ -134,8 +134,9 @@ def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Example]:
             pairs = [(one, _degraded(database[one.index], strength, rng)) for one in chosen]
             for one in verifier.examine(_degraded(keyframe, strength, rng), pairs):
                 metres, degrees = drive.error(query, one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose)
-                right = metres < RIGHT_M and degrees < RIGHT_DEG
-                yield Example(one.measurement, right, f"drive {drive.seed}")
+                right = is_right(metres, degrees)
+                if right is not None:
+                    yield Example(one.measurement, right, f"drive {drive.seed}")
         database.add(keyframe)
     database.close()
 
@@ -180,7 +181,8 @@ def _sprung_traps() -> list[Example]:
 
 def _judge(kind: str, examples: list[Example], odds: Array) -> dict[str, float]:
     """Figures of log-odds that every example got without its domain."""
-    right, accepted = np.array([example.right for example in examples]), odds >= ACCEPTED_ODDS
+    right, refused = np.array([(example.right, refused_anyway(example)) for example in examples]).T
+    accepted = (odds >= ACCEPTED_ODDS) & ~refused
     domains = np.array([example.domain for example in examples])
     recall = [float(accepted[right & (domains == name)].mean()) for name in np.unique(domains[right])]
     return {

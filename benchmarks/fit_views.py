@@ -10,7 +10,6 @@ views alone; everything else in the file stays.
 
 from __future__ import annotations
 
-import json
 import math
 import pickle
 from collections.abc import Iterator
@@ -49,7 +48,6 @@ from umf_ros.verification.verifier import JudgedHypothesis
 
 DEFAULT_OUT = Path(__file__).parent.parent / "config" / "verification" / "calibration.json"
 RIGHT_M, RIGHT_DEG = 0.3, 2.0  # examples between right and wrong are left out
-VIEWS = "; views: benchmarks/fit_views.py on"
 RIDGE = 0.03  # measured: with a tenth of it the wrong ones nearest to the threshold come nearer
 MARGIN = 0.5  # log-odds that the worst wrong example of a recording left out stays below the threshold
 # candidates per query: of retrieval, near ones besides, similar ones that are not near, and of other recordings
@@ -128,12 +126,11 @@ def main(
     model, results = fit(findings)
     for name, value in results.items():
         console.print(f"{name:32} {value:.4g}")
-    shipped, before = load_acceptance(str(out)), json.loads(out.read_text(encoding="utf-8"))
+    shipped = load_acceptance(str(out))
     models, covariances = shipped.models | model.models, shipped.covariances | model.covariances
     whole = replace(shipped, models=models, covariances=covariances)
-    scans_only = {name: value for name, value in before["results"].items() if not name.startswith("image_")}
-    told = f"{before['fitted_with'].split(VIEWS)[0]}{VIEWS} {len(bags)} recordings without scans"
-    save_acceptance(whole, out, told, scans_only | results)
+    told = f"python benchmarks/fit_views.py on {len(bags)} recordings without scans"
+    save_acceptance(whole, out, {IMAGE: told}, results)
     console.print(f"wrote {out}")
 
 

@@ -15,7 +15,11 @@ from sources import PACKAGE, ROOT, distributions, imports, required
 
 from umf_ros.resources import LAB_PACKAGES
 
+<<<<<<< HEAD
+PARTS = ["package.xml", "setup.py", "setup.cfg", "NOTICE", "umf_ros", "resource", "config", "launch", "models"]
+=======
 PARTS = ["package.xml", "setup.py", "setup.cfg", "umf_ros", "resource", "config", "launch", "models", "tools"]
+>>>>>>> survive18
 PARTS += [path.name for path in ROOT.glob("requirements*.txt")]
 TEMPLATE = Path("runs", "templates", "planted.html.j2")
 
@@ -45,6 +49,7 @@ def test_everything_is_installed_to_share(install: Path) -> None:
     share = install / "share" / "umf_ros"
     for path in (
         "package.xml",
+        "NOTICE",
         "config/loop_closure.yaml",
         "config/loop_closure.rviz",
         "config/calibration/simulated.yaml",
@@ -52,8 +57,8 @@ def test_everything_is_installed_to_share(install: Path) -> None:
         "launch/loop_closure.launch.py",
         "models/umf_light.safetensors",
         "models/umf_light.json",
-        "models/umf_resnet50.safetensors",
-        "models/umf_resnet50.json",
+        "models/umf_scene.safetensors",
+        "models/umf_scene.json",
         "models/xfeat.safetensors",
         "models/xfeat.json",
     ):

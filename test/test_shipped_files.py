@@ -43,7 +43,7 @@ def found_by(site_packages: Path, relative: str) -> str:
     return done.stdout.strip()
 
 
-@pytest.mark.parametrize("relative", [CONFIG, "models/umf_resnet50.safetensors", "config/loop_closure.yaml", "models"])
+@pytest.mark.parametrize("relative", [CONFIG, "models/umf_scene.safetensors", "config/loop_closure.yaml", "models"])
 def test_a_checkout_uses_its_own_files(relative: str) -> None:
     assert find(relative) == PACKAGE.parent / relative
     assert find(relative).exists()

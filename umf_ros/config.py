@@ -93,7 +93,7 @@ class EmbeddingSettings(Group):
     """The network that turns a frame into a descriptor and local features."""
 
     method: str = Field("umf", description="embedder by name: umf, or a baseline")
-    weights: str = Field("", description="safetensors file, or umf_light or umf_resnet50; empty: umf_light")
+    weights: str = Field("", description="safetensors file, or umf_scene or umf_light; empty: umf_scene")
     runtime: Literal["auto", "torch", "openvino"] = Field("auto", description="what runs the network")
     device: str = Field("cpu", description="torch device")
     threads: int = Field(0, ge=0, le=64, description="threads of the network; 0: as many as there are cores")

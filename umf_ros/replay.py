@@ -66,6 +66,11 @@ class Replay:
             if detection.fault is not None:
                 raise detection.fault
 
+    def graph_counts(self) -> dict[str, int]:
+        """How many closures the graph has in which state so far; none without odometry."""
+        counts = self._graph.verdict_counts() if self._has_odometry else {}
+        return {state.value: count for state, count in counts.items()}
+
     def _pass_over(self, frame: Frame) -> Detection:
         """Take note of a frame that was dealt with before, and of its closures."""
         self._recorder.count(frame)

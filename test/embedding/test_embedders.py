@@ -8,16 +8,20 @@ import numpy as np
 import pytest
 import torch
 from conftest import CAMERA
+from published import published_tensors
+from scipy.spatial.transform import Rotation
 from tiny_worlds import TINY, some_scan
 
 from umf_ros import embedding
 from umf_ros.config import EmbeddingSettings
 from umf_ros.embedding import make_embedder
+from umf_ros.embedding.gradients_embedder import GradientsEmbedder
 from umf_ros.embedding.scan_context_embedder import ScanContextEmbedder
 from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.embedding.umf_embedder import UmfEmbedder
 from umf_ros.errors import ConfigError, WeightsError, either
 from umf_ros.frames import Frame
+from umf_ros.geometry import transform
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
 
@@ -119,7 +123,7 @@ def test_shipped_weights_load():
     """The default network reads its own weights and knows a frame from another."""
     embedder = make_embedder(EmbeddingSettings(runtime="torch", threads=1))
     one, two = embedder.embed(some_frame(0)), embedder.embed(some_frame(1))
-    assert embedder.dimension == 256
+    assert embedder.dimension == 768
     assert one.descriptor @ two.descriptor < 0.99
 
 
@@ -263,3 +267,47 @@ def test_the_thumbnail_is_blind_to_exposure_and_not_to_the_view():
     codes = [ThumbnailEmbedder().embed(some_frame(left=left)).descriptor for left in (image, image * 2, image[:, ::-1])]
     assert codes[0] @ codes[1] > 0.99
     assert codes[0] @ codes[2] < 0.6
+
+
+def test_gradients_are_blind_to_contrast_and_not_to_the_view():
+    image = (some_frame().left // 4 + 40).astype(np.uint8)
+    flat = np.full_like(image, 90)
+    codes = [GradientsEmbedder().embed(some_frame(left=left)).descriptor for left in (image, image * 2, image[:, ::-1])]
+    assert codes[0].shape == (GradientsEmbedder.dimension,)
+    assert codes[0] @ codes[1] > 0.99
+    assert codes[0] @ codes[2] < codes[0] @ codes[1] - 0.01
+    for nothing in (flat, None):
+        assert np.linalg.norm(GradientsEmbedder().embed(some_frame(left=nothing)).descriptor) == pytest.approx(1)
+
+
+def test_the_untrained_trunk_needs_its_published_weights_and_sees_the_image_alone(tmp_path):
+    with pytest.raises(ConfigError, match=r"lite0: embedding\.weights must name"):
+        make_embedder(EmbeddingSettings(method="lite0"))
+    torch.save(published_tensors(), tmp_path / "lite0.pth")
+    for method, length in (("lite0_mean", 320), ("lite0", 320 * 49)):
+        embedder = make_embedder(EmbeddingSettings(method=method, weights=str(tmp_path / "lite0.pth")))
+        here, again, there = (embedder.embed(some_frame(seed)).descriptor for seed in (0, 0, 1))
+        assert here.shape == (embedder.dimension,) == (length,)
+        np.testing.assert_array_equal(here, again)
+        assert float(here @ here) == pytest.approx(1, abs=1e-4)
+        assert float(here @ there) < 0.9999
+        np.testing.assert_array_equal(embedder.embed(some_frame(0, points=None)).descriptor, here)
+        assert embedder.embed(some_frame(0, left=None)).descriptor[0] == 1
+
+
+def test_the_mount_of_the_lidar_changes_neither_descriptor_nor_where_features_lie(weights):
+    """Scans are set upright on their ground before the network reads them."""
+    embedder = UmfEmbedder(weights, "torch", threads=1)
+    x, y = np.random.default_rng(3).uniform([[1.0], [-18.0]], [[38.0], [18.0]], (2, 20_000))
+    rocks = 1.5 * (np.sin(2 * x) * np.cos(1.5 * y) > 0.9)
+    points = np.column_stack([x, y, rocks]).astype(np.float32)
+    mount = np.eye(4)
+    mount[:3, :3] = Rotation.from_rotvec([0.1, 0.15, 0.0]).as_matrix()
+    mount[2, 3] = -1.2
+    level, tilted = (
+        embedder.embed(some_frame(left=None, points=cloud, intensity=None))
+        for cloud in (points, transform(mount, points))
+    )
+    assert level.descriptor @ tilted.descriptor > 0.99  # .96 if they were not
+    offsets = tilted.cloud.positions[:, None] - transform(mount, points)[None]
+    assert np.linalg.norm(offsets, axis=2).min(axis=1).max() < 0.8

@@ -60,7 +60,7 @@ def test_eight_bits_take_half_the_space_and_say_nearly_the_same(tmp_path):
 
 def test_shipped_weights_are_known_by_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert locate_weights(None) == locate_weights(Path("umf_light"))
+    assert locate_weights(None) == locate_weights(Path("umf_scene"))
     for name in SHIPPED:
         assert load_weights(locate_weights(Path(name))).config == PRESETS[name]
     assert locate_weights(tmp_path / "umf_light") == tmp_path / "umf_light"

@@ -2,153 +2,120 @@
 
 from __future__ import annotations
 
-import base64
 import io
+import json
+import re
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
+from finished_runs import accepted, candidate, closure, examined, trajectory
 from rich.console import Console
-from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import make_pose
-from umf_ros.runs.page import MAX_PICTURES, describe, print_summary, write_page
-from umf_ros.runs.truth import JudgedClosure, JudgedRun
+from umf_ros.runs.findings import ExaminedRun, look_first
+from umf_ros.runs.gallery import Gallery
+from umf_ros.runs.inputs import Advice
+from umf_ros.runs.page import closure_rows, describe, final_verdicts, print_summary, write_page
+from umf_ros.runs.scene import build_scene
+from umf_ros.runs.scene_pairs import pairs_of
+from umf_ros.runs.truth import JudgedClosure
+from umf_ros.runs.verdict import conclude
 
-NASTY = "<script>alert('x')</script> & \"quotes\" [red]"
-STAMP = 1_625_680_800_000_000_000
-SUMMARY: dict[str, Any] = {
-    "frames": 9,
-    "pairs": 8,
-    "keyframes": 7,
-    "queries": 6,
-    "closures_published": 5,
-    "closures_rejected": 4,
-    "ground_truth": None,
-    "latency_ms": {stage: {"p50": p50} for stage, p50 in (("embed", 30), ("query", 1), ("verify", 9), ("total", 40))},
-    "drops": {"image": 1, "worker": 0},
-    "peak_rss_mb": 512.4,
-    "version": "1.2.3",
-    "weights": "umf_light",
-    "seed": 11,
-}
+NASTY = "</script><script>alert('x')</script> & \"quotes\" [red]"
 TRUTH = {"closures_true": 4, "closures_false": 0, "revisits": 3, "ate_odometry_m": 1.5, "ate_optimized_m": 0.25}
 
 
 class Read(HTMLParser):
-    """The text that a browser shows, the table's cells with their classes, and what it would run or load."""
+    """The text that a browser shows outside of scripts, and how many scripts there are."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
         self.text: list[str] = []
-        self.tags: list[str] = []
-        self.images: list[dict[str, str | None]] = []
-        self.cells: list[tuple[str | None, str]] = []
+        self.scripts = 0
+        self._inside = ""
         self.feed(page)
         self.close()
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        if tag == "img":
-            self.images.append(dict(attributes))
-        if tag == "td":
-            self.cells.append((dict(attributes).get("class"), ""))
+        self._inside = tag
+        self.scripts += tag == "script"
+
+    def handle_endtag(self, tag: str) -> None:
+        self._inside = ""
 
     def handle_data(self, data: str) -> None:
-        self.text.append(data)
-        if self.tags[-1:] == ["td"]:
-            self.cells[-1] = self.cells[-1][0], self.cells[-1][1] + data.strip()
+        if self._inside not in ("script", "style") and data.strip():
+            self.text.append(data.strip())
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "matches").mkdir()
-    (tmp_path / "trajectory.png").write_bytes(bytes(range(256)) * 3)
-    return tmp_path
+def written(about: ExaminedRun, findings: list[Advice] | None = None) -> str:
+    findings = look_first(about) if findings is None else findings
+    scene = build_scene(about, pairs_of(about), Gallery([], [], None), {})
+    write_page(about, conclude(about, findings), findings, scene)
+    return (about.run.folder / "report.html").read_text(encoding="utf-8")
 
 
-def closure(number: int = 0) -> LoopClosure:
-    pose = make_pose(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [3, 4, 0])
-    return LoopClosure(STAMP + number, STAMP - number - 1, pose, np.eye(6), 0.91236)
+def scene_in(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
+    assert found
+    content: dict[str, Any] = json.loads(found[1])
+    return content
 
 
-def written(folder: Path, closures: list[LoopClosure], judged: JudgedRun | None = None, **changes: Any) -> Read:
-    write_page(folder, SUMMARY | changes, closures, judged or JudgedRun())
-    return Read((folder / "report.html").read_text(encoding="utf-8"))
+def test_text_stays_text_in_the_page_and_in_its_scripts(tmp_path: Path) -> None:
+    named = examined(tmp_path, [closure(50, 10)], [candidate(50, 10, NASTY)], accepted(reason=NASTY), weights=NASTY)
+    page = written(named, [Advice("warning", NASTY, NASTY)])
+    read = Read(page)
+    assert read.scripts == 3 and read.text.count(NASTY) >= 2
+    assert scene_in(page)["pairs"][0]["graph"].startswith(f"accepted: {NASTY}")
 
 
-def test_text_stays_text(folder: Path) -> None:
-    page = written(folder, [], weights=NASTY, drops={NASTY: 1})
-    assert f"{NASTY} 1" in page.text and any(NASTY in text and "1.2.3" in text for text in page.text)
-    assert "script" not in page.tags
+def test_the_page_stands_alone_and_is_small(tmp_path: Path) -> None:
+    page = written(examined(tmp_path, [closure(50, 10)]))
+    own = page.replace(page[page.index("<script>") : page.rindex("<script>")], "")  # less the drawing library
+    assert not re.search(r'(?:src|href)="(?!data:)', own) and len(page) < 10_000_000
+    assert "Plotly" in page
 
 
-def test_stamps_are_whole_and_figures_short_and_both_set_to_the_right(folder: Path) -> None:
-    one, other = closure(0), closure(1)
-    judged = JudgedRun(
-        [JudgedClosure(one, 5.0, 0.0123456, float("nan"), True), JudgedClosure(other, 5, 0.7, 1, False, 5.125)]
-    )
-    cells = written(folder, [one, other, closure(2)], judged).cells[-27:]
-    rows = [[text for _, text in cells[i : i + 9]] for i in (0, 9, 18)]
-    assert rows[0] == [str(STAMP), str(STAMP - 1), "5", "90", "0.9124", "0.01235", "nan", "nan", "yes"]
-    assert rows[1][5:] == ["0.7", "1", "5.125", "NO"] and rows[2][5:] == ["", "", "", ""]
-    assert [kind for kind, _ in cells[:9]] == ["number"] * 8 + ["good"]
-    assert cells[17][0] == "bad"
+def test_every_closure_is_a_row_and_a_pair_with_its_number(tmp_path: Path) -> None:
+    closures = [closure(50, 10), closure(52, 12, error_m=0.8), closure(54, 14)]
+    about = examined(tmp_path, closures, verdict=accepted("rejected", "contradicts the map"), truth=trajectory(0, 53))
+    rows = closure_rows(about)
+    assert rows[0].cells[:7] == ["1", "50.0", "40.0", "0.00", "0.0", "0.9700", "rejected"]
+    assert [row.word for row in rows[:2]] == ["yes", "NO"] and rows[1].mark == "bad"
+    told = scene_in(written(about))["pairs"]
+    assert [(pair["kind"], pair["number"]) for pair in told] == [("rejected", 1), ("false", 2), ("rejected", 3)]
+    assert told[0]["graph"] == "rejected: contradicts the map (2.0 sigma, 0.10 m)"
+    assert told[1]["truth"].startswith("FALSE: 0.80 m") and told[0]["q"] == 25
 
 
-def test_a_picture_is_inside_the_page(folder: Path) -> None:
-    (image,) = written(folder, []).images
-    content = base64.b64decode(str(image["src"]).removeprefix("data:image/png;base64,"))
-    assert content == (folder / "trajectory.png").read_bytes() and image["alt"] == "seen from above"
+def test_pending_is_not_rejected(tmp_path: Path) -> None:
+    about = examined(tmp_path, [closure(50, 10)], verdict=accepted("undecided", "too little speaks for it"))
+    assert scene_in(written(about))["pairs"][0]["kind"] == "pending"
+    assert final_verdicts(about) == ["closure 1, 40.0 s back: undecided, too little speaks for it (2.0 sigma, 0.10 m)"]
 
 
-def test_a_photograph_is_inside_the_page_and_small(folder: Path) -> None:
-    noise = np.random.default_rng(0).integers(60, 90, (200, 300, 3), np.uint8)
-    cv2.imwrite(str(folder / "matches" / "5_2.png"), noise)
-    page = written(folder, [])
-    content = base64.b64decode(str(page.images[1]["src"]).removeprefix("data:image/jpeg;base64,"))
-    seen = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-    assert seen.shape == noise.shape and abs(seen.mean() - noise.mean()) < 1
-    assert len(content) < 0.5 * (folder / "matches" / "5_2.png").stat().st_size
-    assert "5 matched with 2" in page.text
+def test_the_sweep_counts_what_a_threshold_would_publish(tmp_path: Path) -> None:
+    tested = [
+        candidate(50, 10, "accepted", probability=0.97),
+        candidate(52, 30, "probability 0.80 is below 0.9", probability=0.8),  # 18 m away
+        candidate(54, 14, "turned by 90 deg, more than 28", probability=0.99),
+    ]
+    about = examined(tmp_path, [closure(50, 10)], tested, truth=trajectory())
+    assert scene_in(written(about))["sweep"] == [[0.97, 1, 1], [0.8, 0, 0]]
 
 
-def test_of_many_pictures_a_page_shows_some(folder: Path) -> None:
-    for number in range(MAX_PICTURES + 3):
-        cv2.imwrite(str(folder / "matches" / f"{number:03d}_0.png"), np.zeros((4, 4), np.uint8))
-    assert len(written(folder, []).images) == 1 + MAX_PICTURES
-
-
-@pytest.mark.parametrize(
-    ("truth", "mark", "sentence"),
-    [
-        (None, "verdict ", "5 loop closures; there is no ground truth to judge them by."),
-        (TRUTH, "verdict good", "4 true and 0 false loop closures; trajectory error 1.50 m by odometry, 0.25 m opt"),
-        (TRUTH | {"closures_false": 1}, "verdict bad", "4 true and 1 false loop closures; "),
-        (TRUTH | {"ate_odometry_m": None}, "verdict good", "4 true and 0 false loop closures."),
-    ],
-)
-def test_the_most_important_sentence_has_its_colour(
-    folder: Path, truth: dict[str, Any] | None, mark: str, sentence: str
-) -> None:
-    page = written(folder, [], ground_truth=truth)
-    assert any(text.startswith(sentence) for text in page.text)
-    assert f'<p class="{mark}">' in (folder / "report.html").read_text()
-    assert ("revisits" in page.text) is (truth is not None)
-
-
-def test_the_terminal_gets_the_same_facts(folder: Path) -> None:
+def test_the_terminal_gets_the_same_facts_and_no_line_twice(tmp_path: Path) -> None:
     out = io.StringIO()
-    print_summary(Console(file=out, width=200), folder, SUMMARY | {"drops": {"[red]": 2}, "ground_truth": TRUTH})
+    about = examined(tmp_path, [closure(50, 10)], verdict=accepted(), drops={"[red]": 2}, ground_truth=TRUTH)
+    findings = [Advice("warning", "told"), Advice("fault", "the lens is [covered]", "uncover it"), Advice("note", "x")]
+    print_summary(Console(file=out, width=200), about, conclude(about, findings), findings, frozenset(["told"]))
     lines = [" ".join(line.split()) for line in out.getvalue().splitlines()]
-    assert "keyframes 7, 6 of them with candidates" in lines
+    assert "keyframes 40, 20 of them with candidates" in lines and "dropped [red] 2" in lines
     assert "latency 40 ms per keyframe, median (embed 30, query 1, verify 9)" in lines
-    assert "memory 512 MB at most" in lines and lines[-1] == f"Report: {folder}/report.html"
-    assert any(line.startswith("4 true and 0 false") for line in lines)
+    assert "memory 512 MB at most" in lines and lines[-1] == f"Report: {tmp_path}/report.html"
+    assert lines[-3] == "fault: the lens is [covered]; uncover it" and "warning: told" not in lines
 
 
 @pytest.mark.parametrize(
@@ -160,17 +127,18 @@ def test_the_terminal_gets_the_same_facts(folder: Path) -> None:
         ({"nees_median": 135.0, "inside_95": 0.0}, "too small by a factor of 5; 0% of the closures"),
     ],
 )
-def test_stated_errors_are_judged_in_a_plain_word(folder: Path, honesty: dict[str, Any], said: str) -> None:
-    page = written(folder, [], ground_truth=TRUTH | honesty)
-    assert any(text.startswith(said) for text in page.text)
+def test_stated_errors_are_judged_in_a_plain_word(tmp_path: Path, honesty: dict[str, Any], said: str) -> None:
+    read = Read(written(examined(tmp_path, ground_truth=TRUTH | honesty)))
+    assert any(text.startswith(said) for text in read.text)
 
 
-def test_without_a_keyframe_there_is_no_latency(folder: Path) -> None:
-    empty = {stage: {"p50": None} for stage in SUMMARY["latency_ms"]}
-    assert "latency" not in written(folder, [], latency_ms=empty).text
+def test_without_a_keyframe_there_is_no_latency_and_a_page_all_the_same(tmp_path: Path) -> None:
+    empty = {stage: {"p50": None} for stage in ("embed", "query", "verify", "total")}
+    page = written(examined(tmp_path, keyframe_rows=[], latency_ms=empty, keyframes=0))
+    assert "latency" not in Read(page).text and scene_in(page)["pairs"] == []
 
 
 def test_a_match_is_described_in_a_line() -> None:
-    one = closure()
-    assert describe(one, 31, None) == "5.00 m, 90.0 deg apart   p 0.912   31 image inliers"
+    one = closure(50, 10, error_m=0.5)
+    assert describe(one, 31, None) == "0.50 m, 0.0 deg apart   p 0.970   31 image inliers"
     assert describe(one, 0, JudgedClosure(one, 5, 0.66, 1, False)).endswith("0 image inliers   FALSE, 0.66 m off")

@@ -142,6 +142,7 @@ def test_the_summary_has_its_keys_and_plain_numbers() -> None:
         "revisits": 7,
         "revisits_any_heading": 0,
         "closed_any_heading": 0,
+        "keyframes_covered": 0,
         "ate_odometry_m": 1.2346,
         "ate_optimized_m": None,
         "nees_median": None,

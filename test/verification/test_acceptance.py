@@ -19,6 +19,7 @@ from umf_ros.verification.acceptance import (
     load_acceptance,
     scores,
 )
+from umf_ros.verification.measurement import SCAN
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,7 @@ def shipped() -> AcceptanceModel:
 
 
 def saved(model: AcceptanceModel, folder: Path) -> Path:
-    save_acceptance(model, folder / "model.json", "a command", {"recall": 0.9})
+    save_acceptance(model, folder / "model.json", {SCAN: "a command"}, {"recall": 0.9})
     return folder / "model.json"
 
 

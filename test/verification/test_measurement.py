@@ -11,9 +11,10 @@ import pytest
 from scenes import landscape, pose_at, take, without_image, without_scan
 
 from umf_ros.config import Verification
-from umf_ros.frames import Candidate, Keyframe, LocalFeatures
+from umf_ros.frames import Candidate, Keyframe, LocalFeatures, ScanMotion
 from umf_ros.geometry import make_pose, relative
 from umf_ros.verification import Measurement, Verifier
+from umf_ros.verification.constants import BLUR_M
 from umf_ros.verification.measurement import IMAGE, SCAN, cloud_agreement, image_agreement
 from umf_ros.verification.rerank import strongest
 
@@ -53,7 +54,10 @@ def test_every_field_says_what_it_is() -> None:
 def test_a_pair_of_scans_is_measured_completely() -> None:
     found = measured(QUERY, MATCH)
     assert found.kind == SCAN and found.similarity == 0.7
-    assert found.residual_m < found.noise_m < found.residual_p90_m < 0.1 < 0.8 < found.overlap
+    assert found.residual_m < found.residual_p90_m < 0.1 < 0.8 < found.overlap
+    assert found.noise_m > BLUR_M  # nobody removed the motion during these scans
+    steady = [replace(one, motion=ScanMotion.none(len(one.points))) for one in (QUERY, MATCH)]
+    assert measured(*steady).residual_m < measured(*steady).noise_m < found.residual_p90_m
     assert found.points > 500 and found.relief_m > 0.04
     assert found.terrain_correlation > 0.7 and found.terrain_score > 10
     assert found.position_std_m < 0.1 and found.heading_std_deg < 0.5

@@ -101,3 +101,14 @@ def test_a_pose_beside_the_right_one_has_a_better_rival() -> None:
     beside = make_pose(np.eye(3), [2.0, 0.0, 0.0]) @ THERE
     information = np.diag([0.1, 100.0, 100.0, 100.0, 100.0, 100.0])  # x is known least
     assert rivalry(MATCH, QUERY, beside, information)[1] < -0.3
+
+
+def test_pillars_that_come_again_to_any_side_are_rivals() -> None:
+    x, y = np.meshgrid(np.arange(-9, 10, 3.0), np.arange(-9, 10, 3.0))
+    lattice = np.column_stack([x.ravel() + 1.3, y.ravel() + 0.7])
+    single = RNG.uniform(-10, 10, (len(lattice), 2))
+    found = []
+    for pillars in (lattice, single):
+        query, match = (seen(box((-30, 30), (-30, 30), 3.0, pillars), np.eye(4), 9.0) for _ in range(2))
+        found.append(rivalry(match, query, np.eye(4), np.diag([100.0, 100.0, 100.0, 100.0, 100.0, 100.0]))[1])
+    assert found[0] < 0.15 < found[1] - 0.1

@@ -33,6 +33,7 @@ _PACKAGES = (
     ("pydantic", "pydantic", "2"),
     ("matplotlib", "matplotlib", "3.8"),
     ("jinja2", "Jinja2", "3.1"),
+    ("plotly", "plotly", "6"),
 )
 _MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "visualization_msgs", "std_srvs")
 

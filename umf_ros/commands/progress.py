@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import Any
@@ -20,21 +20,41 @@ WARNING: dict[str, Any] = {"style": "yellow", "markup": False, "highlight": Fals
 
 
 class FrameProgress(Progress):
-    """A bar over the recording, with what was found beside it."""
+    """A bar over the recording, with what was found beside it and what the graph makes of it so far.
 
-    def __init__(self, console: Console) -> None:
+    Args:
+        console: where.
+        graph_counts: gives the number of closures by the graph's state.
+    """
+
+    def __init__(self, console: Console, graph_counts: Callable[[], Mapping[str, int]] = dict) -> None:
         found = TextColumn("{task.fields[found]}")
         columns = TextColumn("{task.description}"), BarColumn(), found, TimeRemainingColumn()
         super().__init__(*columns, console=console, transient=True)
         self._frames = self.add_task("Looking for loops", total=1.0, found="")
         self._places = 0
         self._closures = 0
+        self._graph_counts = graph_counts
+        self._graph = ""
 
     def show(self, done: float, detection: Detection) -> None:
         """Advance to the part of the recording that is done, 0 to 1."""
         self._places += detection.keyframe is not None
-        self._closures += len(detection.closures)
-        self.update(self._frames, completed=done, found=f"{self._places} places, {self._closures} closures")
+        if detection.closures:
+            self._closures += len(detection.closures)
+            self._graph = _in_graph(self._graph_counts())
+        self.update(
+            self._frames, completed=done, found=f"{self._places} places, {self._closures} closures{self._graph}"
+        )
+
+
+def _in_graph(counts: Mapping[str, int]) -> str:
+    """As " (30 in the graph, 4 pending)": what is pending is not rejected."""
+    rejected = counts.get("rejected", 0) + counts.get("refused", 0)
+    pending = sum(counts.values()) - counts.get("accepted", 0) - rejected
+    words = {"in the graph": counts.get("accepted", 0), "pending": pending, "rejected": rejected}
+    told = ", ".join(f"{count} {word}" for word, count in words.items() if count)
+    return f" ({told})" if told else ""
 
 
 @contextmanager

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from umf_ros.embedding import CHOICES
-from umf_ros.errors import either
+from umf_ros.errors import BagError, ConfigError, either
 from umf_ros.resources import dataset_names
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from collections.abc import Callable
 
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.reader import Bag
@@ -22,9 +22,7 @@ BagPath = Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .
 ConfigPath = Annotated[Path | None, typer.Option("--config", help="Parameter file (YAML).")]
 DatasetName = Annotated[str, typer.Option("--dataset", help=f"{either(['auto', *dataset_names()])}.")]
 EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"How places are embedded: {CHOICES}.")]
-WeightsPath = Annotated[
-    Path | None, typer.Option("--weights", help="Weights file, or umf_resnet50; default: umf_light.")
-]
+WeightsPath = Annotated[Path | None, typer.Option("--weights", help="Weights file, or umf_light; default: umf_scene.")]
 OdometryPath = Annotated[
     Path | None, typer.Option("--odometry", help="Odometry as a TUM file, where the recording has none.")
 ]
@@ -32,11 +30,26 @@ OdometryFrame = Annotated[
     str,
     typer.Option(
         "--odometry-frame",
-        help="Whose poses --odometry holds: body, imu, camera or lidar (S3LI's Eval/BASALT: imu).",
+        help="Whose poses --odometry holds: body (the default), imu, camera or lidar (S3LI's Eval/BASALT: imu).",
+        show_default=False,
     ),
 ]
 TruthPath = Annotated[Path | None, typer.Option("--ground-truth", help="Truth as RTKLIB .pos or TUM file.")]
 RunsFolder = Annotated[Path, typer.Option("--out", help="Where results/<timestamp> goes.")]
+
+
+def check_files(bag: Path, *others: Path | None) -> None:
+    """Say what is not there before anything that takes time to import.
+
+    Raises:
+        BagError: there is no such recording.
+        ConfigError: one of the other files is not there.
+    """
+    if not bag.exists():
+        raise BagError(f"there is no recording {bag}")
+    for path in others:
+        if path is not None and not path.exists():
+            raise ConfigError(f"cannot read {path}: No such file or directory")
 
 
 def open_recording(
@@ -61,6 +74,8 @@ def open_recording(
         BagError: it cannot be opened, or its data set is not known.
         ConfigError: the file cannot be read, or a name, type or value is wrong.
     """
+    check_files(bag, config)
+
     from umf_ros.bags.presets import settings_for
     from umf_ros.bags.reader import open_bag
 
@@ -69,10 +84,21 @@ def open_recording(
     return recording, settings_for(recording, config, dataset, **overrides)
 
 
+def check_odometry_options(odometry: Path | None, odometry_frame: str) -> str:
+    """The frame of the odometry file; without a file there is nothing it could be the frame of.
+
+    Raises:
+        ConfigError: only the frame was given.
+    """
+    if odometry_frame and odometry is None:
+        raise ConfigError("--odometry-frame says whose poses an --odometry file holds, and there is none")
+    return odometry_frame or "body"
+
+
 def open_frames(
-    recording: Bag, settings: Settings, console: Console, odometry: Path | None, odometry_frame: str
+    recording: Bag, settings: Settings, warn: Callable[[str], None], odometry: Path | None, odometry_frame: str
 ) -> FrameReader:
-    """The frames of a recording, with the odometry of a file where one is named; faults are told on the console.
+    """The frames of a recording, with the odometry of a file where one is named; `warn` is told of faults.
 
     Raises:
         BagError: the recording or the file cannot be read as frames or odometry.
@@ -80,7 +106,6 @@ def open_frames(
     """
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.trajectories import read_odometry
-    from umf_ros.commands.progress import WARNING
 
     path = read_odometry(odometry, odometry_frame, settings) if odometry else None
-    return FrameReader(recording, settings, path, warn=lambda text: console.print(text, **WARNING))
+    return FrameReader(recording, settings, path, warn=warn)

@@ -17,6 +17,8 @@ from umf_ros.commands.recordings import (
     RunsFolder,
     TruthPath,
     WeightsPath,
+    check_files,
+    check_odometry_options,
     open_frames,
     open_recording,
 )
@@ -37,7 +39,7 @@ def command(
     embedder: EmbedderName = None,
     weights: WeightsPath = None,
     odometry: OdometryPath = None,
-    odometry_frame: OdometryFrame = "body",
+    odometry_frame: OdometryFrame = "",
     ground_truth: TruthPath = None,
     min_probability: MinProbability = None,
     resume: Resume = False,
@@ -45,11 +47,16 @@ def command(
     """Find loop closures in a recording as fast as the machine goes.
 
     Needs no ROS. Writes closures, trajectories, the pose graph and a report to a new folder.
-    Ctrl-C ends the run early and keeps what was found; --resume goes on from there, or after a crash.
+    Ctrl-C ends the run early and keeps what was found; --resume goes on from there, or after a crash. Ends with 3 where
+    the inputs could give nothing.
     """
+    check_files(bag, config, odometry, ground_truth)
+    odometry_frame = check_odometry_options(odometry, odometry_frame)
+
     from rich.console import Console
 
     from umf_ros.bags.trajectories import read_ground_truth
+    from umf_ros.commands.inputs import InputConsole
     from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
     from umf_ros.loop_detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
@@ -61,7 +68,8 @@ def command(
     recording, settings = open_recording(
         bag, config, dataset, embedder, weights, verification__min_probability=min_probability
     )
-    reader = open_frames(recording, settings, console, odometry, odometry_frame)
+    inputs = InputConsole(console, recording)
+    reader = open_frames(recording, settings, inputs.warn, odometry, odometry_frame)
     if ground_truth is not None:
         read_ground_truth(recording, ground_truth)  # what is wrong with it is said now, not after the run
     network = make_detector_embedder(settings)
@@ -69,8 +77,9 @@ def command(
     detector = LoopDetector(settings, network) if settings.database.path else None
     folder = (ReplayFolder.resume if resume else ReplayFolder.create)(out, bag, settings)
     detector = detector or LoopDetector(folder.working_settings, network)
+    inputs.tell_absent(settings, odometry is not None)
     replay = Replay(folder.path, settings, detector, folder.resumed)
-    with stop_on_interrupt() as interrupted, FrameProgress(console) as progress:
+    with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress:
         for detection in replay.run(reader.stream()):
             progress.show(reader.progress, detection)
             if interrupted():
@@ -78,8 +87,9 @@ def command(
     if interrupted():
         console.print("[yellow]Interrupted: the results cover what was done so far; --resume goes on from here.")
     with undisturbed():
-        if not replay.finish(count_drops(reader.counters)):
-            console.print("No odometry: closures only, the pose graph is skipped (--odometry FILE.tum supplies it).")
+        replay.finish(count_drops(reader.counters))
         if not interrupted():
             folder.finish()
-        finish_run(folder.path, recording, console, ground_truth)
+        inputs.remember(folder.path, reader.counters, interrupted(), odometry, odometry_frame)
+        verdict = finish_run(folder.path, recording, console, ground_truth, inputs.told)
+    raise typer.Exit(verdict.exit_code)

@@ -13,11 +13,14 @@ from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_sal
 from umf_ros.embedding.runtimes import Outputs, make_runtime
 from umf_ros.embedding.voxels import VoxelScan
 from umf_ros.frames import Embedding, Frame, LocalFeatures, Points, SuperFeatures
+from umf_ros.geometry import Array, invert, transform
+from umf_ros.levelling import level
 from umf_ros.networks.weights import load_weights, locate_weights
 
 KEYPOINTS = 400
 # of the fair share of attention; the cap decides in a rich view, this in a poor one
 MIN_SALIENCY = 0.01
+READ_AS = b"scans set upright on their ground"
 
 
 class UmfEmbedder:
@@ -48,10 +51,10 @@ class UmfEmbedder:
     ) -> None:
         path = locate_weights(weights)
         network = load_weights(path)
-        # descriptors of other weights are another language: the name tells them apart
-        self.name = f"{path.stem}-{hashlib.sha256(path.read_bytes()).hexdigest()[:8]}"
+        # descriptors of other weights, or of scans read otherwise, are another language: the name tells them apart
+        self.name = f"{path.stem}-{hashlib.sha256(path.read_bytes() + READ_AS).hexdigest()[:8]}"
         self._config = network.config
-        self.dimension = network.config.descriptor
+        self.dimension = network.config.length
         self._super_features = super_features
         rows, columns = (side // 4 for side in network.config.image_size)
         self._regions = cell_regions(rows, columns)
@@ -60,13 +63,15 @@ class UmfEmbedder:
     def embed(self, frame: Frame) -> Embedding:
         """Embed one frame; a black image and an empty scan count as missing."""
         image = None if frame.left is None or is_blank(frame.left) else frame.left
-        scan = prepare_scan(frame.points, frame.intensity, self._config)
+        level_T_body = np.eye(4) if frame.points is None else level(frame.points)
+        points = None if frame.points is None else transform(level_T_body, frame.points)
+        scan = prepare_scan(points, frame.intensity, self._config)
         found = self._runtime.run(pack([prepare_image(image, self._config)], [scan], self._config))
         supers = self._supers(found) if self._super_features else (None, None)
         return Embedding(
             descriptor=found["descriptor"],
             image=None if image is None else self._image_features(found, image.shape[:2]),
-            cloud=self._cloud_features(found, scan) if scan.fine_mask.any() else None,
+            cloud=self._cloud_features(found, scan, level_T_body) if scan.fine_mask.any() else None,
             super_image=None if image is None else supers[0],
             super_cloud=supers[1] if scan.fine_mask.any() else None,
         )
@@ -80,10 +85,10 @@ class UmfEmbedder:
         pixels = np.stack([(column + 0.5) * across - 0.5, (row + 0.5) * down - 0.5], axis=1).astype(np.float32)
         return _features(pixels, np.full((len(chosen), 3), np.nan, np.float32), found["image"], saliency, chosen)
 
-    def _cloud_features(self, found: Outputs, scan: VoxelScan) -> LocalFeatures:
+    def _cloud_features(self, found: Outputs, scan: VoxelScan, level_T_body: Array) -> LocalFeatures:
         saliency = np.where(scan.fine_mask, found["cloud_saliency"], 0)
         chosen = select_salient(saliency, ground_regions(scan.centroids), MIN_SALIENCY, KEYPOINTS)
-        points = scan.centroids[chosen]
+        points = transform(invert(level_T_body), scan.centroids[chosen])
         return _features(points, points, found["cloud"], saliency, chosen)
 
     def _supers(self, found: Outputs) -> tuple[SuperFeatures, SuperFeatures]:

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 from umf_ros.errors import WeightsError
 
-Backbone = Literal["resnet18", "resnet34", "resnet50"]
+Backbone = Literal["resnet18", "resnet34", "resnet50", "efficientnet_lite0"]
 
 
 @dataclass(frozen=True)
@@ -16,19 +16,20 @@ class NetworkConfig:
 
     Attributes:
         backbone: image encoder.
-        width: channels of its first stage (64 is the published ResNet).
+        width: channels of its first stage (64 is the published ResNet); EfficientNet-Lite0 has its own.
         image_size: height and width of the network's input, multiples of 32.
         pyramid: channels of the image feature pyramid.
         voxel_channels: channels of the voxel encoder at 20^3, 10^3 and 5^3 cells.
         voxel_blocks: residual blocks of the voxel encoder at 10^3 and at 5^3 cells.
         tokens: width of the fusion transformer.
         heads, layers, feedforward: of the fusion transformer.
-        descriptor: length of the global descriptor.
+        descriptor: length of the global descriptor, without the scene's part.
         coarse_voxels, fine_voxels: most occupied voxels kept for fusion and for local features.
         local: width of the two local transformer layers.
         image_local, cloud_local: lengths of the local descriptors.
         super_iterations: rounds of the iterative attention of the super-features.
         image_supers, cloud_supers: number of super-features and their length.
+        scene: length of what a trunk that has seen photographs adds to the descriptor; 0: there is none.
     """
 
     backbone: Backbone = "resnet18"
@@ -50,6 +51,7 @@ class NetworkConfig:
     super_iterations: int = 3
     image_supers: tuple[int, int] = (64, 64)
     cloud_supers: tuple[int, int] = (64, 32)
+    scene: int = 0
 
     def __post_init__(self) -> None:
         if self.backbone not in get_args(Backbone):
@@ -58,6 +60,11 @@ class NetworkConfig:
             raise ValueError(f"image_size must be multiples of 32, not {self.image_size}")
         if self.tokens % self.heads or self.local % 4:
             raise ValueError("the width of a transformer must be a multiple of its heads")
+
+    @property
+    def length(self) -> int:
+        """Of the whole descriptor."""
+        return self.descriptor + self.scene
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for a JSON card."""

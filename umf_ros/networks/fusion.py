@@ -77,7 +77,8 @@ class Fused(NamedTuple):
 
     Attributes:
         descriptor: (B, D) float32, L2-normalised: both halves, weighted.
-        image, cloud: (B, D/2) float32, L2-normalised halves; without meaning where the modality is absent.
+        image, cloud: (B, D/2) float32, L2-normalised halves, the scene being part of the image's; without
+            meaning where the modality is absent.
         weights: (B, 2) share of the image and of the cloud in the descriptor, summing to one.
     """
 
@@ -104,14 +105,37 @@ class Fusion(nn.Module):
         self.image_head, self.cloud_head = nn.Linear(config.tokens, half), nn.Linear(config.tokens, half)
         self.weigh = nn.Linear(2 * config.tokens, 2)
 
-    def forward(self, image: Tokens, cloud: Tokens, image_present: Tensor, cloud_present: Tensor) -> Fused:
-        """Fuse tokens of which the absent rows (present: (B,) bool) hold the learned token alone."""
+    def forward(
+        self, image: Tokens, cloud: Tokens, image_present: Tensor, cloud_present: Tensor, scene: Tensor | None = None
+    ) -> Fused:
+        """Fuse tokens of which the absent rows (present: (B,) bool) hold the learned token alone.
+
+        Args:
+            image: its tokens.
+            cloud: its tokens.
+            image_present: (B,) bool.
+            cloud_present: (B,) bool.
+            scene: (B, S), of a network that has such a part; its length is its weight beside the image's half.
+        """
+        seen, felt = self.pool(image, cloud)
+        return self.describe(seen, felt, image_present, cloud_present, scene)
+
+    def pool(self, image: Tokens, cloud: Tokens) -> tuple[Tensor, Tensor]:
+        """(B, C) of the image and of the cloud: all that the heads see of the tokens."""
         for layer in self.layers:
             image, cloud = layer(image, cloud)
         seen = self.image_pool(Tokens(self.image_norm(image.values), image.mask))
         felt = self.cloud_pool(Tokens(self.cloud_norm(cloud.values), cloud.mask))
+        return seen, felt
+
+    def describe(
+        self, seen: Tensor, felt: Tensor, image_present: Tensor, cloud_present: Tensor, scene: Tensor | None = None
+    ) -> Fused:
+        """Descriptors of what was pooled; the other arguments as in `forward`."""
         with torch.autocast(seen.device.type, enabled=False):
             image_half = nn.functional.normalize(self.image_head(seen.float()), dim=-1)
+            if scene is not None:
+                image_half = nn.functional.normalize(torch.cat([image_half, scene.float()], dim=-1), dim=-1)
             cloud_half = nn.functional.normalize(self.cloud_head(felt.float()), dim=-1)
             scores = self.weigh(torch.cat([seen, felt], dim=-1).float())
             present = torch.stack([image_present, cloud_present], dim=-1)

@@ -13,6 +13,7 @@ from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.fusion import AbsentToken, Fused, Fusion, Tokens
 from umf_ros.networks.image_encoder import ImageEncoder
 from umf_ros.networks.local_features import CloudLocal, ImageLocal, IterativeAttention, LocalMap, SuperMap
+from umf_ros.networks.scene import SceneDescriptor
 from umf_ros.networks.voxel_encoder import CELLS, VoxelEncoder
 
 Branch = Literal["both", "image", "cloud"]
@@ -52,12 +53,14 @@ class Features:
         image, cloud: tokens for fusion, positions included.
         fine_image: (B, C, H/4, W/4).
         fine_cloud: (B, V, C).
+        scene: (B, S), longer where the view is a strange one, or None where the network has no such part.
     """
 
     image: Tokens
     cloud: Tokens
     fine_image: Tensor
     fine_cloud: Tensor
+    scene: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +88,7 @@ class UMF(nn.Module):
         self.config = config
         self.image_encoder = ImageEncoder(config)
         self.voxel_encoder = VoxelEncoder(config)
+        self.scene = SceneDescriptor(config.scene) if config.scene else None
         # content and position on one scale, or one of them drowns
         self.image_tokens, self.cloud_tokens = nn.LayerNorm(config.tokens), nn.LayerNorm(config.tokens)
         self.fusion = Fusion(config)
@@ -109,14 +113,17 @@ class UMF(nn.Module):
 
     def encode(self, batch: NetworkInput, branch: Branch = "both") -> Features:
         """Run the encoders and add the positions to the tokens; of the branch left out all is zero."""
+        scene = None
         if branch == "cloud":
             size = batch.image.shape[0]
+            scene = None if self.scene is None else batch.image.new_zeros(size, self.config.scene)
             image = batch.image.new_zeros(size, *self.cells.shape)
             fine_image = batch.image.new_zeros(size, self.config.local, *self.image_local.positions.shape[:2])
         else:
             coarse, fine_image = self.image_encoder(batch.image)
             image = self.image_tokens(coarse.flatten(2).transpose(1, 2))
             image = image + self.cells.to(image.dtype)
+            scene = None if self.scene is None else self.scene(batch.image)
         everywhere = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device)
         if branch == "image":
             cloud = batch.image.new_zeros(*batch.coarse_index.shape, self.config.tokens)
@@ -125,13 +132,16 @@ class UMF(nn.Module):
             cloud, fine_cloud = self.voxel_encoder(batch.grid, batch.coarse_index, batch.fine_index)
             cloud = self.cloud_tokens(cloud)
             cloud = cloud + self.coarse_voxels[batch.coarse_index].to(cloud.dtype)
-        return Features(Tokens(image, everywhere), Tokens(cloud, batch.coarse_mask), fine_image, fine_cloud)
+        return Features(Tokens(image, everywhere), Tokens(cloud, batch.coarse_mask), fine_image, fine_cloud, scene)
 
     def fuse(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> Fused:
         """Descriptors, with the modalities that are present (B,) bool."""
-        image = self.absent_image(features.image, image_present)
-        cloud = self.absent_cloud(features.cloud, cloud_present)
-        return self.fusion(image, cloud, image_present, cloud_present)
+        image, cloud = self.stand_in(features, image_present, cloud_present)
+        return self.fusion(image, cloud, image_present, cloud_present, features.scene)
+
+    def stand_in(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> tuple[Tokens, Tokens]:
+        """Tokens of both modalities; a learned one stands in for what is absent, (B,) bool."""
+        return self.absent_image(features.image, image_present), self.absent_cloud(features.cloud, cloud_present)
 
     def describe_local(self, features: Features, batch: NetworkInput) -> tuple[LocalMap, LocalMap]:
         """Local features of the images and of the scans."""

@@ -15,8 +15,8 @@ from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import UMF, channels_last
 from umf_ros.resources import find
 
-SHIPPED = ("umf_light", "umf_resnet50")
-DEFAULT = "umf_light"
+SHIPPED = ("umf_scene", "umf_light")
+DEFAULT = "umf_scene"
 SCALE = ".scale"
 """End of the name of what the eight bits of another tensor are to be multiplied with."""
 

@@ -153,9 +153,9 @@ class PoseGraphNode(BaseNode):
             return
         self._correct()
         for verdict in verdicts:
-            # what is accepted the front-end has told already, what is undecided will be
-            quiet = verdict.state in (State.ACCEPTED, State.UNDECIDED, State.WAITING)
-            log = self.get_logger().debug if quiet else self.get_logger().info
+            # a verdict may change until the graph is settled: only what is refused is so for good
+            final = verdict.state is State.REFUSED
+            log = self.get_logger().info if final else self.get_logger().debug
             log(describe(verdict))
         report = DiagnosticArray(status=[_as_status(verdict) for verdict in verdicts])
         report.header.stamp = self.get_clock().now().to_msg()

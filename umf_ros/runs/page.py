@@ -2,54 +2,51 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+import json
+from collections.abc import Mapping, Sequence
+from math import isfinite
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table as Grid
 
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import rotation_angle
+from umf_ros.pose_graph.closures import State
+from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.folder import write_atomically
 from umf_ros.runs.honesty import MEDIAN_EXPECTED, in_words
-from umf_ros.runs.truth import JudgedClosure, JudgedRun, endpoints
+from umf_ros.runs.inputs import Advice
+from umf_ros.runs.truth import JudgedClosure, endpoints
+from umf_ros.runs.verdict import RunVerdict
 
 MAX_PICTURES = 40
-JPEG_QUALITY = 85
+MOST_LINES = 8
+"""Of closures and of findings in the terminal; the page has all."""
+COLOURS = {"good": "green", "warn": "yellow", "bad": "red", "fault": "red", "warning": "yellow", "note": "dim"}
 
 Summary = Mapping[str, Any]
 """What `summary.json` holds."""
 
 
-class InlinePicture(NamedTuple):
-    """An image inside the page: a `data:` address, and what is said below."""
-
-    address: str
-    caption: str
-
-
 class ClosureRow(NamedTuple):
-    """A row of the page's table: stamps in ns; shift in m, turn in deg and probability; what the truth says."""
+    """A row of the page's table: its cells, and the last one, which says whether the closure is true."""
 
-    stamps: tuple[int, int]
-    figures: tuple[float, float, float]
-    judged: JudgedClosure | None
+    cells: list[str]
+    word: str
+    mark: str
 
 
-def write_page(folder: Path, summary: Summary, closures: Iterable[LoopClosure], judged: JudgedRun) -> None:
-    """Write report.html with the pictures that lie in the run's folder.
+def write_page(about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advice], scene: Mapping[str, Any]) -> None:
+    """Write report.html.
 
     Raises:
         OutputError: the page cannot be written.
     """
-    verdict, mark = _verdict(summary)
-    matches = sorted((folder / "matches").glob("*.png"))[:MAX_PICTURES]
-    known = judged.by_endpoints()
+    run = about.run
     # undefined is an error: a report must not say less than it should
     environment = Environment(
         loader=PackageLoader("umf_ros.runs"),
@@ -60,29 +57,58 @@ def write_page(folder: Path, summary: Summary, closures: Iterable[LoopClosure], 
         keep_trailing_newline=True,
     )
     page = environment.get_template("report.html").render(
-        name=folder.resolve().name,
+        name=run.folder.resolve().name,
         verdict=verdict,
-        mark=mark,
-        facts=_facts(summary),
-        trajectory=InlinePicture(_address("png", (folder / "trajectory.png").read_bytes()), "seen from above"),
-        matches=[_photograph(path, path.stem.replace("_", " matched with ")) for path in matches],
-        closures=[_row(closure, known.get(endpoints(closure))) for closure in closures],
-        version=summary["version"],
-        weights=summary["weights"],
-        seed=summary["seed"],
+        findings=findings,
+        facts=_facts(run.summary),
+        closures=closure_rows(about),
+        scene=_inside_a_script(scene),
+        plotly=_plotly(),
+        version=run.summary["version"],
+        weights=run.summary["weights"],
+        seed=run.summary["seed"],
     )
-    write_atomically(folder / "report.html", page)
+    write_atomically(run.folder / "report.html", page)
 
 
-def print_summary(console: Console, folder: Path, summary: Summary) -> None:
-    """Print what a person wants to know first."""
+def print_summary(
+    console: Console, about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advice], told: frozenset[str]
+) -> None:
+    """Print what a person wants to know first: figures, what became of the closures, and the verdict.
+
+    Args:
+        console: where.
+        about: the run.
+        verdict: about it.
+        findings: likewise.
+        told: lines that were printed before, and are not again.
+    """
+    plain: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
     grid = Grid(show_header=False, box=None, padding=(0, 2, 0, 0))
-    for name, value in _facts(summary):
-        grid.add_row(name, value)
+    for name, value in _facts(about.run.summary):
+        grid.add_row(name, escape(value))
     console.print(grid)
-    verdict, mark = _verdict(summary)
-    console.print(verdict, style={"good": "green", "bad": "red"}.get(mark, ""), markup=False)
-    console.print(f"Report: {folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+    for line in final_verdicts(about):
+        console.print(line, **plain)
+    shown = [finding for finding in findings if finding.line not in told and finding.severity != "note"]
+    for finding in shown[:MOST_LINES]:
+        console.print(f"{finding.severity}: {finding.line}", style=COLOURS[finding.severity], **plain)
+    console.print(verdict.sentence, style=COLOURS[verdict.mark], markup=False, highlight=False)
+    console.print(f"Report: {about.run.folder / 'report.html'}", **plain)
+
+
+def final_verdicts(about: ExaminedRun) -> list[str]:
+    """A line for each closure, by its number, that the graph did not accept in the end."""
+    lines = []
+    for number, closure in enumerate(about.run.closures, 1):
+        verdict = about.run.verdicts.get(endpoints(closure))
+        if verdict is None or verdict.state == State.ACCEPTED:
+            continue
+        seconds = (closure.query_stamp_ns - closure.match_stamp_ns) * 1e-9
+        figures = f" ({verdict.sigma:.1f} sigma, {verdict.misfit_m:.2f} m)" if isfinite(verdict.sigma) else ""
+        lines.append(f"closure {number}, {seconds:.1f} s back: {verdict.state}, {verdict.reason}{figures}")
+    more = len(lines) - MOST_LINES
+    return lines if more <= 0 else [*lines[:MOST_LINES], f"... and {more} more in graph_verdicts.csv"]
 
 
 def describe(closure: LoopClosure, inliers: int, judged: JudgedClosure | None) -> str:
@@ -94,16 +120,36 @@ def describe(closure: LoopClosure, inliers: int, judged: JudgedClosure | None) -
     return f"{text}   {'true' if judged.is_true else 'FALSE'}, {judged.translation_error_m:.2f} m off"
 
 
-def _verdict(summary: Summary) -> tuple[str, str]:
-    """The most important sentence, and its class in the style sheet."""
-    truth = summary["ground_truth"]
-    if truth is None:
-        return f"{summary['closures_published']} loop closures; there is no ground truth to judge them by.", ""
-    text = f"{truth['closures_true']} true and {truth['closures_false']} false loop closures"
-    before, after = truth["ate_odometry_m"], truth["ate_optimized_m"]
-    if before is not None and after is not None:
-        text += f"; trajectory error {before:.2f} m by odometry, {after:.2f} m optimised"
-    return text + ".", "bad" if truth["closures_false"] else "good"
+def closure_rows(about: ExaminedRun) -> list[ClosureRow]:
+    """The page's table: seconds since the first keyframe, figures, the graph's verdict and the truth's."""
+    known = about.judged.by_endpoints()
+    start = int(about.run.stamps[0]) if len(about.run.stamps) else 0
+    rows = []
+    for number, closure in enumerate(about.run.closures, 1):
+        at_s, back_s = ((closure.query_stamp_ns - other) * 1e-9 for other in (start, closure.match_stamp_ns))
+        shift_m, turn_deg = _size(closure)
+        verdict, judged = about.run.verdicts.get(endpoints(closure)), known.get(endpoints(closure))
+        figures = [f"{at_s:.1f}", f"{back_s:.1f}", f"{shift_m:.2f}", f"{turn_deg:.1f}", f"{closure.probability:.4f}"]
+        cells = [str(number), *figures, verdict.state if verdict else ""]
+        if judged is None:
+            rows.append(ClosureRow([*cells, "", "", ""], "", ""))
+            continue
+        errors = [f"{value:.3g}" for value in (judged.translation_error_m, judged.rotation_error_deg, judged.nees)]
+        rows.append(ClosureRow([*cells, *errors], *(("yes", "good") if judged.is_true else ("NO", "bad"))))
+    return rows
+
+
+def _inside_a_script(scene: Mapping[str, Any]) -> str:
+    """The scene as JSON that no parser of HTML takes for the end of its script."""
+    text = json.dumps(scene, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+def _plotly() -> str:
+    """The drawing library, as its package brings it."""
+    from plotly.offline import get_plotlyjs
+
+    return str(get_plotlyjs())
 
 
 def _facts(summary: Summary) -> list[tuple[str, str]]:
@@ -144,22 +190,7 @@ def _honesty(truth: Summary) -> str:
     )
 
 
-def _row(closure: LoopClosure, judged: JudgedClosure | None) -> ClosureRow:
-    return ClosureRow(endpoints(closure), (*_size(closure), closure.probability), judged)
-
-
 def _size(closure: LoopClosure) -> tuple[float, float]:
     """Metres and degrees between the endpoints."""
     pose = closure.match_T_query
     return float(np.linalg.norm(pose[:3, 3])), float(np.degrees(rotation_angle(pose)))
-
-
-def _photograph(path: Path, caption: str) -> InlinePicture:
-    """A picture as JPEG, which is a fraction of a camera image's size."""
-    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
-    _, data = cv2.imencode(".jpg", np.asarray(image), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return InlinePicture(_address("jpeg", data.tobytes()), caption)
-
-
-def _address(kind: str, content: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"

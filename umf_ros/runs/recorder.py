@@ -8,6 +8,7 @@ import time
 from array import array
 from collections.abc import Mapping
 from contextlib import suppress
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,13 @@ from umf_ros.errors import UmfError
 from umf_ros.frames import Frame, LoopClosure
 from umf_ros.loop_detector import Detection
 from umf_ros.runs import tables
+from umf_ros.runs.descriptors import DescriptorFile
 from umf_ros.runs.folder import write_atomically
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
 COUNTS = ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected")
-STAGES = ("embed", "query", "verify", "submaps", "total")
+STAGES = tables.STAGES
 
 
 class RunRecorder:
@@ -52,6 +54,8 @@ class RunRecorder:
         self._weights = weights
         write_atomically(folder / "config.yaml", dump_settings(settings))
         self._keyframes = tables.CsvTable(folder / "keyframes.csv", tables.KEYFRAMES)
+        self._latencies = tables.CsvTable(folder / "latencies.csv", tables.LATENCIES)
+        self._descriptors = DescriptorFile(folder)
         self.recorded = {(int(row["stamp_ns"]), int(row["session"])) for row in self._keyframes.rows}
         whole = {row["stamp_ns"] for row in self._keyframes.rows}
 
@@ -80,6 +84,9 @@ class RunRecorder:
             return
         self._counts["keyframes"] += 1
         self._counts["queries"] += bool(detection.verdicts)
+        times = [f"{detection.latency_ms.get(stage, nan):.1f}" for stage in STAGES]
+        self._latencies.append([[keyframe.stamp_ns, *times]])
+        self._descriptors.append(keyframe.stamp_ns, keyframe.embedding.descriptor)
         self._candidates.append([tables.candidate_row(keyframe.stamp_ns, verdict) for verdict in detection.verdicts])
         for verdict in detection.verdicts:
             if verdict.closure is None:
@@ -128,8 +135,9 @@ class RunRecorder:
 
     def close(self) -> None:
         """Close the tables."""
-        for table in (self._closures, self._candidates, self._keyframes, self._inliers):
+        for table in (self._closures, self._candidates, self._keyframes, self._latencies, self._inliers):
             table.close()
+        self._descriptors.close()
 
     def _earlier_counts(self, resume: bool) -> dict[str, int]:
         """Counts of what the folder holds; of a recording that is resumed, all frames come by again."""

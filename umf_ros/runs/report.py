@@ -3,97 +3,95 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from rich.console import Console
 
-from umf_ros.bags.frames import read_left_images
 from umf_ros.bags.reader import Bag
-from umf_ros.bags.trajectories import read_ground_truth, read_tum
-from umf_ros.config import Settings, load_settings
+from umf_ros.bags.trajectories import read_odometry
+from umf_ros.errors import UmfError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array
+from umf_ros.runs.findings import ExaminedRun, look_first
+from umf_ros.runs.finished_run import FinishedRun, read_run
+from umf_ros.runs.gallery import Gallery, walk
 from umf_ros.runs.page import MAX_PICTURES, describe, print_summary, write_page
 from umf_ros.runs.plots import ODOMETRY, OPTIMISED, TRUTH, draw_match, plot_trajectories
-from umf_ros.runs.recorder import read_summary, write_summary
-from umf_ros.runs.tables import INLIERS, read_closures, read_table
-from umf_ros.runs.truth import Endpoints, JudgedRun, endpoints, judge_run, positions_in_truth
+from umf_ros.runs.recorder import write_summary
+from umf_ros.runs.scene import build_scene, drawn_trajectory
+from umf_ros.runs.scene_pairs import by_need, pairs_of
+from umf_ros.runs.tables import INLIERS, Endpoints, read_table
+from umf_ros.runs.true_places import TruePlaces
+from umf_ros.runs.truth import JudgedRun, endpoints, judge_run, positions_in_truth
+from umf_ros.runs.verdict import RunVerdict, conclude
+from umf_ros.runs.why import GateKeeper
 from umf_ros.trajectory import Trajectory
 
-
-@dataclass(frozen=True, slots=True)
-class FinishedRun:
-    """What the nodes or the replay have left in a run folder, and the truth.
-
-    Attributes:
-        folder: of the run.
-        summary: what `summary.json` holds.
-        settings: those that the run was made with.
-        closures: that were published.
-        odometry, optimized: trajectories, or None where they were not written.
-        truth: or None.
-    """
-
-    folder: Path
-    summary: dict[str, Any]
-    settings: Settings
-    closures: list[LoopClosure]
-    odometry: Trajectory | None
-    optimized: Trajectory | None
-    truth: Trajectory | None
+MAX_SHOWN = 400
+"""Keyframes that are photographed; the page shows as many as find room."""
 
 
-def finish_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | None = None) -> dict[str, Any]:
-    """Judge a run, write its pictures and its report, print its summary, and return it.
+def finish_run(
+    folder: Path,
+    bag: Bag,
+    console: Console,
+    ground_truth: Path | None = None,
+    told: frozenset[str] = frozenset(),
+) -> RunVerdict:
+    """Judge a run, write its pictures and its report, print its summary, and return the verdict.
 
     Args:
         folder: a run folder with what the nodes or the replay have written.
         bag: the recording the run was made on.
         console: where the summary is printed.
         ground_truth: RTKLIB .pos or TUM file; None takes what the bag carries, if anything.
+        told: lines that were printed before the run, and are not repeated.
 
     Raises:
-        UmfError: the folder holds no run, or the truth cannot be read.
+        UmfError: the folder holds no run, the truth cannot be read, or the recording is another one; then nothing
+            is written.
     """
     run = read_run(folder, bag, ground_truth)
     with console.status("Judging, drawing and writing the report"):
-        judged = judge(run)
-        draw_trajectory(run, judged)
-        draw_matches(run, judged, bag)
-        write_page(folder, run.summary, run.closures, judged)
-    print_summary(console, folder, run.summary)
-    return run.summary
+        about = judge(run, bag)
+        draw_trajectory(run, about.judged)
+        inliers = _read_inliers(folder / "inliers.csv")
+        pairs = pairs_of(about)
+        shown = [stamp for pair in by_need(pairs)[:MAX_SHOWN] for stamp in pair.endpoints]
+        chosen = _spread(run.closures)
+        gallery = Gallery(shown, (s for one in chosen for s in endpoints(one)), drawn_trajectory(about))
+        about = replace(about, sensors=walk(bag, run.settings, gallery, _odometry_file(run), run.odometry))
+        _draw_matches(about, chosen, gallery, inliers)
+        findings = look_first(about)
+        verdict = conclude(about, findings)
+        write_page(about, verdict, findings, build_scene(about, pairs, gallery, inliers))
+    print_summary(console, about, verdict, findings, told)
+    return verdict
 
 
-def read_run(folder: Path, bag: Bag, ground_truth: Path | None = None) -> FinishedRun:
-    """Read a run folder, and the truth from a file or from the recording.
+def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> ExaminedRun:
+    """Hold the run against the truth, if there is one, and fill in the `ground_truth` of its summary, to keep or not.
 
     Raises:
-        UmfError: the folder holds no run, or a file is damaged.
+        UmfError: the truth covers nothing of a run that was judged before.
     """
-    return FinishedRun(
-        folder=folder,
-        summary=read_summary(folder),
-        settings=load_settings(folder / "config.yaml"),
-        closures=read_closures(folder / "closures.csv"),
-        odometry=_trajectory(folder / "trajectory_odometry.tum"),
-        optimized=_trajectory(folder / "trajectory_optimized.tum"),
-        truth=read_ground_truth(bag, ground_truth),
-    )
-
-
-def judge(run: FinishedRun) -> JudgedRun:
-    """Hold the run against the truth, if there is one, and fill in the `ground_truth` of its summary."""
-    if run.truth is None:
-        return JudgedRun()
-    judged = judge_run(run.folder, run.truth, run.closures, run.settings.loop, run.odometry, run.optimized)
-    run.summary["ground_truth"] = judged.summary()
-    write_summary(run.folder, run.summary)
-    return judged
+    judged = JudgedRun()
+    if run.truth is not None:
+        judged = judge_run(run.folder, run.truth, run.closures, run.settings.loop, run.odometry, run.optimized)
+        covered, total = judged.covered
+        if not covered and total and run.summary["ground_truth"]:
+            raise UmfError(
+                f"the ground truth is of another clock: it covers none of the {total} keyframes; {run.folder} was "
+                "judged before, nothing was written"
+            )
+        run.summary["ground_truth"] = judged.summary() if covered or not total else None
+    if keep:
+        write_summary(run.folder, run.summary)
+    places = TruePlaces(run)
+    return ExaminedRun(run, judged, places, GateKeeper(run, places), bag)
 
 
 def draw_trajectory(run: FinishedRun, judged: JudgedRun) -> None:
@@ -107,22 +105,34 @@ def draw_trajectory(run: FinishedRun, judged: JudgedRun) -> None:
     plot_trajectories(run.folder / "trajectory.png", curves, *_closure_lines(run, judged))
 
 
-def draw_matches(run: FinishedRun, judged: JudgedRun, bag: Bag) -> None:
+def _draw_matches(
+    about: ExaminedRun, chosen: list[LoopClosure], gallery: Gallery, inliers: dict[Endpoints, Array]
+) -> None:
     """Write matches/*.png for closures spread over the run."""
-    target = run.folder / "matches"
+    target = about.run.folder / "matches"
     target.mkdir(exist_ok=True)
-    count = min(len(run.closures), MAX_PICTURES)
-    chosen = [run.closures[i] for i in np.linspace(0, len(run.closures) - 1, count).astype(int)]
-    images = read_left_images(bag, run.settings, {stamp for closure in chosen for stamp in endpoints(closure)})
-    inliers, known = _read_inliers(run.folder / "inliers.csv"), judged.by_endpoints()
+    known = about.judged.by_endpoints()
     for closure in chosen:
         key = endpoints(closure)
-        query, match = (images.get(stamp) for stamp in key)
+        query, match = (gallery.images.get(stamp) for stamp in key)
         if query is None or match is None:
             continue
         lines = inliers.get(key, np.empty((0, 4)))
         picture = draw_match(query, match, lines, describe(closure, len(lines), known.get(key)))
         cv2.imwrite(str(target / f"{key[0]}_{key[1]}.png"), picture)
+
+
+def _spread(closures: list[LoopClosure]) -> list[LoopClosure]:
+    count = min(len(closures), MAX_PICTURES)
+    return [closures[i] for i in np.linspace(0, len(closures) - 1, count).astype(int)]
+
+
+def _odometry_file(run: FinishedRun) -> Trajectory | None:
+    """The odometry that the run took from a file, as far as the file is still there."""
+    named = run.summary.get("odometry_file")
+    if not named or not Path(named["path"]).is_file():
+        return None
+    return read_odometry(named["path"], named["frame"], run.settings)
 
 
 def _closure_lines(run: FinishedRun, judged: JudgedRun) -> tuple[Array, list[bool | None]]:
@@ -135,10 +145,6 @@ def _closure_lines(run: FinishedRun, judged: JudgedRun) -> tuple[Array, list[boo
     verdicts = {key: found.is_true for key, found in judged.by_endpoints().items()}
     kept = [verdicts.get(endpoints(run.closures[i])) for i in np.flatnonzero(both)]
     return poses[:, :3, 3].reshape(-1, 2, 3)[both], kept
-
-
-def _trajectory(path: Path) -> Trajectory | None:
-    return read_tum(path) if path.is_file() and path.stat().st_size else None
 
 
 def _read_inliers(path: Path) -> dict[Endpoints, Array]:

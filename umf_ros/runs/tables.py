@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
@@ -14,6 +15,7 @@ import numpy as np
 from umf_ros.errors import UmfError, writing
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, from_quaternion, to_quaternion
+from umf_ros.pose_graph.export import VERDICT_COLUMNS
 
 if TYPE_CHECKING:
     from umf_ros.verification import Verdict
@@ -24,8 +26,68 @@ COVARIANCE = "covariance"
 CLOSURES = ["query_stamp_ns", "match_stamp_ns", *POSE, *SIGMA, "probability", "similarity", COVARIANCE]
 CANDIDATES = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "numbers"]
 KEYFRAMES = ["stamp_ns", "session", "travelled_m"]
+STAGES = ("embed", "query", "verify", "submaps", "total")
+LATENCIES = ["stamp_ns", *STAGES]
+_KEYFRAME = tuple(zip((int, int, float), KEYFRAMES, strict=True))
 INLIERS = ["query_stamp_ns", "match_stamp_ns", "query_u", "query_v", "match_u", "match_v"]
 Row = TypeVar("Row")
+
+Endpoints = tuple[int, int]
+"""Stamps in ns of a closure's query and match."""
+
+
+@dataclass(frozen=True, slots=True)
+class TestedCandidate:
+    """A row of `candidates.csv`.
+
+    Attributes:
+        query_stamp_ns, match_stamp_ns: keys of both keyframes.
+        similarity: of the global descriptors.
+        reason: "accepted", or what stopped it.
+        numbers: what was measured, by name.
+    """
+
+    query_stamp_ns: int
+    match_stamp_ns: int
+    similarity: float
+    reason: str
+    numbers: dict[str, float]
+
+    @property
+    def endpoints(self) -> Endpoints:
+        """Stamps of query and match."""
+        return self.query_stamp_ns, self.match_stamp_ns
+
+    @property
+    def probability(self) -> float | None:
+        """That the pose found is right; None where no pose was found or tried."""
+        return self.numbers.get("probability")
+
+
+@dataclass(frozen=True, slots=True)
+class GraphVerdict:
+    """A row of `graph_verdicts.csv`: what the pose graph did with a closure in the end.
+
+    Attributes:
+        state: a `pose_graph.closures.State`.
+        reason: a short phrase.
+        sigma: Mahalanobis distance to the map, NaN where unknown.
+        misfit_m: distance in metres between the closure's and the map's opinion, NaN where unknown.
+    """
+
+    state: str
+    reason: str
+    sigma: float
+    misfit_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeRow:
+    """A row of `keyframes.csv`: stamp in ns, session, and way in m, NaN without odometry."""
+
+    stamp_ns: int
+    session: int
+    travelled_m: float
 
 
 class CsvTable:
@@ -129,6 +191,55 @@ def read_table(path: Path, parse: Callable[[dict[str, str]], Row]) -> list[Row]:
     except (KeyError, TypeError, ValueError, csv.Error):
         raise UmfError(f"{path}, line {reader.line_num}: not a row of this table") from None
     return rows
+
+
+def read_candidates(path: Path) -> list[TestedCandidate]:
+    """Everything that was tested.
+
+    Raises:
+        UmfError: the file cannot be read; names the line that is damaged.
+    """
+    return read_table(path, _candidate)
+
+
+def read_keyframes(path: Path) -> list[KeyframeRow]:
+    """The keyframes in the order of their stamps.
+
+    Raises:
+        UmfError: the file cannot be read; names the line that is damaged.
+    """
+    return read_table(path, lambda row: KeyframeRow(*(kind(row[name]) for kind, name in _KEYFRAME)))
+
+
+def read_latencies(path: Path) -> dict[int, float]:
+    """Milliseconds that each keyframe took, by its stamp; none where an older version wrote none.
+
+    Raises:
+        UmfError: the file cannot be read; names the line that is damaged.
+    """
+    if not path.is_file():
+        return {}
+    return dict(read_table(path, lambda row: (int(row["stamp_ns"]), float(row["total"]))))
+
+
+def read_graph_verdicts(path: Path) -> dict[Endpoints, GraphVerdict]:
+    """The graph's verdicts by the stamps of query and match; none where there was no graph.
+
+    Raises:
+        UmfError: the file cannot be read; names the line that is damaged.
+    """
+    return dict(read_table(path, _graph_verdict)) if path.is_file() else {}
+
+
+def _candidate(row: dict[str, str]) -> TestedCandidate:
+    numbers = {name: float(value) for name, value in json.loads(row["numbers"]).items()}
+    stamps = int(row["query_stamp_ns"]), int(row["match_stamp_ns"])
+    return TestedCandidate(*stamps, float(row["similarity"]), row["reason"], numbers)
+
+
+def _graph_verdict(row: dict[str, str]) -> tuple[Endpoints, GraphVerdict]:
+    match, query, state, reason, sigma, misfit_m = (row[name] for name in VERDICT_COLUMNS)
+    return (int(query), int(match)), GraphVerdict(state, reason, float(sigma), float(misfit_m))
 
 
 def read_closures(path: Path) -> list[LoopClosure]:

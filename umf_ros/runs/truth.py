@@ -15,7 +15,7 @@ from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, align, heading, invert, relative, rotation_angle, transform, wrap_angle
 from umf_ros.keyframes import is_past
 from umf_ros.runs.honesty import normalised_errors, pose_error, share_inside
-from umf_ros.runs.tables import read_table
+from umf_ros.runs.tables import Endpoints, read_keyframes
 from umf_ros.trajectory import Trajectory
 
 PLACE_RADIUS_M = 12.0
@@ -24,9 +24,6 @@ POSE_TOLERANCE_M = 0.5
 POSE_TOLERANCE_DEG = 5.0
 
 Stamps = NDArray[np.int64]
-
-Endpoints = tuple[int, int]
-"""Stamps in ns of a closure's query and match."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +57,8 @@ class JudgedRun:
         ate_odometry_m: error of the odometry, or None without odometry.
         ate_optimized_m: error of the optimised trajectory, or None.
         any_heading: keyframes that were near an earlier place again, and those of them with a true closure.
+        covered: keyframes whose pose the truth knows, and keyframes in all.
+        missed: stamps of keyframes that saw a place again and have no closure.
     """
 
     closures: list[JudgedClosure] = field(default_factory=list)
@@ -67,6 +66,8 @@ class JudgedRun:
     ate_odometry_m: float | None = None
     ate_optimized_m: float | None = None
     any_heading: tuple[int, int] = (0, 0)
+    covered: tuple[int, int] = (0, 0)
+    missed: list[int] = field(default_factory=list)
 
     def summary(self) -> dict[str, Any]:
         """The `ground_truth` entry of `summary.json`."""
@@ -77,6 +78,7 @@ class JudgedRun:
             "revisits": self.revisits,
             "revisits_any_heading": self.any_heading[0],
             "closed_any_heading": self.any_heading[1],
+            "keyframes_covered": self.covered[0],
             "ate_odometry_m": _rounded(self.ate_odometry_m),
             "ate_optimized_m": _rounded(self.ate_optimized_m),
             **self._honesty(),
@@ -108,16 +110,23 @@ def judge_run(
     optimized: Trajectory | None,
 ) -> JudgedRun:
     """Hold closures, odometry and optimised trajectory of a run folder against the truth."""
-    stamps, travelled = _read_keyframes(folder / "keyframes.csv")
+    rows = read_keyframes(folder / "keyframes.csv")
+    stamps = np.array([row.stamp_ns for row in rows], np.int64)
+    travelled = np.array([row.travelled_m for row in rows], float)
     poses, known = truth.at(stamps)
     stamps, poses, travelled = stamps[known], poses[known], travelled[known]
     judged = _judge_closures(closures, truth)
     again = find_revisits(stamps, poses, travelled, rules, same_view=False)
-    closed = np.isin(stamps[again], [one.closure.query_stamp_ns for one in judged if one.is_true])
+    same_view = find_revisits(stamps, poses, travelled, rules, truth.has_orientation)
+    published = {closure.query_stamp_ns for closure in closures}
+    true_queries = {one.closure.query_stamp_ns for one in judged if one.is_true}
+    closed = np.isin(stamps[again], list(true_queries))
     return JudgedRun(
         closures=judged,
-        revisits=int(find_revisits(stamps, poses, travelled, rules, truth.has_orientation).sum()),
+        revisits=int(same_view.sum()),
         any_heading=(int(again.sum()), int(closed.sum())),
+        covered=(len(stamps), len(rows)),
+        missed=[int(stamp) for stamp in stamps[same_view] if stamp not in published],
         ate_odometry_m=trajectory_error(odometry, truth),
         ate_optimized_m=trajectory_error(optimized, truth),
     )
@@ -214,11 +223,6 @@ def _judge_closures(closures: list[LoopClosure], truth: Trajectory) -> list[Judg
         for i, closure in enumerate(closures)
         if query_known[i] and match_known[i]
     ]
-
-
-def _read_keyframes(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    rows = read_table(path, lambda row: (int(row["stamp_ns"]), float(row["travelled_m"])))
-    return np.array([stamp for stamp, _ in rows], np.int64), np.array([metres for _, metres in rows], float)
 
 
 def _rounded(value: float | None) -> float | None:

@@ -10,7 +10,7 @@ import numpy as np
 from umf_ros.frames import Keyframe
 from umf_ros.geometry import Array, heading, relative
 from umf_ros.verification import constants as const
-from umf_ros.verification.registration import PreparedScan, align_scans
+from umf_ros.verification.registration import PreparedScan, align_scans, prepare
 
 
 class DriftMeter:
@@ -31,7 +31,7 @@ class DriftMeter:
 
     def add(self, keyframe: Keyframe) -> None:
         """Take up the next stop; one session."""
-        scan = PreparedScan(keyframe.points, keyframe.body_T_lidar)
+        scan = prepare(keyframe)
         if self._before is not None:
             self._compare(*self._before, keyframe, scan)
         self._before = keyframe, scan

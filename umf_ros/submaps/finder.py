@@ -9,7 +9,7 @@ import numpy as np
 
 from umf_ros.config import Loop, Verification
 from umf_ros.frames import Candidate, Keyframe, LoopClosure
-from umf_ros.geometry import Array, heading, make_pose
+from umf_ros.geometry import Array, heading
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps.drift import DriftMeter
 from umf_ros.submaps.judgement import load_submap_acceptance, measure_submaps
@@ -21,7 +21,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.all_round import settle
 from umf_ros.verification.field_of_view import FieldOfView
 from umf_ros.verification.hypotheses import TemporalMemory
-from umf_ros.verification.registration import Alignment, align_scans
+from umf_ros.verification.registration import Alignment, align_scans, unlevelled
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,4 +191,4 @@ def _settled(match: Submap, query: Submap, planar: Array) -> Array:
     """Full pose of a planar one: height and tilt from the heights of both submaps."""
     theirs, ours = match.scan.around(const.CELL_M), query.scan.around(const.CELL_M)
     level = settle(theirs, ours, float(heading(planar)), planar[:2, 3])
-    return make_pose(match.scan.up.T, np.zeros(3)) @ level @ make_pose(query.scan.up, np.zeros(3))
+    return unlevelled(match.scan, query.scan, level)

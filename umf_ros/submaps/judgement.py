@@ -21,7 +21,7 @@ from umf_ros.verification.acceptance import Criterion, Logistic, log_ratio
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import TemporalMemory, prior_sigmas
 from umf_ros.verification.measurement import SUBMAP, Measurement
-from umf_ros.verification.registration import NOMINAL, Alignment, CovarianceModel, covariance_of
+from umf_ros.verification.registration import NOMINAL, Alignment, CovarianceModel, covariance_of, levelled
 
 SHIPPED = "config/verification/submaps.json"
 
@@ -120,7 +120,8 @@ def measure_submaps(
         drift: odometry error per distance driven.
     """
     ours, theirs, pose = query.scan.elevation, match.scan.elevation, alignment.pose
-    fit = evaluate(theirs, ours, pose)
+    level = levelled(match.scan, query.scan, pose)
+    fit = evaluate(theirs, ours, level)
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     nominal = covariance_of(alignment.information, NOMINAL)
     return Measurement(
@@ -129,10 +130,10 @@ def measure_submaps(
         residual_m=float(np.median(size)),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),
-        relief_m=shared_relief(theirs, ours, pose),
+        relief_m=shared_relief(theirs, ours, level),
         terrain_correlation=fit.correlation,
         terrain_score=fit.score,
-        terrain_rival=max(evaluate(theirs, ours, beside @ pose).correlation for beside in _BESIDE),
+        terrain_rival=max(evaluate(theirs, ours, beside @ level).correlation for beside in _BESIDE),
         position_std_m=float(np.sqrt(np.linalg.eigvalsh(nominal[:3, :3])[-1])),
         heading_std_deg=float(np.degrees(np.sqrt(nominal[5, 5]))),
         prior_sigmas=prior_sigmas(query.keyframe, match.keyframe, pose, drift),

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from umf_ros.geometry import Array, make_pose, transform
+from umf_ros.geometry import heading as heading_of
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate
-from umf_ros.verification.registration import PreparedScan, draw
+from umf_ros.verification.registration import PreparedScan, draw, levelled, unlevelled
 from umf_ros.verification.surroundings import SIDE, Spectra, Surroundings
 
 
@@ -78,11 +79,10 @@ def search(match: PreparedScan, turned: TurnedSurroundings) -> list[Fit]:
     if not len(wanted) or min(len(around.rows), len(turned.around.rows)) < const.MIN_CELLS:
         return []
     fits = []
-    for heading, row, column in _peaks(_correlate(around, turned.spectra(wanted)), wanted):
+    for index, row, column in _peaks(_correlate(around, turned.spectra(wanted)), wanted, const.PEAKS):
         shift = (np.array([row, column]) - const.AROUND_SHIFT) * turned.cell_m
-        level = settle(around, turned.around, float(const.ALL_HEADINGS[heading]), shift)
-        to_match = make_pose(match.up.T, np.zeros(3))
-        fits.append(scout(match, turned.scan, to_match @ level @ make_pose(turned.scan.up, np.zeros(3))))
+        level = settle(around, turned.around, float(const.ALL_HEADINGS[index]), shift)
+        fits.append(scout(match, turned.scan, unlevelled(match, turned.scan, level)))
     return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
 
 
@@ -92,9 +92,25 @@ def scout(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
     pose = draw(match, query.scouts_cloud, guess, const.SCOUT_REACH * cell_m, const.SCOUT_STEPS)
     squared = match.nearest(transform(pose, query.scouts))[1]
     near = squared < (const.SCOUT_NEAR * cell_m) ** 2
-    terrain = evaluate(match.elevation, query.elevation, pose).score
+    terrain = evaluate(match.elevation, query.elevation, levelled(match, query, pose)).score
     structured = all(scan.around(cell_m).structured for scan in (match, query))
     return Fit(pose, float(near.mean()), terrain, structured)
+
+
+def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
+    """Where else the query could lie at the heading of a pose, drawn to the match: the peaks but that of the pose."""
+    cell_m, level = _cell_for(query), levelled(match, query, pose)
+    theirs, ours, turn = match.around(cell_m), query.around(cell_m), float(heading_of(level))
+    spectra: Spectra = scipy.fft.rfft2(ours.turned(turn).transpose(2, 0, 1)).conj()
+    volumes = _correlate(theirs, spectra[None])
+    row, column = np.round(level[:2, 3] / cell_m).astype(int) + const.AROUND_SHIFT
+    volumes[:, :, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
+    found = []
+    for _, row, column in _peaks(volumes, np.zeros(1, np.intp), const.ALTERNATIVES):
+        shift = (np.array([row, column]) - const.AROUND_SHIFT) * cell_m
+        guess = unlevelled(match, query, settle(theirs, ours, turn, shift))
+        found.append(draw(match, query.scouts_cloud, guess, const.SCOUT_REACH * cell_m, const.SCOUT_STEPS))
+    return found
 
 
 def _cell_for(scan: PreparedScan) -> float:
@@ -113,12 +129,14 @@ def _correlate(around: Surroundings, turned: Spectra) -> NDArray[np.float32]:
     return found
 
 
-def _peaks(volumes: NDArray[np.float32], headings: NDArray[np.intp]) -> list[tuple[int, int, int]]:
-    """Heading, row and column of the highest peaks, no two of them neighbours."""
+def _peaks(
+    volumes: NDArray[np.float32], headings: NDArray[np.intp], counts: tuple[int, ...]
+) -> list[tuple[int, int, int]]:
+    """Heading, row and column of the highest peaks, so many of each volume, no two of them neighbours."""
     peaks: list[tuple[int, int, int]] = []
     every = np.full((len(const.ALL_HEADINGS), *volumes.shape[2:]), -np.inf, np.float32)
     taken = np.zeros(every.shape, bool)
-    for volume, count in zip(volumes, const.PEAKS, strict=True):
+    for volume, count in zip(volumes, counts, strict=True):
         every[headings] = volume
         for _ in range(count):
             every[taken] = -np.inf

@@ -57,8 +57,6 @@ MIN_CELLS = 50  # by hand: cells below which a fit means nothing
 MIN_NEIGHBOURHOOD = 0.25  # by hand: weight of the occupied cells around one, of all, below which it has no relief
 
 # search over all headings
-UPRIGHT_CONES = np.radians([32.0, 24.0, 16.0, 12.0])  # measured: rights LiDARs tilted by 28 deg to 1 or 2
-MIN_UPRIGHT = 10  # by hand: normals of ground that a direction is worth
 SECTORS = 72  # of 5 deg, by hand
 MIN_SECTOR_SHARE = 1e-3  # by hand: of all points; fewer are strays
 AROUND_CELLS, AROUND_RADIUS, AROUND_SHIFT = 64, 26, 12  # geometry: 26 + 26 + 12 cells come round to themselves no more
@@ -72,6 +70,7 @@ SEARCHED_OVERLAP = 0.45  # by hand: a view of 70 deg is looked for within 38
 PEAKS = (3, 4)  # by hand: of relief alone, of relief and structure
 SETTLE_MEDIANS, SETTLE_M = 2.5, 0.05  # by hand: cells that a plane between two maps is fitted to lie so near to it
 MAX_SLOPE = 0.3  # by hand: of one map against the other, rad
+ALTERNATIVES = (2, 2)  # by hand: as PEAKS, at one heading
 SCOUTS, SCOUT_STEPS = 300, 5  # by hand: points and steps that draw a peak to the match
 SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells; geometry: a peak is off by less than a cell and half a heading
 TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain in the open
@@ -101,6 +100,7 @@ SCANS_SUPPORT, SCANS_CONTRADICT = 0.05, 0.12  # measured: right poses stay below
 # meeting of two scans
 MEETING_POINTS = 20  # by hand: of a kind, below which a share of them means nothing
 COUNTERPART_M, COUNTERPART_SPACINGS = 0.05, 0.5  # measured: .3 m and 1 spacing tell places apart less well
+BLUR_M = 0.04  # by hand: a metre per second in a scan of a tenth to a fifth of one, whose motion nobody removed
 UNEXPLAINED = 2.0  # measured: in these reaches; of all measures the most alike from one kind of place to another
 SPACING_NEIGHBOURS = 6  # by hand: the point itself and five, so that they reach the next ring
 UPRIGHT = 0.7  # geometry: surfaces steeper than 45 deg
@@ -122,7 +122,7 @@ MIN_RESIDUAL_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanne
 
 # measurement: every test of a hypothesis
 NO_FIT_M = 0.3  # stands for the residual where nothing overlaps
-MIN_SURFACE_NOISE_M = 0.003  # synthetic scans have none
+MIN_SURFACE_NOISE_M = 0.01  # synthetic scans have less, and no scanner is better
 AGREEMENT_PIXELS = 0.04  # of the image's width, around the place where a feature should reappear; by hand
 AGREEMENT_ROWS = 0.1  # of the image's height: features are compared with their like: sky, horizon, foreground; by hand
 AGREEMENT_M = 1.0  # geometry: a voxel

@@ -44,7 +44,7 @@ class ElevationMap:
     """Heights and relief seen by one scan."""
 
     def __init__(self, points: Points) -> None:
-        """Args: points (M, 3) m, body frame."""
+        """Args: points (M, 3) m, upright, about the body's origin."""
         occupied, across, height = _ground(points)
         self.height: Grid = np.full((const.ROWS, const.COLUMNS), np.nan, np.float32)
         self.height[occupied, across] = height

@@ -20,7 +20,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, near, prior_sigmas
 from umf_ros.verification.meeting import meet, rivalry
-from umf_ros.verification.registration import NOMINAL, Alignment, CovarianceModel, PreparedScan, covariance_of
+from umf_ros.verification.registration import NOMINAL, Alignment, CovarianceModel, PreparedScan, covariance_of, levelled
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
 from umf_ros.verification.scan_motion import closure_covariance
 from umf_ros.verification.views import ViewAlignment
@@ -49,7 +49,7 @@ class Measurement:
         residual_m: median point-to-plane distance of the scans; median distance of the pairs' points without scans.
         residual_sigmas: size of the errors of reprojection in standard deviations of the features' noise.
         residual_p90_m: nine of ten points are nearer than this to their counterpart's plane.
-        noise_m: how far the match's points scatter about their own planes.
+        noise_m: how far the match's points scatter about their own planes, and may be off for the scans' motion.
         overlap: share of the points seen by both that have a counterpart (of the feature pairs: that agree).
         points: points that have one.
         relief_m: standard deviation of the relief on the ground that both scans saw.
@@ -258,7 +258,8 @@ def cloud_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
 def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan, query: PreparedScan) -> Measurement:
     """Tests of how two scans fit."""
     pose = alignment.pose
-    fit = evaluate(match.elevation, query.elevation, pose)
+    level = levelled(match, query, pose)
+    fit = evaluate(match.elevation, query.elevation, level)
     ours, theirs = meet(match, query, pose)
     close, far = rivalry(match, query, pose, alignment.information)
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
@@ -267,10 +268,10 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
         kind=SCAN,
         residual_m=float(np.median(size)),
         residual_p90_m=float(np.percentile(size, 90)),
-        noise_m=max(match.noise_m, const.MIN_SURFACE_NOISE_M),
+        noise_m=math.hypot(max(match.noise_m, const.MIN_SURFACE_NOISE_M), max(match.blur_m, query.blur_m)),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),
-        relief_m=shared_relief(match.elevation, query.elevation, pose),
+        relief_m=shared_relief(match.elevation, query.elevation, level),
         terrain_correlation=fit.correlation,
         terrain_score=fit.score,
         common=min(ours.common, theirs.common),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from umf_ros.geometry import Array, invert, transform
 from umf_ros.verification import constants as const
+from umf_ros.verification.all_round import alternatives
 from umf_ros.verification.free_space import Sight, visible
 from umf_ros.verification.registration import SEARCHED, PreparedScan
 
@@ -62,7 +63,8 @@ def meet(match: PreparedScan, query: PreparedScan, pose: Array) -> tuple[Meeting
     """What the match says of the query's points under `match_T_query`, and the query of the match's."""
     moved, back = transform(pose, query.sample), transform(invert(pose), match.sample)
     ours, theirs = match.nearest(moved), query.nearest(back)
-    reach_ours, reach_theirs = _reach(query.spacing), _reach(match.spacing)
+    blur_m = max(match.blur_m, query.blur_m)
+    reach_ours, reach_theirs = _reach(query.spacing, blur_m), _reach(match.spacing, blur_m)
     return (
         Meeting(match.look_at(moved), np.sqrt(ours[1]) / reach_ours, _upright(match, ours[0])),
         Meeting(query.look_at(back), np.sqrt(theirs[1]) / reach_theirs, _upright(match, match.picks)),
@@ -73,6 +75,7 @@ def rivalry(match: PreparedScan, query: PreparedScan, pose: Array, information: 
     """How much worse the scans fit at poses beside this one, along the way that is known least: near and far.
 
     A corridor fits anywhere along it; where it repeats, it fits better at the right place than at the wrong ones.
+    Where the place looks alike a few metres to any side, likewise.
 
     Args:
         match: the matched scan.
@@ -81,25 +84,44 @@ def rivalry(match: PreparedScan, query: PreparedScan, pose: Array, information: 
         information: (6, 6) of the alignment.
 
     Returns:
-        Logarithm of the ratio of the mean misfits, half a metre away and at the best of the places up to 6 m
-        away: 0 when another place fits as well, negative when it fits better.
+        Logarithm of the ratio of the mean misfits, half a metre away and at the best of the places further away: 0
+        when another place fits as well, negative when it fits better.
     """
     way = _least_known(information)
-    shifts = np.concatenate([[0.0], const.RIVAL_NEAR_M, const.RIVAL_FAR_M])[:, None] * way
-    here = _misfits(match, query, transform(pose, query.sample[:: const.RIVAL_EVERY]), shifts)
-    back = shifts @ -pose[:3, :3]
-    there = _misfits(query, match, transform(invert(pose), match.sample[:: const.RIVAL_EVERY]), back)
-    fit = np.log(np.maximum((here + there) / 2, 0.05))
-    near = 1 + len(const.RIVAL_NEAR_M)
-    return float(fit[1:near].min() - fit[0]), float(fit[near:].min() - fit[0])
+    here, beside, along = (_slid(pose, shifts, way) for shifts in (np.zeros(1), const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
+    rivals = [one for one in alternatives(match, query, pose) if _apart_m(pose, one) > const.DISTINCT_M]
+    fit = _fit(match, query, np.stack([*here, *beside, *along, *rivals]))
+    far = 1 + len(beside)
+    return float(fit[1:far].min() - fit[0]), float(fit[far:].min() - fit[0])
 
 
-def _misfits(scan: PreparedScan, other: PreparedScan, moved: Array, shifts: Array) -> Array:
-    """(K,) mean misfit of the visible points (N, 3), shifted by each of (K, 3); as bad as can be where few are."""
-    points = (moved[None] + shifts[:, None]).reshape(-1, 3)
-    reach = np.tile(_reach(other.spacing[:: const.RIVAL_EVERY]), len(shifts))
+def _apart_m(a: Array, b: Array) -> float:
+    return float(np.linalg.norm((a - b)[:3, 3]))
+
+
+def _slid(pose: Array, shifts: Array, way: Array) -> Array:
+    """(K, 4, 4) the pose, shifted by each of (K,) metres along a way (3,) of the match."""
+    slid = np.repeat(pose[None], len(shifts), axis=0)
+    slid[:, :3, 3] += shifts[:, None] * way
+    return slid
+
+
+def _fit(match: PreparedScan, query: PreparedScan, poses: Array) -> Array:
+    """(K,) logarithms of the mean misfit of both ways at poses (K, 4, 4)."""
+    ours, theirs = query.sample[:: const.RIVAL_EVERY], match.sample[:: const.RIVAL_EVERY]
+    back = np.linalg.inv(poses)
+    here = _misfits(match, query, ours @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3])
+    there = _misfits(query, match, theirs @ back[:, :3, :3].swapaxes(1, 2) + back[:, None, :3, 3])
+    found: Array = np.log(np.maximum((here + there) / 2, 0.05))
+    return found
+
+
+def _misfits(scan: PreparedScan, other: PreparedScan, moved: Array) -> Array:
+    """(K,) mean misfit of the visible ones of points (K, N, 3); as bad as can be where few are."""
+    points = moved.reshape(-1, 3)
+    reach = np.tile(_reach(other.spacing[:: const.RIVAL_EVERY], max(scan.blur_m, other.blur_m)), len(moved))
     misfit = np.minimum(np.sqrt(scan.nearest(points)[1]) / reach, const.RIVAL_MISFIT)
-    seen = visible(scan.look_at(points)).reshape(len(shifts), -1)
+    seen = visible(scan.look_at(points)).reshape(len(moved), -1)
     count = seen.sum(axis=1)
     mean = (misfit.reshape(seen.shape) * seen).sum(axis=1) / np.maximum(count, 1)
     return np.where(count >= const.MEETING_POINTS, mean, const.RIVAL_MISFIT)
@@ -111,9 +133,9 @@ def _least_known(information: Array) -> Array:
     return np.append(across, 0.0)
 
 
-def _reach(spacing: Array) -> Array:
+def _reach(spacing: Array, blur_m: float) -> Array:
     """(N,) how far away a counterpart may be, m: scans of one surface fall between each other's points."""
-    return const.COUNTERPART_M + const.COUNTERPART_SPACINGS * spacing
+    return const.COUNTERPART_M + 2 * blur_m + const.COUNTERPART_SPACINGS * spacing
 
 
 def _upright(scan: PreparedScan, index: NDArray[np.intp]) -> Mask:

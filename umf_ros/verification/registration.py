@@ -11,26 +11,27 @@ import small_gicp
 from numpy.typing import NDArray
 
 from umf_ros.frames import Keyframe, Points
-from umf_ros.geometry import Array, invert, transform
+from umf_ros.geometry import Array, invert, make_pose, transform
+from umf_ros.levelling import upright
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import ElevationMap
 from umf_ros.verification.field_of_view import FieldOfView
 from umf_ros.verification.free_space import RangeImage
 from umf_ros.verification.surroundings import Surroundings
-from umf_ros.verification.upright import upright
 
 
 class PreparedScan:
     """A keyframe's scan made ready for comparison, each part when it is first asked for."""
 
-    def __init__(self, points: Points, body_T_lidar: Array | None = None) -> None:
+    def __init__(self, points: Points, body_T_lidar: Array | None = None, blur_m: float = 0.0) -> None:
         """Prepare nothing yet.
 
         Args:
             points: (M, 3) m, body frame, thinned.
             body_T_lidar: where they were seen from; without it the origin.
+            blur_m: how far points may be off because the LiDAR moved during the scan, standard deviation.
         """
-        self._thinned = points
+        self.blur_m = blur_m
         self._lidar_T_body = np.eye(4) if body_T_lidar is None else invert(body_T_lidar)
         self.points: Array = points.astype(float)
         self._around: dict[float, Surroundings] = {}
@@ -42,8 +43,8 @@ class PreparedScan:
 
     @cached_property
     def elevation(self) -> ElevationMap:
-        """Heights and relief, for the search."""
-        return ElevationMap(self._thinned)
+        """Heights and relief, upright."""
+        return ElevationMap(self.upright_points)
 
     @cached_property
     def up(self) -> Array:
@@ -152,6 +153,25 @@ def _cloud_of(points: Array, tree: small_gicp.KdTree | None = None) -> small_gic
     return cloud
 
 
+def levelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
+    """The pose `match_T_query` (4, 4) between the upright frames of two scans."""
+    to_match, from_query = make_pose(match.up, np.zeros(3)), make_pose(query.up.T, np.zeros(3))
+    found: Array = to_match @ pose @ from_query
+    return found
+
+
+def unlevelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
+    """The pose `match_T_query` (4, 4) that is this one between the upright frames of two scans."""
+    from_match, to_query = make_pose(match.up.T, np.zeros(3)), make_pose(query.up, np.zeros(3))
+    found: Array = from_match @ pose @ to_query
+    return found
+
+
+def prepare(keyframe: Keyframe) -> PreparedScan:
+    """The scan of a keyframe; one whose motion was not removed is blurred."""
+    return PreparedScan(keyframe.points, keyframe.body_T_lidar, const.BLUR_M if keyframe.motion is None else 0.0)
+
+
 class ScanCache:
     """The most recently used scans; a cache, so it changes no result."""
 
@@ -160,7 +180,7 @@ class ScanCache:
 
     def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
         key = (keyframe.session, keyframe.stamp_ns)
-        scan = self._scans.pop(key, None) or PreparedScan(keyframe.points, keyframe.body_T_lidar)
+        scan = self._scans.pop(key, None) or prepare(keyframe)
         self._scans[key] = scan
         if len(self._scans) > const.SCANS_KEPT:
             self._scans.popitem(last=False)

@@ -16,7 +16,7 @@ from umf_ros.verification.acceptance import load_acceptance
 from umf_ros.verification.all_round import TurnedSurroundings
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, find_hypotheses
 from umf_ros.verification.measurement import AlignedHypothesis, Measurement, beside, measure, measure_candidate
-from umf_ros.verification.registration import ScanCache, align_scans
+from umf_ros.verification.registration import ScanCache, align_scans, levelled
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
 UNTESTED, NO_POSE = "less promising than others", "no pose fits, or others fit better"
@@ -116,7 +116,7 @@ class Verifier:
     def examine(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[JudgedHypothesis]:
         """Every hypothesis about every candidate, without a decision: what the decision is fitted on."""
         hypotheses = self._hypotheses(query, rerank(query, candidates, self._settings), self._turned(query))
-        examined = self._compared([self._judge(query, hypothesis) for hypothesis in hypotheses])
+        examined = self._judge(query, hypotheses)
         first = {one.match_stamp_ns: one.aligned for one in reversed(examined)}
         self._memory.remember(query, [(one.match, one.pose, False) for one in first.values()])
         return examined
@@ -133,7 +133,7 @@ class Verifier:
             fresh = [item for item in group if item.candidate.stamp_ns not in tested]
             tested |= {item.candidate.stamp_ns for item in fresh}
             hypotheses = self._hypotheses(query, fresh, turned)[: const.MAX_REFINED]
-            judged += self._compared([self._judge(query, hypothesis) for hypothesis in hypotheses])
+            judged += self._judge(query, hypotheses)
             accepted = {one.match_stamp_ns for one in judged if not self._objection(one)}
             if len(accepted) >= self._settings.max_closures:
                 break
@@ -151,27 +151,24 @@ class Verifier:
             found += find_hypotheses(query, item, turned, self._scans[item.keyframe], self._settings)
         return sorted(found, key=lambda one: -one.score)
 
-    def _judge(self, query: Keyframe, hypothesis: Hypothesis) -> JudgedHypothesis:
+    def _judge(self, query: Keyframe, hypotheses: list[Hypothesis]) -> list[JudgedHypothesis]:
+        """Align and measure hypotheses, and judge each knowing the others about its candidate."""
+        measured = [(one, self._measure(one)) for one in (self._align(query, hypothesis) for hypothesis in hypotheses)]
+        judged = []
+        for one, measurement in measured:
+            others = [(other.pose, found) for other, found in measured if other.match is one.match]
+            known = beside(measurement, one.pose, others)
+            judged.append(JudgedHypothesis(one, known, self._acceptance.probability(known)))
+        return judged
+
+    def _align(self, query: Keyframe, hypothesis: Hypothesis) -> AlignedHypothesis:
         scans = self._scans[hypothesis.ranked.keyframe], self._scans[query]
         if hypothesis.views is not None and not all(scan.usable for scan in scans):
-            aligned = AlignedHypothesis(query, hypothesis, hypothesis.views.align(hypothesis.pose), None)
-        else:
-            aligned = AlignedHypothesis(query, hypothesis, align_scans(*scans, hypothesis.pose), scans)
-        measurement = measure(aligned, self._memory, self._settings.odometry_drift)
-        return JudgedHypothesis(aligned, measurement, self._acceptance.probability(measurement))
+            return AlignedHypothesis(query, hypothesis, hypothesis.views.align(hypothesis.pose), None)
+        return AlignedHypothesis(query, hypothesis, align_scans(*scans, hypothesis.pose), scans)
 
-    def _compared(self, judged: list[JudgedHypothesis]) -> list[JudgedHypothesis]:
-        """The same, each knowing the others about its candidate."""
-        compared = []
-        for one in judged:
-            others = [
-                (other.aligned.pose, other.measurement)
-                for other in judged
-                if other.match_stamp_ns == one.match_stamp_ns
-            ]
-            measurement = beside(one.measurement, one.aligned.pose, others)
-            compared.append(JudgedHypothesis(one.aligned, measurement, self._acceptance.probability(measurement)))
-        return compared
+    def _measure(self, aligned: AlignedHypothesis) -> Measurement:
+        return measure(aligned, self._memory, self._settings.odometry_drift)
 
     def _decide(
         self, query: Keyframe, ranked: list[RankedCandidate], judged: list[JudgedHypothesis], tested: set[int]
@@ -230,5 +227,5 @@ def _shared_view(aligned: AlignedHypothesis) -> float:
     if aligned.scans is None:
         return 1.0 - abs(heading(aligned.pose)) / min(one.camera.width_rad for one in (aligned.query, aligned.match))
     match, query = aligned.scans
-    turn = heading(match.up @ aligned.pose[:3, :3] @ query.up.T)
+    turn = heading(levelled(match, query, aligned.pose))
     return float(match.view.overlap(query.view, np.array([turn]))[0])

@@ -7,8 +7,8 @@ import csv
 import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.frames import Candidate, Frame, LoopClosure
 from umf_ros.geometry import Array, make_pose, relative
 from umf_ros.loop_detector import Detection
+from umf_ros.runs.finished_run import remember_recording
 from umf_ros.runs.recorder import RunRecorder
 from umf_ros.trajectory import Trajectory, write_tum
 from umf_ros.verification import Measurement, Verdict
@@ -78,45 +79,21 @@ def run(bag: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-class Page(HTMLParser):
-    """What a browser would see, and every address that the page refers to."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open_tags: list[str] = []
-        self.addresses: list[str] = []
-        self.rows: list[list[str]] = []
-        self.headings: list[str] = []
-        self.captions: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.addresses += [value or "" for name, value in attributes if name in ("src", "href")]
-        if tag not in ("img", "meta"):
-            self.open_tags.append(tag)
-        if tag == "tr":
-            self.rows.append([])
-        if tag == "td":
-            self.rows[-1].append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open_tags.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        innermost = self.open_tags[-1] if self.open_tags else ""
-        if innermost == "td":
-            self.rows[-1][-1] += data
-        if innermost in ("h1", "h2"):
-            self.headings.append(data)
-        if innermost == "figcaption":
-            self.captions.append(data)
+def scene_of(run: Path) -> dict[str, Any]:
+    """What the page draws."""
+    page = (run / "report.html").read_text(encoding="utf-8")
+    found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
+    assert found
+    content: dict[str, Any] = json.loads(found[1])
+    return content
 
 
-def page_of(run: Path) -> Page:
-    page = Page((run / "report.html").read_text(encoding="utf-8"))
-    assert page.open_tags == []
-    return page
+def rows_of(run: Path) -> list[list[str]]:
+    """The cells of the table of closures."""
+    page = (run / "report.html").read_text(encoding="utf-8")
+    table = page[page.index('<table class="closures">') :]
+    rows = re.findall(r"<tr>(.*?)</tr>", table[: table.index("</table>")], re.S)
+    return [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in rows[1:]]
 
 
 def report(run: Path, bag: Path, *more: str | Path) -> Ended:
@@ -136,30 +113,35 @@ def test_closures_are_judged_by_the_truth_of_the_recording(run: Path, bag: Path)
     assert "2 true and 1 false loop closures" in ended.text and f"Report: {run}/report.html" in ended.out
 
 
-def test_the_page_stands_alone_and_is_well_formed(run: Path, bag: Path) -> None:
+def test_the_page_shows_every_closure_with_pictures_scans_and_errors(run: Path, bag: Path) -> None:
     report(run, bag)
-    page = page_of(run)
-    assert page.headings == ["Loop closures", "Trajectory", "Matches: query left, match right", "All closures"]
-    assert len(page.addresses) == 4 == len(page.captions)
-    for address, kind in zip(page.addresses, ("png", "jpeg", "jpeg", "jpeg"), strict=True):
-        assert address.startswith(f"data:image/{kind};base64,")
-        picture = cv2.imdecode(np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
-        assert picture is not None and picture.std() > 5
-
-
-def test_the_page_lists_every_closure_with_its_errors(run: Path, bag: Path) -> None:
-    report(run, bag)
+    scene = scene_of(run)
     with (run / "closures.csv").open() as file:
-        written = [(row["query_stamp_ns"], row["match_stamp_ns"]) for row in csv.DictReader(file)]
-    rows = [row for row in page_of(run).rows if len(row) == 9]
-    assert [(row[0], row[1]) for row in rows] == written
-    assert [row[8] for row in rows] == ["yes", "yes", "NO"]
-    assert [float(row[5]) for row in rows] == pytest.approx([0.1, 0.3, 0.8], abs=2e-3)
-    assert [row[4] for row in rows] == ["0.99", "0.95", "0.9123"]
-    facts = {row[0]: row[1] for row in page_of(run).rows if len(row) == 2}
-    assert facts["closures"] == "3 published, 3 candidates rejected"
-    assert facts["latency"] == "40 ms per keyframe, median (embed 30, query 1, verify 9)"
-    assert facts["dropped"] == "image 1, cloud 0, odometry 0, worker 0"
+        written = [[row["query_stamp_ns"], row["match_stamp_ns"]] for row in csv.DictReader(file)]
+    pairs = [pair for pair in scene["pairs"] if pair["number"]]
+    assert [pair["stamps"] for pair in pairs] == written
+    assert [pair["kind"] for pair in pairs] == ["accepted", "accepted", "false"]
+    for stamp in {stamp for pair in pairs for stamp in pair["stamps"]}:
+        address, width, height = scene["photographs"][stamp]
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None and picture.std() > 5 and (width, height) == (64, 48)
+        scan = np.frombuffer(base64.b64decode(scene["scans"][stamp]), "<i2").reshape(-1, 3) * scene["scan_unit_m"]
+        assert 10 < len(scan) <= 600 and 2 < np.linalg.norm(scan, axis=1).mean() < 25
+    assert pairs[0]["inliers"] == PIXELS.astype(int).tolist()
+    np.testing.assert_allclose(np.array(pairs[0]["pose"]).reshape(3, 4)[:, :3] @ np.eye(3), np.eye(3), atol=0.4)
+    assert max(scene["errors"]["optimised"][1]) < 0.01 < max(scene["errors"]["odometry"][1])
+    count = len(scene["keyframes"]["t"])
+    assert count == 18 == len(scene["keyframes"]["xy"]) and scene["keyframes"]["latency"][3] == 40
+    assert len(base64.b64decode(scene["similarity"]["data"])) == count**2
+    assert scene["map"]["lower"][0] < scene["map"]["upper"][0]
+
+
+def test_the_table_lists_every_closure_with_its_errors(run: Path, bag: Path) -> None:
+    report(run, bag)
+    rows = rows_of(run)
+    assert [row[0] for row in rows] == ["1", "2", "3"] and [row[10] for row in rows] == ["yes", "yes", "NO"]
+    assert [float(row[7]) for row in rows] == pytest.approx([0.1, 0.3, 0.8], abs=2e-3)
+    assert [row[5] for row in rows] == ["0.9900", "0.9500", "0.9123"]
 
 
 def test_match_pictures_show_both_images_joined_at_the_inliers(run: Path, bag: Path, tmp_path: Path) -> None:
@@ -196,8 +178,7 @@ def test_without_a_truth_nothing_is_judged(bag: Path, tmp_path: Path) -> None:
     ended = report(tmp_path / "run", blind)
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["ground_truth"] is None
     assert "3 loop closures; there is no ground truth to judge them by." in ended.text
-    rows = [row for row in page_of(tmp_path / "run").rows if len(row) == 9]
-    assert [row[5:] for row in rows] == [["", "", "", ""]] * 3
+    assert [row[7:] for row in rows_of(tmp_path / "run")] == [["", "", "", ""]] * 3
 
 
 def test_a_truth_file_goes_before_that_of_the_recording(run: Path, bag: Path, tmp_path: Path) -> None:
@@ -217,7 +198,7 @@ def test_closures_outside_of_the_truth_are_not_judged(run: Path, bag: Path, tmp_
     report(run, bag, "--ground-truth", tmp_path / "short.tum")
     found = json.loads((run / "summary.json").read_text())["ground_truth"]
     assert (found["closures_true"], found["closures_false"]) == (2, 0)
-    assert [row[8] for row in page_of(run).rows if len(row) == 9] == ["yes", "yes", ""]
+    assert [row[10] for row in rows_of(run)] == ["yes", "yes", ""]
 
 
 def test_without_images_there_are_no_match_pictures(bag: Path, tmp_path: Path) -> None:
@@ -225,7 +206,7 @@ def test_without_images_there_are_no_match_pictures(bag: Path, tmp_path: Path) -
     dark = write_mcap(tmp_path / "dark.mcap", [entry for entry in traverse(4.0) if entry[0] in (CLOUD, TRUTH)])
     report(tmp_path / "run", dark)
     assert list((tmp_path / "run" / "matches").iterdir()) == []
-    assert len(page_of(tmp_path / "run").addresses) == 1
+    assert scene_of(tmp_path / "run")["photographs"] == {}
 
 
 def test_a_run_without_closures_and_trajectories(bag: Path, tmp_path: Path) -> None:
@@ -268,7 +249,27 @@ def test_names_with_brackets_are_kept(bag: Path, tmp_path: Path) -> None:
     assert f"Report: {folder}/report.html" in report(folder, bag).out
 
 
-def test_the_recording_of_another_run_is_no_crash(run: Path, tmp_path: Path) -> None:
-    other = write_mcap(tmp_path / "other.mcap", [entry for entry in traverse(0.5) if entry[0] == LEFT])
-    report(run, other)
-    assert list((run / "matches").iterdir()) == []
+def test_another_recording_changes_nothing(run: Path, bag: Path, tmp_path: Path) -> None:
+    report(run, bag)
+    before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    late = write_mcap(tmp_path / "late.mcap", [(topic, at + 10**12, message) for topic, at, message in traverse(0.5)])
+    line = only_line(umf("report", run, late))
+    assert line.startswith(f"{run} was made on another recording than {late}: 18 of 18 keyframes are not of its time")
+    assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
+
+
+def test_a_run_knows_its_recording_from_one_of_the_same_time(run: Path, bag: Path, tmp_path: Path) -> None:
+    remember_recording(run, open_bag(bag))
+    other = write_mcap(tmp_path / "other.mcap", [entry for entry in traverse(4.0) if entry[0] != LEFT])
+    assert only_line(umf("report", run, other)) == (f"{run} was made on another recording, {bag}: nothing was written")
+    report(run, bag)
+
+
+def test_a_truth_of_another_clock_does_not_unjudge_a_run(run: Path, bag: Path, tmp_path: Path) -> None:
+    report(run, bag)
+    before = (run / "summary.json").read_bytes(), (run / "report.html").read_bytes()
+    stamps = START_NS - 10**18 + np.arange(40, dtype=np.int64) * 10**8
+    write_tum(tmp_path / "other.tum", Trajectory(stamps, np.tile(np.eye(4), (40, 1, 1))))
+    line = only_line(umf("report", run, bag, "--ground-truth", tmp_path / "other.tum"))
+    assert line.startswith("the ground truth is of another clock: it covers none of the 18 keyframes")
+    assert ((run / "summary.json").read_bytes(), (run / "report.html").read_bytes()) == before

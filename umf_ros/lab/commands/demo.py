@@ -27,6 +27,7 @@ def command(
     from umf_ros.commands.progress import undisturbed
     from umf_ros.lab.commands import simulate
     from umf_ros.lab.live.live_graph import LiveGraph
+    from umf_ros.runs.finished_run import remember_recording
     from umf_ros.runs.folder import check_writable, create_run_folder
     from umf_ros.runs.report import finish_run
 
@@ -40,4 +41,5 @@ def command(
     with LiveGraph(folder, console) as graph:
         graph.play(bag, recording.duration_s, rate)
     with undisturbed():
+        remember_recording(folder, recording)
         finish_run(folder, recording, console)

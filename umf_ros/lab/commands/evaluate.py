@@ -15,6 +15,7 @@ from umf_ros.commands.recordings import (
     RunsFolder,
     TruthPath,
     WeightsPath,
+    check_odometry_options,
     open_frames,
     open_recording,
 )
@@ -34,7 +35,8 @@ def command(
     data: Annotated[
         Path | None,
         typer.Argument(
-            help="Recording with ground truth: mcap, db3 folder or .bag; or a YAML file that lists sequences."
+            help="Recording with ground truth: mcap, db3 folder or .bag; or a YAML file that lists sequences or "
+            "sets of still images and scans (docs/training.md)."
         ),
     ] = None,
     worlds: Annotated[str | None, Optional(help="Instead of a recording: test or validation worlds.")] = None,
@@ -46,9 +48,9 @@ def command(
     out: RunsFolder = Path("results"),
     config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording.")] = None,
     dataset: DatasetName = "auto",
-    embedder: Annotated[str | None, Optional(help=f"How the places of a recording are embedded: {CHOICES}.")] = None,
+    embedder: Annotated[str | None, Optional(help=f"How places are embedded: {CHOICES}.")] = None,
     odometry: OdometryPath = None,
-    odometry_frame: OdometryFrame = "body",
+    odometry_frame: OdometryFrame = "",
     ground_truth: TruthPath = None,
     rule: Annotated[str, Optional(help="What is the same place in listed sequences: s3li or robotcar.")] = "s3li",
 ) -> None:
@@ -60,6 +62,7 @@ def command(
     test worlds are never trained or tuned on.
     """
     from umf_ros.lab.datasets.listed import is_list
+    from umf_ros.lab.evaluation.places import lists_place_sets
 
     if (data is None) == (worlds is None):
         raise ConfigError("expected either a recording or --worlds test|validation")
@@ -72,6 +75,10 @@ def command(
     if data is None:
         _refuse("simulated worlds", of_lists | of_recordings)
         figures = _on_worlds(str(worlds), seed, quick, methods == "all", weights, out)
+    elif is_list(data) and lists_place_sets(data):
+        others = {name: value for name, value in of_recordings.items() if name != "--embedder"}
+        _refuse("a list of place sets", of_worlds | of_lists | others)
+        figures = _on_places(data, embedder, weights, out)
     elif is_list(data):
         _refuse("a list of sequences", of_worlds | of_recordings)
         figures = _on_sequences(data, rule, weights, out)
@@ -137,7 +144,10 @@ def _on_recording(
 ) -> Figures:
     from rich.console import Console
 
+    frame_of_odometry = check_odometry_options(odometry, odometry_frame)
+
     from umf_ros.bags.trajectories import read_ground_truth
+    from umf_ros.commands.progress import WARNING
     from umf_ros.embedding import make_embedder
     from umf_ros.frames import Frame
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
@@ -148,8 +158,8 @@ def _on_recording(
     truth = read_ground_truth(recording, ground_truth)
     if truth is None:
         raise ConfigError(f"{bag} holds no ground truth; name a file with --ground-truth")
-    frames = open_frames(recording, settings, console, odometry, odometry_frame)
-    evaluation = BagEvaluation(settings, make_embedder(settings.embedding, super_features=True))
+    frames = open_frames(recording, settings, lambda text: console.print(text, **WARNING), odometry, frame_of_odometry)
+    evaluation = BagEvaluation(settings, make_embedder(settings.embedding, True, settings.verification.features))
     folder = create_run_folder(out)
     with _bar(console) as bar:
         task = bar.add_task("embedding", total=recording.duration_s)
@@ -198,6 +208,22 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     ]
     tables = {"Place recognition by the global descriptor": table(results)}
     report = EvaluationReport("Evaluation on sequences", notes, means(results), tables)
+    report.write(folder)
+    report.show(console, folder)
+    return report.figures
+
+
+def _on_places(listing: Path, embedder: str | None, weights: Path | None, out: Path) -> Figures:
+    from rich.console import Console
+
+    from umf_ros.embedding import DEFAULT
+    from umf_ros.lab.evaluation.places_run import evaluate_place_sets
+    from umf_ros.runs.folder import create_run_folder
+
+    console = Console()
+    with console.status("embedding") as status:
+        report = evaluate_place_sets(listing, embedder or DEFAULT, weights, status.update)
+    folder = create_run_folder(out)
     report.write(folder)
     report.show(console, folder)
     return report.figures

@@ -9,8 +9,8 @@ import typer
 
 
 def command(
-    out: Annotated[Path, typer.Argument(help="File to write, such as umf_light.xml; its .bin goes beside it.")],
-    weights: Annotated[Path | None, typer.Option(help="Weights file, or umf_resnet50; default: umf_light.")] = None,
+    out: Annotated[Path, typer.Argument(help="File to write, such as umf_scene.xml; its .bin goes beside it.")],
+    weights: Annotated[Path | None, typer.Option(help="Weights file, or umf_light; default: umf_scene.")] = None,
     super_features: Annotated[bool, typer.Option("--super-features", help="Include the super-features.")] = False,
 ) -> None:
     """Export a network to OpenVINO."""

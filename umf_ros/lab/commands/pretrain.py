@@ -31,7 +31,7 @@ def command(
         typer.Option(help="Folder of the run: weights, card, log, pictures, checkpoint; default: runs/pretrain_NAME."),
     ] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of settings.")] = None,
-    preset: Annotated[str | None, typer.Option(help="Network: umf_light or umf_resnet50.")] = None,
+    preset: Annotated[str | None, typer.Option(help="Network: umf_light, umf_scene, umf_lite0, umf_resnet50.")] = None,
     mask_ratio: Annotated[float | None, typer.Option(help="Share of an image's patches that is hidden.")] = None,
     start: Annotated[
         str | None, typer.Option(help="Weights to start from, as of the other encoder's pretraining.")

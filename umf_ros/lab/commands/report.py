@@ -15,7 +15,10 @@ def command(
     bag: Annotated[Path, typer.Argument(help="The recording the run was made on.")],
     ground_truth: TruthPath = None,
 ) -> None:
-    """Judge a run against the truth, draw its matches and trajectory, and write report.html."""
+    """Judge a run against the truth, draw its matches and trajectory, and write report.html.
+
+    A recording or a truth that is not of the run changes nothing.
+    """
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag

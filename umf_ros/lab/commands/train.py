@@ -17,7 +17,7 @@ def command(
     out: Annotated[Path, typer.Option(help="Folder of the run: weights, card, log, checkpoint.")] = Path("runs/train"),
     validation: Annotated[str | None, typer.Option(help="The same, for validation.")] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of training settings.")] = None,
-    preset: Annotated[str | None, typer.Option(help="Network: umf_light or umf_resnet50.")] = None,
+    preset: Annotated[str | None, typer.Option(help="Network: umf_light, umf_scene, umf_lite0, umf_resnet50.")] = None,
     steps: Annotated[int | None, typer.Option(help="Optimiser steps in all.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of weights, batches and augmentation.")] = None,
     loss: Annotated[str | None, typer.Option(help="multi_similarity, triplet or neighbourhood.")] = None,

@@ -15,6 +15,7 @@ from umf_ros.embedding.voxels import VoxelScan
 from umf_ros.frames import Image, Points
 from umf_ros.geometry import Array, invert, make_pose, transform
 from umf_ros.lab.datasets.sample import Sample
+from umf_ros.levelling import level
 from umf_ros.networks.config import NetworkConfig
 
 
@@ -78,6 +79,7 @@ class ViewMaker:
         if rng is not None and self._augmentation is not None:
             view_T_body = _random_motion(rng, self._augmentation) @ view_T_body
             points, intensity = _thin(points, intensity, rng, self._augmentation)
+        view_T_body = level(transform(view_T_body, points)) @ view_T_body  # as the embedder reads scans
         scan = prepare_scan(transform(view_T_body, points), intensity, self.config)
         return View(sample, image, present, scan, input_T_pixel, np.linalg.inv(view_T_body))
 

@@ -99,13 +99,12 @@ class WorldsSummary:
     Attributes:
         results: one per world.
         baselines: scores of other methods, by name and world.
-        default, resnet50: costs of the evaluated weights, and of the network of [UMF] with random ones.
+        cost: of the evaluated weights.
     """
 
     results: Sequence[WorldResult]
     baselines: dict[str, list[Scores]]
-    default: Cost
-    resnet50: Cost
+    cost: Cost
 
     def of(self, name: str, figure: str = "recall1") -> list[float]:
         """One figure of merit in every world."""
@@ -124,11 +123,8 @@ class WorldsSummary:
             "auc_pr_mean": mean(self.of("fused", "auc_pr")),
             "recall_at_precision1_mean": mean(self.of("fused", "recall_at_precision1")),
         }
-        costs = {"default": self.default, "resnet50": self.resnet50}
-        times = {f"embed_ms_{name}": cost.fast_ms for name, cost in costs.items()}
-        ratios = {f"embed_ratio_{name}": cost.ratio for name, cost in costs.items()}
-        parameters = {f"parameters_{name}": cost.parameters for name, cost in costs.items()}
-        return rounded(shares | times | ratios) | parameters
+        times = {"embed_ms_default": self.cost.fast_ms, "embed_ratio_default": self.cost.ratio}
+        return rounded(shares | times) | {"parameters_default": self.cost.parameters}
 
     def tables(self) -> dict[str, TextTable]:
         """The tables by their titles."""
@@ -173,10 +169,9 @@ class WorldsSummary:
 
     def _costs(self) -> TextTable:
         head = ["", "parameters", "MB (fp32)", "embedding, eager torch [ms]", "fastest runtime [ms]", "ratio"]
-        rows = []
-        for cost in (self.default, self.resnet50):
-            numbers = [f"{cost.megabytes:.1f}", f"{cost.eager_ms:.1f}", f"{cost.fast_ms:.1f}", f"{cost.ratio:.2f}"]
-            rows.append([cost.name, f"{cost.parameters:,}", *numbers])
+        cost = self.cost
+        numbers = [f"{cost.megabytes:.1f}", f"{cost.eager_ms:.1f}", f"{cost.fast_ms:.1f}", f"{cost.ratio:.2f}"]
+        rows = [[cost.name, f"{cost.parameters:,}", *numbers]]
         for name in RERANKERS:
             took = mean([result.milliseconds.get(name, math.nan) for result in self.results])
             rows.append([f"reranking by {name}, {TOP_K} candidates", "", "", "", f"{took:.1f}", ""])

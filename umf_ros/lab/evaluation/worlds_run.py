@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from umf_ros.config import EmbeddingSettings, Verification
+from umf_ros.embedding import DEFAULT, make_embedder
 from umf_ros.embedding import METHODS as EMBEDDERS
-from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.embedding.umf_embedder import UmfEmbedder
+from umf_ros.errors import ConfigError
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array
 from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures
@@ -170,24 +171,24 @@ class WorldsRun:
     ) -> None:
         self._weights = locate_weights(weights)
         self._worlds, self._repeats, self._report = worlds, repeats, report
-        self._embedder = UmfEmbedder(self._weights, super_features=True)
-        names = [name for name in EMBEDDERS if name != "umf"] if others else []
-        self._others = {name: make_embedder(EmbeddingSettings(method=name)) for name in names}
+        self._settings = Verification()
+        wanted = EmbeddingSettings(weights=str(self._weights))
+        self._embedder = make_embedder(wanted, super_features=True, features=self._settings.features)
+        self._others = _untrained() if others else {}
 
     def run(self) -> WorldsSummary:
         """Drive through all worlds, then take times."""
         results: list[WorldResult] = []
         baselines: dict[str, list[Scores]] = {name: [] for name in self._others}
         for world in self._worlds:
-            evaluation = WorldEvaluation(world, self._embedder, Verification(), lambda: self._report(world.name, 1))  # noqa: B023
+            evaluation = WorldEvaluation(world, self._embedder, self._settings, lambda: self._report(world.name, 1))  # noqa: B023
             results.append(evaluation.run())
             for name, embedder in self._others.items():
                 baselines[name].append(evaluation.compare(embedder))
         self._report("taking times", 0)
         seen = [frame for result in results for pair in result.examples for frame in pair]
         frames = [at_full_size(frame) for frame in seen[:TIMED_FRAMES]]
-        default = cost_of_weights(self._weights, frames, self._repeats)
-        return WorldsSummary(results, baselines, default, cost_of_weights(Path("umf_resnet50"), frames, self._repeats))
+        return WorldsSummary(results, baselines, cost_of_weights(self._weights, frames, self._repeats))
 
     def write(self, summary: WorldsSummary, folder: Path, notes: list[str]) -> EvaluationReport:
         """Write tables, figures and pictures.
@@ -217,6 +218,16 @@ class WorldsRun:
         plot_embeddings(folder / "embeddings.png", first.descriptors, first.world_T_body, first.pass_index, first.name)
         pairs = [result.examples[len(result.examples) // 2] for result in results if result.examples]
         _draw_attention(folder, self._weights, self._embedder, pairs)
+
+
+def _untrained() -> dict[str, Embedder]:
+    """The other methods, but for those that need weights which are not shipped."""
+    found: dict[str, Embedder] = {}
+    for name in EMBEDDERS:
+        with suppress(ConfigError):
+            if name != DEFAULT:
+                found[name] = make_embedder(EmbeddingSettings(method=name))
+    return found
 
 
 def _draw_attention(folder: Path, weights: Path, embedder: Embedder, pairs: list[tuple[Frame, Frame]]) -> None:

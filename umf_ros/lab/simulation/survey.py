@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from umf_ros.frames import Image
 from umf_ros.geometry import Array, transform
-from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, resized
+from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, Rendering, resized
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.lidar import Lidar
 from umf_ros.lab.simulation.passes import SETTINGS, Pass, plan_passes
@@ -62,12 +62,22 @@ class Survey:
         x, y = drive.path[here].T
         return stand(self.world.relief, x, y, drive.yaw[here], drive.tilt[here])[0]
 
+    def image(self, index: int, step: int) -> Image:
+        """The image alone of one sample of a numbered pass."""
+        return self._take(index, step)[0].image
+
+    def _take(self, index: int, step: int) -> tuple[Rendering, np.random.Generator]:
+        """What the camera sees, and what draws everything random that comes after it."""
+        drive = self.passes[index]
+        rng = np.random.default_rng([self.world.seed, 4, index, step])
+        world_T_camera = self.pose(index, step) @ self.calibration.body_T_camera
+        return self._camera.take(world_T_camera, drive.sun, rng, drive.exposure), rng
+
     def sample(self, index: int, step: int) -> SurveyFrame:
         """One sample of a numbered pass."""
         drive, calibration = self.passes[index], self.calibration
         pose = self.pose(index, step)
-        rng = np.random.default_rng([self.world.seed, 4, index, step])
-        picture = self._camera.take(pose @ calibration.body_T_camera, drive.sun, rng, drive.exposure)
+        picture, rng = self._take(index, step)
         scan = self._lidar.scan(pose @ calibration.body_T_lidar, rng)
         kept = scan.usable(calibration.min_intensity, calibration.max_height_m)
         in_body = transform(calibration.body_T_lidar, scan.points[kept])

@@ -88,10 +88,14 @@ def fit_decision(examples: list[Example], kind: str, threshold: float) -> tuple[
     mine = [example for example in examples if example.measurement.kind == kind]
     odds = left_out_odds(mine, kind)
     model = fit_logistic(mine, kind)
-    # whoever has a rival is refused anyway
-    wrong = [not (one.right or one.measurement.runner_up < const.MIN_RUNNER_UP) for one in mine]
-    safe = made_safe(model, odds[np.array(wrong, bool)], threshold)
+    wrong = np.array([not (one.right or refused_anyway(one)) for one in mine], bool)
+    safe = made_safe(model, odds[wrong], threshold)
     return safe, odds + safe.bias - model.bias
+
+
+def refused_anyway(example: Example) -> bool:
+    """Whether verification refuses it, however probable: it has a rival, or its surfaces do not coincide."""
+    return example.measurement.runner_up < const.MIN_RUNNER_UP or example.measurement.misfit > const.MAX_MISFIT
 
 
 def fit_without(examples: list[Example], kind: str, domain: str) -> Logistic:
@@ -136,9 +140,22 @@ def inside_ellipsoid(errors: Array, covariances: Array, confidence: float = 0.95
     return share_inside(normalised_errors(errors, covariances), confidence)
 
 
-def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: str, results: dict[str, float]) -> None:
-    """Write a fitted decision for `load_acceptance`, with the command that made it and what it reached."""
-    content: dict[str, Any] = {"fitted_with": fitted_with, "results": results}
+def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: dict[str, str], results: dict[str, float]) -> None:
+    """Write a fitted decision for `load_acceptance`.
+
+    What a file there says of other parts, and of how they did, stays.
+
+    Args:
+        model: all of it.
+        path: of the file.
+        fitted_with: the command that made a part, by the name of the part.
+        results: what it reached.
+    """
+    before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"fitted_with": {}, "results": {}}
+    content: dict[str, Any] = {
+        "fitted_with": before["fitted_with"] | fitted_with,
+        "results": before["results"] | results,
+    }
     content["models"] = {kind: asdict(model.models[kind]) for kind in KINDS}
     content["bounds"] = model.bounds
     content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in KINDS}

@@ -56,10 +56,10 @@ class MetricObjective(Objective):
         self._validation = validation
         self._rule = rule_of(settings)
         self._loss = MetricLoss(network.config, settings, self._rule)
-        self._no_bank = Bank(0, network.config.descriptor)
+        self._no_bank = Bank(0, network.config.length)
         self._sampler: tuple[int, PairSampler] | None = None
         self._results: Results = {}
-        self.bank = Bank(settings.bank, network.config.descriptor)
+        self.bank = Bank(settings.bank, network.config.length)
         self.batch_size = settings.batch
         self.best, self.stale = -1.0, 0
         _choose_parameters(network, settings)

@@ -23,6 +23,10 @@ SMALL = 4096
 PRESETS: dict[str, NetworkConfig] = {
     # the horizon and the rocks under a moved sun need these pixels: at 128 x 96 the image alone finds a tenth less
     "umf_light": NetworkConfig(backbone="resnet34", image_size=(160, 224), voxel_blocks=2),
+    # what it says of the scene comes from a trunk trained on photographs (`umf_ros.networks.scene`)
+    "umf_scene": NetworkConfig(backbone="resnet34", image_size=(160, 224), voxel_blocks=2, scene=512),
+    # its trunk begins with what it learned on photographs (`umf_ros.networks.efficientnet`)
+    "umf_lite0": NetworkConfig(backbone="efficientnet_lite0", image_size=(160, 224), voxel_blocks=2),
     "umf_resnet50": NetworkConfig(
         backbone="resnet50",
         width=64,
@@ -49,6 +53,8 @@ def branch_layers(network: UMF, branch: Literal["image", "cloud"]) -> list[nn.Mo
     names = ["image_encoder" if branch == "image" else "voxel_encoder", f"{branch}_tokens"]
     names += [f"fusion.layers.{layer}.{branch}_self" for layer in range(network.config.layers)]
     names += [f"fusion.{branch}_{part}" for part in ("norm", "pool", "head")]
+    if branch == "image" and network.scene is not None:
+        names.append("scene.projection")
     return [network.get_submodule(name) for name in names]
 
 

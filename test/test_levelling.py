@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.verification.upright import upright
+from umf_ros.geometry import heading, transform
+from umf_ros.levelling import level, upright
 
 
 def normals(ground: int, walls: int, seed: int = 0) -> np.ndarray:
@@ -33,3 +34,31 @@ def test_no_heading_is_added() -> None:
 @pytest.mark.parametrize("known", [np.empty((0, 3)), np.zeros((500, 3)), normals(3, 500)])
 def test_without_ground_the_body_is_taken_as_it_stands(known: np.ndarray) -> None:
     assert upright(known) == pytest.approx(np.eye(3))
+
+
+def yard(seed: int = 1) -> np.ndarray:
+    """(N, 3) a level floor with boxes on it, seen from 1.4 m above, some points lost."""
+    rng = np.random.default_rng(seed)
+    floor = np.column_stack([rng.uniform(-20, 20, (20_000, 2)), rng.normal(0, 0.02, 20_000)])
+    wall = np.column_stack([rng.uniform(-20, 20, 5_000), np.full(5_000, 8.0), rng.uniform(0, 3, 5_000)])
+    points = np.concatenate([floor, wall]) - [0.0, 0.0, 1.4]
+    points[rng.random(len(points)) < 0.02] = np.nan
+    return points
+
+
+@pytest.mark.parametrize("tilt", [[0.0, 0.0, 0.0], [0.2, 0.1, 0.0], [-0.25, 0.2, 0.0]])
+def test_a_level_scan_stands_on_its_ground_whatever_the_mount(tilt: list[float]) -> None:
+    mount = np.eye(4)
+    mount[:3, :3] = Rotation.from_rotvec(tilt).as_matrix()
+    points = transform(mount, yard())
+    level_T_body = level(points)
+    stands = transform(level_T_body, points)
+    floor = stands[np.abs(yard()[:, 2] + 1.4) < 0.1]
+    assert np.abs(floor[np.isfinite(floor).all(axis=1)][:, 2]).max() < 0.4
+    assert abs(np.nanmedian(floor[:, 2])) < 0.06
+    assert abs(np.degrees(heading(level_T_body @ mount))) < 3.0
+
+
+@pytest.mark.parametrize("count", [0, 20])
+def test_of_a_few_points_nobody_knows_what_is_up(count: int) -> None:
+    assert level(yard()[:count]) == pytest.approx(np.eye(4))

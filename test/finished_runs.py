@@ -1,0 +1,131 @@
+"""Runs as tests need them: finished ones, made of numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from umf_ros.config import Settings, load_settings
+from umf_ros.frames import LoopClosure
+from umf_ros.geometry import Array, make_pose, relative
+from umf_ros.runs.findings import ExaminedRun
+from umf_ros.runs.finished_run import FinishedRun
+from umf_ros.runs.sensor_check import SensorReport
+from umf_ros.runs.tables import GraphVerdict, KeyframeRow, TestedCandidate
+from umf_ros.runs.true_places import TruePlaces
+from umf_ros.runs.truth import JudgedRun, judge_closure
+from umf_ros.runs.why import GateKeeper
+from umf_ros.trajectory import Trajectory
+
+START_NS = 1_600_000_000 * 10**9
+LAP_S = 40
+SUMMARY: dict[str, Any] = {
+    "frames": 90,
+    "pairs": 80,
+    "keyframes": 40,
+    "queries": 20,
+    "closures_published": 5,
+    "closures_rejected": 4,
+    "ground_truth": None,
+    "latency_ms": {stage: {"p50": p50} for stage, p50 in (("embed", 30), ("query", 1), ("verify", 9), ("total", 40))},
+    "drops": {"image": 1, "worker": 0},
+    "realtime_factor": 2.0,
+    "peak_rss_mb": 512.4,
+    "version": "1.2.3",
+    "weights": "umf_light",
+    "seed": 11,
+}
+BELOW = {
+    "similarity": 0.8,
+    "noise_m": 0.02,
+    "residual_m": 0.02,
+    "residual_p90_m": 0.05,
+    "overlap": 0.9,
+    "points": 900.0,
+    "relief_m": 0.1,
+    "terrain_correlation": 0.5,
+    "terrain_score": 5.0,
+    "common": 0.7,
+    "contradiction": 0.0,
+    "counterparts": 0.7,
+    "rival_near": 0.1,
+    "rival_far": 0.2,
+    "position_std_m": 0.1,
+    "heading_std_deg": 1.0,
+    "probability": 0.6,
+}
+
+
+def stamp(second: float) -> int:
+    return START_NS + round(second * 1e9)
+
+
+def at(second: float) -> Array:
+    """1 m/s along x for 40 s, then the same again: the rover was carried back."""
+    return make_pose(np.eye(3), [second % LAP_S, 0.0, 0.0])
+
+
+def trajectory(first: int = 0, last: int = 80) -> Trajectory:
+    seconds = np.arange(first, last)
+    return Trajectory(np.array([stamp(second) for second in seconds], np.int64), np.stack([at(s) for s in seconds]))
+
+
+def closure(query_s: float, match_s: float, error_m: float = 0.0, probability: float = 0.97) -> LoopClosure:
+    pose = relative(at(match_s), at(query_s)) @ make_pose(np.eye(3), [0, error_m, 0])
+    return LoopClosure(stamp(query_s), stamp(match_s), pose, np.eye(6) * 0.01, probability)
+
+
+def candidate(query_s: float, match_s: float, reason: str, looks: float = 0.8, **numbers: float) -> TestedCandidate:
+    return TestedCandidate(stamp(query_s), stamp(match_s), looks, reason, numbers)
+
+
+def accepted(state: str = "accepted", reason: str = "agrees with the map") -> GraphVerdict:
+    return GraphVerdict(state, reason, 2.0, 0.1)
+
+
+def examined(
+    folder: Path,
+    closures: list[LoopClosure] | None = None,
+    candidates: list[TestedCandidate] | None = None,
+    verdict: GraphVerdict | None = None,
+    truth: Trajectory | None = None,
+    settings: Settings | None = None,
+    sensors: SensorReport | None = None,
+    missed: list[float] | None = None,
+    keyframe_rows: list[KeyframeRow] | None = None,
+    ate: tuple[float, float] | None = None,
+    **summary: Any,
+) -> ExaminedRun:
+    """A run with a keyframe every two seconds, closures that all have one verdict of the graph, and a truth or none."""
+    closures = closures or []
+    rows = keyframe_rows
+    if rows is None:
+        rows = [KeyframeRow(stamp(second), 0, float(second)) for second in range(0, 80, 2)]
+    run = FinishedRun(
+        folder=folder,
+        summary={**SUMMARY, **summary},
+        settings=settings or load_settings(None),
+        closures=closures,
+        keyframes=rows,
+        candidates=candidates or [],
+        verdicts={(one.query_stamp_ns, one.match_stamp_ns): verdict for one in closures} if verdict else {},
+        odometry=trajectory(),
+        optimized=trajectory(),
+        truth=truth,
+    )
+    judged = JudgedRun()
+    if truth is not None:
+        poses = {stamp(second): at(second) for second in range(80)}
+        covered = int(truth.at(run.stamps)[1].sum()) if rows else 0
+        judged = JudgedRun(
+            closures=[judge_closure(one, poses[one.query_stamp_ns], poses[one.match_stamp_ns]) for one in closures],
+            revisits=len(closures) + len(missed or []),
+            covered=(covered, len(rows)),
+            missed=[stamp(second) for second in missed or []],
+            ate_odometry_m=ate and ate[0],
+            ate_optimized_m=ate and ate[1],
+        )
+    places = TruePlaces(run)
+    return ExaminedRun(run, judged, places, GateKeeper(run, places), None, sensors or SensorReport())

@@ -1,0 +1,168 @@
+"""What to look at first, and the verdict: green only when something was found or there was nothing to find."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from finished_runs import BELOW, START_NS, accepted, candidate, closure, examined, stamp, trajectory
+
+from umf_ros.config import load_settings
+from umf_ros.runs.findings import ExaminedRun, look_first
+from umf_ros.runs.inputs import Advice, useless_inputs
+from umf_ros.runs.sensor_check import SensorReport
+from umf_ros.runs.sensor_motion import Disagreement
+from umf_ros.runs.verdict import USELESS, conclude
+from umf_ros.trajectory import Trajectory
+
+
+def verdict(about: ExaminedRun) -> tuple[str, int, str]:
+    found = conclude(about, look_first(about))
+    return found.mark, found.exit_code, found.sentence
+
+
+def test_what_was_found_and_used_is_green(tmp_path: Path) -> None:
+    about = examined(tmp_path, [closure(50, 10)], verdict=accepted(), truth=trajectory(), ate=(1.5, 0.25))
+    assert verdict(about) == (
+        "good",
+        0,
+        "1 true and 0 false loop closures at 1 revisits, the graph used all of them; trajectory error 1.50 m by "
+        "odometry, 0.25 m optimised.",
+    )
+
+
+def test_without_a_truth_what_was_found_is_green_and_not_called_true(tmp_path: Path) -> None:
+    mark, status, sentence = verdict(examined(tmp_path, [closure(50, 10)], verdict=accepted()))
+    assert (mark, status) == ("good", 0)
+    assert sentence.startswith("1 loop closures; there is no ground truth to judge them by")
+
+
+def test_revisits_of_which_none_was_closed_are_not_green(tmp_path: Path) -> None:
+    tested = [candidate(50, 10, "probability 0.60 is below 0.9", **BELOW)]
+    mark, status, sentence = verdict(examined(tmp_path, candidates=tested, truth=trajectory(), missed=[50]))
+    assert (mark, status) == ("bad", USELESS)
+    assert sentence.startswith("1 of 1 revisits are missed, 100% of them at the gate 'probability' (at 50.0 s: prob")
+
+
+def test_nothing_to_find_is_green(tmp_path: Path) -> None:
+    mark, status, sentence = verdict(examined(tmp_path, candidates=[candidate(50, 10, "x")], truth=trajectory()))
+    assert (mark, status) == ("good", 0) and sentence.startswith("No place was seen twice. 0 true and 0 false")
+
+
+def test_nothing_found_without_a_truth_is_not_green(tmp_path: Path) -> None:
+    tested = [candidate(50, 10, "probability 0.60 is below 0.9", **BELOW)]
+    mark, status, sentence = verdict(examined(tmp_path, candidates=tested))
+    assert (mark, status) == ("warn", 0)
+    assert sentence.startswith(
+        "None of 1 candidates became a closure; the best (probability 0.60 is below 0.9) is at 50"
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"frames": 0, "pairs": 0, "keyframes": 0, "keyframe_rows": []}, "No keyframe came of 0 frames"),
+        (
+            {"pairs": 0, "inputs": {name: {"received": 9, "used": 9, "dropped": {}} for name in ("left", "cloud")}},
+            "None of 90 scans has an image within 0.05 s of it",
+        ),
+        ({"settings": load_settings(None, loop__min_time_gap_s=600)}, "The gap rules exclude every pair: a match must"),
+        (
+            {"inputs": {"cloud": {"received": 9, "used": 0, "dropped": {"fields": 9}}}},
+            "9 of 9 messages of the scans could not be used (fields 9)",
+        ),
+    ],
+)
+def test_inputs_that_can_give_nothing_are_red_and_the_exit_status_says_so(
+    tmp_path: Path, changes: dict[str, Any], said: str
+) -> None:
+    mark, status, sentence = verdict(examined(tmp_path, **changes))
+    assert (mark, status) == ("bad", USELESS) and sentence.startswith(said), sentence
+
+
+def test_a_truth_of_another_clock_is_named_and_judges_nothing(tmp_path: Path) -> None:
+    whole = trajectory()
+    late = Trajectory(whole.stamps_ns + 10**13, whole.poses)
+    mark, _, sentence = verdict(examined(tmp_path, [closure(50, 10)], verdict=accepted(), truth=late))
+    assert mark == "bad" and sentence.startswith("The ground truth is of another clock: it covers none of the 40 key")
+    assert "+10000.0 s from start to start" in sentence and "true and" not in sentence
+
+
+def test_closures_that_the_graph_did_not_use_are_pending_not_rejected(tmp_path: Path) -> None:
+    waiting = accepted("waiting", "its odometry has not arrived")
+    mark, _, sentence = verdict(examined(tmp_path, [closure(50, 10)], verdict=waiting, truth=trajectory()))
+    assert mark == "bad" and sentence.startswith("All closures are pending: the graph used none of 1 (its odometry has")
+    assert "the graph used none of them (1 pending)" in sentence and "rejected" not in sentence
+
+
+def test_false_closures_come_with_the_threshold_that_excludes_them(tmp_path: Path) -> None:
+    closures = [closure(50, 10, probability=0.99), closure(52, 12, error_m=0.9, probability=0.93)]
+    about = examined(tmp_path, closures, verdict=accepted(), truth=trajectory())
+    mark, _, sentence = verdict(about)
+    assert mark == "bad" and sentence.startswith("1 of 2 closures are false, the worst 0.9 m off")
+    assert look_first(about)[0].remedy.startswith("verification.min_probability above 0.930 would have kept 1 true")
+
+
+def test_causes_come_before_what_they_bring_about(tmp_path: Path) -> None:
+    about = examined(
+        tmp_path,
+        [closure(50, 10, error_m=2)],
+        verdict=accepted(),
+        truth=trajectory(),
+        warnings=["min_intensity 15 is not applied"],
+        interrupted=True,
+    )
+    assert [finding.severity for finding in look_first(about)] == ["warning", "fault", "note"]
+
+
+LIDAR = Disagreement(0.0, np.array([0.0, 9.0, 1.0]), 0.1, 99)
+FINE = Disagreement(0.0, np.array([0.5, 1.0, -2.5]), 0.1, 99)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "said"),
+    [
+        (SensorReport(right_contrast=0.4), "the right images are empty: their grey values vary by 0.4"),
+        (SensorReport(left_contrast=5.0), "the left images show little"),
+        (SensorReport(returns=120), "scans have 120 returns in the median"),
+        (SensorReport(intensity_max=0.0), "all intensities are 0"),
+        (SensorReport(stereo_scale=1.5), "stereo sees everything 1.50 times as far as the LiDAR"),
+        (SensorReport(lidar=LIDAR, camera=FINE), "the LiDAR's mounting is off by 9 deg, mostly about y (+9 deg)"),
+        (SensorReport(lidar=LIDAR, camera=LIDAR), "the odometry is not of the body frame"),
+        (SensorReport(forward=np.array([0, 0, 0.9])), "the odometry is not of the body: by its poses"),
+        (SensorReport(lidar=Disagreement(-0.5, None, 0.1, 99), camera=FINE), "the LiDAR's clock is about +0.5 s off"),
+        (
+            SensorReport(lidar=Disagreement(0.4, None, 0.1, 99), camera=Disagreement(0.4, None, 0.1, 99)),
+            "the odometry's clock is about +0.4 s off those of camera and LiDAR",
+        ),
+    ],
+)
+def test_what_is_wrong_with_the_sensors_is_said_with_its_number(
+    tmp_path: Path, sensors: SensorReport, said: str
+) -> None:
+    first = look_first(examined(tmp_path, [closure(50, 10)], verdict=accepted(), sensors=sensors))[0]
+    assert first.what.startswith(said), first.what
+    assert first.remedy
+
+
+def test_sensors_that_agree_are_not_mentioned(tmp_path: Path) -> None:
+    fine = SensorReport(90, 50.0, 50.0, 9000.0, 200.0, 1.01, 0.02, FINE, FINE, np.array([0.99, 0.1, 0.0]))
+    assert look_first(examined(tmp_path, [closure(50, 10)], verdict=accepted(), sensors=fine)) == []
+
+
+def test_losses_of_an_input_are_told_with_their_reasons_and_surplus_images_are_none() -> None:
+    left = {"received": 100, "used": 40, "dropped": {"surplus": 30, "late": 20, "size": 10}}
+    found = useless_inputs({"left": left, "right": {"received": 9, "used": 1, "dropped": {"surplus": 8}}})
+    assert found == [
+        Advice(
+            "warning",
+            "30 of 100 messages of the left images could not be used (late 20, size 10)",
+            "sync.max_wait_s waits longer",
+        )
+    ]
+
+
+def test_the_keyframes_of_the_helper_start_where_they_say() -> None:
+    assert stamp(0) == START_NS

@@ -1,0 +1,102 @@
+"""Clocks, mountings, baseline and light, measured on frames of a simulated drive that were spoilt on purpose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.reader import open_bag
+from umf_ros.config import load_settings
+from umf_ros.frames import Frame
+from umf_ros.geometry import make_pose, transform
+from umf_ros.runs.sensor_check import SensorCheck, SensorReport
+from umf_ros.runs.sensor_motion import MIN_PAIRS, Step, compare_motion
+from umf_ros.sensors.messages import OdometrySample
+from umf_ros.trajectory import Trajectory
+
+Drive = tuple[list[Frame], Trajectory]
+
+
+@pytest.fixture(scope="module")
+def drive(mini_bag: Path) -> Drive:
+    reader = FrameReader(open_bag(mini_bag), load_settings(None))
+    items = list(reader.stream())
+    samples = [item for item in items if isinstance(item, OdometrySample)]
+    odometry = Trajectory(np.array([one.stamp_ns for one in samples]), np.stack([one.odom_T_body for one in samples]))
+    return [item for item in items if isinstance(item, Frame)], odometry
+
+
+def checked(drive: Drive, spoil: Callable[[Frame], Frame]) -> SensorReport:
+    check = SensorCheck()
+    for frame in drive[0]:
+        check.take(spoil(frame))
+    return check.report(drive[1])
+
+
+def test_sensors_as_they_are_agree(drive: Drive) -> None:
+    seen = checked(drive, lambda frame: frame)
+    assert seen.lidar is not None and seen.camera is not None and seen.forward is not None
+    for one in (seen.lidar, seen.camera):
+        assert abs(one.lag_s) < 0.1 and one.mounting_deg is not None and np.linalg.norm(one.mounting_deg) < 5
+    assert seen.stereo_scale == pytest.approx(1, abs=0.05) and seen.stereo_spread < 0.1
+    assert seen.forward[0] > 0.9 and seen.left_contrast > 10 and seen.returns > 1000
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_lidar_that_is_mounted_otherwise_than_stated_is_found(drive: Drive, axis: int) -> None:
+    turn = np.radians(10) * np.eye(3)[axis]
+    wrong = make_pose(Rotation.from_rotvec(turn).as_matrix(), [0, 0, 0])
+    bare = [replace(frame, left=None, right=None, image_stamp_ns=None) for frame in drive[0]]
+    seen = checked((bare, drive[1]), lambda one: replace(one, points=transform(wrong, one.points)))
+    assert seen.lidar is not None and seen.lidar.mounting_deg is not None and seen.camera is None
+    np.testing.assert_allclose(seen.lidar.mounting_deg, -np.degrees(turn), atol=4)
+
+
+def test_a_baseline_that_is_too_long_and_an_empty_image_are_found(drive: Drive) -> None:
+    def spoil(frame: Frame) -> Frame:
+        return replace(frame, camera=replace(frame.camera, baseline=1.4 * frame.camera.baseline), points=frame.points)
+
+    few = drive[0][:60]
+    assert checked((few, drive[1]), spoil).stereo_scale == pytest.approx(1.4, abs=0.05)
+    blank = checked((few, drive[1]), lambda one: replace(one, right=np.full((512, 688), 9, np.uint8)))
+    assert blank.right_contrast == 0 and np.isnan(blank.stereo_scale)
+
+
+def bumpy(seconds: np.ndarray) -> np.ndarray:
+    """Poses of a body that rolls, pitches, turns and drives."""
+    angles = np.column_stack(
+        [0.05 * np.sin(2.1 * seconds), 0.06 * np.sin(1.3 * seconds + 1), 0.3 * np.sin(0.5 * seconds)]
+    )
+    turns = Rotation.from_euler("xyz", angles).as_matrix()
+    ways = np.column_stack([seconds, np.sin(0.4 * seconds), 0 * seconds])
+    return np.stack([make_pose(turn, way) for turn, way in zip(turns, ways, strict=True)])
+
+
+@pytest.mark.parametrize("lag_s", [-0.6, 0.0, 0.35])
+def test_a_clock_that_is_off_is_found_whatever_the_mounting(lag_s: float) -> None:
+    seconds = np.arange(0, 60, 0.05)
+    odometry = Trajectory((seconds * 1e9).astype(np.int64), bumpy(seconds))
+    mounted = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+    starts = np.arange(5, 50, 0.25)
+    steps = []
+    for start, earlier, later in zip(starts, bumpy(starts), bumpy(starts + 0.25), strict=True):
+        motion = np.linalg.inv(earlier) @ later
+        turn = mounted.T @ Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+        steps.append(Step(start - lag_s, start + 0.25 - lag_s, turn, mounted.T @ motion[:3, 3]))
+    found = compare_motion(steps, odometry, 0)
+    assert found is not None and found.lag_s == pytest.approx(lag_s) and found.mounting_deg is not None
+    np.testing.assert_allclose(np.radians(found.mounting_deg), [0.1, -0.2, 0.3], atol=0.01)
+    assert compare_motion(steps[: MIN_PAIRS - 1], odometry, 0) is None
+
+
+def test_motion_that_has_nothing_to_do_with_the_odometry_says_nothing(rng: np.random.Generator) -> None:
+    seconds = np.arange(0, 60, 0.05)
+    odometry = Trajectory((seconds * 1e9).astype(np.int64), bumpy(seconds))
+    noise = [Step(s, s + 0.25, rng.normal(0, 0.02, 3), rng.normal(0, 0.2, 3)) for s in np.arange(5, 50, 0.25)]
+    assert compare_motion(noise, odometry, 0) is None

@@ -1,0 +1,96 @@
+"""`umf why`: why a moment of a finished run closed no loop, and what would have let it through."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from umf_ros.commands.recordings import TruthPath
+from umf_ros.errors import UmfError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from umf_ros.bags.reader import Bag
+    from umf_ros.runs.findings import ExaminedRun
+    from umf_ros.runs.why import Why
+
+SHOWN = 8
+"""Candidates and criteria in the terminal."""
+
+
+def command(
+    folder: Annotated[Path, typer.Argument(help="A run folder, such as results/latest.")],
+    moment: Annotated[str, typer.Argument(metavar="STAMP", help="Stamp in ns, or seconds from the first keyframe.")],
+    bag: Annotated[
+        Path | None, typer.Argument(help="The recording, for its truth; default: where the run found it.")
+    ] = None,
+    ground_truth: TruthPath = None,
+) -> None:
+    """Say why a keyframe closed no loop: what the database returned, which gate stopped it, and by how much.
+
+    Also which parameter would have let it through, and what that costs. Reads the run folder alone.
+    """
+    from umf_ros.runs.recorder import read_summary
+
+    summary = read_summary(folder)
+
+    from rich.console import Console
+
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.runs.finished_run import read_run
+    from umf_ros.runs.report import judge
+
+    known = bag or Path(summary.get("recording", {}).get("path", ""))
+    recording: Bag | None = open_bag(known) if bag or known.is_file() or (known.is_dir() and known.name) else None
+    about = judge(read_run(folder, recording, ground_truth), recording, keep=False)
+    if not about.run.keyframes:
+        raise UmfError(f"{folder} holds no keyframe")
+    row = about.places.nearest_row(_stamp(moment, int(about.run.stamps[0])))
+    _tell(Console(), about, row, about.gates.explain(row))
+
+
+def _stamp(text: str, start_ns: int) -> int:
+    from umf_ros.bags.moments import parse_moment
+
+    try:
+        moment = parse_moment(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+    return moment if isinstance(moment, int) else start_ns + round(moment * 1e9)
+
+
+def _tell(console: Console, about: ExaminedRun, row: int, why: Why) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    start = int(about.run.stamps[0])
+
+    def at(stamp_ns: int) -> str:
+        return f"{(stamp_ns - start) * 1e-9:.1f} s"
+
+    plain: dict[str, Any] = {"highlight": False, "soft_wrap": True}
+    console.print(f"keyframe {row + 1} of {len(about.run.keyframes)}, {at(why.stamp_ns)}, {why.stamp_ns} ns", **plain)
+    console.print(f"[bold]{escape(why.gate)}[/]: {escape(why.what)}", **plain)
+    if why.match_stamp_ns is not None:
+        apart = f", {why.distance_m:.1f} m away by the truth" if why.distance_m < float("inf") else ""
+        console.print(f"the place is that of {at(why.match_stamp_ns)}, {why.match_stamp_ns} ns{apart}", **plain)
+    if why.gate != "found":
+        through = why.parameter or "no parameter: the measurements do not speak for it"
+        console.print(f"would let it through: {escape(through)}", **plain)
+    tested = about.gates.tested(why.stamp_ns)
+    if tested:
+        table = Table("returned", "similarity", "probability", "m by the truth", "reason", box=None, pad_edge=False)
+        for one in tested[:SHOWN]:
+            match = about.places.row(one.match_stamp_ns)
+            apart_m = float("inf") if match is None else float(about.places.distances(row)[match])
+            probability = "" if one.probability is None else f"{one.probability:.3f}"
+            known = f"{apart_m:.1f}" if apart_m < float("inf") else ""
+            table.add_row(at(one.match_stamp_ns), f"{one.similarity:.3f}", probability, known, escape(one.reason))
+        console.print(table)
+    for name, value in sorted(why.contributions.items(), key=lambda one: -abs(one[1]))[:SHOWN]:
+        console.print(f"  {name.replace('_', ' '):24} {value:+.1f}", **plain)
+    if why.match_stamp_ns is not None:
+        console.print(f"a picture of it: umf explain BAG {why.stamp_ns} {why.match_stamp_ns}", **plain)

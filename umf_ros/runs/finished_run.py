@@ -1,0 +1,130 @@
+"""What a run has left in its folder, read as one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from umf_ros.bags.reader import Bag
+from umf_ros.bags.trajectories import read_ground_truth, read_tum
+from umf_ros.config import Settings, load_settings
+from umf_ros.errors import UmfError
+from umf_ros.frames import LoopClosure, Points
+from umf_ros.runs import tables
+from umf_ros.runs.descriptors import read_descriptors
+from umf_ros.runs.recorder import read_summary, write_summary
+from umf_ros.trajectory import Trajectory
+
+CLOCK_SLACK_NS = 5_000_000_000
+"""Stamps of sensors may lie this far from the times of recording."""
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """What the nodes or the replay have left in a run folder, and the truth.
+
+    Attributes:
+        folder: of the run.
+        summary: what `summary.json` holds.
+        settings: those that the run was made with.
+        closures: that were published; a closure's number is its place in this list, from 1.
+        keyframes: in the order of their stamps.
+        candidates: everything that was tested.
+        verdicts: what the graph did with the closures in the end, by stamps of query and match; none without a graph.
+        odometry, optimized: trajectories, or None where they were not written.
+        truth: or None.
+    """
+
+    folder: Path
+    summary: dict[str, Any]
+    settings: Settings
+    closures: list[LoopClosure]
+    keyframes: list[tables.KeyframeRow]
+    candidates: list[tables.TestedCandidate]
+    verdicts: dict[tables.Endpoints, tables.GraphVerdict]
+    odometry: Trajectory | None
+    optimized: Trajectory | None
+    truth: Trajectory | None
+
+    @cached_property
+    def stamps(self) -> Any:
+        """(N,) int64 ns of the keyframes."""
+        return np.array([row.stamp_ns for row in self.keyframes], np.int64)
+
+    @cached_property
+    def descriptors(self) -> Points | None:
+        """(N, D) of the keyframes; None where an older version wrote none."""
+        return read_descriptors(self.folder, [row.stamp_ns for row in self.keyframes])
+
+    @cached_property
+    def latencies_ms(self) -> dict[int, float]:
+        """Milliseconds that a keyframe took, by its stamp."""
+        return tables.read_latencies(self.folder / "latencies.csv")
+
+
+def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = None) -> FinishedRun:
+    """Read a run folder, and the truth from a file or from the recording.
+
+    Raises:
+        UmfError: the folder holds no run, a file is damaged, or the recording is not the one of the run.
+    """
+    run = FinishedRun(
+        folder=folder,
+        summary=read_summary(folder),
+        settings=load_settings(folder / "config.yaml"),
+        closures=tables.read_closures(folder / "closures.csv"),
+        keyframes=tables.read_keyframes(folder / "keyframes.csv"),
+        candidates=tables.read_candidates(folder / "candidates.csv"),
+        verdicts=tables.read_graph_verdicts(folder / "graph_verdicts.csv"),
+        odometry=_trajectory(folder / "trajectory_odometry.tum"),
+        optimized=_trajectory(folder / "trajectory_optimized.tum"),
+        truth=read_ground_truth(bag, ground_truth),
+    )
+    if bag is not None:
+        _check_recording(run, bag)
+    return run
+
+
+def describe_recording(bag: Bag) -> dict[str, Any]:
+    """The `recording` entry of a summary: what tells a recording from any other."""
+    return {
+        "path": str(bag.path.resolve()),
+        "start_ns": bag.start_ns,
+        "end_ns": bag.end_ns,
+        "messages": {topic: info.count for topic, info in bag.topics.items()},
+    }
+
+
+def remember_recording(folder: Path, bag: Bag, **more: Any) -> None:
+    """Write into the summary of a run which recording it was made on, and what else is known of it.
+
+    Raises:
+        UmfError: the folder holds no run.
+    """
+    write_summary(folder, read_summary(folder) | {"recording": describe_recording(bag)} | more)
+
+
+def _check_recording(run: FinishedRun, bag: Bag) -> None:
+    """Refuse to judge a run by another recording.
+
+    Raises:
+        UmfError: says what tells the two apart.
+    """
+    known = run.summary.get("recording")
+    if known and (known["start_ns"], known["messages"]) != (bag.start_ns, describe_recording(bag)["messages"]):
+        raise UmfError(f"{run.folder} was made on another recording, {known['path']}: nothing was written")
+    first, last = bag.start_ns - CLOCK_SLACK_NS, bag.end_ns + CLOCK_SLACK_NS
+    outside = [row.stamp_ns for row in run.keyframes if not first <= row.stamp_ns <= last]
+    if outside:
+        raise UmfError(
+            f"{run.folder} was made on another recording than {bag.path}: {len(outside)} of {len(run.keyframes)} "
+            f"keyframes are not of its time, the first at {outside[0]} ns; nothing was written"
+        )
+
+
+def _trajectory(path: Path) -> Trajectory | None:
+    return read_tum(path) if path.is_file() and path.stat().st_size else None

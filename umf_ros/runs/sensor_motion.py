@@ -1,0 +1,166 @@
+"""How each sensor says the body moved, and how its clock and its mounting differ from what the odometry says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import small_gicp
+from scipy.spatial.transform import Rotation, Slerp
+
+from umf_ros.frames import Frame, Image, Points
+from umf_ros.geometry import Array
+from umf_ros.trajectory import Trajectory
+
+SCAN_CELL_M, SCAN_REACH_M, SCAN_NEIGHBOURS = 0.4, 1.0, 10  # by hand: consecutive scans, a quarter of a metre apart
+MIN_SCAN_POINTS = 200  # by hand: below, consecutive scans are not registered
+CORNERS, CORNER_QUALITY, CORNER_SPACING, CORNER_WINDOW, CORNER_LEVELS = 300, 0.01, 8, (21, 21), 4  # by hand
+MIN_CORNERS = 30  # by hand: inliers that make an essential matrix believed
+MIN_PAIRS = 30  # by hand: of consecutive frames
+LAGS_S = np.arange(-1.0, 1.01, 0.05)  # by hand: a clock further off than this makes no pairs
+NOISE_RAD = 0.005  # measured on simulated drives: of the rotation between consecutive scans
+NOISE_DIRECTION = 0.3  # by hand: of the direction of a quarter of a metre of way
+ROUNDS = 5  # of reweighting
+KNOWN = 0.02  # by hand: share of the second direction of motion below which the mounting is not observable
+CONTRAST = 0.6  # by hand: residual at the best lag, of that at a usual one, above which nothing is said
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Motion between two consecutive measurements of one sensor.
+
+    Attributes:
+        start_s, end_s: their stamps, s since an arbitrary moment.
+        turn: (3,) rotation vector, rad, body axes as the calibration has them.
+        shift: (3,) m, or a direction of length 1 where one camera cannot tell the length; likewise.
+    """
+
+    start_s: float
+    end_s: float
+    turn: Array
+    shift: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Disagreement:
+    """How a sensor's motion differs from the odometry's.
+
+    Attributes:
+        lag_s: to be added to the sensor's stamps.
+        mounting_deg: (3,) rotation vector that turns the sensor's motion into the odometry's, body axes; None where
+            the motion does not tell.
+        residual_deg: median difference of the turns that remains.
+        steps: number of pairs.
+    """
+
+    lag_s: float
+    mounting_deg: Array | None
+    residual_deg: float
+    steps: int
+
+
+def scan_turn(earlier: Points, later: Points) -> Array | None:
+    """Pose (4, 4) of the later body in the earlier one from their scans (N, 3), m; None where they do not align."""
+    if min(len(earlier), len(later)) < MIN_SCAN_POINTS:
+        return None
+    target, tree = small_gicp.preprocess_points(earlier.astype(float), SCAN_CELL_M, SCAN_NEIGHBOURS, 1)
+    source, _ = small_gicp.preprocess_points(later.astype(float), SCAN_CELL_M, SCAN_NEIGHBOURS, 1)
+    found = small_gicp.align(
+        target, source, tree, np.eye(4), "GICP", max_correspondence_distance=SCAN_REACH_M, num_threads=1
+    )
+    pose: Array = found.T_target_source
+    return pose if found.converged else None
+
+
+def view_turn(earlier: Frame, later: Frame) -> tuple[Array, Array] | None:
+    """Rotation (3, 3) of the later body in the earlier one and direction (3,) of its way, from left images alone."""
+    assert earlier.left is not None and later.left is not None
+    pairs = _tracked(earlier.left, later.left)
+    if pairs is None:
+        return None
+    camera = earlier.camera
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    essential, inliers = cv2.findEssentialMat(*pairs, matrix, method=cv2.RANSAC, prob=0.999, threshold=1.0)
+    if essential is None or essential.shape != (3, 3):
+        return None
+    count, turn, way, _ = cv2.recoverPose(essential, *pairs, matrix, mask=inliers)
+    if count < MIN_CORNERS:
+        return None
+    mounted = earlier.body_T_camera[:3, :3]
+    return mounted @ turn.T @ mounted.T, mounted @ (-turn.T @ way).ravel()
+
+
+def _tracked(earlier: Image, later: Image) -> tuple[Any, Any] | None:
+    corners = cv2.goodFeaturesToTrack(earlier, CORNERS, CORNER_QUALITY, CORNER_SPACING)
+    if corners is None or len(corners) < MIN_CORNERS:
+        return None
+    there, seen, _ = cv2.calcOpticalFlowPyrLK(
+        earlier, later, corners, np.zeros_like(corners), winSize=CORNER_WINDOW, maxLevel=CORNER_LEVELS
+    )
+    kept = seen.ravel() > 0
+    return (corners[kept], there[kept]) if kept.sum() >= MIN_CORNERS else None
+
+
+def compare_motion(steps: list[Step], odometry: Trajectory, epoch_ns: int) -> Disagreement | None:
+    """Clock and mounting of a sensor against the odometry; None where the motion does not tell.
+
+    Every lag is tried; at each the one rotation that turns all of the sensor's motion into the odometry's is found,
+    from turns and directions of the way together, and what is left of the turns says how well the lag fits.
+
+    Args:
+        steps: motion of the sensor.
+        odometry: poses of the body, as stated.
+        epoch_ns: what the steps' times count from.
+    """
+    if len(steps) < MIN_PAIRS or len(odometry) < MIN_PAIRS:
+        return None
+    times = (odometry.stamps_ns - epoch_ns) * 1e-9
+    turns = Slerp(times, Rotation.from_matrix(odometry.poses[:, :3, :3]))
+    starts: Array = np.array([step.start_s for step in steps])
+    ends: Array = np.array([step.end_s for step in steps])
+    seen = np.array([step.turn for step in steps]), _directions(np.array([step.shift for step in steps]))
+    tried: list[tuple[float, float, Array, bool]] = []
+    for lag in LAGS_S:
+        inside = (starts + lag >= times[0]) & (ends + lag <= times[-1])
+        if inside.sum() < MIN_PAIRS:
+            continue
+        first, last = starts[inside] + lag, ends[inside] + lag
+        stated = (turns(first).inv() * turns(last)).as_rotvec()
+        driven = _positions(last, times, odometry) - _positions(first, times, odometry)
+        way = _directions(turns(first).inv().apply(driven))
+        rotation, residuals, known = _one_rotation(seen[0][inside], stated, seen[1][inside], way)
+        tried.append((float(np.median(residuals)), float(lag), rotation, known))
+    if not tried:
+        return None
+    residual, lag, rotation, known = min(tried, key=lambda one: one[0])
+    if residual > CONTRAST * float(np.median([one[0] for one in tried])):
+        return None
+    mounting = np.degrees(Rotation.from_matrix(rotation).as_rotvec()) if known else None
+    return Disagreement(round(lag, 2), mounting, float(np.degrees(residual)), len(steps))
+
+
+def _one_rotation(turns: Array, stated: Array, ways: Array, stated_ways: Array) -> tuple[Array, Array, bool]:
+    """Rotation (3, 3) that turns (N, 3) into stated (N, 3), robustly; what is left of it; whether it is known."""
+    weights = np.ones(len(turns))
+    rotation, residuals, known = np.eye(3), np.zeros(len(turns)), False
+    for _ in range(ROUNDS):
+        weighed = weights[:, None]
+        sums = (turns * weighed).T @ stated / NOISE_RAD**2 + (ways * weighed).T @ stated_ways / NOISE_DIRECTION**2
+        left, sizes, right = np.linalg.svd(sums)
+        sign = np.sign(np.linalg.det(left @ right))
+        rotation = (left @ np.diag([1, 1, sign]) @ right).T
+        residuals = np.linalg.norm(turns @ rotation.T - stated, axis=1)
+        weights = 1 / (1 + (residuals / max(float(np.median(residuals)), 1e-9)) ** 2)
+        known = bool(sizes[1] > KNOWN * sizes[0])
+    return rotation, residuals, known
+
+
+def _positions(at: Array, times: Array, odometry: Trajectory) -> Array:
+    return np.stack([np.interp(at, times, odometry.poses[:, axis, 3]) for axis in range(3)], axis=1)
+
+
+def _directions(vectors: Array) -> Array:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 0.02, vectors / np.maximum(length, 1e-9), 0.0)  # who stands goes nowhere
