@@ -41,7 +41,7 @@ class Rover(Node):
         super().__init__("endurance")
         self.world = world
         self.odometry = self.create_publisher(Odometry, "/odom", 500)
-        self.closures = self.create_publisher(Odometry, "/loop_closures", 500)
+        self.closures = self.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS)
         self.reject = self.create_publisher(String, "/pose_graph_node/reject_edge", 500)
         self.decided: set[str] = set()
         self.values: dict[str, str] = {}

@@ -37,6 +37,7 @@ from umf_ros.lab.training.acceptance_examples import Example, save_examples
 from umf_ros.lab.training.acceptance_fit import (
     bounds_of,
     fit_decision,
+    refused_anyway,
     save_acceptance,
 )
 from umf_ros.places.database import PlaceDatabase
@@ -180,7 +181,8 @@ def _sprung_traps() -> list[Example]:
 
 def _judge(kind: str, examples: list[Example], odds: Array) -> dict[str, float]:
     """Figures of log-odds that every example got without its domain."""
-    right, accepted = np.array([example.right for example in examples]), odds >= ACCEPTED_ODDS
+    right, refused = np.array([(example.right, refused_anyway(example)) for example in examples]).T
+    accepted = (odds >= ACCEPTED_ODDS) & ~refused
     domains = np.array([example.domain for example in examples])
     recall = [float(accepted[right & (domains == name)].mean()) for name in np.unique(domains[right])]
     return {

@@ -11,6 +11,10 @@ import rclpy
 from nav_msgs.msg import Odometry
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+# with the history of the run, for whoever joins late
+LATCHED = QoSProfile(depth=5000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class SlamSubscriber(Node):
@@ -19,7 +23,7 @@ class SlamSubscriber(Node):
     def __init__(self) -> None:
         super().__init__("slam_subscriber")
         self.graph = gtsam.NonlinearFactorGraph()
-        self.create_subscription(Odometry, "/loop_closures", self.add_closure, 100)
+        self.create_subscription(Odometry, "loop_closures", self.add_closure, LATCHED)
 
     def add_closure(self, message: Odometry) -> None:
         """x_query = x_match * match_T_query; frames are called keyframe/<stamp in ns>."""

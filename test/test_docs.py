@@ -9,7 +9,7 @@ import pytest
 import yaml
 from sources import PACKAGE, ROOT
 
-DOCUMENTS = ["README.md", "CONTRIBUTING.md", "docs/architecture.md"]
+DOCUMENTS = ["README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/ros.md"]
 WALK = "docs/architecture.md"
 
 

@@ -10,7 +10,7 @@ folder=$(mktemp -d)
 table=$folder/table.md
 failures=0
 launched=0
-trap 'kill -INT $launched 2>/dev/null; wait 2>/dev/null; rm -rf "$folder"' EXIT
+trap 'kill -INT $launched 2>/dev/null; wait 2>/dev/null; ros2 daemon stop >/dev/null 2>&1; rm -rf "$folder"' EXIT
 
 row() { # command, what is expected (an extended regular expression), what that means
   local got verdict
@@ -24,6 +24,7 @@ row() { # command, what is expected (an extended regular expression), what that 
   printf '| `%s` | %s | %s |\n' "${1//|/\\|}" "$3" "$verdict" | tee -a "$table"
 }
 
+ros2 daemon start >/dev/null 2>&1  # the first question to a fresh one finds an empty graph
 printf '| tried | expected | got |\n|---|---|---|\n' >"$table"
 row 'ros2 pkg executables umf_ros' 'loop_closure_node' 'both nodes are there'
 row 'ros2 launch umf_ros loop_closure.launch.py --show-args' 'params_file' 'every argument is described'
@@ -32,6 +33,7 @@ row 'umf --version' 'umf_ros [0-9]' '`umf` is in the path'
 ros2 launch umf_ros loop_closure.launch.py namespace:=one results_dir:="$folder/run" >"$folder/launch.log" 2>&1 &
 launched=$!
 for _ in $(seq 60); do [ "$(grep -c ': ready' "$folder/launch.log")" -ge 2 ] && break; sleep 1; done
+sleep 5
 front=/one/loop_closure_node back=/one/pose_graph_node
 row 'ros2 node list' "$front" 'both nodes in their namespace'
 row "ros2 node info $front" '/one/loop_closures: nav_msgs/msg/Odometry' 'topics are relative to the namespace'

@@ -28,6 +28,7 @@ COMMANDS = {
     "why": "umf_ros.commands.why",
     "explain": "umf_ros.lab.commands.explain",
     "train": "umf_ros.lab.commands.train",
+    "adapt": "umf_ros.lab.commands.adapt",
     "export": "umf_ros.lab.commands.export",
     "doctor": "umf_ros.commands.doctor",
     "pretrain": "umf_ros.lab.commands.pretrain",

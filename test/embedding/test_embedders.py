@@ -15,6 +15,7 @@ from tiny_worlds import TINY, some_scan
 from umf_ros import embedding
 from umf_ros.config import EmbeddingSettings
 from umf_ros.embedding import make_embedder
+from umf_ros.embedding.gradients_embedder import GradientsEmbedder
 from umf_ros.embedding.scan_context_embedder import ScanContextEmbedder
 from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.embedding.umf_embedder import UmfEmbedder
@@ -266,6 +267,17 @@ def test_the_thumbnail_is_blind_to_exposure_and_not_to_the_view():
     codes = [ThumbnailEmbedder().embed(some_frame(left=left)).descriptor for left in (image, image * 2, image[:, ::-1])]
     assert codes[0] @ codes[1] > 0.99
     assert codes[0] @ codes[2] < 0.6
+
+
+def test_gradients_are_blind_to_contrast_and_not_to_the_view():
+    image = (some_frame().left // 4 + 40).astype(np.uint8)
+    flat = np.full_like(image, 90)
+    codes = [GradientsEmbedder().embed(some_frame(left=left)).descriptor for left in (image, image * 2, image[:, ::-1])]
+    assert codes[0].shape == (GradientsEmbedder.dimension,)
+    assert codes[0] @ codes[1] > 0.99
+    assert codes[0] @ codes[2] < codes[0] @ codes[1] - 0.01
+    for nothing in (flat, None):
+        assert np.linalg.norm(GradientsEmbedder().embed(some_frame(left=nothing)).descriptor) == pytest.approx(1)
 
 
 def test_the_untrained_trunk_needs_its_published_weights_and_sees_the_image_alone(tmp_path):

@@ -85,6 +85,15 @@ def test_the_same_scan_of_sensors_of_other_scales_is_the_same(scale):
     np.testing.assert_allclose(voxelise(points, level * np.float32(scale), 60, 300).grid, of_the_cube.grid, atol=1e-5)
 
 
+def test_intensities_that_vary_as_none_did_in_training_fade():
+    """Half of the returns at zero, as KITTI's sensor tells it: the grid is that of a scan without intensity."""
+    points, rng = some_scan(1), np.random.default_rng(0)
+    coarse = np.where(rng.random(2000) < 0.5, 0, rng.uniform(0.2, 0.6, 2000)).astype(np.float32)
+    without = voxelise(points, None, 60, 300).grid
+    np.testing.assert_array_equal(voxelise(points, coarse, 60, 300).grid, without)
+    assert np.abs(voxelise(points, coarse + np.float32(0.1), 60, 300).grid - without).max() > 0.5
+
+
 def test_intensities_of_the_cube_are_taken_as_they_are():
     """What the network was trained on: bit for bit."""
     points, level = some_scan(1), np.random.default_rng(0).uniform(16, 900, 2000).astype(np.float32)

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from umf_ros.embedding.voxels import VoxelScan, voxelise
-from umf_ros.frames import Image, Points
+from umf_ros.frames import Frame, Image, Points
+from umf_ros.geometry import transform
+from umf_ros.levelling import level
 from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import NetworkInput
 
@@ -29,9 +31,9 @@ def pack(
     """
     blank = np.zeros(config.image_size, np.float32)
     lengths: dict[str, int | None] = {"grid": None}
-    for level in ("coarse", "fine"):
-        longest = max(1, *(int(getattr(scan, f"{level}_mask").sum()) for scan in scans)) if trim else None
-        lengths |= {f"{level}_index": longest, f"{level}_mask": longest}
+    for size in ("coarse", "fine"):
+        longest = max(1, *(int(getattr(scan, f"{size}_mask").sum()) for scan in scans)) if trim else None
+        lengths |= {f"{size}_index": longest, f"{size}_mask": longest}
 
     def gather(name: str) -> Tensor:
         return torch.from_numpy(np.stack([getattr(scan, name)[: lengths[name]] for scan in scans]))
@@ -53,6 +55,13 @@ def prepare_scan(points: Points | None, intensity: Points | None, config: Networ
     if points is None:
         points, intensity = np.empty((0, 3), np.float32), None
     return voxelise(points, intensity, config.coarse_voxels, config.fine_voxels)
+
+
+def read_frame(frame: Frame, config: NetworkConfig) -> NetworkInput:
+    """A batch of one frame as the network reads it: a black image is none, a scan stands upright on its ground."""
+    image = None if frame.left is None or is_blank(frame.left) else prepare_image(frame.left, config)
+    points = None if frame.points is None else transform(level(frame.points), frame.points)
+    return pack([image], [prepare_scan(points, frame.intensity, config)], config)
 
 
 def blank_input(config: NetworkConfig) -> NetworkInput:

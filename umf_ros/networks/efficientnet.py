@@ -1,4 +1,4 @@
-"""EfficientNet-Lite0 (Tan and Le 2019, and its "lite" release of 2020), an image trunk that has seen photographs.
+"""EfficientNet-Lite0 ([Tan 2019], and its "lite" release of 2020), an image trunk that has seen photographs.
 
 The lite networks leave out squeeze-and-excitation and clip their activations at six. Batch normalisation is
 folded into the convolutions: what was learned on millions of photographs is not to drift with a batch of one world.

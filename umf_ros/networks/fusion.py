@@ -117,10 +117,21 @@ class Fusion(nn.Module):
             cloud_present: (B,) bool.
             scene: (B, S), of a network that has such a part; its length is its weight beside the image's half.
         """
+        seen, felt = self.pool(image, cloud)
+        return self.describe(seen, felt, image_present, cloud_present, scene)
+
+    def pool(self, image: Tokens, cloud: Tokens) -> tuple[Tensor, Tensor]:
+        """(B, C) of the image and of the cloud: all that the heads see of the tokens."""
         for layer in self.layers:
             image, cloud = layer(image, cloud)
         seen = self.image_pool(Tokens(self.image_norm(image.values), image.mask))
         felt = self.cloud_pool(Tokens(self.cloud_norm(cloud.values), cloud.mask))
+        return seen, felt
+
+    def describe(
+        self, seen: Tensor, felt: Tensor, image_present: Tensor, cloud_present: Tensor, scene: Tensor | None = None
+    ) -> Fused:
+        """Descriptors of what was pooled; the other arguments as in `forward`."""
         with torch.autocast(seen.device.type, enabled=False):
             image_half = nn.functional.normalize(self.image_head(seen.float()), dim=-1)
             if scene is not None:

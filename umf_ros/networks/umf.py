@@ -136,9 +136,12 @@ class UMF(nn.Module):
 
     def fuse(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> Fused:
         """Descriptors, with the modalities that are present (B,) bool."""
-        image = self.absent_image(features.image, image_present)
-        cloud = self.absent_cloud(features.cloud, cloud_present)
+        image, cloud = self.stand_in(features, image_present, cloud_present)
         return self.fusion(image, cloud, image_present, cloud_present, features.scene)
+
+    def stand_in(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> tuple[Tokens, Tokens]:
+        """Tokens of both modalities; a learned one stands in for what is absent, (B,) bool."""
+        return self.absent_image(features.image, image_present), self.absent_cloud(features.cloud, cloud_present)
 
     def describe_local(self, features: Features, batch: NetworkInput) -> tuple[LocalMap, LocalMap]:
         """Local features of the images and of the scans."""

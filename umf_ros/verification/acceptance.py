@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from umf_ros.errors import ConfigError
 from umf_ros.resources import find
 from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
@@ -58,13 +60,19 @@ def _log(share: float) -> float:
     return math.log(max(share, 1e-3))  # of NaN it is NaN
 
 
+def _shape(measurement: Measurement) -> float:
+    """How well the ground agrees or what stands on it: one place has terrain, another walls."""
+    terrain, standing = measurement.terrain_correlation, measurement.upright_counterparts
+    return float(np.fmax((terrain - 0.2) / 0.7, (standing - 0.3) / 0.6))
+
+
 # every range is by hand: wide enough for right poses, beyond the reach of most wrong ones
 CRITERIA: dict[str, Criterion] = {
     "residual_like_noise": Criterion(lambda m: log_ratio(m.noise_m, m.residual_m), math.log(0.5), math.log(2.0)),
     "tail_like_noise": Criterion(lambda m: log_ratio(m.noise_m, m.residual_p90_m), math.log(0.15), math.log(0.6)),
     "relief_explained": Criterion(lambda m: log_ratio(m.relief_m, m.residual_m), math.log(1.5), math.log(12)),
     "relief_present": Criterion(lambda m: log_ratio(m.relief_m, m.noise_m), math.log(1.2), math.log(5.0)),
-    "terrain_correlation": Criterion(lambda m: m.terrain_correlation, 0.2, 0.9),
+    "shape": Criterion(_shape, 0.0, 1.0),
     "terrain_score": Criterion(lambda m: m.terrain_score, 3.0, 15.0),
     "overlap": Criterion(lambda m: m.overlap, 0.4, 0.95),
     "common_view": Criterion(lambda m: _log(m.common), math.log(0.1), math.log(0.8)),

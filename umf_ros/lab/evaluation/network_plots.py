@@ -19,7 +19,7 @@ from sklearn.manifold import TSNE
 from torch import Tensor
 
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.embedding.inputs import is_blank, pack, prepare_image, prepare_scan
+from umf_ros.embedding.inputs import prepare_scan, read_frame
 from umf_ros.frames import Embedding, Frame, Image, Points
 from umf_ros.geometry import Array, transform
 from umf_ros.lab.evaluation.retrieval import Indices
@@ -62,10 +62,9 @@ def look(network: UMF, embedder: Embedder, frame: Frame) -> Seen:
         embedder: the same network as it is used, with super-features.
         frame: with an image and a scan.
     """
-    image = None if frame.left is None or is_blank(frame.left) else frame.left
     points = None if frame.points is None else transform(level(frame.points), frame.points)
     scan = prepare_scan(points, frame.intensity, network.config)
-    batch = pack([prepare_image(image, network.config)], [scan], network.config)
+    batch = read_frame(frame, network.config)
     maps: list[Tensor] = []
     last = network.get_submodule(f"fusion.layers.{network.config.layers - 1}.cloud_cross")
     hook = last.register_forward_hook(lambda module, tokens, found: maps.append(found[1]))

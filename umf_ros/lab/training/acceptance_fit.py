@@ -88,10 +88,14 @@ def fit_decision(examples: list[Example], kind: str, threshold: float) -> tuple[
     mine = [example for example in examples if example.measurement.kind == kind]
     odds = left_out_odds(mine, kind)
     model = fit_logistic(mine, kind)
-    # whoever has a rival is refused anyway
-    wrong = [not (one.right or one.measurement.runner_up < const.MIN_RUNNER_UP) for one in mine]
-    safe = made_safe(model, odds[np.array(wrong, bool)], threshold)
+    wrong = np.array([not (one.right or refused_anyway(one)) for one in mine], bool)
+    safe = made_safe(model, odds[wrong], threshold)
     return safe, odds + safe.bias - model.bias
+
+
+def refused_anyway(example: Example) -> bool:
+    """Whether verification refuses it, however probable: it has a rival, or its surfaces do not coincide."""
+    return example.measurement.runner_up < const.MIN_RUNNER_UP or example.measurement.misfit > const.MAX_MISFIT
 
 
 def fit_without(examples: list[Example], kind: str, domain: str) -> Logistic:

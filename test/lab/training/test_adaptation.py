@@ -1,0 +1,162 @@
+"""Fitting the heads to a rover's own drives: what is learned, what is held out, and when it is kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import typer
+from recordings import small_settings, traverse, write_mcap
+from rich.console import Console
+from tiny_worlds import TINY, pose_at
+from typer.testing import CliRunner
+
+from umf_ros.config import dump_settings
+from umf_ros.errors import ConfigError, UmfError
+from umf_ros.lab.commands import adapt as command
+from umf_ros.lab.training.adaptation import Adaptation, Lesson, Recall, adapt, measure
+from umf_ros.lab.training.drives import Drive
+from umf_ros.lab.training.networks import read_card, save_weights
+from umf_ros.lab.training.scene_fit import with_scene
+from umf_ros.networks.efficientnet import EfficientNetLite0
+from umf_ros.networks.scene import DEPTH
+from umf_ros.networks.umf import UMF
+from umf_ros.networks.weights import load_weights
+
+PLACES = 60
+STEP_M = 5.0
+EAGER = Adaptation(steps=300, learning_rate=5e-3, pull=0.001, way=1.0)
+
+
+def network() -> UMF:
+    torch.manual_seed(0)
+    return with_scene(UMF(TINY).eval(), EfficientNetLite0(DEPTH), 8)
+
+
+def drive(seed: int = 0, told: float = 0.7, blind: bool = False) -> Drive:
+    """Two laps: a few numbers tell the places apart, louder ones are another sun."""
+    rng = np.random.default_rng(seed)
+    seen = np.tile(told * rng.normal(size=(PLACES, TINY.tokens)), (2, 1))
+    seen[:, 6:] = 2 * rng.normal(size=(2 * PLACES, TINY.tokens - 6))
+    count = 2 * PLACES
+    along = np.arange(PLACES) * STEP_M
+    return Drive(
+        seen.astype(np.float32),
+        rng.normal(size=(count, TINY.tokens)).astype(np.float32),
+        np.zeros((count, 15 * 112), np.float16),
+        np.ones(count, bool),
+        np.full(count, not blind),
+        np.stack([pose_at(x, 0.0) for x in np.tile(along, 2)]),
+        np.arange(count) * STEP_M,
+        np.zeros(count, np.int64),
+        np.column_stack([np.arange(PLACES, count), np.arange(PLACES)]),
+    )
+
+
+def test_what_is_held_out_is_never_learned_from() -> None:
+    lesson = Lesson(drive())
+    assert len(lesson.held_out) and len(lesson.learned)
+    assert not set(lesson.held_out) & set(lesson.learned)
+    hidden = {int(row) % PLACES for row in lesson.held_out}
+    assert not hidden & {int(row) % PLACES for row in lesson.learned}
+
+
+def test_the_heads_learn_what_tells_places_apart_and_nothing_else_changes() -> None:
+    fitted, start = network(), network().state_dict()
+    lessons, unseen = [Lesson(drive(seed)) for seed in range(12)], [Lesson(drive(12))]
+    steps: list[int] = []
+    before = measure(fitted, unseen)
+    adapt(fitted, lessons, EAGER, steps.append)
+    after = measure(fitted, unseen)
+    assert after.image > before.image + 0.5
+    assert steps == list(range(1, EAGER.steps + 1))
+    changed = {name for name, value in fitted.state_dict().items() if not torch.equal(value, start[name])}
+    assert changed
+    assert all(
+        name.startswith(("fusion.image_head", "fusion.cloud_head", "fusion.weigh", "scene.proj")) for name in changed
+    )
+
+
+def test_the_pull_holds_back() -> None:
+    gone = []
+    for pull in (0.01, 1000.0):
+        fitted = network()
+        adapt(fitted, [Lesson(drive())], Adaptation(steps=60, learning_rate=5e-3, pull=pull))
+        gone.append(float((fitted.fusion.image_head.weight - network().fusion.image_head.weight).norm()))
+    assert gone[1] < 0.2 * gone[0]
+
+
+def test_a_modality_that_is_absent_has_no_figure_and_no_say() -> None:
+    found = measure(network(), [Lesson(drive(blind=True))])
+    assert np.isnan(found.lidar) and np.isfinite(found.image)
+    assert "LiDAR" not in found.said()
+    better = found._replace(fused=found.fused + 0.1, image=found.image + 0.1)
+    assert better.gain_over(found) == pytest.approx(0.1)
+
+
+def test_a_gain_that_costs_a_modality_is_none() -> None:
+    before = Recall(0.8, 0.5, 0.7, 100)
+    assert Recall(0.8, 0.9, 0.69, 100).gain_over(before) < 0
+    assert Recall(0.8, 0.62, 0.7, 100).gain_over(before) == pytest.approx(0.04)
+
+
+@pytest.fixture
+def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Weights, and a command whose recordings have been read before."""
+    save_weights(network(), tmp_path / "tiny.safetensors", {})
+    monkeypatch.setattr(
+        command, "_drive", lambda bag, *_: drive(int(bag.stem), 0.0 if bag.suffix == ".alike" else 0.7, blind=True)
+    )
+    return tmp_path
+
+
+def run(folder: Path, bags: list[str], out: str = "mine.safetensors") -> str:
+    app = typer.Typer()
+    app.command()(command.command)
+    arguments = [*bags, "--out", str(folder / out), "--weights", str(folder / "tiny.safetensors")]
+    found = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert found.exit_code == 0, found.output
+    return " ".join(found.output.split())
+
+
+def test_what_was_gained_is_written_and_said(given: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("umf_ros.lab.training.adaptation.Adaptation", lambda: EAGER)
+    bags = [f"{seed}.mcap" for seed in range(12)]
+    said = run(given, bags)
+    assert said.startswith("Gained: held out: ") and "mine.safetensors" in said
+    fitted = load_weights(given / "mine.safetensors")
+    assert not torch.equal(fitted.fusion.image_head.weight, network().fusion.image_head.weight)
+    assert read_card(given / "mine.safetensors")["drives"] == bags
+
+
+def test_when_nothing_is_gained_nothing_is_written(given: Path) -> None:
+    assert run(given, ["0.alike"]).startswith("Nothing was gained, and nothing is written")
+    assert not (given / "mine.safetensors").exists()
+
+
+def test_what_cannot_be_adapted_is_one_clear_line(given: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match=r"expected a \.safetensors file"):
+        run(given, ["0.mcap"], "mine.onnx")
+    monkeypatch.setattr(command, "_drive", lambda *_: replace(drive(), closures=np.empty((0, 2), np.int64)))
+    with pytest.raises(UmfError, match="too few places were seen twice"):
+        run(given, ["0.mcap"])
+    save_weights(UMF(TINY), given / "tiny.safetensors", {})
+    with pytest.raises(ConfigError, match="only networks with a scene"):
+        run(given, ["0.mcap"])
+
+
+def test_a_recording_is_read_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    weights = tmp_path / "tiny.safetensors"
+    save_weights(network(), weights, {})
+    config = tmp_path / "rover.yaml"
+    config.write_text(dump_settings(small_settings(tmp_path, database={"path": str(tmp_path / "map.sqlite")})))
+    bag = write_mcap(tmp_path / "a.mcap", traverse(4))
+    for _ in range(2):
+        found = command._drive(bag, load_weights(weights), weights, config, "auto", tmp_path / "kept", Console())
+        assert len(found.session) > 1 and found.closures.shape == (0, 2)
+    told = capsys.readouterr().out
+    assert f"{len(found.session)} keyframes, 0 closures" in told and "read before" in told
+    assert not (tmp_path / "map.sqlite").exists()  # the rover's map is not touched
