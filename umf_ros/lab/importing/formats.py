@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from umf_ros.bags.trajectories import read_tum
-from umf_ros.config import read_yaml
 from umf_ros.errors import SensorFileError
 from umf_ros.geometry import Array, from_quaternion, invert
 from umf_ros.lab.importing.files import depth_of, entries_of, entry, lines_of, numbers_of, rigid, size_of
@@ -20,6 +19,7 @@ from umf_ros.sensors.messages import Cloud
 from umf_ros.sensors.scan_files import SUFFIXES, read_scan
 from umf_ros.sensors.snapshots import IMAGE_SUFFIXES
 from umf_ros.trajectory import Trajectory
+from umf_ros.yaml_files import read_yaml
 
 KITTI_START_NS = 1_300_000_000 * 10**9
 """KITTI's odometry counts its times from 0; a message needs a stamp."""
