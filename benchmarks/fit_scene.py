@@ -116,10 +116,11 @@ def main() -> None:
     print(f"loss {np.mean(losses[:20]):.3f} -> {np.mean(losses[-20:]):.3f}")
     card = read_card(start)
     told = ("command", "settings", "steps", "training_hours", "training_worlds")
+    of_start = ("final_losses", "remark", "training_samples", "validation", "validation_stride")
     card |= {
         "name": chosen.out.stem,
         "parameters": count_parameters(network),
-        "earlier_runs": [*card.get("earlier_runs", []), {name: card.get(name) for name in told}],
+        "earlier_runs": [*card.get("earlier_runs", []), {name: card.get(name) for name in (*told, *of_start)}],
         "command": f"python benchmarks/fit_scene.py --first {chosen.first} --worlds {chosen.worlds} "
         f"--stride {chosen.stride} --length {chosen.length} --views {chosen.views}",
         "settings": asdict(settings),
@@ -128,7 +129,7 @@ def main() -> None:
         "training_worlds": [f"world_{seed:05d}" for seed in seeds],
         "scene_trunk": ORIGIN,
     }
-    card.pop("validation", None)
+    card = {name: value for name, value in card.items() if name not in of_start}
     save_weights(network, chosen.out, card)
     print(f"weights: {chosen.out}")
 
