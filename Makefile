@@ -2,7 +2,8 @@
 # make test   the whole test suite
 # make test-jazzy   the suite against what an installed Jazzy has: NumPy 1.26.4, in a venv of its own
 # make lint   ruff, mypy, and the contracts on who may import whom
-.PHONY: demo test test-jazzy lint install clean
+# make docs   the documentation as a site, build/site
+.PHONY: demo test test-jazzy lint docs install clean
 SHELL := /bin/bash
 
 VENV ?= .venv
@@ -33,6 +34,11 @@ lint: install
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
+
+# every page and every link, as a site in build/site
+docs: install
+	@$(BIN)/python tools/parameters_doc.py --check
+	@$(BIN)/mkdocs build --quiet --strict
 
 install: $(VENV)/.installed
 

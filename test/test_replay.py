@@ -167,7 +167,8 @@ def test_a_replay_that_was_cut_off_ends_like_one_that_was_not(
     replay = replay_of(tmp_path / "whole", settings)
     list(replay.run(stream))
     replay.finish({})
-    for table in [name for name in TABLES + GRAPH if name.endswith((".csv", ".tum", ".g2o"))]:
+    same = (".csv", ".tum", ".g2o")
+    for table in [name for name in TABLES + GRAPH if name.endswith(same) and name != "latencies.csv"]:
         assert (tmp_path / "cut" / table).read_text() == (tmp_path / "whole" / table).read_text(), table
     counts = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("cut", "whole")]
     for key in ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected"):

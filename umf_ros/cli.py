@@ -18,6 +18,8 @@ from umf_ros.resources import LAB_PACKAGES
 COMMANDS = {
     "demo": "umf_ros.lab.commands.demo",
     "simulate": "umf_ros.lab.commands.simulate",
+    "import": "umf_ros.lab.commands.import_data",
+    "inspect": "umf_ros.commands.inspect",
     "replay": "umf_ros.commands.replay",
     "compare": "umf_ros.commands.compare",
     "play": "umf_ros.lab.commands.play",

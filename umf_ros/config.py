@@ -14,10 +14,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from umf_ros.errors import ConfigError, either
 from umf_ros.resources import DEFAULT_DATASET, dataset_names, find
-
-LARGEST_YAML = 2**22
-MOST_NODES = 100_000
-"""A file of settings has some hundreds; aliases of aliases are how a small one stands for a thousand million."""
+from umf_ros.yaml_files import read_values
 
 
 class Group(BaseModel):
@@ -293,68 +290,6 @@ def _set(values: dict[str, Any], path: list[str], value: Any) -> None:
         if not isinstance(values, dict):
             raise ConfigError(f"{part}: holds settings, not a value")
     values[path[-1]] = value
-
-
-def read_yaml(path: Path) -> Any:
-    """What a YAML file holds; None where it is empty.
-
-    Raises:
-        ConfigError: the file cannot be read.
-    """
-    try:
-        if path.stat().st_size > LARGEST_YAML:
-            raise ConfigError(f"{path} is not valid YAML: larger than {LARGEST_YAML >> 20} MB")
-        text = path.read_text(encoding="utf-8")
-        _count_nodes(yaml.compose(text, yaml.SafeLoader), {})
-        return yaml.safe_load(text)
-    except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
-    except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:
-        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
-
-
-def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
-    """Nodes of a document with every alias written out.
-
-    Raises:
-        ValueError: they are too many, or a node is its own part.
-    """
-    if id(node) in known:
-        if not known[id(node)]:
-            raise ValueError("a part of it contains itself")
-        return known[id(node)]
-    known[id(node)] = count = 0
-    if isinstance(node, yaml.SequenceNode):
-        count = sum(_count_nodes(item, known) for item in node.value)
-    elif isinstance(node, yaml.MappingNode):
-        count = sum(_count_nodes(item, known) for pair in node.value for item in pair)
-    known[id(node)] = count + 1
-    if count > MOST_NODES:
-        raise ValueError("its aliases stand for too much")
-    return count + 1
-
-
-def read_values(path: Path) -> dict[str, Any]:
-    """The names and values of a YAML file; none where it is empty.
-
-    Raises:
-        ConfigError: the file cannot be read, or holds something else.
-    """
-    content = read_yaml(path)
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
-        raise ConfigError(f"{path}: expected names and values, found a {type(content).__name__}")
-    _check_names(content, path)
-    return content
-
-
-def _check_names(content: dict[Any, Any], path: Path) -> None:
-    for name, value in content.items():
-        if not isinstance(name, str):
-            raise ConfigError(f"{path}: a name is text, not {name!r}")
-        if isinstance(value, dict):
-            _check_names(value, path)
 
 
 def _node_parameters(content: dict[str, Any], path: str | Path) -> dict[str, Any]:

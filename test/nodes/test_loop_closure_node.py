@@ -117,13 +117,13 @@ def test_it_takes_frames_survives_bad_ones_and_ends_in_order(rig: Rig, node: Pro
         rig.publish_pair(START_NS + i * step)
         rig.until(lambda i=i: rig.count("left_received") > i)
     bad = START_NS + 5 * step
-    rig.images.publish(rig.image(bad, encoding="yuv422"))
+    rig.images.publish(rig.image(bad, encoding="nv12"))
     rig.images.publish(rig.image(bad, height=0, width=0, step=0, data=array("B")))
     rig.images.publish(rig.image(bad, step=5))
     nameless = rig.cloud(bad)
     nameless.fields = nameless.fields[1:]
     rig.clouds.publish(nameless)
-    assert rig.until(lambda: "yuv422" in node.output and rig.values and "x" in node.output)
+    assert rig.until(lambda: "nv12" in node.output and rig.values and "x" in node.output)
     for i in range(6, 9):
         rig.publish_pair(START_NS + i * step)
         rig.until(lambda i=i: rig.count("cloud_received") > i)

@@ -32,7 +32,7 @@ def test_every_bad_message_is_counted_and_each_kind_told_once(synchronizer: Sync
     intake = Intake(synchronizer, Topics(), told.append)
     pixels = np.zeros((48, 64), np.uint8)
     for i in range(3):
-        intake.take(LEFT, image(START_NS + i, pixels, "yuv422"))
+        intake.take(LEFT, image(START_NS + i, pixels, "nv12"))
         intake.take(LEFT, image(START_NS + i, pixels, step=10))
         intake.take(LEFT, image(START_NS + i, np.zeros((4, 4), np.uint8)))
         intake.take(CLOUD, cloud(START_NS + i, scan(np.ones((3, 3))), data=np.zeros(5, np.uint8)))
@@ -43,7 +43,7 @@ def test_every_bad_message_is_counted_and_each_kind_told_once(synchronizer: Sync
     assert synchronizer.counters["cloud"].dropped == {"truncated": 3}
     assert synchronizer.counters["odometry"].dropped == {"pose": 3}
     assert len(told) == 5
-    assert any(LEFT in line and "yuv422" in line for line in told)
+    assert any(LEFT in line and "nv12" in line for line in told)
 
 
 def test_good_messages_after_bad_ones_still_make_a_frame(synchronizer: Synchronizer) -> None:

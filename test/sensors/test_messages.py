@@ -70,7 +70,7 @@ def test_bayer_patterns_start_at_the_upper_left(pattern: str, colour: str, weigh
 @pytest.mark.parametrize(
     ("changes", "kind"),
     [
-        ({"encoding": "yuv422"}, "encoding"),
+        ({"encoding": "nv12"}, "encoding"),
         ({"encoding": "16SC1"}, "encoding"),
         ({"width": 0}, "size"),
         ({"height": 0}, "size"),
@@ -87,8 +87,8 @@ def test_bad_image_is_refused_by_kind(changes: dict[str, Any], kind: str) -> Non
 
 
 def test_refused_encoding_is_named() -> None:
-    with pytest.raises(MessageError, match="'yuv422'"):
-        decode_image(image(0, np.zeros((4, 4), np.uint8), "yuv422"))
+    with pytest.raises(MessageError, match="'nv12'"):
+        decode_image(image(0, np.zeros((4, 4), np.uint8), "nv12"))
 
 
 def test_cloud_of_the_cube_1() -> None:
@@ -229,3 +229,10 @@ def test_messages_of_rclpy_are_the_same(rng: np.random.Generator) -> None:
     ours, theirs = decode_cloud(cloud(0, records)), decode_cloud(ros_cloud)
     assert (ours.points == theirs.points).all()
     assert (ours.time_offset_ns == theirs.time_offset_ns).all()
+
+
+@pytest.mark.parametrize(("encoding", "place"), [("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)])
+def test_of_colours_in_pairs_the_brightness_is_taken(encoding: str, place: int) -> None:
+    pixels = np.full((4, 6, 2), 200, np.uint8)
+    pixels[..., place] = np.arange(24).reshape(4, 6)
+    np.testing.assert_array_equal(decode_image(image(0, pixels, encoding)), np.arange(24).reshape(4, 6))

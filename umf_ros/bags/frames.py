@@ -10,24 +10,17 @@ from umf_ros.bags.presets import calibration_of, topics_of
 from umf_ros.bags.reader import Bag, decode
 from umf_ros.bags.records import RawMessage
 from umf_ros.config import Settings, Topics
-from umf_ros.errors import BagError, MessageError
+from umf_ros.errors import BagError, MessageError, either
 from umf_ros.frames import Frame, Image
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.intake import Intake, wanted_inputs
+from umf_ros.sensors.message_kinds import TYPES
 from umf_ros.sensors.messages import OdometrySample, stamp_ns
 from umf_ros.sensors.sessions import Input
 from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
-_TYPES = {
-    "left_image": "sensor_msgs/msg/Image",
-    "right_image": "sensor_msgs/msg/Image",
-    "left_info": "sensor_msgs/msg/CameraInfo",
-    "right_info": "sensor_msgs/msg/CameraInfo",
-    "cloud": "sensor_msgs/msg/PointCloud2",
-    "odometry": "nav_msgs/msg/Odometry",
-}
 
 
 class FrameReader:
@@ -145,12 +138,20 @@ def _present(topics: Topics, bag: Bag) -> Topics:
         BagError: a topic is of another type than expected, as with compressed images.
     """
     for name, topic in topics.model_dump().items():
-        if topic in bag.topics and bag.topics[topic].type != _TYPES[name]:
-            raise BagError(f"{bag.path}: {topic} is of type {bag.topics[topic].type}, expected {_TYPES[name]}")
+        if topic in bag.topics and bag.topics[topic].type not in TYPES[name]:
+            found, expected = bag.topics[topic].type, either(TYPES[name])
+            raise BagError(f"{bag.path}: {topic} is of type {found}, expected {expected}{_instead(found)}")
     missing = [
         name for name, topic in topics.model_dump().items() if topic not in bag.topics or not bag.topics[topic].count
     ]
     return topics.model_copy(update=dict.fromkeys(missing, ""))
+
+
+def _instead(found: str) -> str:
+    """What to run where the odometry is named as what it is made of."""
+    if found != "sensor_msgs/msg/Imu":
+        return ""
+    return "; an IMU is no odometry: run one (KISS-ICP, Basalt, FAST-LIO) and give its poses with --odometry FILE.tum"
 
 
 def _check_overlap(odometry: Trajectory, bag: Bag) -> None:

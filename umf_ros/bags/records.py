@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Protocol
 
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
+
+from umf_ros.sensors.message_kinds import LIVOX, LIVOX_DEFINITION
 
 LARGEST_CHUNK = 2**29
 """Bytes of a chunk after unpacking, and of any record; recorders write some megabytes."""
@@ -59,5 +61,9 @@ class Storage(Protocol):
 
 @cache
 def message_types() -> Typestore:
-    """The message definitions of ROS 2 Jazzy."""
-    return get_typestore(Stores.ROS2_JAZZY)
+    """The message definitions of ROS 2 Jazzy, and those of Livox."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for kind in LIVOX:
+        definition = LIVOX_DEFINITION.format(package=kind.split("/")[0])
+        store.register(get_types_from_msg(definition, kind))
+    return store

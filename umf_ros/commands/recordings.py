@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from umf_ros.embedding import CHOICES
-from umf_ros.errors import BagError, ConfigError, either
+from umf_ros.errors import BagError, ConfigError, UmfError, either
 from umf_ros.resources import dataset_names
 
 if TYPE_CHECKING:
@@ -50,6 +50,16 @@ def check_files(bag: Path, *others: Path | None) -> None:
     for path in others:
         if path is not None and not path.exists():
             raise ConfigError(f"cannot read {path}: No such file or directory")
+
+
+def check_run(folder: Path) -> None:
+    """Likewise of a run folder.
+
+    Raises:
+        UmfError: it holds no finished run.
+    """
+    if not (folder / "summary.json").is_file():
+        raise UmfError(f"{folder} holds no finished run: summary.json is missing")
 
 
 def open_recording(

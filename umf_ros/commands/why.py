@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from umf_ros.commands.recordings import TruthPath
+from umf_ros.commands.recordings import TruthPath, check_run
 from umf_ros.errors import UmfError
 
 if TYPE_CHECKING:
@@ -33,16 +33,16 @@ def command(
 
     Also which parameter would have let it through, and what that costs. Reads the run folder alone.
     """
-    from umf_ros.runs.recorder import read_summary
-
-    summary = read_summary(folder)
+    check_run(folder)
 
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
     from umf_ros.runs.finished_run import read_run
+    from umf_ros.runs.recorder import read_summary
     from umf_ros.runs.report import judge
 
+    summary = read_summary(folder)
     known = bag or Path(summary.get("recording", {}).get("path", ""))
     recording: Bag | None = open_bag(known) if bag or known.is_file() or (known.is_dir() and known.name) else None
     about = judge(read_run(folder, recording, ground_truth), recording, keep=False)

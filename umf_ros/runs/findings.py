@@ -121,7 +121,11 @@ def _pairs(about: ExaminedRun) -> Iterator[Advice]:
 
 def _gaps(about: ExaminedRun) -> Iterator[Advice]:
     count, rules = len(about.places.stamps), about.run.settings.loop
-    if not count or any(about.places.admissible(row).any() for row in range(count - 1, 0, -1)):
+    if (
+        not count
+        or about.run.summary.get("interrupted")
+        or any(about.places.admissible(row).any() for row in range(count - 1, 0, -1))
+    ):
         return
     seconds = (int(about.places.stamps[-1]) - int(about.places.stamps[0])) * 1e-9
     metres = np.nanmax([row.travelled_m for row in about.run.keyframes] + [0.0])

@@ -9,6 +9,7 @@ import numpy as np
 
 from umf_ros.geometry import Array, align
 from umf_ros.runs.findings import ExaminedRun
+from umf_ros.runs.finished_run import FinishedRun
 from umf_ros.runs.gallery import SCAN_UNIT_M, Gallery, encode_scans
 from umf_ros.runs.scene_pairs import Pair, by_need, describe
 from umf_ros.runs.tables import Endpoints
@@ -65,7 +66,7 @@ def build_scene(
         "similarity": _similarity(about),
         "threshold": about.run.settings.verification.min_probability,
         "sweep": _sweep(about),
-        "errors": _errors(about),
+        "errors": error_curves(about.run) or None,
         "map": _map(gallery),
     }
 
@@ -157,23 +158,20 @@ def _sweep(about: ExaminedRun) -> list[list[float | int]]:
     return rows
 
 
-def _errors(about: ExaminedRun) -> dict[str, Any] | None:
-    """Distance from the truth over the way driven, of odometry and optimised trajectory."""
-    run, truth = about.run, about.run.truth
-    if truth is None or not about.judged.covered[0]:
-        return None
-    told: dict[str, Any] = {}
+def error_curves(run: FinishedRun) -> dict[str, list[list[float]]]:
+    """Way in m and distance from the truth in m, of odometry and optimised trajectory as far as there are."""
+    told: dict[str, list[list[float]]] = {}
     for name, trajectory in (("odometry", run.odometry), ("optimised", run.optimized)):
-        if trajectory is None:
+        if trajectory is None or run.truth is None:
             continue
-        poses, known = truth.at(trajectory.stamps_ns)
+        poses, known = run.truth.at(trajectory.stamps_ns)
         if np.count_nonzero(known) < 3:
             continue
-        there = positions_in_truth(trajectory, truth)[known]
+        there = positions_in_truth(trajectory, run.truth)[known]
         way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(poses[known, :3, 3], axis=0), axis=1))])
         both = np.column_stack([way, np.linalg.norm(there - poses[known, :3, 3], axis=1)])
         told[name] = _rounded(_thin(both)).T.tolist()
-    return told or None
+    return told
 
 
 def _map(gallery: Gallery) -> dict[str, Any] | None:

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from umf_ros.config import Group, load_preset, problems, read_values
+from umf_ros.config import Group, load_preset, problems
 from umf_ros.errors import CalibrationError, ConfigError
 from umf_ros.frames import StereoCamera
 from umf_ros.geometry import Array, from_quaternion
 from umf_ros.resources import dataset_names
 from umf_ros.sensors.rectification import Pinhole, RawCamera, StereoRectifier
+from umf_ros.yaml_files import read_values
 
 
 @dataclass(frozen=True, slots=True)

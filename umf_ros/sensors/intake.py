@@ -9,11 +9,10 @@ import numpy as np
 
 from umf_ros.config import Topics
 from umf_ros.errors import MessageError
+from umf_ros.sensors.message_kinds import decode_any_cloud, decode_any_image
 from umf_ros.sensors.messages import (
     OdometrySample,
     decode_camera_info,
-    decode_cloud,
-    decode_image,
     decode_odometry,
     stamp_ns,
 )
@@ -85,7 +84,7 @@ class Intake:
                 self._use_info(entry, message)
             else:
                 self._mount(entry, message)
-                decode = decode_cloud if entry == "cloud" else decode_image
+                decode = decode_any_cloud if entry == "cloud" else decode_any_image
                 self._synchronizer.add(_INPUTS[entry], stamp_ns(message), decode(message))
         except MessageError as error:
             self.refuse(topic, error)

@@ -31,6 +31,10 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     "bayer_bggr8": (1, 1, cv2.COLOR_BayerBGGR2GRAY),
     "bayer_gbrg8": (1, 1, cv2.COLOR_BayerGBRG2GRAY),
     "bayer_grbg8": (1, 1, cv2.COLOR_BayerGRBG2GRAY),
+    "yuv422": (2, 1, cv2.COLOR_YUV2GRAY_UYVY),
+    "uyvy": (2, 1, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2GRAY_YUY2),
+    "yuyv": (2, 1, cv2.COLOR_YUV2GRAY_YUY2),
 }
 
 # sensor_msgs/PointField.datatype
@@ -44,6 +48,11 @@ LARGEST_IMAGE = 20_000
 """Pixels of a side."""
 LARGEST_RECORD = 4096
 """Bytes of a point; drivers have some dozens."""
+INTENSITY_NAMES = ("intensity", "reflectivity", "reflectance", "i")
+"""Fields of the strength of a return, by whoever's driver."""
+TIME_NAMES = ("point_time_offset", "offset_time", "t", "time", "time_offset", "timestamp")
+"""Fields of the time of a point: whole numbers are ns, others s; Blickfeld, Livox, Ouster, Velodyne, Hesai."""
+LONGEST_SWEEP_NS = 1_000_000_000
 NO_RETURN_RANGE_M = 1.0
 """Range at which the Blickfeld driver puts the pulses that came back from nowhere, with intensity 0."""
 
@@ -135,9 +144,10 @@ def decode_cloud(message: Any) -> Cloud:
     records = _cloud_records(message)
     names = records.dtype.names or ()
     points = np.stack([records[axis] for axis in "xyz"], axis=1, dtype=np.float32, casting="unsafe")
-    intensity = records["intensity"].astype(np.float32) if "intensity" in names else None
+    strength = next((name for name in INTENSITY_NAMES if name in names), None)
+    intensity = None if strength is None else records[strength].astype(np.float32)
     real = real_returns(points, intensity)
-    offsets = records["point_time_offset"][real].astype(np.int64) if "point_time_offset" in names else None
+    offsets = _time_offsets_ns(records[real], message)
     return Cloud(points[real], None if intensity is None else intensity[real], offsets)
 
 
@@ -152,9 +162,27 @@ def real_returns(points: Points, intensity: Points | None) -> NDArray[np.bool_]:
     return np.isfinite(squared) & (squared > 0) & ~dummy
 
 
+def _time_offsets_ns(records: NDArray[Any], message: Any) -> NDArray[np.int64] | None:
+    """(N,) ns after the message's stamp: drivers count from it, or since the epoch; None where they do not tell."""
+    name = next((name for name in TIME_NAMES if name in (records.dtype.names or ())), None)
+    if name is None:
+        return None
+    times = records[name]
+    if times.dtype.kind in "ui":
+        offsets = times.astype(np.int64)
+    elif len(times) and times[0] > 1e17:  # ns since the epoch, as Livox' driver for PCL writes them
+        offsets = (times - float(stamp_ns(message))).astype(np.int64)
+    elif len(times) and times[0] > 1e8:  # s since the epoch, as Hesai writes them
+        offsets = np.rint((times - stamp_ns(message) * 1e-9) * 1e9).astype(np.int64)
+    else:
+        offsets = np.rint(times.astype(float) * 1e9).astype(np.int64)
+    # no sweep takes a second: what says so counts from elsewhere
+    return offsets if not len(offsets) or np.abs(offsets).max() < LONGEST_SWEEP_NS else None
+
+
 def _cloud_records(message: Any) -> NDArray[Any]:
     """(N,) structured array over the fields the package uses."""
-    wanted = {"x", "y", "z", "intensity", "point_time_offset"}
+    wanted = {"x", "y", "z", *INTENSITY_NAMES, *TIME_NAMES}
     fields = {field.name: field for field in message.fields if field.name in wanted}
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from umf_ros.commands.recordings import TruthPath
+from umf_ros.commands.recordings import TruthPath, check_files, check_run
 
 
 def command(
@@ -19,6 +19,9 @@ def command(
 
     A recording or a truth that is not of the run changes nothing.
     """
+    check_run(folder)
+    check_files(bag, ground_truth)
+
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag

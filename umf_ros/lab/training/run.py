@@ -14,7 +14,7 @@ import torch
 from pydantic import ValidationError
 from torch import nn
 
-from umf_ros.config import problems, read_values
+from umf_ros.config import problems
 from umf_ros.errors import ConfigError
 from umf_ros.lab.datasets.listed import Source, open_source
 from umf_ros.lab.training.distributed import join_team
@@ -27,6 +27,7 @@ from umf_ros.networks.image_encoder import ResidualBlock
 from umf_ros.networks.umf import UMF, channels_last, count_parameters
 from umf_ros.networks.voxel_encoder import ResidualBlock3d
 from umf_ros.networks.weights import load_weights
+from umf_ros.yaml_files import read_values
 
 
 def load_run(path: Path | None, **overrides: object) -> Any:

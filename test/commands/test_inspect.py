@@ -1,0 +1,152 @@
+"""`umf inspect`, and recordings of every kind of message through inspection and replay."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import recordings
+import yaml
+from command_line import only_line, umf
+from foreign_messages import HESAI, OUSTER, VELODYNE, compressed, drive, livox, relaid
+from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, START_NS, Entry, camera_info, header, image, make, traverse
+
+from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.reader import open_bag
+from umf_ros.bags.records import message_types
+from umf_ros.config import load_settings
+from umf_ros.errors import BagError
+from umf_ros.geometry import make_pose, to_quaternion
+from umf_ros.sensors.calibration import load_calibration
+
+
+def write(path: Path, entries: Iterable[Entry], monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Write messages of all types the package knows."""
+    monkeypatch.setattr(recordings, "STORE", message_types())
+    return recordings.write_mcap(path, sorted(entries, key=lambda entry: entry[1]))
+
+
+def config_for(bag: Path, folder: Path) -> Path:
+    """What `umf inspect --write` makes of a recording, with the calibration's images as large as they are."""
+    ended = umf("inspect", bag, "--write", folder)
+    assert (folder / "my_rover.yaml").is_file(), ended.text
+    return folder / "my_rover.yaml"
+
+
+KINDS: dict[str, dict[str, Any]] = {
+    "compressed images": {"images": compressed},
+    "jpeg images": {"images": partial(compressed, kind="jpg")},
+    "Livox": {"clouds": livox},
+    "Ouster": {"clouds": lambda message: relaid(message, OUSTER)},
+    "Hesai": {"clouds": lambda message: relaid(message, HESAI)},
+    "Velodyne": {"clouds": lambda message: relaid(message, VELODYNE)},
+    "yuyv": {"images": lambda m: image(START_NS, np.stack([np.frombuffer(m.data, np.uint8).reshape(48, 64)] * 2, -1), "yuyv", header=m.header)},  # noqa: E501
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_message_goes_through_inspection_and_replay(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = write(tmp_path / "bag.mcap", drive(**KINDS[kind]), monkeypatch)
+    config = config_for(bag, tmp_path)
+    as_usual = write(tmp_path / "usual.mcap", traverse(3.0), monkeypatch)
+    usual = list(
+        FrameReader(open_bag(as_usual), load_settings(config, topics__left_image=LEFT, topics__right_image=RIGHT))
+    )
+    frames = list(FrameReader(open_bag(bag), load_settings(config), warn=pytest.fail))
+    assert len(frames) == len(usual) > 10
+    for mine, other in zip(frames, usual, strict=True):
+        assert mine.points is not None and other.points is not None and (mine.left is None) == (other.left is None)
+        np.testing.assert_allclose(mine.points, other.points, atol=1e-4)
+        if mine.left is not None and "jpeg" not in kind:
+            np.testing.assert_array_equal(mine.left, other.left)
+    ended = umf("replay", bag, "--config", config, "--embedder", "thumbnail", "--out", tmp_path / "runs")
+    assert "3.0 s" not in ended.err and (tmp_path / "runs" / "latest" / "report.html").is_file(), ended.text
+
+
+def test_it_says_what_is_there_and_what_that_gives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag = write(tmp_path / "bag.mcap", traverse(25.0), monkeypatch)
+    ended = umf("inspect", bag)
+    assert ended.status == 0, ended.text
+    assert "left_image /stereo/left/image_rect 30.0 Hz 64 x 48, mono8" in ended.text
+    assert "200 returns, intensity up to 100, 0.20 s per scan" in " ".join(ended.text.split())
+    assert "not used: /ground_truth/pose" in ended.text and "117 of 117 scans have an image within 0.05 s" in ended.text
+    assert "note: no camera_info: the calibration must say the intrinsics" in ended.text
+    assert ended.out.splitlines()[-1] == "It would work."
+
+
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [
+        (traverse(3.0), "fault: 3.0 s are shorter than loop.min_time_gap_s, 20 s: no match is allowed"),
+        ([e for e in traverse(25.0) if e[0] == LEFT], "fault: one camera without a LiDAR or a second camera"),
+        ([e for e in traverse(25.0) if e[0] == ODOMETRY], "fault: neither images nor scans"),
+    ],
+)
+def test_what_could_find_nothing_ends_with_3(
+    tmp_path: Path, entries: list[Entry], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = umf("inspect", write(tmp_path / "bag.mcap", entries, monkeypatch))
+    assert said in ended.text, ended.text
+    assert ended.status == 3 and "It would find nothing." in ended.text
+
+
+def transform(parent: str, child: str, pose: np.ndarray) -> Any:
+    x, y, z = map(float, pose[:3, 3])
+    turn = dict(zip("xyzw", map(float, to_quaternion(pose)), strict=True))
+    return make(
+        "geometry_msgs/msg/TransformStamped",
+        header=header(START_NS, parent),
+        child_frame_id=child,
+        transform=make(
+            "geometry_msgs/msg/Transform",
+            translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=make("geometry_msgs/msg/Quaternion", **turn),
+        ),
+    )
+
+
+def test_camera_info_and_transforms_become_the_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.4, 0.1, 1.2])
+    lidar = make_pose(np.eye(3), [0.3, 0.0, 1.3])
+    tree = make("tf2_msgs/msg/TFMessage", transforms=[transform("base_link", "eye", camera), transform("base_link", "beam", lidar)])  # noqa: E501  # fmt: skip
+    entries: list[Entry] = [("/tf_static", START_NS, tree)]
+    for topic, at, message in traverse(3.0):
+        if topic in (LEFT, CLOUD):
+            message.header.frame_id = "eye" if topic == LEFT else "beam"
+        entries.append((topic, at, message))
+    entries.append(("/stereo/left/camera_info", START_NS + 1, camera_info(START_NS, 50.0, (64, 48))))
+    entries.append(("/stereo/right/camera_info", START_NS + 2, camera_info(START_NS, 50.0, (64, 48), 0.25)))
+    bag = write(tmp_path / "bag.mcap", entries, monkeypatch)
+    settings = load_settings(config_for(bag, tmp_path))
+    found = load_calibration(settings.calibration)
+    np.testing.assert_allclose(found.body_T_camera, camera, atol=1e-6)
+    np.testing.assert_allclose(found.body_T_lidar, lidar, atol=1e-6)
+    assert (found.camera.fx, found.camera.width, found.camera.baseline) == (50.0, 64, 0.25)
+    assert "TO BE MEASURED" not in (tmp_path / "my_calibration.yaml").read_text()
+    assert (
+        yaml.safe_load((tmp_path / "my_rover.yaml").read_text())["/**"]["ros__parameters"]["topics"]["cloud"] == CLOUD
+    )
+    line = only_line(umf("inspect", bag, "--write", tmp_path))
+    assert line.endswith("my_rover.yaml is there already: nothing was written")
+
+
+def test_an_imu_is_no_odometry_and_what_to_run_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from umf_ros.lab.simulation.messages import imu_message
+
+    entries = [entry for entry in traverse(3.0) if entry[0] != ODOMETRY]
+    entries += [("/imu", START_NS + i, imu_message(np.zeros(3), np.zeros(3), START_NS + i)) for i in range(3)]
+    bag = write(tmp_path / "bag.mcap", entries, monkeypatch)
+    assert "/imu is an IMU, which is no odometry; run one (KISS-ICP" in umf("inspect", bag).text
+    settings = load_settings(config_for(bag, tmp_path), topics__odometry="/imu")
+    with pytest.raises(BagError, match="an IMU is no odometry: run one"):
+        FrameReader(open_bag(bag), settings)
+
+
+def test_a_recording_that_is_not_there_is_one_line() -> None:
+    assert only_line(umf("inspect", "nowhere.mcap")) == "there is no recording nowhere.mcap"

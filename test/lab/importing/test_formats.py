@@ -1,0 +1,200 @@
+"""Small folders of every format: imported, inspected, and read as frames with the right geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from command_line import only_line, umf
+
+from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.reader import open_bag
+from umf_ros.bags.trajectories import read_ground_truth
+from umf_ros.config import load_settings
+from umf_ros.frames import Frame
+from umf_ros.lab.commands.import_data import KINDS
+from umf_ros.lab.importing import FORMATS
+
+SIZE = (64, 48)
+COUNT = 5
+START_S = 1_400_000_000
+PROJECTION = "50 0 32 {} 0 50 24 0 0 0 1 0"
+VELO_TO_CAMERA = "0 -1 0 0 0 0 -1 -0.1 1 0 0 -0.3"
+"""`camera_T_velo`, three rows: a camera that looks ahead, 0.3 m before the LiDAR and 0.1 m below it."""
+
+
+def picture(path: Path, value: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.full((SIZE[1], SIZE[0]), value, np.uint8))
+
+
+def scan(path: Path, number: int) -> np.ndarray:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    points = np.random.default_rng(number).uniform((2, -5, -1, 0), (20, 5, 1, 1), (200, 4)).astype("<f4")
+    points.tofile(path)
+    return points
+
+
+def kitti_odometry(root: Path) -> Path:
+    source = root / "sequences" / "07"
+    for i in range(COUNT):
+        picture(source / "image_0" / f"{i:06d}.png", 10 * i)
+        picture(source / "image_1" / f"{i:06d}.png", 10 * i + 5)
+        scan(source / "velodyne" / f"{i:06d}.bin", i)
+    (source / "times.txt").write_text("\n".join(f"{0.1 * i:.6e}" for i in range(COUNT)))
+    (source / "calib.txt").write_text(
+        f"P0: {PROJECTION.format(0)}\nP1: {PROJECTION.format(-10)}\nTr: {VELO_TO_CAMERA}\n"
+    )
+    (root / "poses").mkdir()
+    rows = [f"1 0 0 0 0 1 0 0 0 0 1 {i}" for i in range(COUNT)]  # the camera drives ahead, a metre at a time
+    (root / "poses" / "07.txt").write_text("\n".join(rows))
+    return source
+
+
+def kitti_raw(root: Path) -> Path:
+    source = root / "2011_09_26_drive_0001_sync"
+    stamps = "\n".join(f"2014-05-13 16:53:20.{i}00000000" for i in range(COUNT))
+    for name in ("image_00", "image_01", "velodyne_points"):
+        (source / name / "data").mkdir(parents=True)
+        (source / name / "timestamps.txt").write_text(stamps)
+        for i in range(COUNT):
+            path = source / name / "data" / f"{i:010d}"
+            if name == "velodyne_points":
+                scan(path.with_suffix(".bin"), i)
+            else:
+                picture(path.with_suffix(".png"), 10 * i)
+    one = "1 0 0 0 1 0 0 0 1"
+    (root / "calib_cam_to_cam.txt").write_text(
+        f"calib_time: 09-Jan-2012\nR_rect_00: {one}\nP_rect_00: {PROJECTION.format(0)}\n"
+        f"P_rect_01: {PROJECTION.format(-10)}\n"
+    )
+    (root / "calib_velo_to_cam.txt").write_text("R: 0 -1 0 0 0 -1 1 0 0\nT: 0 -0.1 -0.3\n")
+    return source
+
+
+def euroc(root: Path) -> Path:
+    for name, shift in (("cam0", 0.0), ("cam1", 0.2)):
+        folder = root / "mav0" / name
+        rows = ["#timestamp [ns],filename"]
+        for i in range(COUNT):
+            stamp = START_S * 10**9 + i * 50_000_000
+            picture(folder / "data" / f"{stamp}.png", 20 * i)
+            rows.append(f"{stamp},{stamp}.png")
+        (folder / "data.csv").write_text("\n".join(rows))
+        (folder / "sensor.yaml").write_text(
+            "# camera\nT_BS:\n  cols: 4\n  rows: 4\n"
+            f"  data: [1, 0, 0, {shift}, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
+            "resolution: [64, 48]\nintrinsics: [50, 50, 32, 24]\ndistortion_coefficients: [0, 0, 0, 0]\n"
+        )
+    truth = root / "mav0" / "state_groundtruth_estimate0"
+    truth.mkdir()
+    lines = [f"{START_S * 10**9 + i * 50_000_000},{i},0,0,1,0,0,0,0,0,0" for i in range(COUNT)]
+    (truth / "data.csv").write_text("#timestamp, p, q\n" + "\n".join(lines))
+    return root
+
+
+def tum_rgbd(root: Path) -> Path:
+    rgb, depth, truth = [], [], []
+    for i in range(COUNT):
+        seconds = f"{START_S + 0.1 * i:.4f}"
+        picture(root / "rgb" / f"{i}.png", 20 * i)
+        (root / "depth").mkdir(exist_ok=True)
+        cv2.imwrite(str(root / "depth" / f"{i}.png"), np.full((48, 64), 10_000, np.uint16))  # 2 m ahead
+        rgb.append(f"{seconds} rgb/{i}.png")
+        depth.append(f"{seconds} depth/{i}.png")
+        truth.append(f"{seconds} {i} 0 0 0 0 0 1")
+    for name, rows in (("rgb", rgb), ("depth", depth), ("groundtruth", truth)):
+        (root / f"{name}.txt").write_text("# comment\n" + "\n".join(rows))
+    return root
+
+
+def folder(root: Path) -> Path:
+    rows = []
+    for i in range(COUNT):
+        picture(root / "left" / f"{i}.png", 20 * i)
+        picture(root / "right" / f"{i}.png", 20 * i)
+        scan(root / "scans" / f"{i}.bin", i)
+        rows += [f"{name} {START_S + 0.1 * i:.3f}" for name in (f"left/{i}.png", f"right/{i}.png", f"scans/{i}.bin")]
+    (root / "times.txt").write_text("\n".join(rows))
+    return root
+
+
+MADE: dict[str, Callable[[Path], Path]] = {
+    "kitti-odometry": kitti_odometry,
+    "kitti-raw": kitti_raw,
+    "euroc": euroc,
+    "tum-rgbd": tum_rgbd,
+    "folder": folder,
+}
+
+
+def imported(kind: str, tmp_path: Path) -> list[Frame]:
+    (tmp_path / "set").mkdir()
+    source = MADE[kind](tmp_path / "set")
+    ended = umf("import", kind, source, tmp_path / "made.mcap")
+    assert ended.status == 0 and "next: umf replay" in ended.text, ended.text
+    return list(FrameReader(open_bag(tmp_path / "made.mcap"), load_settings(tmp_path / "made.yaml"), warn=pytest.fail))
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_every_format_becomes_frames(kind: str, tmp_path: Path) -> None:
+    frames = imported(kind, tmp_path)
+    assert len(frames) == COUNT
+    assert [frame.left is not None for frame in frames] == [True] * COUNT
+    assert all((frame.points is not None) == (kind != "euroc") for frame in frames)
+    assert all((frame.right is not None) == (kind != "tum-rgbd") for frame in frames)
+    assert np.allclose(np.diff([frame.stamp_ns for frame in frames]), 50_000_000 if kind == "euroc" else 10**8)
+    inspected = umf("inspect", tmp_path / "made.mcap")
+    assert "no match is allowed" in inspected.text and inspected.text.count("fault") == 1  # half a second is too short
+
+
+def test_kittis_camera_looks_ahead_from_its_lidar_and_drives_that_way(tmp_path: Path) -> None:
+    frame = imported("kitti-odometry", tmp_path)[0]
+    np.testing.assert_allclose(frame.body_T_camera[:3, 2], [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(frame.body_T_camera[:3, 3], [0.3, 0, -0.1], atol=1e-9)
+    assert frame.camera.baseline == pytest.approx(0.2) and (frame.camera.width, frame.camera.fx) == (64, 50)
+    truth = read_ground_truth(open_bag(tmp_path / "made.mcap"))
+    assert truth is not None
+    np.testing.assert_allclose(truth.poses[:, :3, 3], [[i, 0, 0] for i in range(COUNT)], atol=1e-9)
+    assert frame.intensity is not None and 0 < frame.intensity.max() <= 1
+
+
+def test_depth_images_are_scans_ahead_of_the_camera(tmp_path: Path) -> None:
+    frame = imported("tum-rgbd", tmp_path)[2]
+    assert frame.points is not None
+    np.testing.assert_allclose(frame.points[:, 0], 2.0, atol=1e-5)
+    assert len(frame.points) == 16 * 12
+
+
+def test_eurocs_pair_is_rectified(tmp_path: Path) -> None:
+    assert imported("euroc", tmp_path)[0].camera.baseline == pytest.approx(0.2, abs=1e-6)
+
+
+def test_the_command_knows_every_format() -> None:
+    assert set(KINDS) == set(FORMATS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["nuscenes", ".", "a.mcap"],
+            "unknown kind 'nuscenes'; expected kitti-odometry, kitti-raw, euroc",
+        ),
+        (["folder", "nowhere", "a.mcap"], "there is no folder nowhere"),
+        (["folder", "{empty}", "a.bag"], "the name must end in .mcap"),
+        (["folder", "{empty}", "a.mcap"], "times.txt"),
+        (["kitti-odometry", "{empty}", "a.mcap"], "calib.txt"),
+        (["kitti-raw", "{empty}", "a.mcap"], "calib_cam_to_cam.txt"),
+        (["euroc", "{empty}", "a.mcap"], "sensor.yaml"),
+        (["tum-rgbd", "{empty}", "a.mcap"], "rgb.txt"),
+    ],
+)
+def test_a_folder_of_another_format_is_one_clear_line(tmp_path: Path, arguments: list[str], message: str) -> None:
+    (tmp_path / "empty").mkdir()
+    filled = [text.format(empty=tmp_path / "empty") for text in arguments]
+    assert message in only_line(umf("import", *filled[:2], tmp_path / filled[2]))
+    assert not (tmp_path / "a.mcap").exists()

@@ -1,0 +1,94 @@
+"""`umf inspect`: what is in a recording, whether it would work, and a first parameter file and calibration for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from umf_ros.commands.recordings import BagPath, check_files
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from umf_ros.bags.reader import Bag
+    from umf_ros.commands.inspection import Inspected
+
+PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
+
+SEVERITY = {"fault": "red", "warning": "yellow", "note": "dim"}
+
+
+def command(
+    bag: BagPath,
+    write: Annotated[
+        Path | None, typer.Option("--write", help="Folder for my_rover.yaml and my_calibration.yaml.")
+    ] = None,
+) -> None:
+    """Say what a recording holds, which topics would be used, what is missing, and whether it would work.
+
+    Ends with 3 where a replay could find nothing.
+    """
+    check_files(bag)
+
+    from rich.console import Console
+
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.commands.inspection import inspect
+    from umf_ros.runs.verdict import USELESS
+
+    console, recording = Console(), open_bag(bag)
+    found = inspect(recording)
+    _tell(console, bag, recording, found)
+    if write is not None:
+        _write(console, found, recording, write)
+    elif found.settings is None:
+        console.print(f"of no known data set: umf inspect {bag} --write . writes a first --config", **PLAIN)
+    if not found.works:
+        console.print("It would find nothing.", style="red")
+        raise typer.Exit(USELESS)
+    console.print("It would work.", style="green" if not found.advice else "")
+
+
+def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    console.print(f"{bag}: {recording.duration_s:.1f} s", **PLAIN)
+    if recording.warning:
+        console.print(recording.warning, style="yellow", **PLAIN)
+    table = Table("input", "topic", "rate", "what it is", box=None, pad_edge=False)
+    for name, topic in found.topics.model_dump().items():
+        if topic:
+            rate = f"{recording.topics[topic].count / max(recording.duration_s, 1e-9):.1f} Hz"
+            table.add_row(name, escape(topic), rate, escape(found.found.get(name, "")))
+    console.print(table)
+    others = sorted(set(recording.topics) - set(found.topics.model_dump().values()))
+    if others:
+        console.print(f"not used: {', '.join(others)}", style="dim", **PLAIN)
+    if "pairs" in found.found:
+        console.print(found.found["pairs"], **PLAIN)
+    for one in found.advice:
+        console.print(f"{one.severity}: {one.line}", style=SEVERITY[one.severity], **PLAIN)
+    if found.settings is not None:
+        console.print(f"data set: {found.settings.dataset}; umf replay {bag} needs no --config", **PLAIN)
+
+
+def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> None:
+    from umf_ros.commands import first_settings
+    from umf_ros.errors import OutputError, writing
+    from umf_ros.runs.folder import write_atomically
+
+    settings, calibration = folder / "my_rover.yaml", folder / "my_calibration.yaml"
+    for path in (settings, calibration):
+        if path.exists():
+            raise OutputError(f"{path} is there already: nothing was written")
+    with writing(f"to {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
+    text = first_settings.write_calibration(found, first_settings.read_transforms(recording))
+    write_atomically(calibration, text)
+    write_atomically(settings, first_settings.write_settings(found, str(calibration.resolve())))
+    guesses = text.count(first_settings.GUESS)
+    then = f"; {guesses} entries of the calibration are guesses: measure them" if guesses else ""
+    console.print(f"wrote {settings} and {calibration}{then}", **PLAIN)

@@ -1,0 +1,223 @@
+"""What a recording holds, and whether it would work."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.bags.presets import settings_for
+from umf_ros.bags.reader import Bag, decode
+from umf_ros.config import Settings, Topics
+from umf_ros.errors import MessageError, UmfError
+from umf_ros.runs.inputs import Advice
+from umf_ros.sensors.message_kinds import CLOUD, COMPRESSED, IMAGE, LIVOX, decode_any_cloud, decode_any_image
+from umf_ros.sensors.messages import decode_camera_info, decode_odometry
+
+SAMPLES = 20
+"""Messages of a topic that are decoded."""
+FEW_PAIRS = 0.5
+"""Share of the scans with an image, by hand, below which something is wrong."""
+
+
+@dataclass
+class Inspected:
+    """What was found.
+
+    Attributes:
+        topics: that would be used.
+        found: words about each input, by its name in `Topics`.
+        frames: `header.frame_id` of each input.
+        advice: what is wrong or missing, with what helps.
+        info: left and right camera_info, as far as there are.
+        image_size: width and height, or None.
+        settings: that would be used without --config; None where the topics are of no known data set.
+    """
+
+    topics: Topics
+    found: dict[str, str] = field(default_factory=dict)
+    frames: dict[str, str] = field(default_factory=dict)
+    advice: list[Advice] = field(default_factory=list)
+    info: dict[str, Any] = field(default_factory=dict)
+    image_size: tuple[int, int] | None = None
+    settings: Settings | None = None
+
+    @property
+    def works(self) -> bool:
+        """Whether a replay can find anything."""
+        return not any(one.severity == "fault" for one in self.advice)
+
+
+def inspect(bag: Bag) -> Inspected:
+    """Look at a recording: topics to use, the first messages of each, how they pair, and what excludes everything."""
+    found = Inspected(guess_topics(bag))
+    try:
+        found.settings = settings_for(bag, None, "auto")
+    except UmfError:
+        found.settings = None
+    _read_samples(bag, found)
+    _about_depth(found)
+    _about_odometry(bag, found)
+    _about_pairs(bag, found)
+    _about_gaps(bag, found)
+    return found
+
+
+def guess_topics(bag: Bag) -> Topics:
+    """The topics of each input by type and name: of several the one that says left or right, else the fullest."""
+    by_type = {kind: [t for t, i in bag.topics.items() if i.type == kind and i.count] for kind in _TYPES_SEEN}
+    images = by_type[IMAGE] + by_type[COMPRESSED]
+    images = [topic for topic in images if not any(word in topic.lower() for word in ("depth", "mask", "semantic"))]
+    right = next((topic for topic in images if "right" in topic.lower()), "")
+    left = next((topic for topic in images if "left" in topic.lower()), "")
+    left = left or next((topic for topic in images if topic != right), "")
+    infos = by_type["sensor_msgs/msg/CameraInfo"]
+    clouds = sorted((topic for kind in (CLOUD, *LIVOX) for topic in by_type[kind]), key=lambda t: -bag.topics[t].count)
+    odometry = sorted(by_type["nav_msgs/msg/Odometry"], key=lambda topic: -bag.topics[topic].count)
+    return Topics(
+        left_image=left,
+        right_image=right if left else "",
+        left_info=_nearest(left, infos),
+        right_info=_nearest(right, infos) if right else "",
+        cloud=clouds[0] if clouds else "",
+        odometry=odometry[0] if odometry else "",
+    )
+
+
+_TYPES_SEEN = (IMAGE, COMPRESSED, "sensor_msgs/msg/CameraInfo", CLOUD, *LIVOX, "nav_msgs/msg/Odometry")
+
+
+def _nearest(image: str, infos: list[str]) -> str:
+    """The camera_info beside an image: the one of the same namespace."""
+    space = image.split("/")
+    alike = {info: sum(a == b for a, b in zip(space, info.split("/")[:-1], strict=False)) for info in infos}
+    best = max(alike, key=lambda info: alike[info], default="")
+    return best if best and alike[best] > 1 else ""
+
+
+def _read_samples(bag: Bag, found: Inspected) -> None:
+    """Decode the first messages of each input and tell what they are."""
+    names = {topic: name for name, topic in found.topics.model_dump().items() if topic}
+    left: dict[str, int] = dict.fromkeys(names, SAMPLES)
+    faults: dict[str, str] = {}
+    for raw in bag.raw_messages(list(names)):
+        name = names[raw.topic]
+        if left[raw.topic] <= 0:
+            if not any(left.values()):
+                break
+            continue
+        left[raw.topic] -= 1
+        try:
+            message = decode(raw)
+            found.found[name] = _DESCRIBE[name](message, found)
+            found.frames.setdefault(name, message.header.frame_id)
+            left[raw.topic] = 0
+        except MessageError as error:
+            faults[name] = str(error)
+    for name, fault in faults.items():
+        if name not in found.found:
+            topic = getattr(found.topics, name)
+            found.advice.append(Advice("fault", f"{topic}: {fault}", "no message of the first ones can be used"))
+
+
+def _image_words(message: Any, found: Inspected) -> str:
+    image = decode_any_image(message)
+    found.image_size = image.shape[1], image.shape[0]
+    kind = getattr(message, "encoding", "") or message.format
+    return f"{image.shape[1]} x {image.shape[0]}, {kind}, grey values vary by {image.std():.0f}"
+
+
+def _cloud_words(message: Any, _: Inspected) -> str:
+    cloud = decode_any_cloud(message)
+    words = [f"{len(cloud.points)} returns"]
+    words.append("no intensity" if cloud.intensity is None else f"intensity up to {cloud.intensity.max(initial=0):.4g}")
+    times = cloud.time_offset_ns
+    span_s = 0.0 if times is None or not len(times) else float(np.ptp(times)) * 1e-9
+    words.append("no time per point" if times is None else f"{span_s:.2f} s per scan")
+    return ", ".join(words)
+
+
+def _info_words(side: str, message: Any, found: Inspected) -> str:
+    found.info[side] = message
+    camera = decode_camera_info(message)
+    distorted = np.any(np.asarray(message.d, float))
+    return f"{camera.width} x {camera.height}, fx {camera.fx:.1f}" + (", with distortion" if distorted else "")
+
+
+def _odometry_words(message: Any, _: Inspected) -> str:
+    decode_odometry(message)
+    return f"of {message.child_frame_id or 'no named frame'} in {message.header.frame_id or 'no named frame'}"
+
+
+_DESCRIBE: dict[str, Any] = {
+    "left_image": _image_words,
+    "right_image": _image_words,
+    "cloud": _cloud_words,
+    "left_info": lambda message, found: _info_words("left", message, found),
+    "right_info": lambda message, found: _info_words("right", message, found),
+    "odometry": _odometry_words,
+}
+
+
+def _about_depth(found: Inspected) -> None:
+    topics = found.topics
+    if not topics.left_image and not topics.cloud:
+        found.advice.append(Advice("fault", "neither images nor scans", "nothing to recognise a place by"))
+    elif not topics.cloud and not topics.right_image:
+        what = "one camera without a LiDAR or a second camera: places are recognised, but no closure is metric"
+        found.advice.append(Advice("fault", what, "record scans or a stereo pair"))
+    elif not topics.cloud:
+        found.advice.append(Advice("warning", "no scans: everything rests on the stereo pair"))
+    elif not topics.left_image:
+        found.advice.append(Advice("warning", "no images: everything rests on the scans"))
+    if topics.left_image and not topics.left_info:
+        found.advice.append(Advice("note", "no camera_info: the calibration must say the intrinsics"))
+
+
+def _about_odometry(bag: Bag, found: Inspected) -> None:
+    if found.topics.odometry:
+        return
+    imu = [topic for topic, info in bag.topics.items() if info.type == "sensor_msgs/msg/Imu"]
+    remedy = "run one (KISS-ICP on the scans, Basalt on the images) and give its poses with --odometry FILE.tum"
+    also = f"; {imu[0]} is an IMU, which is no odometry" if imu else ""
+    found.advice.append(Advice("warning", f"no odometry: closures only, the pose graph is skipped{also}", remedy))
+
+
+def _about_pairs(bag: Bag, found: Inspected) -> None:
+    """How many scans will have an image, by their stamps alone."""
+    topics, slop_ns = found.topics, 0.05e9
+    if found.settings is not None:
+        slop_ns = found.settings.sync.slop_s * 1e9
+    if not topics.left_image or not topics.cloud:
+        return
+    stamps: dict[str, list[int]] = {topics.left_image: [], topics.cloud: []}
+    for raw in bag.raw_messages([topics.left_image, topics.cloud]):
+        seconds, nanoseconds = struct.unpack_from("<iI" if raw.data[1] & 1 else ">iI", raw.data, 4)
+        stamps[raw.topic].append(seconds * 10**9 + nanoseconds)
+    scans = np.array(stamps[topics.cloud])
+    away = _distances(np.sort(stamps[topics.left_image]), scans)
+    pairs, median_s = int((away <= slop_ns).sum()), float(np.median(away)) * 1e-9
+    told = f"{pairs} of {len(scans)} scans have an image within {slop_ns * 1e-9:g} s, {median_s:.3f} s in the median"
+    found.found["pairs"] = told
+    if pairs < FEW_PAIRS * len(scans):
+        what = f"only {pairs} of {len(scans)} scans have an image, {median_s:.2f} s away in the median"
+        remedy = "two clocks? sync.slop_s, or the driver's stamps"
+        found.advice.append(Advice("warning" if pairs else "fault", what, remedy))
+
+
+def _distances(images: NDArray[np.int64], scans: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How far the nearest image is from each scan, ns."""
+    after = np.clip(np.searchsorted(images, scans), 0, len(images) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.minimum(np.abs(scans - images[before]), np.abs(scans - images[after]))
+
+
+def _about_gaps(bag: Bag, found: Inspected) -> None:
+    rules = (found.settings or Settings()).loop
+    if bag.duration_s < rules.min_time_gap_s:
+        gap = f"loop.min_time_gap_s, {rules.min_time_gap_s:g} s"
+        what = f"{bag.duration_s:.1f} s are shorter than {gap}: no match is allowed"
+        found.advice.append(Advice("fault", what, "drive longer, or lower loop.min_time_gap_s"))

@@ -1,0 +1,46 @@
+"""`umf import`: a data set or a folder of files as a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from umf_ros.errors import BagError, ConfigError, OutputError, either
+
+KINDS = ("kitti-odometry", "kitti-raw", "euroc", "tum-rgbd", "folder")
+
+
+def command(
+    kind: Annotated[str, typer.Argument(help=f"{either(KINDS)}.")],
+    source: Annotated[Path, typer.Argument(help="Folder of the sequence.")],
+    out: Annotated[Path, typer.Argument(help="The .mcap to write; its .yaml and .calibration.yaml go beside it.")],
+) -> None:
+    """Make a recording of a data set: KITTI, EuRoC (ASL), TUM RGB-D, or images and scans with a times.txt.
+
+    Odometry is not part of them: run one, and give its poses with --odometry.
+    """
+    if kind not in KINDS:
+        raise ConfigError(f"unknown kind {kind!r}; expected {either(KINDS)}")
+    if not source.is_dir():
+        raise BagError(f"there is no folder {source}")
+    if out.suffix != ".mcap":
+        raise OutputError(f"cannot write {out}: the name must end in .mcap")
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from umf_ros.lab.importing import FORMATS, write_recording
+
+    console = Console()
+    found = FORMATS[kind](source)
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("importing", total=1.0)
+        config = write_recording(found, out, lambda done: bar.update(task, completed=done))
+    counts = f"{len(found.left)} left and {len(found.right)} right images, {len(found.scans)} scans"
+    truth = ", with ground truth" if found.truth is not None else ""
+    console.print(f"{out}: {counts}{truth}", markup=False, highlight=False, soft_wrap=True)
+    for what in found.guessed:
+        console.print(f"a guess that you must replace: {what}", style="yellow", markup=False)
+    console.print(f"next: umf replay {out} --config {config} --odometry YOURS.tum", markup=False, soft_wrap=True)

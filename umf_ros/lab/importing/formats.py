@@ -1,0 +1,184 @@
+"""The formats: what lies where in a data set, and in which frames."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from umf_ros.bags.trajectories import read_tum
+from umf_ros.errors import SensorFileError
+from umf_ros.geometry import Array, from_quaternion, invert
+from umf_ros.lab.importing.files import depth_of, entries_of, entry, lines_of, numbers_of, rigid, size_of
+from umf_ros.lab.importing.imported import OPTICAL, Imported, pinhole, pose_entry
+from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.scan_files import SUFFIXES, read_scan
+from umf_ros.sensors.snapshots import IMAGE_SUFFIXES
+from umf_ros.trajectory import Trajectory
+from umf_ros.yaml_files import read_yaml
+
+KITTI_START_NS = 1_300_000_000 * 10**9
+"""KITTI's odometry counts its times from 0; a message needs a stamp."""
+TUM_INTRINSICS = {"freiburg1": (517.3, 516.5, 318.6, 255.3), "freiburg2": (520.9, 521.0, 325.1, 249.7)}
+TUM_USUAL = (535.4, 539.2, 320.1, 247.6)
+DEPTH_UNITS, DEPTH_STEP, FARTHEST_M = 5000.0, 4, 6.0
+"""Of TUM RGB-D: units per metre; every fourth pixel; beyond, a structured light knows nothing."""
+
+
+def kitti_odometry(source: Path) -> Imported:
+    """A sequence of KITTI's odometry: calib.txt, times.txt, image_0 and image_1, velodyne; the LiDAR is the body."""
+    path = source / "calib.txt"
+    entries = entries_of(path)
+    left, right = (entry(entries, name, (3, 4), path) for name in ("P0", "P1"))
+    camera_T_body = np.vstack([entry(entries, "Tr", (3, 4), path), [0, 0, 0, 1]])
+    stamps = [KITTI_START_NS + round(float(line) * 1e9) for line in lines_of(source / "times.txt")]
+    found = Imported({}, invert(camera_T_body))
+    found.left, found.right = (_in_order(source / name, stamps) for name in ("image_0", "image_1"))
+    found.scans = [(s, partial(read_scan, file, 4)) for s, file in _in_order(source / "velodyne", stamps)]
+    found.check(source)
+    size = size_of(found.left[0][1]) if found.left else (1241, 376)
+    found.camera = {"camera": pinhole(*size, left, baseline=float(-right[0, 3] / right[0, 0]))}
+    poses = source.parent.parent / "poses" / f"{source.name}.txt"
+    if poses.is_file():
+        cameras = numbers_of(poses).reshape(-1, 3, 4)
+        bodies = np.stack([invert(camera_T_body) @ np.vstack([one, [0, 0, 0, 1]]) @ camera_T_body for one in cameras])
+        found.truth = Trajectory(np.array(stamps[: len(bodies)], np.int64), bodies)
+    return found
+
+
+def kitti_raw(source: Path) -> Imported:
+    """A drive of KITTI's raw data, synchronised and rectified, with the calibration in the folder above."""
+    cameras, lidar = source.parent / "calib_cam_to_cam.txt", source.parent / "calib_velo_to_cam.txt"
+    entries, mounted = entries_of(cameras), entries_of(lidar)
+    left, right = (entry(entries, f"P_rect_{name}", (3, 4), cameras) for name in ("00", "01"))
+    upright = rigid(entry(entries, "R_rect_00", (3, 3), cameras), np.zeros(3))
+    velo = rigid(entry(mounted, "R", (3, 3), lidar), entry(mounted, "T", (3,), lidar))
+    found = Imported({}, invert(upright @ velo))
+    found.left, found.right = (_raw_files(source / name) for name in ("image_00", "image_01"))
+    found.scans = [(s, partial(read_scan, file, 4)) for s, file in _raw_files(source / "velodyne_points")]
+    found.check(source)
+    size = size_of(found.left[0][1]) if found.left else (1242, 375)
+    found.camera = {"camera": pinhole(*size, left, baseline=float(-right[0, 3] / right[0, 0]))}
+    return found
+
+
+def euroc(source: Path) -> Imported:
+    """A folder in EuRoC's ASL format: cam0, cam1 with their sensor.yaml, and state_groundtruth_estimate0; no scans."""
+    root = source / "mav0" if (source / "mav0").is_dir() else source
+    (left, body_T_left), (right, body_T_right) = (_asl_camera(root / name) for name in ("cam0", "cam1"))
+    turn = invert(body_T_left) @ body_T_right
+    found = Imported({"raw_camera": {"left": left, "right": right, "left_T_right": pose_entry(turn)}})
+    found.camera["raw_camera"] |= {"width": left["width"], "height": left["height"]}
+    found.left, found.right = (_asl_files(root / name) for name in ("cam0", "cam1"))
+    truth = root / "state_groundtruth_estimate0" / "data.csv"
+    if truth.is_file():
+        rows = [line.split(",") for line in lines_of(truth)]
+        poses = [from_quaternion([float(v) for v in row[1:4]], [float(row[i]) for i in (5, 6, 7, 4)]) for row in rows]
+        bodies = np.stack(poses) @ body_T_left @ invert(OPTICAL)
+        found.truth = Trajectory(np.array([int(row[0]) for row in rows], np.int64), bodies)
+    return found.check(source)
+
+
+def tum_rgbd(source: Path) -> Imported:
+    """A sequence of TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt; the depth images are the scans."""
+    fx, fy, cx, cy = next((k for name, k in TUM_INTRINSICS.items() if name in source.name), TUM_USUAL)
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    found = Imported({})
+    found.left = _listed(source / "rgb.txt")
+    found.scans = [(s, partial(_depth_scan, file, matrix)) for s, file in _listed(source / "depth.txt")]
+    found.check(source)
+    size = size_of(found.left[0][1]) if found.left else (640, 480)
+    found.camera = {"camera": pinhole(*size, matrix, baseline=0.0)}
+    if (source / "groundtruth.txt").is_file():
+        found.truth = read_tum(source / "groundtruth.txt").of_body(OPTICAL)
+    return found
+
+
+def folder(source: Path) -> Imported:
+    """Images and scans with a times.txt of lines `FILE SECONDS`; what has right in its path is the right camera's."""
+    found = Imported({}, guessed=["the intrinsics of the camera", "the mountings of camera and LiDAR"])
+    for line in lines_of(source / "times.txt"):
+        name, _, seconds = line.rpartition(" ")
+        path = source / name.strip()
+        try:
+            stamp = round(float(seconds) * 1e9)
+        except ValueError:
+            raise SensorFileError(f"{source / 'times.txt'}: expected lines FILE SECONDS, found {line[:60]!r}") from None
+        if path.suffix.lower() in SUFFIXES:
+            found.scans.append((stamp, partial(read_scan, path)))
+        elif path.suffix.lower() in IMAGE_SUFFIXES:
+            (found.right if "right" in name.lower() else found.left).append((stamp, path))
+    for files in (found.left, found.right, found.scans):
+        files.sort(key=lambda one: one[0])
+    found.check(source)
+    width, height = size_of(found.left[0][1]) if found.left else (640, 480)
+    matrix = np.array([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
+    found.camera = {"camera": pinhole(width, height, matrix, baseline=0.1 if found.right else 0.0)}
+    return found
+
+
+FORMATS: dict[str, Callable[[Path], Imported]] = {
+    "kitti-odometry": kitti_odometry,
+    "kitti-raw": kitti_raw,
+    "euroc": euroc,
+    "tum-rgbd": tum_rgbd,
+    "folder": folder,
+}
+
+
+def _in_order(source: Path, stamps: list[int]) -> list[tuple[int, Path]]:
+    """The files of a folder by their number, each with its stamp."""
+    files = sorted(path for path in source.glob("*") if path.stem.isdigit())
+    return [(stamps[int(path.stem)], path) for path in files if int(path.stem) < len(stamps)]
+
+
+def _raw_files(source: Path) -> list[tuple[int, Path]]:
+    if not (source / "timestamps.txt").is_file():
+        return []
+    try:
+        times = np.array(lines_of(source / "timestamps.txt"), "datetime64[ns]").astype(np.int64)
+    except ValueError:
+        raise SensorFileError(f"{source / 'timestamps.txt'}: expected lines of dates and times") from None
+    return _in_order(source / "data", times.tolist())
+
+
+def _asl_camera(source: Path) -> tuple[dict[str, Any], Array]:
+    path = source / "sensor.yaml"
+    try:
+        content = read_yaml(path)
+        width, height = content["resolution"]
+        fx, fy, cx, cy = content["intrinsics"]
+        mounted = np.array(content["T_BS"]["data"], float).reshape(4, 4)
+        distortion = [float(value) for value in content["distortion_coefficients"]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise SensorFileError(f"{path}: expected resolution, intrinsics, distortion and T_BS ({error})") from None
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return pinhole(width, height, matrix, distortion=distortion), mounted
+
+
+def _asl_files(source: Path) -> list[tuple[int, Path]]:
+    rows = csv.reader(lines_of(source / "data.csv"))
+    return sorted((int(row[0]), source / "data" / row[1].strip()) for row in rows)
+
+
+def _listed(path: Path) -> list[tuple[int, Path]]:
+    """`seconds name` lines of TUM."""
+    rows = [line.split() for line in lines_of(path)]
+    try:
+        return sorted((round(float(row[0]) * 1e9), path.parent / row[1]) for row in rows)
+    except (ValueError, IndexError):
+        raise SensorFileError(f"{path}: expected lines SECONDS FILE") from None
+
+
+def _depth_scan(path: Path, matrix: Array) -> Cloud:
+    """Points in the body frame of a camera that is the body."""
+    depth = depth_of(path)[::DEPTH_STEP, ::DEPTH_STEP] / DEPTH_UNITS
+    v, u = np.nonzero((depth > 0) & (depth < FARTHEST_M))
+    z = depth[v, u]
+    x = (u * DEPTH_STEP - matrix[0, 2]) / matrix[0, 0] * z
+    y = (v * DEPTH_STEP - matrix[1, 2]) / matrix[1, 1] * z
+    return Cloud((np.column_stack([x, y, z]) @ OPTICAL[:3, :3].T).astype(np.float32))
