@@ -69,7 +69,8 @@ def start_nodes(context, *_):
         nodes.append(node("bag_player_node", arguments=[value["bag"], "--wait-for-subscribers"]))
     if _is_true(value["rviz"]):
         rviz = ["-d", f"{share}/config/loop_closure.rviz"]
-        nodes.append(Node(package="rviz2", executable="rviz2", name="rviz2", arguments=rviz))
+        options = {"namespace": value["namespace"], "arguments": rviz}
+        nodes.append(Node(package="rviz2", executable="rviz2", name="rviz2", **options))
     return [*nodes, *ends]
 
 

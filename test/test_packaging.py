@@ -15,7 +15,8 @@ from sources import PACKAGE, ROOT, distributions, imports, required
 
 from umf_ros.resources import LAB_PACKAGES
 
-PARTS = ["package.xml", "setup.py", "setup.cfg", "NOTICE", "umf_ros", "resource", "config", "launch", "models", "tools"]
+PARTS = ["package.xml", "setup.py", "setup.cfg", "NOTICE", "umf_ros", "resource"]
+PARTS += ["config", "launch", "models", "tools"]
 PARTS += [path.name for path in ROOT.glob("requirements*.txt")]
 TEMPLATE = Path("runs", "templates", "planted.html.j2")
 
@@ -48,6 +49,7 @@ def test_everything_is_installed_to_share(install: Path) -> None:
         "NOTICE",
         "config/loop_closure.yaml",
         "config/loop_closure.rviz",
+        "config/foxglove_layout.json",
         "config/calibration/simulated.yaml",
         "config/calibration/s3li_etna.yaml",
         "launch/loop_closure.launch.py",

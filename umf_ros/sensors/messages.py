@@ -154,7 +154,8 @@ def decode_cloud(message: Any) -> Cloud:
 def real_returns(points: Points, intensity: Points | None) -> NDArray[np.bool_]:
     """(N,) which of the points (N, 3), m, are echoes: finite, away from the sensor, and no dummy of the Cube-1."""
     x, y, z = points.T
-    squared = x * x + y * y + z * z
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is not finite, and no echo
+        squared = x * x + y * y + z * z
     dummy = np.abs(squared - NO_RETURN_RANGE_M**2) < 2e-5
     if intensity is not None:
         dummy &= intensity == 0
