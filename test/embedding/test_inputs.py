@@ -35,7 +35,7 @@ def scan() -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(4)
     points = np.concatenate([some_scan(2, 1500), rng.uniform((-5, -30, -9), (60, 30, 9), (400, 3))]).astype(np.float32)
     points[::97] = np.nan
-    return points, (20 + 120 * (points[:, 1] > 0) + rng.random(len(points))).astype(np.float32)
+    return points, (100 + 300 * (points[:, 1] > 0) + rng.random(len(points))).astype(np.float32)
 
 
 def test_voxels_are_those_of_a_loop_over_the_points(scan):
