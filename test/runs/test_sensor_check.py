@@ -100,3 +100,19 @@ def test_motion_that_has_nothing_to_do_with_the_odometry_says_nothing(rng: np.ra
     odometry = Trajectory((seconds * 1e9).astype(np.int64), bumpy(seconds))
     noise = [Step(s, s + 0.25, rng.normal(0, 0.02, 3), rng.normal(0, 0.2, 3)) for s in np.arange(5, 50, 0.25)]
     assert compare_motion(noise, odometry, 0) is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_clock_is_right_until_the_motion_clearly_says_otherwise(seed: int) -> None:
+    """Smooth motion under noise fits a little better at some other lag."""
+    rng = np.random.default_rng(seed)
+    seconds = np.arange(0, 60, 0.05)
+    odometry = Trajectory((seconds * 1e9).astype(np.int64), bumpy(seconds))
+    starts = np.arange(5, 50, 0.6)
+    steps = []
+    for start, earlier, later in zip(starts, bumpy(starts), bumpy(starts + 0.25), strict=True):
+        motion = np.linalg.inv(earlier) @ later
+        turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec() + rng.normal(0, 0.01, 3)
+        steps.append(Step(start - 0.08, start + 0.17, turn, motion[:3, 3]))
+    found = compare_motion(steps, odometry, 0)
+    assert found is None or found.lag_s == 0

@@ -24,6 +24,7 @@ NOISE_RAD = 0.005  # measured on simulated drives: of the rotation between conse
 NOISE_DIRECTION = 0.3  # by hand: of the direction of a quarter of a metre of way
 ROUNDS = 5  # of reweighting
 KNOWN = 0.02  # by hand: share of the second direction of motion below which the mounting is not observable
+BETTER = 0.75  # by hand: residual at another lag, of that without any, below which a clock is called wrong
 CONTRAST = 0.6  # by hand: residual at the best lag, of that at a usual one, above which nothing is said
 
 
@@ -135,6 +136,9 @@ def compare_motion(steps: list[Step], odometry: Trajectory, epoch_ns: int) -> Di
     if not tried:
         return None
     residual, lag, rotation, known = min(tried, key=lambda one: one[0])
+    in_step = min(tried, key=lambda one: abs(one[1]))
+    if residual > BETTER * in_step[0]:  # a clock is right until the motion clearly says otherwise
+        residual, lag, rotation, known = in_step
     if residual > CONTRAST * float(np.median([one[0] for one in tried])):
         return None
     mounting = np.degrees(Rotation.from_matrix(rotation).as_rotvec()) if known else None
