@@ -1,80 +1,17 @@
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
-from recordings import CALIBRATION, drive
+from recordings import drive
+from streams import MS, OFFSET, T0, Measurement, S, check_accounts, feed, in_order, picture, points, rover, same
 
 from umf_ros.config import Sync
 from umf_ros.errors import MessageError
 from umf_ros.frames import Frame, StereoCamera
 from umf_ros.geometry import invert, transform
-from umf_ros.sensors.calibration import Calibration, load_calibration
+from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.messages import Cloud
 from umf_ros.sensors.synchronizer import INPUTS, Synchronizer
-
-S = 10**9
-MS = 10**6
-OFFSET = 100 * MS  # of the calibration: a scan's key is its middle
-T0 = 1_625_680_800 * S
-
-Measurement = tuple[str, int, Any]
-
-
-@pytest.fixture
-def calibration(tmp_path: Path) -> Calibration:
-    path = tmp_path / "calibration.yaml"
-    path.write_text(CALIBRATION)
-    return load_calibration(path)
-
-
-def picture(value: int = 0) -> np.ndarray:
-    return np.full((48, 64), value % 256, np.uint8)
-
-
-def points(count: int = 20, duration_ns: int = 200 * MS) -> Cloud:
-    xyz = np.random.default_rng(count).uniform((-5, 5, -3), (5, 15, 3), (count, 3)).astype(np.float32)
-    return Cloud(xyz, np.full(count, 50, np.float32), np.linspace(0, duration_ns, count).astype(np.int64))
-
-
-def rover(duration_s: float = 10.0) -> dict[str, list[Measurement]]:
-    """Measurements of each input: stereo at 30 Hz whose right camera drops some, scans, odometry at 20 Hz."""
-    lefts = [T0 + round(i * S / 30) for i in range(int(duration_s * 30))]
-    scans = [T0 + round(i * S / 4.7) for i in range(int(duration_s * 4.7))]
-    poses = [T0 + round(i * S / 20) for i in range(int(duration_s * 20))]
-    return {
-        "left": [("left", stamp, picture(i)) for i, stamp in enumerate(lefts)],
-        "right": [("right", stamp, picture(i + 1)) for i, stamp in enumerate(lefts) if i % 11 != 5],
-        "cloud": [("cloud", stamp, points(20 + i % 5)) for i, stamp in enumerate(scans)],
-        "odometry": [("odometry", stamp, drive((stamp - T0) / S)) for stamp in poses],
-    }
-
-
-def feed(synchronizer: Synchronizer, measurements: list[Measurement]) -> list[Frame]:
-    frames: list[Frame] = []
-    for name, stamp, value in measurements:
-        synchronizer.add(name, stamp, value)
-        frames += synchronizer.pop()
-    return frames
-
-
-def in_order(streams: dict[str, list[Measurement]]) -> list[Measurement]:
-    return sorted((item for stream in streams.values() for item in stream), key=lambda item: item[1])
-
-
-def same(a: Frame, b: Frame) -> bool:
-    fields = ("left", "right", "points", "intensity", "odom_T_body", "body_T_camera")
-    arrays = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in fields)
-    return arrays and (a.stamp_ns, a.image_stamp_ns, a.session) == (b.stamp_ns, b.image_stamp_ns, b.session)
-
-
-def check_accounts(synchronizer: Synchronizer) -> None:
-    """After a flush every message has found its fate."""
-    for counter in synchronizer.counters.values():
-        assert counter.waiting == 0
-        assert counter.received == counter.used + counter.dropped.total()
 
 
 def test_one_frame_per_scan_with_the_nearest_image_and_its_own_right_one(calibration: Calibration) -> None:
@@ -274,82 +211,6 @@ def test_neither_image_nor_points_is_no_frame(calibration: Calibration) -> None:
     with_image = Synchronizer(Sync(), calibration, {"cloud", "left"})
     frame = feed(with_image, [("cloud", T0 - OFFSET, empty), ("left", T0, picture())])[0]
     assert frame.points is None and frame.left is not None
-
-
-def test_a_recording_that_starts_again_is_a_new_session(calibration: Calibration) -> None:
-    once = in_order(rover(4.0))
-    synchronizer = Synchronizer(Sync(), calibration)
-    first = feed(synchronizer, once)
-    second = feed(synchronizer, once)
-    # the jump completed what was waiting; it comes out first
-    ending = [frame for frame in second if frame.session == 0]
-    second = [frame for frame in second if frame.session == 1] + synchronizer.flush()
-    whole = first + ending
-    assert len(whole) == len(second) == int(4.0 * 4.7)
-    assert synchronizer.session == 1
-    fields = [(frame.stamp_ns, frame.image_stamp_ns) for frame in whole]
-    assert fields == [(frame.stamp_ns, frame.image_stamp_ns) for frame in second]
-    assert all(frame.odom_T_body is not None for frame in second[:-1])
-    check_accounts(synchronizer)
-
-
-@pytest.mark.parametrize("name", ["left", "odometry", "cloud"])
-def test_one_stamp_that_jumps_back_is_no_restart(calibration: Calibration, name: str) -> None:
-    """A sensor that loses its clock for one message, and says the time since it was switched on."""
-    streams = rover(6.0)
-    plain = feed(Synchronizer(Sync(), calibration), in_order(streams))
-    synchronizer = Synchronizer(Sync(), calibration)
-    arrivals = in_order(streams)
-    for row, stamp in ((150, 12 * S), (300, 15 * S)):
-        arrivals.insert(row, (name, stamp, streams[name][0][2]))
-    frames = feed(synchronizer, arrivals)
-    assert synchronizer.session == 0 and synchronizer.counters[name].dropped["clock jump"] == 2
-    assert len(frames) == len(plain) and all(same(a, b) for a, b in zip(frames, plain, strict=True))
-
-
-def test_odometry_that_is_reset_is_a_new_session_and_costs_nothing_else(calibration: Calibration) -> None:
-    streams = rover(6.0)
-    away = np.array([[0, -1, 0, 80], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-    plain = feed(Synchronizer(Sync(), calibration), in_order(streams))
-    streams["odometry"] = [
-        (n, stamp, away @ pose if stamp > T0 + 3 * S else pose) for n, stamp, pose in rover(6.0)["odometry"]
-    ]
-    synchronizer = Synchronizer(Sync(), calibration)
-    frames = feed(synchronizer, in_order(streams))
-    assert [frame.stamp_ns for frame in frames] == [frame.stamp_ns for frame in plain]
-    assert synchronizer.session == 1 and synchronizer.counters["odometry"].dropped.total() == 0
-    around = [f for f in frames if f.odom_T_body is None]
-    assert len(around) <= 2 and all(abs(frame.stamp_ns - T0 - 3 * S) < 0.5 * S for frame in around)
-    for frame, before in zip(frames, plain, strict=True):
-        if frame.odom_T_body is not None:
-            expected = before.odom_T_body if frame.session == 0 else away @ before.odom_T_body
-            assert np.allclose(frame.odom_T_body, expected) and frame.left is before.left
-
-
-def test_odometry_of_a_computer_whose_clock_runs_ahead_costs_no_image(calibration: Calibration) -> None:
-    streams = rover(6.0)
-    streams["odometry"] = [(name, stamp + 3 * S, pose) for name, stamp, pose in streams["odometry"]]
-    arrivals = sorted(
-        (item for stream in streams.values() for item in stream),
-        key=lambda item: item[1] - 3 * S * (item[0] == "odometry"),
-    )
-    synchronizer = Synchronizer(Sync(), calibration)
-    frames = feed(synchronizer, arrivals) + synchronizer.flush()
-    assert len(frames) == len(streams["cloud"]) and all(frame.left is not None for frame in frames)
-    assert synchronizer.counters["left"].lost == 0
-
-
-def test_stragglers_of_the_session_before_do_not_start_another_one(calibration: Calibration) -> None:
-    streams = rover(4.0)
-    synchronizer = Synchronizer(Sync(), calibration)
-    late_clouds = streams["cloud"][-2:]
-    feed(synchronizer, [item for item in in_order(streams) if item not in late_clouds and item[1] < T0 + 3.8 * S])
-    feed(synchronizer, streams["left"][:3] + late_clouds)
-    frames = feed(synchronizer, in_order({**streams, "left": streams["left"][3:]})) + synchronizer.flush()
-    assert synchronizer.session == 1
-    assert synchronizer.counters["cloud"].dropped == {"stale": 2}
-    assert sum(frame.session == 1 for frame in frames) == len(streams["cloud"])
-    check_accounts(synchronizer)
 
 
 def test_duplicates_and_messages_out_of_order_are_counted_not_used(calibration: Calibration) -> None:
