@@ -37,12 +37,11 @@ from umf_ros.lab.training.acceptance_examples import Example, save_examples
 from umf_ros.lab.training.acceptance_fit import (
     bounds_of,
     fit_decision,
-    refused_anyway,
     save_acceptance,
 )
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
-from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
+from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance, refuted
 from umf_ros.verification.measurement import SCAN
 
 EXAMINED = 5  # candidates per query: what retrieval offers first
@@ -181,7 +180,7 @@ def _sprung_traps() -> list[Example]:
 
 def _judge(kind: str, examples: list[Example], odds: Array) -> dict[str, float]:
     """Figures of log-odds that every example got without its domain."""
-    right, refused = np.array([(example.right, refused_anyway(example)) for example in examples]).T
+    right, refused = np.array([(example.right, bool(refuted(example.measurement))) for example in examples]).T
     accepted = (odds >= ACCEPTED_ODDS) & ~refused
     domains = np.array([example.domain for example in examples])
     recall = [float(accepted[right & (domains == name)].mean()) for name in np.unique(domains[right])]

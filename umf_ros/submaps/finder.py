@@ -18,10 +18,10 @@ from umf_ros.submaps.submap import Submap
 from umf_ros.submaps.trail import Trail
 from umf_ros.verification import Measurement, Verdict
 from umf_ros.verification import constants as const
-from umf_ros.verification.all_round import settle
+from umf_ros.verification.all_round import settled
 from umf_ros.verification.field_of_view import FieldOfView
 from umf_ros.verification.hypotheses import TemporalMemory
-from umf_ros.verification.registration import Alignment, align_scans, unlevelled
+from umf_ros.verification.registration import Alignment, align_scans
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,10 @@ class SubmapFinder:
         ours, theirs = self.trail.behind(query, way_m), self.trail.around(proposal.row, last_m)
         if theirs.way_m < const.MIN_SUBMAP_M or not (ours.scan.usable and theirs.scan.usable):
             return None
-        guess = _settled(theirs, ours, proposal.pose) if proposal.planar else proposal.pose
+        guess = proposal.pose
+        if proposal.planar:
+            shift = guess[:2, 3]
+            guess = settled(theirs.scan, ours.scan, const.CELL_M, float(heading(guess)), shift)
         alignment = align_scans(theirs.scan, ours.scan, guess)
         measurement = measure_submaps(theirs, ours, alignment, self._memory, self._settings.odometry_drift)
         return Tested(theirs, ours, alignment, measurement)
@@ -185,10 +188,3 @@ class SubmapFinder:
 def _narrow(keyframe: Keyframe) -> bool:
     """Whether the sensor sees so little around it that a turned visit shows it something else."""
     return FieldOfView(keyframe.points - keyframe.body_T_lidar[:3, 3]).width_deg < const.NARROW_DEG
-
-
-def _settled(match: Submap, query: Submap, planar: Array) -> Array:
-    """Full pose of a planar one: height and tilt from the heights of both submaps."""
-    theirs, ours = match.scan.around(const.CELL_M), query.scan.around(const.CELL_M)
-    level = settle(theirs, ours, float(heading(planar)), planar[:2, 3])
-    return unlevelled(match.scan, query.scan, level)

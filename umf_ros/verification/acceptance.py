@@ -18,6 +18,7 @@ import numpy as np
 
 from umf_ros.errors import ConfigError
 from umf_ros.resources import find
+from umf_ros.verification import constants as const
 from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
 from umf_ros.verification.registration import CovarianceModel
 
@@ -113,6 +114,13 @@ def criteria_of(kind: str) -> dict[str, Criterion]:
 def scores(measurement: Measurement) -> dict[str, float]:
     """How far the measurement meets every criterion of its kind, 0 to 1, by name."""
     return {name: criterion(measurement) for name, criterion in criteria_of(measurement.kind).items()}
+
+
+def refuted(measurement: Measurement) -> str:
+    """Why a hypothesis is no closure however probable, or nothing."""
+    if measurement.misfit > const.MAX_MISFIT:
+        return f"surfaces are {measurement.misfit:.0f} times their noise apart"
+    return "another pose fits as well" if measurement.runner_up < const.MIN_RUNNER_UP else ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,8 +81,8 @@ def search(match: PreparedScan, turned: TurnedSurroundings) -> list[Fit]:
     fits = []
     for index, row, column in _peaks(_correlate(around, turned.spectra(wanted)), wanted, const.PEAKS):
         shift = (np.array([row, column]) - const.AROUND_SHIFT) * turned.cell_m
-        level = settle(around, turned.around, float(const.ALL_HEADINGS[index]), shift)
-        fits.append(scout(match, turned.scan, unlevelled(match, turned.scan, level)))
+        guess = settled(match, turned.scan, turned.cell_m, float(const.ALL_HEADINGS[index]), shift)
+        fits.append(scout(match, turned.scan, guess))
     return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
 
 
@@ -108,7 +108,7 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     found = []
     for _, row, column in _peaks(volumes, np.zeros(1, np.intp), const.ALTERNATIVES):
         shift = (np.array([row, column]) - const.AROUND_SHIFT) * cell_m
-        guess = unlevelled(match, query, settle(theirs, ours, turn, shift))
+        guess = settled(match, query, cell_m, turn, shift)
         found.append(draw(match, query.scouts_cloud, guess, const.SCOUT_REACH * cell_m, const.SCOUT_STEPS))
     return found
 
@@ -147,6 +147,11 @@ def _peaks(
             beside = np.arange(heading - 1, heading + 2) % len(every)
             taken[beside, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = True
     return peaks
+
+
+def settled(match: PreparedScan, query: PreparedScan, cell_m: float, heading: float, shift: Array) -> Array:
+    """`match_T_query` of a planar fit, rad and (2,) m between the upright frames, with the height and tilt it needs."""
+    return unlevelled(match, query, settle(match.around(cell_m), query.around(cell_m), heading, shift))
 
 
 def settle(match: Surroundings, query: Surroundings, heading: float, shift: Array) -> Array:

@@ -12,7 +12,7 @@ from umf_ros.config import Verification
 from umf_ros.frames import Candidate, Keyframe, LoopClosure, Points
 from umf_ros.geometry import heading
 from umf_ros.verification import constants as const
-from umf_ros.verification.acceptance import load_acceptance
+from umf_ros.verification.acceptance import load_acceptance, refuted
 from umf_ros.verification.all_round import TurnedSurroundings
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, find_hypotheses
 from umf_ros.verification.measurement import AlignedHypothesis, Measurement, beside, measure, measure_candidate
@@ -204,12 +204,10 @@ class Verifier:
         if judged.probability < self._threshold:
             below = f"probability {judged.probability:.2f} is below {self._threshold:g}"
             return ": ".join(filter(None, (below, judged.measurement.discord)))
-        if judged.measurement.misfit > const.MAX_MISFIT:
-            return f"surfaces are {judged.measurement.misfit:.0f} times their noise apart"
+        if reason := refuted(judged.measurement):
+            return reason
         if strange := self._acceptance.unlike(judged.measurement):
             return f"unlike anything the decision was fitted on: {strange}"
-        if judged.measurement.runner_up < const.MIN_RUNNER_UP:
-            return "another pose fits as well"
         pose = judged.aligned.pose
         turn_deg, shift_m = abs(np.degrees(heading(pose))), float(np.linalg.norm(pose[:3, 3]))
         # a place is a position and a view [UMF 5.1.2]: whoever looks elsewhere is somewhere else

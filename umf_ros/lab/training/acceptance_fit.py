@@ -17,8 +17,7 @@ from scipy.stats import chi2
 from umf_ros.geometry import Array
 from umf_ros.lab.training.acceptance_examples import Example
 from umf_ros.runs.honesty import normalised_errors, share_inside
-from umf_ros.verification import constants as const
-from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, scores
+from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, refuted, scores
 from umf_ros.verification.measurement import IMAGE, SCAN
 from umf_ros.verification.registration import CovarianceModel, covariance_of
 
@@ -88,14 +87,9 @@ def fit_decision(examples: list[Example], kind: str, threshold: float) -> tuple[
     mine = [example for example in examples if example.measurement.kind == kind]
     odds = left_out_odds(mine, kind)
     model = fit_logistic(mine, kind)
-    wrong = np.array([not (one.right or refused_anyway(one)) for one in mine], bool)
+    wrong = np.array([not (one.right or refuted(one.measurement)) for one in mine], bool)
     safe = made_safe(model, odds[wrong], threshold)
     return safe, odds + safe.bias - model.bias
-
-
-def refused_anyway(example: Example) -> bool:
-    """Whether verification refuses it, however probable: it has a rival, or its surfaces do not coincide."""
-    return example.measurement.runner_up < const.MIN_RUNNER_UP or example.measurement.misfit > const.MAX_MISFIT
 
 
 def fit_without(examples: list[Example], kind: str, domain: str) -> Logistic:
