@@ -30,6 +30,7 @@ COMMANDS = {
     "train": "umf_ros.lab.commands.train",
     "adapt": "umf_ros.lab.commands.adapt",
     "export": "umf_ros.lab.commands.export",
+    "bench": "umf_ros.lab.commands.bench",
     "doctor": "umf_ros.commands.doctor",
     "pretrain": "umf_ros.lab.commands.pretrain",
     "graph": "umf_ros.lab.commands.graph",
