@@ -13,7 +13,7 @@ import typer
 
 from umf_ros import __version__
 from umf_ros.errors import UmfError
-from umf_ros.resources import LAB_PACKAGES
+from umf_ros.resources import FLEET_PACKAGES, LAB_PACKAGES
 
 COMMANDS = {
     "demo": "umf_ros.lab.commands.demo",
@@ -78,6 +78,8 @@ def _what_helps(package: str) -> str:
     """Where a missing package comes from."""
     if package in LAB_PACKAGES:
         return "the lab needs it: pip install 'umf_ros[lab]'"
+    if package in FLEET_PACKAGES:
+        return "pip install 'umf_ros[fleet]' brings it"
     return "umf doctor says what helps"
 
 

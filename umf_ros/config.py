@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import PydanticCustomError
 
 from umf_ros.errors import ConfigError, either
 from umf_ros.resources import DEFAULT_DATASET, dataset_names, find
@@ -29,6 +30,13 @@ def _known(name: str) -> str:
         find("config/datasets")  # a broken installation lacks them all
         raise ValueError(f"Input should be {either([repr(one) for one in names])}")
     return name
+
+
+def _without_password(address: str) -> str:
+    if "password" in address.lower() or (":" in address.partition("://")[2].partition("@")[0] and "@" in address):
+        # not repeated by whoever tells this, and never written beside the results
+        raise PydanticCustomError("secret", "the password belongs into ~/.pgpass or PGPASSWORD, not into the address")
+    return address
 
 
 Dataset = Annotated[str, AfterValidator(_known)]
@@ -198,6 +206,16 @@ class Database(Group):
 
     path: str = Field("", description="file to keep places in, loaded when it exists; empty: a temporary file")
     cached_keyframes: int = Field(400, ge=20, description="keyframes whose local features stay in memory")
+    backend: Literal["sqlite", "postgres"] = Field(
+        "sqlite",
+        description="postgres: what is kept here goes to a fleet's server too, and others' places are asked for",
+    )
+    server: Annotated[str, AfterValidator(_without_password)] = Field(
+        "", description="of a fleet, postgresql://ROVER@HOST/DATABASE; the password is in ~/.pgpass or PGPASSWORD"
+    )
+    fleet_candidates: int = Field(
+        5, ge=1, le=50, description="places of other rovers handed to verification, of each keyframe"
+    )
 
 
 class WorkerSettings(Group):
@@ -322,4 +340,6 @@ def _explain(problem: Any) -> str:
         return f"unknown parameter {name}"
     if problem["type"] == "missing":
         return f"{name} is missing"
+    if problem["type"] == "secret":
+        return f"{name}: {text}"
     return f"{name}: {text[0].lower()}{text[1:]} (got {problem['input']!r})"

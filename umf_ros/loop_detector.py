@@ -8,17 +8,21 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from umf_ros.config import Settings
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.depth import lift
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.errors import OutputError
+from umf_ros.errors import ConfigError, OutputError, UmfError
 from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure
 from umf_ros.keyframes import KeyframeSelector
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
 from umf_ros.verification import NO_DEPTH, Verdict, Verifier, thin_frame
+
+if TYPE_CHECKING:
+    from umf_ros.fleet.meetings import Meeting, Meetings
 
 logger = logging.getLogger(__name__)
 NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
@@ -58,6 +62,10 @@ class LoopDetector:
         settings: all settings.
         embedder: the network.
 
+    Attributes:
+        database: the rover's places.
+        meetings: with other rovers of a fleet; None of a rover on its own.
+
     Raises:
         UmfError: the place database of the settings belongs to another embedder.
     """
@@ -68,6 +76,7 @@ class LoopDetector:
         self._embedder = embedder
         self._verifier = Verifier(settings.verification)
         self.database = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
+        self.meetings = _meetings(settings, self.database, embedder)
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
         self._session: int | None = None
         self._stored_session = self.database.next_session
@@ -146,7 +155,9 @@ class LoopDetector:
             OutputError: the disk is full.
         """
         if not stored:
-            self.database.add(keyframe)
+            row = self.database.add(keyframe)
+            if self.meetings is not None:
+                self.meetings.link.remembered(row)
         self._submaps.remember(keyframe)
 
     def resume(self, frame: Frame) -> bool:
@@ -161,6 +172,16 @@ class LoopDetector:
         if known is not None:
             self._submaps.remember(self._go_on_from(frame, known))
         return True
+
+    def meet(self) -> Meeting | None:
+        """Verify what a fleet's server found for an earlier keyframe, if there is anything new."""
+        return self.meetings.next() if self.meetings is not None else None
+
+    def close(self) -> None:
+        """Leave the fleet's server, and release the database."""
+        if self.meetings is not None:
+            self.meetings.close()
+        self.database.close()
 
     def end_session(self) -> None:
         """End the session: the next frame begins a new one; every place is kept."""
@@ -213,6 +234,24 @@ def make_keyframe(frame: Frame, embedder: Embedder, travelled_m: float = float("
         body_T_lidar=frame.body_T_lidar,
         motion=motion,
     )
+
+
+def _meetings(settings: Settings, database: PlaceDatabase, embedder: Embedder) -> Meetings | None:
+    """The way to other rovers' places, where there is a fleet; what it takes is imported only then.
+
+    Raises:
+        ConfigError: the settings name no server.
+        UmfError: what it takes is not installed.
+    """
+    if settings.database.backend == "sqlite":
+        return None
+    if not settings.database.server:
+        raise ConfigError("database.backend: postgres needs database.server")
+    try:
+        from umf_ros.fleet.meetings import Meetings
+    except ModuleNotFoundError as error:
+        raise UmfError(f"{error.name} is not installed; database.backend: postgres needs umf_ros[fleet]") from None
+    return Meetings(settings, database.store, (embedder.name, embedder.dimension))
 
 
 def make_detector_embedder(settings: Settings) -> Embedder:

@@ -20,7 +20,9 @@ def units(rng: np.random.Generator, count: int, dimension: int = 32) -> np.ndarr
 def along_drives(rng: np.random.Generator, count: int, dimension: int = 32) -> np.ndarray:
     """Neighbours are alike, and few directions say most."""
     spread = 1 / np.arange(1, dimension + 1)
-    rows = np.cumsum(rng.standard_normal((count, dimension)), axis=0) % 40 * spread + 0.3 * rng.standard_normal(dimension)
+    rows = np.cumsum(rng.standard_normal((count, dimension)), axis=0) % 40 * spread + 0.3 * rng.standard_normal(
+        dimension
+    )
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 

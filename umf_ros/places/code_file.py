@@ -56,8 +56,7 @@ class CodeFile:
         if count > len(keys) or not self._agrees(records, keys, fetch):
             logger.warning("%s does not belong to the places as they are now; it is made anew", self._path)
             return 0
-        for first in range(0, count, BATCH):
-            table.load(records[first : first + BATCH])
+        table.load(records)
         self._saved = count
         return count
 

@@ -34,6 +34,7 @@ class PlaceDatabase:
         dimension: numbers per descriptor.
 
     Attributes:
+        store: the keyframes.
         search: finds descriptors.
 
     Raises:
@@ -43,41 +44,41 @@ class PlaceDatabase:
     def __init__(self, settings: Database, embedder: str, dimension: int) -> None:
         path = Path(settings.path) if settings.path else None
         identity = {"embedder": embedder, "dimension": str(dimension)}
-        self._store = KeyframeStore(path, identity, settings.cached_keyframes)
-        self.search = PlaceSearch(self._store, dimension)
+        self.store = KeyframeStore(path, identity, settings.cached_keyframes, settings.backend == "postgres")
+        self.search = PlaceSearch(self.store, dimension)
 
     def __len__(self) -> int:
-        return len(self._store)
+        return len(self.store)
 
     def __getitem__(self, index: int) -> Keyframe:
-        return self._store[index]
+        return self.store[index]
 
     def index_of(self, stamp_ns: int, session: int) -> int | None:
         """Index of a keyframe by its key; None when it is not there."""
-        sessions = self._store.keys["session"]
-        return next((row for row in reversed(self._store.rows_at(stamp_ns)) if sessions[row] == session), None)
+        sessions = self.store.keys["session"]
+        return next((row for row in reversed(self.store.rows_at(stamp_ns)) if sessions[row] == session), None)
 
     def newest_at(self, stamp_ns: int) -> int | None:
         """Index of the newest keyframe of a stamp; None when there is none."""
-        return next(reversed(self._store.rows_at(stamp_ns)), None)
+        return next(reversed(self.store.rows_at(stamp_ns)), None)
 
     def recognise(self, keyframe: Keyframe) -> int | None:
         """Index of the same measurement, stored before, as when a recording is played again; or None."""
-        rows = self._store.rows_at(keyframe.stamp_ns)
+        rows = self.store.rows_at(keyframe.stamp_ns)
         if not rows:
             return None
-        similarity = self._store.descriptors(np.array(rows)) @ keyframe.embedding.descriptor
+        similarity = self.store.descriptors(np.array(rows)) @ keyframe.embedding.descriptor
         best = int(similarity.argmax())
         return rows[best] if similarity[best] >= SAME_KEYFRAME else None
 
     @property
     def next_session(self) -> int:
         """A session number no stored keyframe has."""
-        return int(self._store.keys["session"].max(initial=-1)) + 1
+        return int(self.store.keys["session"].max(initial=-1)) + 1
 
     def add(self, keyframe: Keyframe) -> int:
         """Remember a keyframe and return its index."""
-        row = self._store.add(keyframe)
+        row = self.store.add(keyframe)
         self.search.add(keyframe.embedding.descriptor)
         return row
 
@@ -88,7 +89,7 @@ class PlaceDatabase:
         the path than `min_travel_m`; where either path length is unknown, time alone decides. A place that was
         visited in many sessions does not crowd out the others.
         """
-        descriptor, stamps = keyframe.embedding.descriptor, self._store.keys["stamp_ns"]
+        descriptor, stamps = keyframe.embedding.descriptor, self.store.keys["stamp_ns"]
 
         def admissible(rows: Rows | slice) -> Mask:
             return self._admissible(keyframe, rules, rows)
@@ -103,22 +104,22 @@ class PlaceDatabase:
 
     def save(self, path: Path) -> None:
         """Write a copy of the database to `path`."""
-        self._store.save(path)
+        self.store.save(path)
 
     def close(self) -> None:
         """Release the file."""
         self.search.close()
-        self._store.close()
+        self.store.close()
 
     def _diverse(self, found: list[tuple[int, float]], count: int) -> list[tuple[int, float]]:
         """The best `count`, but of one place those of `VISITS` sessions only.
 
         Two keyframes of different sessions show one place when they are more like each other than like the query.
         """
-        sessions = self._store.keys["session"]
+        sessions = self.store.keys["session"]
         if len(found) <= count or len({int(sessions[row]) for row, _ in found}) <= VISITS:
             return found[:count]
-        descriptors = self._store.descriptors(np.array([row for row, _ in found]))
+        descriptors = self.store.descriptors(np.array([row for row, _ in found]))
         likeness = descriptors @ descriptors.T
         chosen: list[int] = []
         for position, (row, similarity) in enumerate(found):
@@ -131,7 +132,7 @@ class PlaceDatabase:
         return [found[position] for position in chosen]
 
     def _admissible(self, keyframe: Keyframe, rules: Loop, rows: Rows | slice) -> Mask:
-        keys = self._store.keys
+        keys = self.store.keys
         age_ns = keyframe.stamp_ns - keys["stamp_ns"][rows]
         way_m = keyframe.travelled_m - keys["travelled_m"][rows]
         return is_past(age_ns, way_m, rules, keys["session"][rows] == keyframe.session)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import sqlite3
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from umf_ros.errors import UmfError, writing
 from umf_ros.frames import Keyframe
 from umf_ros.locks import FileLock
 from umf_ros.places.columns import Columns
+from umf_ros.places.outbox import Outbox
 from umf_ros.places.packing import pack, unpack
 from umf_ros.places.schema import BY_STAMP, check_identity, prepare
 
@@ -38,22 +40,27 @@ class KeyframeStore:
             behind.
         identity: what must agree with a stored file, such as the embedder's name and dimension.
         cached: keyframes kept in memory.
+        outgoing: whether every keyframe has to be told to a fleet's server.
+
+    Attributes:
+        keys: of all keyframes.
 
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use.
         OutputError: the file cannot be written.
     """
 
-    def __init__(self, path: Path | None, identity: dict[str, str], cached: int) -> None:
+    def __init__(self, path: Path | None, identity: dict[str, str], cached: int, outgoing: bool = False) -> None:
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, Keyframe] = OrderedDict()
         self._cached = cached
         self.path = path
         self._dimension = int(identity["dimension"])
-        self.keys = Columns(**{name: kind for name, (kind, _) in (_KEYS.fields or {}).items()})
+        self.keys = Columns(**{name: _KEYS[name] for name in _KEYS.names or ()})
         self._file_lock: FileLock | None = None
         try:
             self._connection = self._open(identity)
+            self._outbox = Outbox(self._connection) if outgoing else None
         except BaseException:
             self._unlock()
             raise
@@ -119,9 +126,42 @@ class KeyframeStore:
             values = (row, *key.values(), descriptor, pack(keyframe))
             with writing(self._name, sqlite3.Error), self._connection:
                 self._connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?, ?)", values)
+                if self._outbox is not None:
+                    self._outbox.put(row)
             self.keys.append(id=row, **key)
             self._remember(row, keyframe)
             return len(self.keys) - 1
+
+    @property
+    def store_id(self) -> UUID:
+        """What names the file among all those of a rover; only where keyframes go to a fleet's server."""
+        return self._the_outbox.store
+
+    def outgoing(self, count: int) -> list[int]:
+        """Indices of the first keyframes that a fleet's server does not have yet."""
+        with self._lock, self._reading():
+            ids = self._the_outbox.oldest(count)
+        return [int(row) for row in np.searchsorted(self.keys["id"], ids)]
+
+    def waiting(self) -> int:
+        """How many these are."""
+        with self._lock, self._reading():
+            return len(self._the_outbox)
+
+    def delivered(self, rows: Sequence[int]) -> None:
+        """Take note that a fleet's server has some keyframes.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        with self._lock, writing(self._name, sqlite3.Error):
+            self._the_outbox.remove(self.keys["id"][list(rows)].tolist())
+
+    @property
+    def _the_outbox(self) -> Outbox:
+        if self._outbox is None:
+            raise ValueError("this store tells no server")
+        return self._outbox
 
     def save(self, path: Path) -> None:
         """Write a copy to `path` while the store stays in use.
