@@ -35,6 +35,7 @@ COMMANDS = {
     "pretrain": "umf_ros.lab.commands.pretrain",
     "graph": "umf_ros.lab.commands.graph",
     "places": "umf_ros.commands.places",
+    "fleet": "umf_ros.commands.fleet",
 }
 """The module of every subcommand, by name: those of the lab are known here by their names alone."""
 

@@ -32,9 +32,9 @@ def _known(name: str) -> str:
     return name
 
 
-def _without_password(address: str) -> str:
+def without_password(address: str) -> str:
+    """The address of a server, unless it holds a password, which would be written beside the results."""
     if "password" in address.lower() or (":" in address.partition("://")[2].partition("@")[0] and "@" in address):
-        # not repeated by whoever tells this, and never written beside the results
         raise PydanticCustomError("secret", "the password belongs into ~/.pgpass or PGPASSWORD, not into the address")
     return address
 
@@ -210,7 +210,7 @@ class Database(Group):
         "sqlite",
         description="postgres: what is kept here goes to a fleet's server too, and others' places are asked for",
     )
-    server: Annotated[str, AfterValidator(_without_password)] = Field(
+    server: Annotated[str, AfterValidator(without_password)] = Field(
         "", description="of a fleet, postgresql://ROVER@HOST/DATABASE; the password is in ~/.pgpass or PGPASSWORD"
     )
     fleet_candidates: int = Field(
