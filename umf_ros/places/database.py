@@ -32,6 +32,7 @@ class PlaceDatabase:
         settings: where to keep the keyframes.
         embedder: name of the embedder; a stored database of another one is refused.
         dimension: numbers per descriptor.
+        read_only: leave the file as it is, and to whoever else reads it.
 
     Attributes:
         store: the keyframes.
@@ -41,10 +42,11 @@ class PlaceDatabase:
         UmfError: the file is no place database, belongs to another embedder, or is in use.
     """
 
-    def __init__(self, settings: Database, embedder: str, dimension: int) -> None:
+    def __init__(self, settings: Database, embedder: str, dimension: int, read_only: bool = False) -> None:
         path = Path(settings.path) if settings.path else None
         identity = {"embedder": embedder, "dimension": str(dimension)}
-        self.store = KeyframeStore(path, identity, settings.cached_keyframes, settings.backend == "postgres")
+        outgoing = settings.backend == "postgres" and not read_only
+        self.store = KeyframeStore(path, identity, settings.cached_keyframes, read_only, outgoing)
         self.search = PlaceSearch(self.store, dimension)
 
     def __len__(self) -> int:
@@ -82,17 +84,22 @@ class PlaceDatabase:
         self.search.add(keyframe.embedding.descriptor)
         return row
 
-    def query(self, keyframe: Keyframe, rules: Loop) -> list[Candidate]:
+    def query(self, keyframe: Keyframe, rules: Loop, sessions: range | None = None) -> list[Candidate]:
         """The most similar earlier places, best first.
 
         Keyframes must be older than `min_time_gap_s`, and those of the same session further back along
         the path than `min_travel_m`; where either path length is unknown, time alone decides. A place that was
         visited in many sessions does not crowd out the others.
+
+        Args:
+            keyframe: what is looked for.
+            rules: which places may be candidates.
+            sessions: look among the places of these sessions, whatever their age.
         """
         descriptor, stamps = keyframe.embedding.descriptor, self.store.keys["stamp_ns"]
 
         def admissible(rows: Rows | slice) -> Mask:
-            return self._admissible(keyframe, rules, rows)
+            return self._admissible(keyframe, rules, rows) if sessions is None else self._of_sessions(sessions, rows)
 
         for wanted in (2 * rules.top_k, WIDER * rules.top_k):
             found = self.search(descriptor, wanted, admissible)
@@ -136,3 +143,7 @@ class PlaceDatabase:
         age_ns = keyframe.stamp_ns - keys["stamp_ns"][rows]
         way_m = keyframe.travelled_m - keys["travelled_m"][rows]
         return is_past(age_ns, way_m, rules, keys["session"][rows] == keyframe.session)
+
+    def _of_sessions(self, sessions: range, rows: Rows | slice) -> Mask:
+        numbers = self.store.keys["session"][rows]
+        return np.asarray((numbers >= sessions.start) & (numbers < sessions.stop))

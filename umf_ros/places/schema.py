@@ -8,7 +8,6 @@ import sqlite3
 from umf_ros.errors import UmfError
 
 SCHEMA_VERSION = 3
-BY_STAMP = "keyframe_by_stamp"
 _TABLES = (
     "CREATE TABLE about (content TEXT NOT NULL)",
     # the blob comes last: whoever wants the columns before it does not read it
@@ -17,7 +16,7 @@ _TABLES = (
 )
 _ADDED = (
     # holds all that is wanted of every keyframe at once, on a hundredth of the pages
-    f"CREATE INDEX IF NOT EXISTS {BY_STAMP} ON keyframe (stamp_ns, session, travelled_m)",
+    "CREATE INDEX IF NOT EXISTS keyframe_by_stamp ON keyframe (stamp_ns, session, travelled_m)",
 )
 """What later versions have added, in order; a file of an older one gets it when it is opened."""
 

@@ -120,7 +120,7 @@ class PlaceSearch:
             self._builder.start(self._table)
 
     def _save(self, last: bool = False) -> None:
-        if self._file is None or not len(self._table):
+        if self._file is None or self._store.read_only or not len(self._table):
             return
         self._file.save(self._table, self._store.keys)
         cells = self._approximate

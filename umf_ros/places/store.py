@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from uuid import UUID
@@ -20,7 +20,7 @@ from umf_ros.locks import FileLock
 from umf_ros.places.columns import Columns
 from umf_ros.places.outbox import Outbox
 from umf_ros.places.packing import pack, unpack
-from umf_ros.places.schema import BY_STAMP, check_identity, prepare
+from umf_ros.places.schema import check_identity, prepare
 
 Keys = Columns
 """`id` in the file, `stamp_ns`, `session` and `travelled_m` of every keyframe; metres are NaN without odometry."""
@@ -40,26 +40,31 @@ class KeyframeStore:
             behind.
         identity: what must agree with a stored file, such as the embedder's name and dimension.
         cached: keyframes kept in memory.
+        read_only: the file is there and stays as it is, whoever else has it.
         outgoing: whether every keyframe has to be told to a fleet's server.
 
     Attributes:
+        path: the file, or None.
         keys: of all keyframes.
+        read_only: as above.
 
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use.
         OutputError: the file cannot be written.
     """
 
-    def __init__(self, path: Path | None, identity: dict[str, str], cached: int, outgoing: bool = False) -> None:
+    def __init__(
+        self, path: Path | None, identity: dict[str, str], cached: int, read_only: bool = False, outgoing: bool = False
+    ) -> None:
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, Keyframe] = OrderedDict()
         self._cached = cached
-        self.path = path
+        self.path, self.read_only = path, read_only
         self._dimension = int(identity["dimension"])
         self.keys = Columns(**{name: _KEYS[name] for name in _KEYS.names or ()})
         self._file_lock: FileLock | None = None
         try:
-            self._connection = self._open(identity)
+            self._connection = self._open_to_read(identity) if read_only else self._open(identity)
             self._outbox = Outbox(self._connection) if outgoing else None
         except BaseException:
             self._unlock()
@@ -109,7 +114,7 @@ class KeyframeStore:
             UmfError: the file is damaged.
         """
         with self._lock, self._reading():
-            statement = f"SELECT id FROM keyframe INDEXED BY {BY_STAMP} WHERE stamp_ns = ? ORDER BY id"
+            statement = "SELECT id FROM keyframe WHERE stamp_ns = ? ORDER BY id"
             ids = [one for (one,) in self._connection.execute(statement, (stamp_ns,))]
         return [int(row) for row in np.searchsorted(self.keys["id"], ids)]
 
@@ -208,11 +213,20 @@ class KeyframeStore:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
             # without a name SQLite keeps a file that no folder lists
             connection = sqlite3.connect(self.path or "", check_same_thread=False)
+        self._take_up(connection, lambda: self._prepare(connection, identity))
+        return connection
+
+    def _open_to_read(self, identity: dict[str, str]) -> sqlite3.Connection:
+        if self.path is None or not self.path.is_file():
+            raise UmfError(f"there is no place database {self.path}")
+        connection = sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
+        self._take_up(connection, lambda: check_identity(connection, self._name, identity))
+        return connection
+
+    def _take_up(self, connection: sqlite3.Connection, check: Callable[[], None]) -> None:
+        """Number the keyframes of a file that passes a check; what does not is closed."""
         try:
-            check_identity(connection, self._name, identity)
-            if self.path is not None:
-                self._file_lock = FileLock(self.path)
-            prepare(connection, identity)
+            check()
             self._read_keys(connection)
         except UmfError:
             connection.close()
@@ -220,11 +234,17 @@ class KeyframeStore:
         except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
             connection.close()
             raise UmfError(f"{self._name} cannot be used as a place database: {error}") from None
-        return connection
+
+    def _prepare(self, connection: sqlite3.Connection, identity: dict[str, str]) -> None:
+        """Look at what is there before anything is changed, and let nobody else write from then on."""
+        check_identity(connection, self._name, identity)
+        if self.path is not None:
+            self._file_lock = FileLock(self.path)
+        prepare(connection, identity)
 
     def _read_keys(self, connection: sqlite3.Connection) -> None:
         # SQLite keeps a NaN as NULL; 9e999 is infinity
-        columns = f"SELECT id, stamp_ns, session, ifnull(travelled_m, 9e999) FROM keyframe INDEXED BY {BY_STAMP}"
+        columns = "SELECT id, stamp_ns, session, ifnull(travelled_m, 9e999) FROM keyframe"
         keys = np.fromiter(connection.execute(columns), _KEYS)
         keys = keys[np.argsort(keys["id"])]
         keys["travelled_m"][np.isinf(keys["travelled_m"])] = np.nan

@@ -141,8 +141,8 @@ def measure_store(path: Path, seed: int) -> StoreFigures:
     disk = sum(file.stat().st_size for file in path.parent.iterdir())
     exact = places.search.is_exact
     places.close()
-    ram, disk = used / len(places), disk / len(places)
-    return StoreFigures(query_ms, query_cpu_ms, open_s, open_cpu_s, ram, disk, recall, exact)
+    size = len(places)
+    return StoreFigures(query_ms, query_cpu_ms, open_s, open_cpu_s, used / size, disk / size, recall, exact)
 
 
 def _ask(places: PlaceDatabase, rng: np.random.Generator) -> tuple[float, float, float]:
