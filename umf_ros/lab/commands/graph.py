@@ -122,10 +122,8 @@ def _compare(console: Console, graph: PoseGraph, recording: GraphRecording) -> N
     for when, path in (("before", graph.odometry()[1]), ("after", after)):
         found = np.linalg.inv(path[ends[same, 0]]) @ path[ends[same, 1]]
         gap = np.linalg.norm((found - told)[:, :3, 3], axis=1)
-        console.print(
-            f"{when + ':':8}accepted closures are off by {np.median(gap):.3g} m in the median, {gap.max():.3g} m at most",
-            highlight=False,
-        )
+        off = f"off by {np.median(gap):.3g} m in the median, {gap.max():.3g} m at most"
+        console.print(f"{when + ':':8}accepted closures are {off}", highlight=False)
 
 
 def _row(verdict: ClosureVerdict, recording: GraphRecording) -> list[str]:
