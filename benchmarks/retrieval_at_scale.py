@@ -15,8 +15,10 @@ with as much noise as tells two scans of one place apart.
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -30,7 +32,8 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.config import Settings
+from umf_ros.config import EmbeddingSettings, Settings
+from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.errors import BagError
 from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure
@@ -53,11 +56,6 @@ class Method:
     embedder: str = "umf"
     camera: bool = True
     lidar: bool = True
-
-    def settings(self, base: Settings) -> Settings:
-        """The settings of a recording with this method."""
-        embedding = base.embedding.model_copy(update={"method": self.embedder})
-        return base.model_copy(update={"embedding": embedding})
 
     def seen(self, frame: Frame) -> Frame:
         """What is embedded of a frame; all of it is still verified."""
@@ -100,34 +98,33 @@ class CrowdedDetector(LoopDetector):
 
 
 class Recording:
-    """The keyframes of a recording, embedded once for every size of the crowd."""
+    """The keyframes of a recording, and the descriptors that every method makes of them."""
 
-    def __init__(self, bag: Path, method: Method) -> None:
+    def __init__(self, bag: Path, embedders: dict[Method, Embedder]) -> None:
         source = open_bag(bag)
-        shipped = settings_for(source, None, "auto")
-        self.settings = method.settings(shipped)
+        self._settings = settings_for(source, None, "auto")
         truth = read_ground_truth(source)
         if truth is None or not truth.has_orientation:
             raise BagError(f"{bag} holds no ground truth with orientations")
         self._truth: Trajectory = truth
-        self.embedder = make_detector_embedder(self.settings)
+        self._embedders = embedders
+        self._descriptors: dict[Method, list[Array]] = {method: [] for method in embedders}
         self._keyframes: list[tuple[Frame, Keyframe]] = []
-        detector = LoopDetector(shipped, make_detector_embedder(shipped))
-        for frame in FrameReader(source, shipped):
+        detector = LoopDetector(self._settings, make_detector_embedder(self._settings))
+        for frame in FrameReader(source, self._settings):
             if detector.select(frame):
-                keyframe = detector.embed(frame)
-                descriptor = self.embedder.embed(method.seen(frame)).descriptor
-                frame = replace(frame, left=None, right=None, points=None, intensity=None, motion=None)
-                self._keyframes.append(
-                    (frame, replace(keyframe, embedding=replace(keyframe.embedding, descriptor=descriptor)))
-                )
+                bare = replace(frame, left=None, right=None, points=None, intensity=None, motion=None)
+                self._keyframes.append((bare, detector.embed(frame)))
+                for method, embedder in embedders.items():
+                    self._descriptors[method].append(embedder.embed(method.seen(frame)).descriptor)
 
-    def closed(self, crowd: Array) -> float:
+    def closed(self, method: Method, crowd: Array) -> float:
         """Share of the revisits of any heading that got a right closure beside a crowd of places."""
-        detector = CrowdedDetector(self.settings, self.embedder, crowd)
+        detector = CrowdedDetector(self._settings, self._embedders[method], crowd)
         closures: list[LoopClosure] = []
-        for frame, keyframe in self._keyframes:
+        for (frame, whole), descriptor in zip(self._keyframes, self._descriptors[method], strict=True):
             detector.select(frame)
+            keyframe = replace(whole, embedding=replace(whole.embedding, descriptor=descriptor))
             verdicts = detector.look_around(keyframe, detector.verify(keyframe, detector.query(keyframe)))
             closures += [verdict.closure for verdict in verdicts if verdict.closure is not None]
             detector.remember(keyframe)
@@ -138,7 +135,7 @@ class Recording:
         poses, known = self._truth.at(stamps)
         travelled = np.array([keyframe.travelled_m for _, keyframe in self._keyframes])
         again = stamps[known][
-            find_revisits(stamps[known], poses[known], travelled[known], self.settings.loop, same_view=False)
+            find_revisits(stamps[known], poses[known], travelled[known], self._settings.loop, same_view=False)
         ]
         true = {closure.query_stamp_ns for closure in closures if self._is_true(closure)}
         return float(np.isin(again, list(true)).mean()) if len(again) else float("nan")
@@ -156,7 +153,7 @@ def other_places(worlds: int, quick: bool) -> Iterator[tuple[int, Frame]]:
                 yield seed, visit.frame
 
 
-def crowd_of(known: Array, worlds: Array, count: int, seed: int = 0) -> Array:
+def crowd_of(known: Array, worlds: Array, count: int = PLACES[-1], seed: int = 0) -> Array:
     """(count, D) float32 unit descriptors: the known ones, and as many more between neighbours on a trail."""
     rng = np.random.default_rng(seed)
     neighbours = np.flatnonzero(worlds[1:] == worlds[:-1])
@@ -181,21 +178,22 @@ def main(
     places = (PLACES[0], PLACES[-1]) if quick else PLACES
     elsewhere = list(other_places(2 if quick else 12, quick))
     worlds = np.array([world for world, _ in elsewhere])
-    figures: dict[str, float] = {}
-    for method in (one for one in METHODS if only in one.name):
-        shares: dict[int, list[float]] = {count: [] for count in places}
-        for bag in bags:
-            recording = Recording(bag, method)
-            known = np.stack([recording.embedder.embed(method.seen(frame)).descriptor for _, frame in elsewhere])
-            crowd = crowd_of(known, worlds, max(places))
-            for count in places:
-                shares[count].append(recording.closed(crowd[:count]))
-                console.print(f"{method.name} {bag.stem} beside {count} places: {shares[count][-1]:.3f} closed")
-        figures |= {f"{method.name}.closed_{count}": float(np.mean(found)) for count, found in shares.items()}
+    chosen = [method for method in METHODS if only in method.name]
+    embedders = {method: make_embedder(EmbeddingSettings(method=method.embedder)) for method in chosen}
+    crowds = {
+        method: crowd_of(np.stack([embedder.embed(method.seen(frame)).descriptor for _, frame in elsewhere]), worlds)
+        for method, embedder in embedders.items()
+    }
+    shares: dict[tuple[Method, int], list[float]] = defaultdict(list)
+    for bag in bags:
+        recording = Recording(bag, embedders)
+        for method, count in product(embedders, places):
+            shares[method, count].append(recording.closed(method, crowds[method][:count]))
+            console.print(f"{method.name} {bag.stem} beside {count} places: {shares[method, count][-1]:.3f} closed")
+    figures = {f"{method.name}.closed_{count}": float(np.mean(found)) for (method, count), found in shares.items()}
     table = Table("method", *(f"{count:,} places" for count in places), title="revisits closed, any heading", box=None)
-    for method in METHODS:
-        if f"{method.name}.closed_0" in figures:
-            table.add_row(method.name, *(f"{figures[f'{method.name}.closed_{count}']:.3f}" for count in places))
+    for method in embedders:
+        table.add_row(method.name, *(f"{figures[f'{method.name}.closed_{count}']:.3f}" for count in places))
     console.print(table)
     if json_file:
         json_file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
