@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import PydanticCustomError
 
 from umf_ros.errors import ConfigError, either
 from umf_ros.resources import DEFAULT_DATASET, dataset_names, find
@@ -32,10 +31,14 @@ def _known(name: str) -> str:
     return name
 
 
+class SecretError(ValueError):
+    """A value that must not be repeated."""
+
+
 def without_password(address: str) -> str:
     """The address of a server, unless it holds a password, which would be written beside the results."""
     if "password" in address.lower() or (":" in address.partition("://")[2].partition("@")[0] and "@" in address):
-        raise PydanticCustomError("secret", "the password belongs into ~/.pgpass or PGPASSWORD, not into the address")
+        raise SecretError("the password belongs into ~/.pgpass or PGPASSWORD, not into the address")
     return address
 
 
@@ -340,6 +343,6 @@ def _explain(problem: Any) -> str:
         return f"unknown parameter {name}"
     if problem["type"] == "missing":
         return f"{name} is missing"
-    if problem["type"] == "secret":
+    if isinstance(problem.get("ctx", {}).get("error"), SecretError):
         return f"{name}: {text}"
     return f"{name}: {text[0].lower()}{text[1:]} (got {problem['input']!r})"

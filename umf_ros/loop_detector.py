@@ -22,7 +22,7 @@ from umf_ros.submaps import SubmapFinder
 from umf_ros.verification import NO_DEPTH, Verdict, Verifier, thin_frame
 
 if TYPE_CHECKING:
-    from umf_ros.fleet.meetings import Meeting, Meetings
+    from umf_ros.fleet.encounters import Encounter, Encounters
 
 logger = logging.getLogger(__name__)
 NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
@@ -64,7 +64,7 @@ class LoopDetector:
 
     Attributes:
         database: the rover's places.
-        meetings: with other rovers of a fleet; None of a rover on its own.
+        encounters: with other rovers of a fleet; None of a rover on its own.
 
     Raises:
         UmfError: the place database of the settings belongs to another embedder.
@@ -76,7 +76,7 @@ class LoopDetector:
         self._embedder = embedder
         self._verifier = Verifier(settings.verification)
         self.database = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
-        self.meetings = _meetings(settings, self.database, embedder)
+        self.encounters = _encounters(settings, self.database, embedder)
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
         self._session: int | None = None
         self._stored_session = self.database.next_session
@@ -156,8 +156,8 @@ class LoopDetector:
         """
         if not stored:
             row = self.database.add(keyframe)
-            if self.meetings is not None:
-                self.meetings.link.remembered(row)
+            if self.encounters is not None:
+                self.encounters.link.remembered(row)
         self._submaps.remember(keyframe)
 
     def resume(self, frame: Frame) -> bool:
@@ -173,14 +173,14 @@ class LoopDetector:
             self._submaps.remember(self._go_on_from(frame, known))
         return True
 
-    def meet(self) -> Meeting | None:
+    def meet(self) -> Encounter | None:
         """Verify what a fleet's server found for an earlier keyframe, if there is anything new."""
-        return self.meetings.next() if self.meetings is not None else None
+        return self.encounters.next() if self.encounters is not None else None
 
     def close(self) -> None:
         """Leave the fleet's server, and release the database."""
-        if self.meetings is not None:
-            self.meetings.close()
+        if self.encounters is not None:
+            self.encounters.close()
         self.database.close()
 
     def end_session(self) -> None:
@@ -236,7 +236,7 @@ def make_keyframe(frame: Frame, embedder: Embedder, travelled_m: float = float("
     )
 
 
-def _meetings(settings: Settings, database: PlaceDatabase, embedder: Embedder) -> Meetings | None:
+def _encounters(settings: Settings, database: PlaceDatabase, embedder: Embedder) -> Encounters | None:
     """The way to other rovers' places, where there is a fleet; what it takes is imported only then.
 
     Raises:
@@ -248,10 +248,10 @@ def _meetings(settings: Settings, database: PlaceDatabase, embedder: Embedder) -
     if not settings.database.server:
         raise ConfigError("database.backend: postgres needs database.server")
     try:
-        from umf_ros.fleet.meetings import Meetings
+        from umf_ros.fleet.encounters import Encounters
     except ModuleNotFoundError as error:
         raise UmfError(f"{error.name} is not installed; database.backend: postgres needs umf_ros[fleet]") from None
-    return Meetings(settings, database.store, (embedder.name, embedder.dimension))
+    return Encounters(settings, database.store, (embedder.name, embedder.dimension))
 
 
 def make_detector_embedder(settings: Settings) -> Embedder:

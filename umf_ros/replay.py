@@ -64,8 +64,8 @@ class Replay:
             self._recorder.record(item, detection)
             for closure in detection.closures:
                 self._graph.add_closure(closure)
-            while (meeting := self._detector.meet()) is not None:
-                self._recorder.record_meeting(meeting)
+            while (encounter := self._detector.meet()) is not None:
+                self._recorder.record_encounter(encounter)
             yield detection
             if detection.fault is not None:
                 raise detection.fault
@@ -86,9 +86,9 @@ class Replay:
 
     def finish(self, drops: Mapping[str, int]) -> bool:
         """Write the summary, and trajectories and graph where there was odometry; returns whether there was."""
-        if self._detector.meetings is not None:
-            for meeting in self._detector.meetings.rest(FLEET_PATIENCE_S):
-                self._recorder.record_meeting(meeting)
+        if self._detector.encounters is not None:
+            for encounter in self._detector.encounters.rest(FLEET_PATIENCE_S):
+                self._recorder.record_encounter(encounter)
         self._recorder.write_summary(drops)
         self._recorder.close()
         self._detector.close()

@@ -55,14 +55,13 @@ def add(server: Address, rover: Annotated[str, typer.Argument(help="Name of the 
 def _connected(server: str) -> Iterator[Connection]:
     """A connection whose faults are one line."""
     import psycopg
-    from pydantic_core import PydanticCustomError
 
-    from umf_ros.config import without_password
+    from umf_ros.config import SecretError, without_password
 
     try:
         with psycopg.connect(without_password(server), autocommit=True, connect_timeout=10) as connection:
             yield connection
-    except PydanticCustomError as error:
+    except SecretError as error:
         raise UmfError(str(error)) from None
     except psycopg.Error as error:
         raise UmfError(f"the server cannot do that: {' '.join(str(error).split())[:300]}") from None

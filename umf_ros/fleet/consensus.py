@@ -21,7 +21,7 @@ KEPT = 200
 """Closures that wait for confirmation, of each rover."""
 
 
-class Pair(NamedTuple):
+class EncounterPair(NamedTuple):
     """A closure between two rovers, with both its keyframes."""
 
     query: Keyframe
@@ -29,7 +29,7 @@ class Pair(NamedTuple):
     closure: LoopClosure
 
 
-class Consensus:
+class FleetConsensus:
     """Holds a closure between two rovers back until one of another place agrees with it.
 
     Within one rover the pose graph finds out which closures are wrong. Between two there is no common graph on board,
@@ -41,10 +41,10 @@ class Consensus:
 
     def __init__(self, drift: float) -> None:
         self._drift = drift
-        self._waiting: list[Pair] = []
-        self._confirmed: list[Pair] = []
+        self._waiting: list[EncounterPair] = []
+        self._confirmed: list[EncounterPair] = []
 
-    def confirm(self, pair: Pair) -> list[Pair]:
+    def confirm(self, pair: EncounterPair) -> list[EncounterPair]:
         """Take up a closure; returns those that are believed now and were not before."""
         believed = [other for other in self._waiting if self.agree(pair, other)]
         if not believed and not any(self.agree(pair, other) for other in self._confirmed):
@@ -55,7 +55,7 @@ class Consensus:
         self._confirmed = [*self._confirmed, *new][-KEPT:]
         return new
 
-    def agree(self, one: Pair, other: Pair) -> bool:
+    def agree(self, one: EncounterPair, other: EncounterPair) -> bool:
         """Whether the loop through two closures of different places and both odometries closes."""
         if one.query.session != other.query.session or one.match.session != other.match.session:
             return False

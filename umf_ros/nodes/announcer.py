@@ -22,7 +22,7 @@ from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS
 from umf_ros.verification import Verdict
 
 if TYPE_CHECKING:
-    from umf_ros.fleet.meetings import Meeting
+    from umf_ros.fleet.encounters import Encounter
 
 # RViz redraws every line it is sent: a rover that runs for days shows its latest ones
 MAX_LINES = 500
@@ -66,12 +66,14 @@ class Announcer:
             self._candidates.publish(report)
             self._draw(keyframe, detection.verdicts, matches)
 
-    def announce_meeting(self, meeting: Meeting) -> None:
+    def announce_encounter(self, encounter: Encounter) -> None:
         """Publish what was found of another rover's places: closures like any other, with the names of both rovers."""
-        for closure in meeting.closures:
-            self._closures.publish(conversions.closure_to_message(closure, meeting.own, meeting.robot))
-        report = DiagnosticArray(status=[_describe(meeting.keyframe, one, meeting.robot) for one in meeting.verdicts])
-        report.header.stamp = conversions.to_time(meeting.keyframe.stamp_ns)
+        for closure in encounter.closures:
+            self._closures.publish(conversions.closure_to_message(closure, encounter.own, encounter.robot))
+        report = DiagnosticArray(
+            status=[_describe(encounter.keyframe, one, encounter.robot) for one in encounter.verdicts]
+        )
+        report.header.stamp = conversions.to_time(encounter.keyframe.stamp_ns)
         self._candidates.publish(report)
 
     def wait_until_heard(self) -> None:

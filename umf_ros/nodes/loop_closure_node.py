@@ -32,7 +32,7 @@ from umf_ros.sensors.static_transforms import Mounting, OdometryFrames, StaticTr
 from umf_ros.sensors.synchronizer import Synchronizer
 
 if TYPE_CHECKING:
-    from umf_ros.fleet.meetings import Meeting
+    from umf_ros.fleet.encounters import Encounter
 
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
 INTAKE_QUEUE = 400
@@ -130,16 +130,16 @@ class LoopClosureNode(BaseNode):
         if self._recorder is not None:
             self._recorder.record(frame, detection)
         with self._lock:
-            meeting = self._detector.meet()
-        if meeting is not None:
-            self._meet(meeting)
+            encounter = self._detector.meet()
+        if encounter is not None:
+            self._meet(encounter)
 
-    def _meet(self, meeting: Meeting) -> None:
+    def _meet(self, encounter: Encounter) -> None:
         """Tell of the closures with another rover of the fleet."""
-        self._announcer.announce_meeting(meeting)
-        self._between += len(meeting.closures)
+        self._announcer.announce_encounter(encounter)
+        self._between += len(encounter.closures)
         if self._recorder is not None:
-            self._recorder.record_meeting(meeting)
+            self._recorder.record_encounter(encounter)
 
     def _drops(self) -> dict[str, int]:
         return count_drops(self._synchronizer.counters, self._worker.dropped + self._decoder.dropped)
@@ -178,9 +178,9 @@ class LoopClosureNode(BaseNode):
 
     def _fleet(self) -> dict[str, Any]:
         """How the fleet's server is doing, where there is one."""
-        if self._detector.meetings is None:
+        if self._detector.encounters is None:
             return {}
-        link = self._detector.meetings.link
+        link = self._detector.encounters.link
         known = {"fleet_connected": link.connected, "fleet_waiting": link.waiting(), "fleet_pushed": link.pushed}
         return {**known, "fleet_closures": self._between, "fleet_trouble": link.trouble or "none"}
 

@@ -26,7 +26,7 @@ from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
 if TYPE_CHECKING:
-    from umf_ros.fleet.meetings import Meeting
+    from umf_ros.fleet.encounters import Encounter
 
 COUNTS = ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected")
 STAGES = tables.STAGES
@@ -109,13 +109,13 @@ class RunRecorder:
         for stage, milliseconds in detection.latency_ms.items():
             self._latency[stage].append(milliseconds)
 
-    def record_meeting(self, meeting: Meeting) -> None:
+    def record_encounter(self, encounter: Encounter) -> None:
         """Write down the closures with another rover of a fleet."""
-        if not meeting.closures:
+        if not encounter.closures:
             return
         if self._between is None:
             self._between = tables.CsvTable(self.folder / "closures_between.csv", tables.CLOSURES_BETWEEN)
-        rows = [[meeting.robot, *tables.closure_row(closure, float("nan"))] for closure in meeting.closures]
+        rows = [[encounter.robot, *tables.closure_row(closure, float("nan"))] for closure in encounter.closures]
         self._between.append(rows)
 
     def count(self, frame: Frame) -> None:

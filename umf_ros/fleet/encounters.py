@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from umf_ros.config import Settings
-from umf_ros.fleet.consensus import Consensus, Pair
+from umf_ros.fleet.consensus import EncounterPair, FleetConsensus
 from umf_ros.fleet.link import Answer, FleetLink
 from umf_ros.frames import Keyframe, LoopClosure
 from umf_ros.places.store import KeyframeStore
@@ -18,7 +18,7 @@ UNCONFIRMED = "waits for a closure of another place that agrees"
 
 
 @dataclass(frozen=True, slots=True)
-class Meeting:
+class Encounter:
     """What verification says of a keyframe and those of one other rover.
 
     Attributes:
@@ -36,7 +36,7 @@ class Meeting:
     closures: list[LoopClosure]
 
 
-class Meetings:
+class Encounters:
     """Verifies what a fleet's server finds, each rover by a verifier of its own, for memories must not mix.
 
     Args:
@@ -52,20 +52,20 @@ class Meetings:
         self._settings = settings.verification
         self.link = FleetLink(store, settings.database, identity)
         self._verifiers: dict[str, Verifier] = {}
-        self._consensus: dict[str, Consensus] = {}
+        self._consensus: dict[str, FleetConsensus] = {}
 
-    def next(self) -> Meeting | None:
+    def next(self) -> Encounter | None:
         """Verify what the server found first; None while there is nothing new."""
         answer = self.link.answer()
         return self._verify(answer) if answer is not None else None
 
-    def rest(self, timeout_s: float) -> Iterator[Meeting]:
+    def rest(self, timeout_s: float) -> Iterator[Encounter]:
         """Push and ask what waits, as long as there is time, and verify all that comes of it."""
         end = time.monotonic() + timeout_s
         while True:
             done = self.link.drain(0.1) or time.monotonic() > end
-            while (meeting := self.next()) is not None:
-                yield meeting
+            while (encounter := self.next()) is not None:
+                yield encounter
             if done:
                 return
 
@@ -73,11 +73,11 @@ class Meetings:
         """Leave the server."""
         self.link.close()
 
-    def _verify(self, answer: Answer) -> Meeting:
+    def _verify(self, answer: Answer) -> Encounter:
         robot = answer.robot
         if robot not in self._verifiers:
             self._verifiers[robot] = Verifier(self._settings)
-            self._consensus[robot] = Consensus(self._settings.odometry_drift)
+            self._consensus[robot] = FleetConsensus(self._settings.odometry_drift)
         verifier, consensus = self._verifiers[robot], self._consensus[robot]
         matches = {candidate.stamp_ns: match for candidate, match in answer.found}
         verdicts = verifier.verify(answer.keyframe, answer.found)
@@ -86,8 +86,8 @@ class Meetings:
             if verdict.closure is None:
                 told.append(verdict)
                 continue
-            pair = Pair(answer.keyframe, matches[verdict.candidate.stamp_ns], verdict.closure)
+            pair = EncounterPair(answer.keyframe, matches[verdict.candidate.stamp_ns], verdict.closure)
             confirmed = consensus.confirm(pair)
             closures += [one.closure for one in confirmed]
             told.append(verdict if confirmed else replace(verdict, reason=UNCONFIRMED))
-        return Meeting(answer.keyframe, self.link.robot, robot, told, closures)
+        return Encounter(answer.keyframe, self.link.robot, robot, told, closures)
