@@ -8,11 +8,8 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-<<<<<<< HEAD
-from typing import TYPE_CHECKING
-=======
 from pathlib import Path
->>>>>>> main
+from typing import TYPE_CHECKING
 
 from umf_ros.config import Settings
 from umf_ros.embedding import make_embedder
@@ -79,13 +76,9 @@ class LoopDetector:
         self._selector = KeyframeSelector(settings.keyframe)
         self._embedder = embedder
         self._verifier = Verifier(settings.verification)
-<<<<<<< HEAD
-        self.database = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
-        self.encounters = _encounters(settings, self.database, embedder)
-=======
         self.database = _open_places(settings, embedder)
+        self.encounters = _encounters(settings, self.database, embedder)
         self._map = range(self.database.next_session) if settings.localizing else None
->>>>>>> main
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
         self._session: int | None = None
         self._stored_session = self.database.next_session
@@ -260,7 +253,7 @@ def _encounters(settings: Settings, database: PlaceDatabase, embedder: Embedder)
         ConfigError: the settings name no server.
         UmfError: what it takes is not installed.
     """
-    if settings.database.backend == "sqlite":
+    if settings.database.backend == "sqlite" or settings.localizing:
         return None
     if not settings.database.server:
         raise ConfigError("database.backend: postgres needs database.server")
