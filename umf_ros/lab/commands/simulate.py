@@ -45,6 +45,9 @@ def command(
     sequences: Annotated[str, typer.Option(help="Shards of named sequences instead: etna (7) or thesis (13).")] = "",
     contact_sheet: Annotated[Path | None, typer.Option(help="Write a PNG of 24 frames and 6 scans instead.")] = None,
     workers: Annotated[int, typer.Option(min=1, max=64, help="Threads that render.")] = 2,
+    ray: Annotated[
+        str | None, typer.Option(help="Spread --shards by Ray: address of a cluster that sees their folder, or local.")
+    ] = None,
 ) -> None:
     """Simulate a rover with S3LI's sensors: stereo, LiDAR, IMU, odometry, GNSS and ground truth.
 
@@ -56,7 +59,7 @@ def command(
     if contact_sheet is not None:
         _write_contact_sheet(contact_sheet, seed, family or "etna", console)
     elif shards is not None:
-        _write_shards(shards, worlds, sequences, seed, workers, console)
+        _write_shards(shards, worlds, sequences, seed, workers, ray, console)
     elif out is not None:
         _write_bag(out, preset, (seed, world), duration, family, aliasing, image_rate, truth, workers, console)
     else:
@@ -94,7 +97,12 @@ def _write_bag(
     console.print(f"{out}: {simulator.duration_s:.0f} s, {scans} scans, {size:.0f} MB", markup=False, soft_wrap=True)
 
 
-def _write_shards(folder: Path, worlds: str, sequences: str, seed: int, workers: int, console: Console) -> None:
+def _write_shards(
+    folder: Path, worlds: str, sequences: str, seed: int, workers: int, ray: str | None, console: Console
+) -> None:
+    if ray is not None:
+        _spread_shards(folder, worlds, sequences, seed, workers, ray, console)
+        return
     from umf_ros.lab.simulation.sequences import SEQUENCES
     from umf_ros.lab.simulation.survey import shard_plan, survey_world
 
@@ -112,6 +120,20 @@ def _write_shards(folder: Path, worlds: str, sequences: str, seed: int, workers:
             path = folder / f"world_{world:05d}.npz"
             if not path.exists():
                 _write_shard(path, survey_world(world, family, setting), setting, workers, progress)
+
+
+def _spread_shards(
+    folder: Path, worlds: str, sequences: str, seed: int, workers: int, ray: str, console: Console
+) -> None:
+    from umf_ros.lab.simulation.shards import write_world
+    from umf_ros.spread import spread
+
+    if sequences:
+        raise ConfigError("--ray spreads --worlds, not --sequences")
+    missing = [(folder, world) for world in _seed_range(worlds) if not (folder / f"world_{world:05d}.npz").exists()]
+    with _progress(console) as progress:
+        task = progress.add_task("worlds", total=len(missing))
+        spread(write_world, missing, workers, ray, lambda done: progress.update(task, completed=done))
 
 
 def _write_shard(path: Path, survey: Survey, setting: str, workers: int, progress: Progress) -> None:

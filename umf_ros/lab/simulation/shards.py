@@ -22,7 +22,7 @@ import numpy as np
 
 from umf_ros.errors import OutputError
 from umf_ros.geometry import Array
-from umf_ros.lab.simulation.survey import Survey, SurveyFrame
+from umf_ros.lab.simulation.survey import Survey, SurveyFrame, shard_plan, survey_world
 
 
 def write_shard(
@@ -49,6 +49,17 @@ def write_shard(
         samples.append(sample)
         progress(len(samples))
     save(path, _arrays(survey, samples, setting))
+
+
+def write_world(task: tuple[Path, int]) -> None:
+    """The shard of a seed, by its plan, in a folder: a task of its own.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    folder, world = task
+    family, setting = shard_plan(world)
+    write_shard(folder / f"world_{world:05d}.npz", survey_world(world, family, setting), setting, workers=1)
 
 
 def save(path: Path, arrays: dict[str, Array]) -> None:
