@@ -1,0 +1,269 @@
+"""Training of other methods' networks: batch-hard triplets in batches that grow [Komorowski 2021].
+
+The early stages of an image trunk are frozen, so their maps are computed once for each variant of an image and
+remembered: what learns is small, and learns in minutes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from umf_ros.embedding.place_inputs import PlaceView, some_points, stack, stack_images
+from umf_ros.geometry import transform
+from umf_ros.lab.datasets.labels import Places, Rule
+from umf_ros.lab.datasets.listed import open_source
+from umf_ros.lab.datasets.sample import Sample, SampleSequence
+from umf_ros.lab.datasets.views import Augmentation, View, ViewMaker
+from umf_ros.lab.evaluation.protocol import place_recognition
+from umf_ros.lab.evaluation.results import mean
+from umf_ros.lab.evaluation.retrieval import rank
+from umf_ros.lab.evaluation.scores import score
+from umf_ros.lab.training.losses import batch_hard_triplet
+from umf_ros.lab.training.metric_loss import Bank, relate
+from umf_ros.lab.training.networks import Precision, save_tensors
+from umf_ros.lab.training.objective import Judgement, Objective, generator
+from umf_ros.lab.training.sampler import Draw, PairSampler, places_drawn
+from umf_ros.lab.training.settings import DescriptorSettings, RunSettings
+from umf_ros.networks.config import NetworkConfig
+from umf_ros.networks.place_network import IMAGE_SIZE, VOXELS, PlaceInput, PlaceNetwork
+from umf_ros.networks.place_networks import load_place_network, make_place_network
+from umf_ros.networks.weights import load_weights, locate_weights
+
+RULE = Rule(negative_m=20.0, negative_deg=40.0, between_passes=True)
+"""A later pass looks for itself in an earlier one."""
+CONFIG = NetworkConfig(image_size=IMAGE_SIZE, fine_voxels=VOXELS)
+TRUNK_FROM = "umf_scene"
+"""Shipped weights that hold the published trunk."""
+
+Key = tuple[int, int, int]
+"""Of a remembered map: sequence, sample, variant; mirrored ones are variants too."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceBatch:
+    """Views and where they were taken; row i and row B/2 + i are a pair.
+
+    Attributes:
+        input: without maps.
+        images: (B, 1, 160, 224), empty where none are read.
+        keys: (B,) of their early maps.
+        places: where.
+    """
+
+    input: PlaceInput
+    images: Tensor
+    keys: list[Key]
+    places: Places
+
+    def to(self, device: torch.device) -> Self:
+        """The batch on another device; images stay until they are needed."""
+        return replace(self, input=self.input.to(device))
+
+
+class DescriptorObjective(Objective):
+    """Trains one of `umf_ros.networks.place_networks`.
+
+    Args:
+        network: trained in place.
+        settings: of the run.
+    """
+
+    settings_type: ClassVar[type[RunSettings]] = DescriptorSettings
+    network: PlaceNetwork
+
+    def __init__(self, network: PlaceNetwork, settings: DescriptorSettings) -> None:
+        super().__init__(network, settings)
+        self._settings = settings
+        self._validation = open_source(Path(settings.validation)).refresh if settings.validation else list
+        self._sequences: Sequence[SampleSequence] = []
+        self._sampler: PairSampler | None = None
+        self._maps: dict[Key, Tensor] = {}
+        self._plain: dict[str, tuple[PlaceInput, Tensor]] = {}
+        self._made = ViewMaker(CONFIG, Augmentation())
+        self.batch_size, self.best, self.stale = settings.batch, -1.0, 0
+        self.untrained: dict[str, float] = {}
+
+    @classmethod
+    def make_network(cls, settings: DescriptorSettings) -> PlaceNetwork:
+        """A fresh network on the published trunk, or one that starts from weights."""
+        if settings.start:
+            return load_place_network(settings.method, Path(settings.start))
+        network = make_place_network(settings.method)
+        if network.trunk is not None:
+            scene = load_weights(locate_weights(Path(TRUNK_FROM))).scene
+            assert scene is not None
+            network.trunk.network.load_state_dict(scene.trunk.state_dict())
+        return network
+
+    def save(self, path: Path, card: dict[str, Any], precision: Precision) -> None:
+        """Write the weights and their card."""
+        save_tensors(self.network, path, card, {"method": self._settings.method}, precision)
+
+    def batch_maker(self, sequences: Sequence[SampleSequence], rank: int) -> Callable[[int], PlaceBatch]:
+        """What makes the batch of a step: pairs of views, half of each world's along one stretch of it.
+
+        Raises:
+            ConfigError: no place of these sequences is visited twice.
+        """
+        if self._sampler is None or len(self._sequences) != len(sequences):  # to find all revisits takes its time
+            self._sampler = PairSampler(sequences, RULE)
+        sampler, self._sequences = self._sampler, sequences
+        if not self.untrained:
+            self.begin()
+            self.settle()
+            self.untrained = self.recalls()
+        pairs, seed = self.batch_size // 2, self._settings.seed
+
+        def make(step: int) -> PlaceBatch:
+            rng = generator(seed, step, rank)
+            drawn = sampler.draw(pairs, rng)
+            draws = [anchor for anchor, _ in drawn] + [positive for _, positive in drawn]
+            return self._batch(draws, rng)
+
+        return make
+
+    def begin(self) -> None:
+        """Prepare a fresh network, before its first step."""
+
+    def settle(self) -> None:
+        """Fit what is not learned, before the network is judged."""
+
+    def forward(self, batch: PlaceBatch) -> dict[str, Tensor]:
+        """The triplet losses of the descriptor and of the modalities that have one of their own."""
+        found = self.network(self._with_maps(batch))
+        relations = relate(batch.places, Bank(0, 1).places, RULE, found["descriptor"].device)
+        image, cloud = self.network.weight_image, self.network.weight_cloud
+        weights = {"descriptor": 1 - image - cloud, "image": image, "cloud": cloud}
+        losses, active = {}, found["descriptor"].new_zeros(())
+        for name, weight in weights.items():
+            if not weight:
+                continue
+            unit = F.normalize(found[name].float(), dim=1)
+            loss, share = batch_hard_triplet(
+                unit @ unit.T, relations.positive, relations.negative, self._settings.margin
+            )
+            losses[name], active = loss, share if name == "descriptor" else active
+        total = sum((weights[name] * loss for name, loss in losses.items()), start=active.new_zeros(()))
+        return losses | {"total": total, "active": active}
+
+    def finish_epoch(self, losses: Mapping[str, float]) -> None:
+        """Let the batches grow while too few triplets are active."""
+        settings = self._settings
+        if losses["active"] < settings.active_share:
+            self.batch_size = min(int(self.batch_size * settings.batch_growth) // 2 * 2, settings.batch_limit)
+
+    def judge(self, step: int, folder: Path) -> Judgement:
+        """Recall on the validation worlds."""
+        self.settle()
+        found = self.recalls()
+        better = not found or found["recall1"] > self.best
+        self.best = max(self.best, found.get("recall1", -1.0))
+        self.stale = 0 if better else self.stale + 1
+        stop = bool(self._settings.patience) and self.stale >= self._settings.patience
+        return Judgement(better, stop, found | {f"{name}_untrained": value for name, value in self.untrained.items()})
+
+    def card(self) -> dict[str, Any]:
+        """How good it was before and is now."""
+        return {"untrained": self.untrained, "validation_recall1": round(self.best, 4)}
+
+    def recalls(self) -> dict[str, float]:
+        """Mean recall at one and five of later passes of the validation worlds, asked for the first."""
+        worlds = self._validation()
+        results = []
+        for world in worlds:
+            task = place_recognition(np.asarray(world.world_T_body), np.asarray(world.pass_index))
+            found = self.describe(world)
+            results.append(score(task, rank(found[task.queries] @ found[task.references].T)))
+        if not results:
+            return {}
+        return {name: mean([getattr(one, name) for one in results]) for name in ("recall1", "recall5")}
+
+    def describe(self, world: SampleSequence) -> np.ndarray:
+        """Unit descriptors (N, D) of all samples of a world, as they are in use."""
+        self.network.eval()
+        if world.name not in self._plain:
+            views = [self._view(self._made.plain(self._needed(world.sample(k))), None) for k in range(len(world))]
+            self._plain[world.name] = stack(views, None), self._see(stack_images(views)).half()
+        whole, maps = self._plain[world.name]
+        device = next(self.network.parameters()).device
+        parts = []
+        for start in range(0, len(world), 32):
+            rows = slice(start, start + 32)
+            batch = PlaceInput(*(part[rows] for part in whole))._replace(maps=maps[rows].float())
+            with torch.inference_mode():
+                parts.append(F.normalize(self.network(batch.to(device))["descriptor"].float(), dim=1).cpu())
+        return torch.cat(parts).numpy()
+
+    def early_maps(self, samples: Sequence[Sample]) -> Tensor:
+        """Maps (N, 80, 10, 14) of some samples as they are."""
+        views = [self._view(self._made.plain(self._needed(sample)), None) for sample in samples]
+        return self._see(stack_images(views))
+
+    def _batch(self, draws: list[Draw], rng: np.random.Generator) -> PlaceBatch:
+        views, keys = [], []
+        for draw in draws:
+            variant = int(rng.integers(self._settings.variants))
+            keys.append((draw.sequence, draw.index, 2 * variant + draw.mirror))
+            # the same variant is the same image, whatever the batch; scans vary every time
+            luck = generator(self._settings.seed, draw.sequence, draw.index, purpose=2 + keys[-1][2])
+            sample = self._needed(self._sequences[draw.sequence].sample(draw.index))
+            reads_scan = sample.points is not None
+            view = self._made.varied(sample, luck if not reads_scan else rng, draw.mirror)
+            if reads_scan and sample.image is not None:
+                view = replace(view, image=self._made.varied(replace(sample, points=None), luck, draw.mirror).image)
+            views.append(self._view(view, rng))
+        return PlaceBatch(stack(views, None), stack_images(views), keys, places_drawn(draws, self._sequences))
+
+    def _needed(self, sample: Sample) -> Sample:
+        reads = self.network.reads
+        if "image" not in reads:
+            sample = replace(sample, image=None)
+        return sample if reads & {"voxels", "points"} else replace(sample, points=None, intensity=None)
+
+    def _view(self, view: View, rng: np.random.Generator | None) -> PlaceView:
+        reads, points = self.network.reads, view.sample.points
+        if "points" in reads and points is not None:
+            points = transform(np.linalg.inv(view.body_T_view), points)
+            points = some_points(points.astype(np.float32), rng or np.random.default_rng(0))
+        return PlaceView(
+            image=view.image if view.image_present and "image" in reads else None,
+            scan=view.scan if "voxels" in reads else None,
+            points=points if "points" in reads else None,
+        )
+
+    def _with_maps(self, batch: PlaceBatch) -> PlaceInput:
+        if "image" not in self.network.reads:
+            return batch.input
+        new = [row for row, key in enumerate(batch.keys) if key not in self._maps]
+        if new:
+            for row, found in zip(new, self._see(batch.images[new]), strict=True):
+                self._maps[batch.keys[row]] = found.half()
+        maps = torch.stack([self._maps[key] for key in batch.keys]).float()
+        return batch.input._replace(maps=maps.to(batch.input.maps.device))
+
+    def _see(self, images: Tensor) -> Tensor:
+        """Early maps of images, on the CPU."""
+        trunk = self.network.trunk
+        if trunk is None or "image" not in self.network.reads:
+            return torch.zeros(len(images), 0)
+        device = next(trunk.parameters()).device
+        with torch.no_grad():
+            return torch.cat([trunk.early(part.to(device)).cpu() for part in images.split(16)])
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """For a checkpoint: what is not a weight."""
+        names = ("batch_size", "best", "stale", "untrained")
+        return {name: getattr(self, name) for name in names}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Inverse of `get_extra_state`."""
+        for name, value in state.items():
+            setattr(self, name, value)
