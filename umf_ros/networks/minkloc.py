@@ -29,7 +29,7 @@ class Normalised(nn.Module):
 
 
 class AttentiveBlock(nn.Module):
-    """Residual block whose channels are weighted by their neighbours' means [Wang 2020b]."""
+    """Residual block whose channels are weighted by their neighbours' means [ECA-Net 2020]."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()

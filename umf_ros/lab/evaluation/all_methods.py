@@ -40,8 +40,8 @@ def compare_methods(
         run.add(places)
     folder = make_folder()
     said = [
-        "Intervals: queries drawn anew within each set, 1000 times. Matching: the best of 858 places, and of 20 of "
-        "them by local features where a reranker is named. R@1 + XFeat: UMF's default local features of images rerank the "
+        "Intervals: queries drawn anew within each set, 1000 times. Matching: the best of 858 places, then 20 of them "
+        "again by local features where a reranker is named. R@1 + XFeat: UMF's default features of images rerank the "
         "method's own 20 best. Times are medians on this machine, as busy as it was."
     ]
     said += [f"Not compared: {line}." for line in missing]

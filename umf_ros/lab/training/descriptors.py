@@ -1,4 +1,4 @@
-"""Training of other methods' networks: batch-hard triplets in batches that grow [Komorowski 2021].
+"""Training of other methods' networks: by UMF's own loss, or by batch-hard triplets [Komorowski 2021].
 
 The early stages of an image trunk are frozen, so their maps are computed once for each variant of an image and
 remembered: what learns is small, and learns in minutes.
@@ -26,8 +26,8 @@ from umf_ros.lab.evaluation.protocol import place_recognition
 from umf_ros.lab.evaluation.results import mean
 from umf_ros.lab.evaluation.retrieval import rank
 from umf_ros.lab.evaluation.scores import score
-from umf_ros.lab.training.losses import batch_hard_triplet
-from umf_ros.lab.training.metric_loss import Bank, relate
+from umf_ros.lab.training.losses import batch_hard_triplet, neighbourhood_components
+from umf_ros.lab.training.metric_loss import Bank, Relations, relate
 from umf_ros.lab.training.networks import Precision, save_tensors
 from umf_ros.lab.training.objective import Judgement, Objective, generator
 from umf_ros.lab.training.sampler import Draw, PairSampler, places_drawn
@@ -108,13 +108,13 @@ class DescriptorObjective(Objective):
         save_tensors(self.network, path, card, {"method": self._settings.method}, precision)
 
     def batch_maker(self, sequences: Sequence[SampleSequence], rank: int) -> Callable[[int], PlaceBatch]:
-        """What makes the batch of a step: pairs of views, half of each world's along one stretch of it.
+        """What makes the batch of a step: pairs of views.
 
         Raises:
             ConfigError: no place of these sequences is visited twice.
         """
         if self._sampler is None or len(self._sequences) != len(sequences):  # to find all revisits takes its time
-            self._sampler = PairSampler(sequences, RULE)
+            self._sampler = PairSampler(sequences, RULE, whole=self._settings.loss == "neighbourhood")
         sampler, self._sequences = self._sampler, sequences
         if not self.untrained:
             self.begin()
@@ -137,7 +137,7 @@ class DescriptorObjective(Objective):
         """Fit what is not learned, before the network is judged."""
 
     def forward(self, batch: PlaceBatch) -> dict[str, Tensor]:
-        """The triplet losses of the descriptor and of the modalities that have one of their own."""
+        """The losses of the descriptor and of the modalities that have one of their own."""
         found = self.network(self._with_maps(batch))
         relations = relate(batch.places, Bank(0, 1).places, RULE, found["descriptor"].device)
         image, cloud = self.network.weight_image, self.network.weight_cloud
@@ -147,17 +147,24 @@ class DescriptorObjective(Objective):
             if not weight:
                 continue
             unit = F.normalize(found[name].float(), dim=1)
-            loss, share = batch_hard_triplet(
-                unit @ unit.T, relations.positive, relations.negative, self._settings.margin
-            )
+            loss, share = self._loss(unit @ unit.T, relations)
             losses[name], active = loss, share if name == "descriptor" else active
         total = sum((weights[name] * loss for name, loss in losses.items()), start=active.new_zeros(()))
         return losses | {"total": total, "active": active}
 
+    def _loss(self, similarity: Tensor, relations: Relations) -> tuple[Tensor, Tensor]:
+        """The loss, and the share of rows that have something to learn."""
+        positive, negative = relations.positive, relations.negative
+        if self._settings.loss == "triplet":
+            return batch_hard_triplet(similarity, positive, negative, self._settings.margin)
+        best = similarity.masked_fill(~positive, -1.0).amax(1)
+        worst = similarity.masked_fill(~negative, -1.0).amax(1)
+        return neighbourhood_components(similarity, positive, negative), (best < worst).float().mean()
+
     def finish_epoch(self, losses: Mapping[str, float]) -> None:
-        """Let the batches grow while too few triplets are active."""
+        """Let the batches of the triplet loss grow while too few triplets are active."""
         settings = self._settings
-        if losses["active"] < settings.active_share:
+        if settings.loss == "triplet" and losses["active"] < settings.active_share:
             self.batch_size = min(int(self.batch_size * settings.batch_growth) // 2 * 2, settings.batch_limit)
 
     def judge(self, step: int, folder: Path) -> Judgement:

@@ -24,6 +24,7 @@ class NetVladSettings(DescriptorSettings):
     """What it was trained with."""
 
     method: Literal["netvlad"] = "netvlad"
+    loss: Literal["neighbourhood", "triplet"] = Field("triplet", description="as it was published")
     learning_rate: float = Field(2e-4, gt=0, description="peak of the cosine schedule")
 
 

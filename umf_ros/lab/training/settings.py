@@ -48,7 +48,7 @@ class RunSettings(Group):
 
 
 class DescriptorSettings(RunSettings):
-    """Training of another method's network, by the loss that MinkLoc++ was published with."""
+    """Training of another method's network."""
 
     method: str = Field(description="whose network")
     validation: str = Field("", description="as train, for validation; empty: the latest weights are kept")
@@ -59,8 +59,12 @@ class DescriptorSettings(RunSettings):
     batch_limit: int = Field(96, ge=4, description="largest batch")
     batch_growth: float = Field(1.4, ge=1, description="factor when too few triplets are active")
     active_share: float = Field(0.7, ge=0, le=1, description="share of active triplets below which the batch grows")
+    loss: Literal["neighbourhood", "triplet"] = Field(
+        "neighbourhood",
+        description="as UMF learns, from batches all over one world; or batch-hard triplets, half along one stretch",
+    )
     margin: float = Field(0.2, gt=0, description="of the triplet loss")
-    patience: int = Field(4, ge=0, description="validations without progress before stopping; 0: never")
+    patience: int = Field(6, ge=0, description="validations without progress before stopping; 0: never")
     variants: int = Field(2, ge=1, description="augmentations of every image, whose early maps are remembered")
     half: bool = Field(False, description="bfloat16 mixed precision")
 
