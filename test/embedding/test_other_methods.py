@@ -56,7 +56,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
         settings = DescriptorSettings(method=method, train="nowhere")
         network = DescriptorObjective.make_network(settings)
         save_tensors(network, folder / f"{method}.safetensors", {}, {"method": method}, "half")
-    words = grow([OrbFeatures().of(scene(seed)) for seed in range(6)], 8, 2, np.random.default_rng(0))
+    words = grow([OrbFeatures().of(scene(seed)) for seed in range(6)], 8, 3, np.random.default_rng(0))
     words.save(folder / "dbow2.safetensors")
     return folder
 

@@ -35,7 +35,8 @@ def command(
         ),
     ] = None,
     worlds: Annotated[str | None, Optional(help="Instead of a recording: test or validation worlds.")] = None,
-    seed: Annotated[int | None, Optional(min=0, help="First of the four worlds' seeds.")] = None,
+    seed: Annotated[int | None, Optional(min=0, help="First of the worlds' seeds.")] = None,
+    count: Annotated[int, Optional(min=1, max=8, help="How many worlds, of different families.")] = 4,
     quick: Annotated[bool, Optional("--quick", help="A smaller sample of every world.")] = False,
     methods: Annotated[str, Optional(help="umf, or all: every method of docs/benchmarks.md beside it.")] = "umf",
     trained: Annotated[
@@ -69,14 +70,15 @@ def command(
         raise ConfigError(f"--methods: expected umf or all, not {methods!r}")
     if trained is not None and methods == "umf":
         raise ConfigError("--trained names weights of other methods, and without --methods all there are none")
-    of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick}
+    of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick, "--count": count != 4}
     of_lists: dict[str, object] = {"--rule": rule != "s3li"}
     of_recordings: dict[str, object] = {"--config": config, "--dataset": dataset != "auto", "--embedder": embedder}
     of_recordings |= {"--odometry": odometry, "--ground-truth": ground_truth}
     every = EveryMethod(weights, trained, quick, out) if methods == "all" else None
     if data is None:
         _refuse("simulated worlds", of_lists | of_recordings)
-        figures = every.worlds(str(worlds), seed) if every else _on_worlds(str(worlds), seed, quick, weights, out)
+        chosen = str(worlds), seed, count
+        figures = every.worlds(*chosen) if every else _on_worlds(*chosen, quick, weights, out)
     elif is_list(data) and lists_place_sets(data):
         others = {name: value for name, value in of_recordings.items() if name != "--embedder" or every}
         _refuse("a list of place sets", of_worlds | of_lists | others)
@@ -103,14 +105,14 @@ def _refuse(data: str, options: Mapping[str, object]) -> None:
         raise ConfigError(f"{data} {'has' if data.startswith('a ') else 'have'} no use for {', '.join(given)}")
 
 
-def _on_worlds(name: str, seed: int | None, quick: bool, weights: Path | None, out: Path) -> Figures:
+def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
     from umf_ros.lab.evaluation.worlds_run import WorldsRun, work
     from umf_ros.runs.folder import create_run_folder
 
     console = Console()
-    chosen = choose_worlds(name, seed, quick)
+    chosen = choose_worlds(name, seed, quick, count)
     with progress_bar(console) as bar:
         task = bar.add_task("", total=sum(work(world) for world in chosen))
 

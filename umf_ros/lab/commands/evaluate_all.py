@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from umf_ros.lab.evaluation.methods_run import FrameSet
     from umf_ros.lab.evaluation.results import Figures
 
+REPEATS = 3
+"""Of every timed frame."""
+
 
 @dataclass(frozen=True)
 class EveryMethod:
@@ -24,7 +27,7 @@ class EveryMethod:
     Attributes:
         weights: of UMF; None: the default.
         trained: folder with the weights of other methods; None: the shipped ones.
-        quick: take times on fewer repeats.
+        quick: a smaller sample of every world.
         out: folder of the results.
     """
 
@@ -33,13 +36,13 @@ class EveryMethod:
     quick: bool
     out: Path
 
-    def worlds(self, name: str, seed: int | None) -> Figures:
+    def worlds(self, name: str, seed: int | None, count: int) -> Figures:
         """On simulated worlds."""
         from rich.console import Console
 
         from umf_ros.lab.evaluation.frame_sets import world_set
 
-        chosen = choose_worlds(name, seed, self.quick)
+        chosen = choose_worlds(name, seed, self.quick, count)
         return self._compare(Console(), map(world_set, chosen), note_on_worlds(chosen, self.quick))
 
     def places(self, listing: Path) -> Figures:
@@ -96,9 +99,8 @@ class EveryMethod:
                 done.append(frames)
                 bar.update(task, description=f"{what}, {sum(done)} frames")
 
-            repeats = 3 if self.quick else 10
             report, folder = compare_methods(
-                sets, [note], self.weights, self.trained, lambda: create_run_folder(self.out), repeats, show
+                sets, [note], self.weights, self.trained, lambda: create_run_folder(self.out), REPEATS, show
             )
         report.show(console, folder)
         return report.figures

@@ -66,8 +66,8 @@ class RecordingOptions:
         return OpenRecording(frames, settings, truth, recording.duration_s)
 
 
-def choose_worlds(name: str, seed: int | None, quick: bool) -> list[TestWorld]:
-    """The four worlds of a name, or those from a seed on.
+def choose_worlds(name: str, seed: int | None, quick: bool, count: int) -> list[TestWorld]:
+    """The first worlds of a name, or those from a seed on.
 
     Raises:
         ConfigError: there is no such name.
@@ -76,7 +76,7 @@ def choose_worlds(name: str, seed: int | None, quick: bool) -> list[TestWorld]:
 
     if name not in FIRST_SEEDS:
         raise ConfigError(f"--worlds: expected {' or '.join(FIRST_SEEDS)}, not {name!r}")
-    return test_worlds(FIRST_SEEDS[name] if seed is None else seed, QUICK if quick else FULL)
+    return test_worlds(FIRST_SEEDS[name] if seed is None else seed, QUICK if quick else FULL, count)
 
 
 def note_on_worlds(worlds: Sequence[TestWorld], quick: bool) -> str:

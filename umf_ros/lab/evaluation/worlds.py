@@ -100,9 +100,9 @@ class TestWorld:
                 yield _visit(stamp, sample, calibration)
 
 
-def test_worlds(first_seed: int, sampling: Sampling) -> list[TestWorld]:
-    """Four worlds of different families, made from `first_seed` on."""
-    return [TestWorld(first_seed + number, sampling) for number in range(WORLDS)]
+def test_worlds(first_seed: int, sampling: Sampling, count: int = WORLDS) -> list[TestWorld]:
+    """So many worlds of different families, made from `first_seed` on."""
+    return [TestWorld(first_seed + number, sampling) for number in range(count)]
 
 
 def _drives(seed: int, family: str, sampling: Sampling) -> list[Pass]:
