@@ -21,6 +21,7 @@ COMMANDS = {
     "import": "umf_ros.lab.commands.import_data",
     "inspect": "umf_ros.commands.inspect",
     "replay": "umf_ros.commands.replay",
+    "map": "umf_ros.commands.map",
     "compare": "umf_ros.commands.compare",
     "play": "umf_ros.lab.commands.play",
     "report": "umf_ros.lab.commands.report",

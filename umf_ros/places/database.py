@@ -31,15 +31,16 @@ class PlaceDatabase:
         settings: where to keep the keyframes.
         embedder: name of the embedder; a stored database of another one is refused.
         dimension: numbers per descriptor.
+        read_only: leave the file as it is, and to whoever else reads it.
 
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use.
     """
 
-    def __init__(self, settings: Database, embedder: str, dimension: int) -> None:
+    def __init__(self, settings: Database, embedder: str, dimension: int, read_only: bool = False) -> None:
         path = Path(settings.path) if settings.path else None
         identity = {"embedder": embedder, "dimension": str(dimension)}
-        self._store = KeyframeStore(path, identity, settings.cached_keyframes)
+        self._store = KeyframeStore(path, identity, settings.cached_keyframes, read_only)
         self._index = DescriptorIndex(dimension)
         self._columns = Columns(stamp=np.int64, session=np.int64, travelled=np.float64)
         self._by_stamp: dict[int, tuple[int, ...]] = {}
@@ -79,15 +80,21 @@ class PlaceDatabase:
         self._store.add(keyframe)
         return self._register(PlaceEntry.of(keyframe))
 
-    def query(self, keyframe: Keyframe, rules: Loop) -> list[Candidate]:
+    def query(self, keyframe: Keyframe, rules: Loop, sessions: range | None = None) -> list[Candidate]:
         """The most similar earlier places, best first, by exhaustive search.
 
         Keyframes must be older than `min_time_gap_s`, and those of the same session further back along
         the path than `min_travel_m`; where either path length is unknown, time alone decides. A place that was
         visited in many sessions does not crowd out the others.
+
+        Args:
+            keyframe: what is looked for.
+            rules: which places may be candidates.
+            sessions: look among the places of these sessions, whatever their age.
         """
         descriptor, wanted = keyframe.embedding.descriptor, rules.top_k * WIDER
-        found = self._index.search(descriptor, wanted, self._admissible(keyframe, rules))
+        admissible = self._admissible(keyframe, rules) if sessions is None else self._of_sessions(sessions)
+        found = self._index.search(descriptor, wanted, admissible)
         similar = [(row, similarity) for row, similarity in found if similarity >= rules.min_similarity]
         stamps = self._columns["stamp"]
         chosen = self._diverse(similar, rules.top_k)
@@ -130,3 +137,7 @@ class PlaceDatabase:
         age_ns = keyframe.stamp_ns - self._columns["stamp"]
         way_m = keyframe.travelled_m - self._columns["travelled"]
         return is_past(age_ns, way_m, rules, self._columns["session"] == keyframe.session)
+
+    def _of_sessions(self, sessions: range) -> Mask:
+        numbers = self._columns["session"]
+        return np.asarray((numbers >= sessions.start) & (numbers < sessions.stop))

@@ -6,7 +6,7 @@ import json
 import sqlite3
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,21 +63,23 @@ class KeyframeStore:
             behind.
         identity: what must agree with a stored file, such as the embedder's name and dimension.
         cached: keyframes kept in memory.
+        read_only: the file is there and stays as it is, whoever else has it.
 
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use.
         OutputError: the file cannot be written.
     """
 
-    def __init__(self, path: Path | None, identity: dict[str, str], cached: int) -> None:
+    def __init__(self, path: Path | None, identity: dict[str, str], cached: int, read_only: bool = False) -> None:
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, Keyframe] = OrderedDict()
         self._cached = cached
         self.path = path
         self._rows: list[int] = []
         self._file_lock: FileLock | None = None
+        identity = {"schema": str(SCHEMA_VERSION), **identity}
         try:
-            self._connection = self._open({"schema": str(SCHEMA_VERSION), **identity})
+            self._connection = self._open_to_read(identity) if read_only else self._open(identity)
         except BaseException:
             self._unlock()
             raise
@@ -179,8 +181,20 @@ class KeyframeStore:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
             # without a name SQLite keeps a file that no folder lists
             connection = sqlite3.connect(self.path or "", check_same_thread=False)
+        self._take_up(connection, lambda: self._prepare(connection, identity))
+        return connection
+
+    def _open_to_read(self, identity: dict[str, str]) -> sqlite3.Connection:
+        if self.path is None or not self.path.is_file():
+            raise UmfError(f"there is no place database {self.path}")
+        connection = sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
+        self._take_up(connection, lambda: self._check_identity(connection, identity))
+        return connection
+
+    def _take_up(self, connection: sqlite3.Connection, check: Callable[[], None]) -> None:
+        """Number the keyframes of a file that passes a check; what does not is closed."""
         try:
-            self._prepare(connection, identity)
+            check()
             self._rows = [row for (row,) in connection.execute("SELECT id FROM keyframe ORDER BY id")]
         except UmfError:
             connection.close()
@@ -188,7 +202,6 @@ class KeyframeStore:
         except sqlite3.Error as error:
             connection.close()
             raise UmfError(f"{self._name} cannot be used as a place database: {error}") from None
-        return connection
 
     def _prepare(self, connection: sqlite3.Connection, identity: dict[str, str]) -> None:
         """Make an empty file a place database, and look at what others are before anything is changed."""

@@ -138,7 +138,8 @@ def test_a_vocabulary_grows_from_the_same_worlds(folder: Path, tmp_path: Path) -
     found = CliRunner().invoke(app, arguments)
     assert found.exit_code == 0, found.output
     words = Vocabulary.load(tmp_path / "words" / "dbow2.safetensors").words
-    assert 4 <= words <= 16
+    card = read_card(tmp_path / "words" / "dbow2.safetensors")
+    assert 4 <= words <= 16 and card["words"] == words and card["training_worlds"] == ["world_00001", "world_00002"]
     again = fit_vocabulary(vocabulary_settings(config, train=str(folder)), tmp_path / "again", ignore)
     np.testing.assert_array_equal(
         Vocabulary.load(again).nodes, Vocabulary.load(tmp_path / "words" / "dbow2.safetensors").nodes

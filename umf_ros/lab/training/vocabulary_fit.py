@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from umf_ros.embedding.vocabulary import Binary, Indices, Vocabulary
 from umf_ros.errors import ConfigError
 from umf_ros.lab.datasets.listed import open_source
 from umf_ros.lab.datasets.sample import SampleSequence
+from umf_ros.runs.folder import write_atomically
 from umf_ros.yaml_files import read_values
 
 Signs = NDArray[np.float32]
@@ -58,15 +60,26 @@ def fit_vocabulary(settings: VocabularySettings, out: Path, report: Callable[[st
         ConfigError: there are no images.
         OutputError: it cannot be written.
     """
-    images = list(_features(open_source(Path(settings.train)).refresh(), settings.every, report))
+    worlds = open_source(Path(settings.train)).refresh()
+    images = list(_features(worlds, settings.every, report))
     if not sum(map(len, images)):
         raise ConfigError(f"train: there are no images with features in {settings.train}")
     report("clustering")
     vocabulary = grow(images, settings.branching, settings.depth, np.random.default_rng(settings.seed))
     path = out / f"{METHOD}.safetensors"
     vocabulary.save(path)
+    write_card(path, vocabulary, settings, [world.name for world in worlds], len(images))
     report(f"{vocabulary.words} words of {len(images)} images")
     return path
+
+
+def write_card(
+    path: Path, vocabulary: Vocabulary, settings: VocabularySettings, worlds: list[str], images: int
+) -> None:
+    """Say beside a vocabulary what it grew from; of folders only the name."""
+    said = settings.model_dump() | {"train": Path(settings.train).name}
+    facts = {"name": METHOD, "words": vocabulary.words, "images": images, "training_worlds": worlds, "settings": said}
+    write_atomically(path.with_suffix(".json"), json.dumps(facts, indent=2) + "\n")
 
 
 def _features(sequences: Sequence[SampleSequence], every: int, report: Callable[[str], None]) -> Iterator[Binary]:
