@@ -25,7 +25,7 @@ from umf_ros.lab.training.descriptors import DescriptorObjective
 from umf_ros.lab.training.networks import save_tensors
 from umf_ros.lab.training.settings import DescriptorSettings
 from umf_ros.lab.training.vocabulary_fit import grow
-from umf_ros.loop_detector import LoopDetector
+from umf_ros.loop_detector import LoopDetector, make_detector_embedder
 from umf_ros.networks.place_networks import NETWORKS
 from umf_ros.replay import Replay
 
@@ -120,12 +120,12 @@ def _nothing(name: str) -> Path:
 
 @pytest.mark.parametrize("method", [*SEEN, *FELT, *BOTH])
 def test_one_parameter_drives_a_recording(method: str, weights: Path, tmp_path: Path) -> None:
-    """The detector that the live node has too, on a short bag."""
+    """Replay and the live node make their embedder by the same function: here on a short bag."""
     bag = open_bag(write_mcap(tmp_path / "a.mcap", traverse(2.0)))
     policy = {"keyframe__min_translation_m": 0.2, "keyframe__min_period_s": 0.0}
     settings = small_settings(tmp_path, **policy).model_copy(update={"embedding": settings_of(method, weights)})
     (tmp_path / "run").mkdir()
-    detector = LoopDetector(settings, make_embedder(settings.embedding, features=settings.verification.features))
+    detector = LoopDetector(settings, make_detector_embedder(settings))
     replay = Replay(tmp_path / "run", settings, detector)
     detections = list(replay.run(FrameReader(bag, settings).stream()))
     assert replay.finish({"image": 0}) is True
