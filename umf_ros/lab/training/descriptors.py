@@ -7,65 +7,37 @@ remembered: what learns is small, and learns in minutes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from umf_ros.embedding.place_inputs import PlaceView, some_points, stack, stack_images
-from umf_ros.geometry import transform
-from umf_ros.lab.datasets.labels import Places, Rule
+from umf_ros.embedding.place_inputs import stack, stack_images
+from umf_ros.lab.datasets.labels import Rule
 from umf_ros.lab.datasets.listed import open_source
 from umf_ros.lab.datasets.sample import Sample, SampleSequence
-from umf_ros.lab.datasets.views import Augmentation, View, ViewMaker
 from umf_ros.lab.evaluation.protocol import place_recognition
 from umf_ros.lab.evaluation.results import mean
 from umf_ros.lab.evaluation.retrieval import rank
 from umf_ros.lab.evaluation.scores import score
+from umf_ros.lab.training.descriptor_batches import Key, PlaceBatch, PlaceViews
 from umf_ros.lab.training.losses import batch_hard_triplet, neighbourhood_components
 from umf_ros.lab.training.metric_loss import Bank, Relations, relate
 from umf_ros.lab.training.networks import Precision, save_tensors
 from umf_ros.lab.training.objective import Judgement, Objective, generator
-from umf_ros.lab.training.sampler import Draw, PairSampler, places_drawn
+from umf_ros.lab.training.sampler import PairSampler
 from umf_ros.lab.training.settings import DescriptorSettings, RunSettings
-from umf_ros.networks.config import NetworkConfig
-from umf_ros.networks.place_network import IMAGE_SIZE, VOXELS, PlaceInput, PlaceNetwork
+from umf_ros.networks.place_network import PlaceInput, PlaceNetwork
 from umf_ros.networks.place_networks import load_place_network, make_place_network
 from umf_ros.networks.weights import load_weights, locate_weights
 
 RULE = Rule(negative_m=20.0, negative_deg=40.0, between_passes=True)
 """A later pass looks for itself in an earlier one."""
-CONFIG = NetworkConfig(image_size=IMAGE_SIZE, fine_voxels=VOXELS)
 TRUNK_FROM = "umf_scene"
 """Shipped weights that hold the published trunk."""
-
-Key = tuple[int, int, int]
-"""Of a remembered map: sequence, sample, variant; mirrored ones are variants too."""
-
-
-@dataclass(frozen=True, slots=True)
-class PlaceBatch:
-    """Views and where they were taken; row i and row B/2 + i are a pair.
-
-    Attributes:
-        input: without maps.
-        images: (B, 1, 160, 224), empty where none are read.
-        keys: (B,) of their early maps.
-        places: where.
-    """
-
-    input: PlaceInput
-    images: Tensor
-    keys: list[Key]
-    places: Places
-
-    def to(self, device: torch.device) -> Self:
-        """The batch on another device; images stay until they are needed."""
-        return replace(self, input=self.input.to(device))
 
 
 class DescriptorObjective(Objective):
@@ -87,7 +59,7 @@ class DescriptorObjective(Objective):
         self._sampler: PairSampler | None = None
         self._maps: dict[Key, Tensor] = {}
         self._plain: dict[str, tuple[PlaceInput, Tensor]] = {}
-        self._made = ViewMaker(CONFIG, Augmentation())
+        self._views = PlaceViews(network.reads)
         self.batch_size, self.best, self.stale = settings.batch, -1.0, 0
         self.untrained: dict[str, float] = {}
 
@@ -126,7 +98,7 @@ class DescriptorObjective(Objective):
             rng = generator(seed, step, rank)
             drawn = sampler.draw(pairs, rng)
             draws = [anchor for anchor, _ in drawn] + [positive for _, positive in drawn]
-            return self._batch(draws, rng)
+            return self._views.batch(sequences, draws, self._settings, rng)
 
         return make
 
@@ -197,7 +169,7 @@ class DescriptorObjective(Objective):
         """Unit descriptors (N, D) of all samples of a world, as they are in use."""
         self.network.eval()
         if world.name not in self._plain:
-            views = [self._view(self._made.plain(self._needed(world.sample(k))), None) for k in range(len(world))]
+            views = [self._views.plain(world.sample(index)) for index in range(len(world))]
             self._plain[world.name] = stack(views, None), self._see(stack_images(views)).half()
         whole, maps = self._plain[world.name]
         device = next(self.network.parameters()).device
@@ -211,40 +183,7 @@ class DescriptorObjective(Objective):
 
     def early_maps(self, samples: Sequence[Sample]) -> Tensor:
         """Maps (N, 80, 10, 14) of some samples as they are."""
-        views = [self._view(self._made.plain(self._needed(sample)), None) for sample in samples]
-        return self._see(stack_images(views))
-
-    def _batch(self, draws: list[Draw], rng: np.random.Generator) -> PlaceBatch:
-        views, keys = [], []
-        for draw in draws:
-            variant = int(rng.integers(self._settings.variants))
-            keys.append((draw.sequence, draw.index, 2 * variant + draw.mirror))
-            # the same variant is the same image, whatever the batch; scans vary every time
-            luck = generator(self._settings.seed, draw.sequence, draw.index, purpose=2 + keys[-1][2])
-            sample = self._needed(self._sequences[draw.sequence].sample(draw.index))
-            reads_scan = sample.points is not None
-            view = self._made.varied(sample, luck if not reads_scan else rng, draw.mirror)
-            if reads_scan and sample.image is not None:
-                view = replace(view, image=self._made.varied(replace(sample, points=None), luck, draw.mirror).image)
-            views.append(self._view(view, rng))
-        return PlaceBatch(stack(views, None), stack_images(views), keys, places_drawn(draws, self._sequences))
-
-    def _needed(self, sample: Sample) -> Sample:
-        reads = self.network.reads
-        if "image" not in reads:
-            sample = replace(sample, image=None)
-        return sample if reads & {"voxels", "points"} else replace(sample, points=None, intensity=None)
-
-    def _view(self, view: View, rng: np.random.Generator | None) -> PlaceView:
-        reads, points = self.network.reads, view.sample.points
-        if "points" in reads and points is not None:
-            points = transform(np.linalg.inv(view.body_T_view), points)
-            points = some_points(points.astype(np.float32), rng or np.random.default_rng(0))
-        return PlaceView(
-            image=view.image if view.image_present and "image" in reads else None,
-            scan=view.scan if "voxels" in reads else None,
-            points=points if "points" in reads else None,
-        )
+        return self._see(stack_images([self._views.plain(sample) for sample in samples]))
 
     def _with_maps(self, batch: PlaceBatch) -> PlaceInput:
         if "image" not in self.network.reads:
