@@ -32,6 +32,7 @@ from umf_ros.lab.evaluation.retrieval import METHODS, PlaceCollection, Ranking, 
 from umf_ros.lab.evaluation.summary import ETNA_RECALL1, measure
 from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import load_weights, locate_weights
+from umf_ros.places.codes import CodeTable
 from umf_ros.places.index import DescriptorIndex
 
 RERANKED = {"umf_superfeatures": "superfeatures both", "umf_ransac": "ransac both"}
@@ -250,11 +251,12 @@ class MethodsRun:
 
 def search_ms(dimension: int, repeats: int = 30) -> float:
     """Median milliseconds to find the best of 858 places by descriptors of so many numbers."""
-    rng = np.random.default_rng(0)
-    index = DescriptorIndex(dimension)
-    for row in rng.standard_normal((PLACES, dimension)).astype(np.float32):
-        index.add(row / np.linalg.norm(row))
-    query, everywhere = index.descriptors[0].copy(), np.ones(PLACES, bool)
+    places = np.random.default_rng(0).standard_normal((PLACES, dimension)).astype(np.float32)
+    places /= np.linalg.norm(places, axis=1, keepdims=True)
+    table = CodeTable(dimension)
+    table.extend(places)
+    index = DescriptorIndex(table, lambda rows: places[rows])
+    query, everywhere = places[0], np.ones(PLACES, bool)
     took = []
     for _ in range(repeats):
         started = time.perf_counter()
