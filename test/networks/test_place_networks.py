@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny_worlds import some_scan
 
-from umf_ros.embedding.place_inputs import PlaceView, some_points, stack
+from umf_ros.embedding.place_inputs import PreparedView, some_points, stack
 from umf_ros.embedding.voxels import voxelise
 from umf_ros.errors import ConfigError, WeightsError
 from umf_ros.lab.training.networks import save_tensors
@@ -31,7 +31,7 @@ def some_batch(count: int = 3) -> PlaceInput:
     for seed in range(count):
         points = some_scan(seed)
         kept = some_points(points, np.random.default_rng(seed))
-        views.append(PlaceView(np.ones((160, 224), np.float32), voxelise(points, None, 1, VOXELS), kept))
+        views.append(PreparedView(np.ones((160, 224), np.float32), voxelise(points, None, 1, VOXELS), kept))
     return stack(views, torch.randn(count, EARLY, 10, 14))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from umf_ros.config import EmbeddingSettings
 from umf_ros.embedding.embedder import unit_descriptor
-from umf_ros.embedding.vocabulary import Bag, Binary, Vocabulary
+from umf_ros.embedding.vocabulary import WordBag, Binary, Vocabulary
 from umf_ros.frames import Embedding, Frame, Image
 from umf_ros.networks.place_networks import locate_place_weights
 
@@ -52,7 +52,7 @@ class Dbow2Embedder:
             np.add.at(spread, self._place[bag.words] % self.dimension, bag.weights)
         return Embedding(unit_descriptor(np.sqrt(spread)))
 
-    def bag(self, image: Image) -> Bag:
+    def bag(self, image: Image) -> WordBag:
         """The words of an image."""
         return self._vocabulary.bag(self._orb.of(image))
 

@@ -22,7 +22,7 @@ EMPTY_MAPS = (EARLY, IMAGE_SIZE[0] // 16, IMAGE_SIZE[1] // 16)
 
 
 @dataclass(frozen=True, slots=True)
-class PlaceView:
+class PreparedView:
     """One frame, preprocessed; None for what is missing or not read.
 
     Attributes:
@@ -36,15 +36,15 @@ class PlaceView:
     points: Points | None = None
 
 
-def view_frame(frame: Frame, reads: frozenset[str]) -> PlaceView:
+def view_frame(frame: Frame, reads: frozenset[str]) -> PreparedView:
     """What a network reads of a frame; a black image is none, and a scan stands upright on its ground."""
     image = frame.left if "image" in reads else None
     seen = None if image is None or is_blank(image) else standardise(shrink(image, IMAGE_SIZE))
     if frame.points is None or not len(frame.points) or not reads & {"voxels", "points"}:
-        return PlaceView(seen)
+        return PreparedView(seen)
     upright = transform(level(frame.points), frame.points).astype(np.float32)
     scan = voxelise(upright, frame.intensity, 1, VOXELS) if "voxels" in reads else None
-    return PlaceView(seen, scan, some_points(upright, np.random.default_rng(0)) if "points" in reads else None)
+    return PreparedView(seen, scan, some_points(upright, np.random.default_rng(0)) if "points" in reads else None)
 
 
 def some_points(points: Points, rng: np.random.Generator, reach_m: float = 40.0) -> Points | None:
@@ -55,13 +55,13 @@ def some_points(points: Points, rng: np.random.Generator, reach_m: float = 40.0)
     return near[rng.choice(len(near), POINTS, replace=len(near) < POINTS)].astype(np.float32)
 
 
-def stack_images(views: Sequence[PlaceView]) -> Tensor:
+def stack_images(views: Sequence[PreparedView]) -> Tensor:
     """(B, 1, 160, 224), zeros for what is missing."""
     blank = np.zeros(IMAGE_SIZE, np.float32)
     return torch.from_numpy(np.stack([blank if view.image is None else view.image for view in views]))[:, None]
 
 
-def stack(views: Sequence[PlaceView], maps: Tensor | None) -> PlaceInput:
+def stack(views: Sequence[PreparedView], maps: Tensor | None) -> PlaceInput:
     """A batch.
 
     Args:
@@ -91,7 +91,7 @@ def stack(views: Sequence[PlaceView], maps: Tensor | None) -> PlaceInput:
     )
 
 
-def _feels(view: PlaceView) -> bool:
+def _feels(view: PreparedView) -> bool:
     return view.points is not None or (view.scan is not None and bool(view.scan.fine_mask.any()))
 
 

@@ -32,7 +32,7 @@ def hamming(one: Binary, two: Binary) -> Indices:
 
 
 @dataclass(frozen=True, slots=True)
-class Bag:
+class WordBag:
     """What an image says in words.
 
     Attributes:
@@ -46,7 +46,7 @@ class Bag:
     nodes: Indices
 
 
-def similarity(one: Bag, two: Bag) -> float:
+def similarity(one: WordBag, two: WordBag) -> float:
     """1 - |v - w| / 2 of the two bags [Gálvez-López 2012]: what they share, 0 to 1."""
     _, of_one, of_two = np.intersect1d(one.words, two.words, assume_unique=True, return_indices=True)
     return float(np.minimum(one.weights[of_one], two.weights[of_two]).sum())
@@ -90,13 +90,13 @@ class Vocabulary:
         nearest = np.take_along_axis(among, distance.argmin(axis=1)[:, None], 1)[:, 0]
         return np.where(count > 0, nearest, here)
 
-    def bag(self, descriptors: Binary) -> Bag:
+    def bag(self, descriptors: Binary) -> WordBag:
         """The bag of an image's descriptors (F, 32)."""
         leaves, nodes = self.descend(descriptors)
         words, times = np.unique(leaves, return_counts=True)
         weights = times * self.idf[words]
         total = weights.sum()
-        return Bag(words, (weights / total if total > 0 else weights).astype(np.float32), nodes)
+        return WordBag(words, (weights / total if total > 0 else weights).astype(np.float32), nodes)
 
     def save(self, path: Path) -> None:
         """Write it as safetensors.
@@ -135,14 +135,14 @@ class InvertedIndex:
     def __len__(self) -> int:
         return self._size
 
-    def add(self, bag: Bag) -> int:
+    def add(self, bag: WordBag) -> int:
         """Remember a bag and return its number."""
         for word, weight in zip(bag.words.tolist(), bag.weights.tolist(), strict=True):
             self._entries.setdefault(word, []).append((self._size, weight))
         self._size += 1
         return self._size - 1
 
-    def scores(self, query: Bag) -> Points:
+    def scores(self, query: WordBag) -> Points:
         """(N,) similarity of every remembered bag, as `similarity` gives it."""
         found = np.zeros(self._size, np.float32)
         for word, weight in zip(query.words.tolist(), query.weights.tolist(), strict=True):

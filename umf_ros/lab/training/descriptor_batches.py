@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from umf_ros.embedding.place_inputs import PlaceView, some_points, stack, stack_images
+from umf_ros.embedding.place_inputs import PreparedView, some_points, stack, stack_images
 from umf_ros.geometry import transform
 from umf_ros.lab.datasets.labels import Places
 from umf_ros.lab.datasets.sample import Sample, SampleSequence
@@ -59,7 +59,7 @@ class PlaceViews:
         self._reads = reads
         self._maker = ViewMaker(CONFIG, Augmentation())
 
-    def plain(self, sample: Sample) -> PlaceView:
+    def plain(self, sample: Sample) -> PreparedView:
         """The view as it is, the same every time."""
         return self._view(self._maker.plain(self._needed(sample)), np.random.default_rng(0))
 
@@ -79,7 +79,7 @@ class PlaceViews:
             views.append(self._varied(sequences[draw.sequence].sample(draw.index), draw.mirror, luck, rng))
         return PlaceBatch(stack(views, None), stack_images(views), keys, places_drawn(draws, sequences))
 
-    def _varied(self, sample: Sample, mirror: bool, luck: np.random.Generator, rng: np.random.Generator) -> PlaceView:
+    def _varied(self, sample: Sample, mirror: bool, luck: np.random.Generator, rng: np.random.Generator) -> PreparedView:
         """`luck` varies the image, `rng` the scan."""
         sample = self._needed(sample)
         image = self._maker.varied(replace(sample, points=None), luck, mirror)
@@ -93,12 +93,12 @@ class PlaceViews:
             sample = replace(sample, image=None)
         return sample if self._reads & {"voxels", "points"} else replace(sample, points=None, intensity=None)
 
-    def _view(self, view: View, rng: np.random.Generator) -> PlaceView:
+    def _view(self, view: View, rng: np.random.Generator) -> PreparedView:
         points = view.sample.points
         if "points" in self._reads and points is not None:
             upright = transform(np.linalg.inv(view.body_T_view), points).astype(np.float32)
             points = some_points(upright, rng)
-        return PlaceView(
+        return PreparedView(
             image=view.image if view.image_present else None,
             scan=view.scan if "voxels" in self._reads else None,
             points=points if "points" in self._reads else None,
