@@ -29,6 +29,9 @@ MinProbability = Annotated[
 Resume = Annotated[
     bool, typer.Option("--resume", help="Go on with the newest replay of this recording in --out that was cut off.")
 ]
+RerunPath = Annotated[
+    Path | None, typer.Option("--rerun", help="Also write the run for the Rerun viewer: an .rrd file.")
+]
 
 
 def command(
@@ -43,6 +46,7 @@ def command(
     ground_truth: TruthPath = None,
     min_probability: MinProbability = None,
     resume: Resume = False,
+    rerun: RerunPath = None,
 ) -> None:
     """Find loop closures in a recording as fast as the machine goes.
 
@@ -62,6 +66,7 @@ def command(
     from umf_ros.replay import Replay
     from umf_ros.runs.recorder import count_drops
     from umf_ros.runs.report import finish_run
+    from umf_ros.runs.rerun_log import RerunLog
     from umf_ros.runs.resumption import ReplayFolder
 
     console = Console()
@@ -72,6 +77,7 @@ def command(
     reader = open_frames(recording, settings, inputs.warn, odometry, odometry_frame)
     if ground_truth is not None:
         read_ground_truth(recording, ground_truth)  # what is wrong with it is said now, not after the run
+    viewer = RerunLog(rerun) if rerun else None
     network = make_detector_embedder(settings)
     # a store that cannot be used is told before there is a folder
     detector = LoopDetector(settings, network) if settings.database.path else None
@@ -80,8 +86,11 @@ def command(
     inputs.tell_absent(settings, odometry is not None)
     replay = Replay(folder.path, settings, detector, folder.resumed)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress:
-        for detection in replay.run(reader.stream()):
+        stream = reader.stream()
+        for detection in replay.run(viewer.watch(stream) if viewer else stream):
             progress.show(reader.progress, detection)
+            if viewer:
+                viewer.show(detection)
             if interrupted():
                 break
     if interrupted():
@@ -90,6 +99,8 @@ def command(
         replay.finish(count_drops(reader.counters))
         if not interrupted():
             folder.finish()
+        if viewer:
+            viewer.finish(folder.path)
         inputs.remember(folder.path, reader.counters, interrupted(), odometry, odometry_frame)
         verdict = finish_run(folder.path, recording, console, ground_truth, inputs.told)
     raise typer.Exit(verdict.exit_code)
