@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from umf_ros.errors import ConfigError, either
 from umf_ros.resources import DEFAULT_DATASET, dataset_names, find
@@ -213,6 +213,10 @@ class Settings(Group):
         DEFAULT_DATASET, description="preset of calibration and topics, a file in `config/datasets` by its name"
     )
     calibration: str = Field("", description="calibration file (YAML); empty: the data set's")
+    mode: Literal["mapping", "localization"] = Field(
+        "mapping", description="remember new places, or say where the rover is in the map that `map` names"
+    )
+    map: str = Field("", description="folder of a map that `umf map` made, for mode localization; it stays as it is")
     topics: Topics = Topics()
     qos: Qos = Qos()
     sync: Sync = Sync()
@@ -224,6 +228,17 @@ class Settings(Group):
     frames: Frames = Frames()
     database: Database = Database()
     worker: WorkerSettings = WorkerSettings()
+
+    @model_validator(mode="after")
+    def _names_its_map(self) -> Settings:
+        if self.localizing and not self.map:
+            raise ValueError("mode localization needs a map: the parameter map names its folder")
+        return self
+
+    @property
+    def localizing(self) -> bool:
+        """Whether places are looked for in a map that stays as it is."""
+        return self.mode == "localization"
 
 
 def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:

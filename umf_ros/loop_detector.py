@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from umf_ros.config import Settings
 from umf_ros.embedding import make_embedder
@@ -52,7 +53,7 @@ class LoopDetector:
     """Finds loop closures in a stream of frames; the live node, the replay and the evaluation run this same class.
 
     `process` takes a frame through all stages: `select`, `embed`, `query`, `verify`, `look_around`,
-    `remember`.
+    `remember`. In a map that stays as it is, the last two have nothing to do.
 
     Args:
         settings: all settings.
@@ -67,7 +68,8 @@ class LoopDetector:
         self._selector = KeyframeSelector(settings.keyframe)
         self._embedder = embedder
         self._verifier = Verifier(settings.verification)
-        self.database = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
+        self.database = _open_places(settings, embedder)
+        self._map = range(self.database.next_session) if settings.localizing else None
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
         self._session: int | None = None
         self._stored_session = self.database.next_session
@@ -92,20 +94,21 @@ class LoopDetector:
         latency = Stopwatch()
         with latency.measure("embed"):
             keyframe = self.embed(frame)
-        known = self.database.recognise(keyframe)
+        known = self.database.recognise(keyframe) if self._map is None else None
         if known is not None:
             keyframe = self._go_on_from(frame, known)
         with latency.measure("query"):
             candidates = self.query(keyframe)
         with latency.measure("verify"):
             verdicts = self.verify(keyframe, candidates)
-        with latency.measure("submaps"):
-            verdicts = self.look_around(keyframe, verdicts)
         fault = None
-        try:
-            self.remember(keyframe, known is not None)
-        except OutputError as error:
-            fault = error
+        if self._map is None:
+            with latency.measure("submaps"):
+                verdicts = self.look_around(keyframe, verdicts)
+            try:
+                self.remember(keyframe, known is not None)
+            except OutputError as error:
+                fault = error
         return Detection(frame.stamp_ns, keyframe, verdicts, latency.milliseconds, fault)
 
     def select(self, frame: Frame) -> bool:
@@ -121,7 +124,7 @@ class LoopDetector:
 
     def query(self, keyframe: Keyframe) -> list[Candidate]:
         """Remembered places that look like a keyframe, best first."""
-        return self.database.query(keyframe, self._rules)
+        return self.database.query(keyframe, self._rules, self._map)
 
     def verify(self, keyframe: Keyframe, candidates: Sequence[Candidate]) -> list[Verdict]:
         """Test the candidates geometrically."""
@@ -176,7 +179,7 @@ class LoopDetector:
         """A new way begins; where the clock was set back, what was stored later than now waits for its time."""
         self._session = frame.session
         self._stored_session, self._ahead_m = self.database.next_session, 0.0
-        if len(self.database):
+        if len(self.database) and self._map is None:
             logger.warning("a new session begins; the %d places known so far are kept", len(self.database))
         self._selector.reset()
         self._verifier.reset()
@@ -189,6 +192,13 @@ class LoopDetector:
         ahead_m = keyframe.travelled_m - self._selector.travelled_m(frame)
         self._ahead_m = 0.0 if math.isnan(ahead_m) else ahead_m
         return keyframe
+
+
+def _open_places(settings: Settings, embedder: Embedder) -> PlaceDatabase:
+    """The store of the settings, or that of the map to localise in."""
+    if settings.localizing:
+        return PlaceDatabase.of_map(Path(settings.map), embedder.name, embedder.dimension)
+    return PlaceDatabase(settings.database, embedder.name, embedder.dimension)
 
 
 def make_keyframe(frame: Frame, embedder: Embedder, travelled_m: float = float("nan"), session: int = 0) -> Keyframe:

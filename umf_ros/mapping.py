@@ -22,7 +22,7 @@ from umf_ros.config import Database, Settings
 from umf_ros.errors import BagError, writing
 from umf_ros.frames import Keyframe
 from umf_ros.loop_detector import Detection, LoopDetector, make_detector_embedder
-from umf_ros.maps.map_folder import BETWEEN, PLACES, MapFolder, MapSession
+from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
 from umf_ros.maps.matching import Match, match_between
 from umf_ros.maps.odometry_log import OdometryLog
 from umf_ros.maps.tracking import track
@@ -31,6 +31,7 @@ from umf_ros.places.upkeep import delete_sessions, stored_identity, stored_sessi
 from umf_ros.replay import Replay
 from umf_ros.runs.finished_run import describe_recording, remember_recording
 from umf_ros.runs.recorder import count_drops
+from umf_ros.runs.resumption import PLACES
 from umf_ros.runs.tables import CLOSURES, CsvTable, closure_row
 
 Heard = Callable[[float, Detection], None]
@@ -54,7 +55,7 @@ class Opening:
             UmfError: they are wrong, or the recording's data set is not known.
         """
         overrides = {"embedding__method": self.embedder, "embedding__weights": self.weights}
-        return settings_for(bag, self.config, self.dataset, **overrides)
+        return settings_for(bag, self.config, self.dataset, mode="mapping", **overrides)
 
 
 def find_recordings(paths: list[Path]) -> list[Path]:

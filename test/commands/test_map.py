@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,8 @@ from umf_ros.bags.trajectories import read_ground_truth, read_tum
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.runs.tables import read_closures
 from umf_ros.runs.truth import trajectory_error
+from umf_ros.sensors.pcd import parse_pcd
+from umf_ros.sensors.ply import parse_ply
 
 
 def without_odometry(bag: Path, path: Path) -> Path:
@@ -105,3 +108,45 @@ def test_what_a_user_gets_wrong_is_one_line(tmp_path: Path) -> None:
     for recordings, told in wrong_calls(tmp_path):
         assert told in only_line(umf("map", *recordings, "--out", tmp_path / "map"))
     assert not (tmp_path / "map").exists() or not list((tmp_path / "map").iterdir())
+
+
+def test_a_rover_finds_itself_in_the_map_which_stays_as_it_is(
+    made: tuple[Path, Ended], mini_bag: Path, mini_config: Path, tmp_path: Path
+) -> None:
+    out, _ = made
+    before = {path: path.read_bytes() for path in (out / "places.sqlite", out / "poses.npz", out / "map.json")}
+    ended = umf("replay", mini_bag, "--config", mini_config, "--map", out, "--out", tmp_path)
+    assert ended.status == 0, ended.text
+    assert "found after" in ended.text
+    summary = json.loads((tmp_path / "latest" / "summary.json").read_text())
+    about = summary["localization"]
+    assert about["keyframes_until_found"] <= 20 and about["relocalised"] == 1 and about["contradicted"] <= 1
+    found, known = read_tum(tmp_path / "latest" / "trajectory_in_map.tum"), read_tum(out / "trajectories" / "mini.tum")
+    there, both = known.at(found.stamps_ns)
+    apart = np.linalg.norm(found.poses[both, :3, 3] - there[both, :3, 3], axis=1)
+    assert both.sum() > 5 and apart.max() < 0.5
+    with (tmp_path / "latest" / "localization.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == about["located"] and all(float(row["probability"]) > 0.99 for row in rows)
+    assert all(0 < float(row["sigma_x_m"]) < 1 for row in rows)
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_the_map_is_a_point_cloud_too(made: tuple[Path, Ended]) -> None:
+    out, ended = made
+    columns = parse_ply((out / "map.ply").read_bytes())
+    assert len(columns["x"]) > 5000 and set(columns["session"].tolist()) == {0, 1}
+    assert len(parse_pcd((out / "map.pcd").read_bytes())["x"]) == len(columns["x"])
+    assert (out / "map.png").read_bytes().startswith(b"\x89PNG")
+    thickness = json.loads((out / "summary.json").read_text())["thickness_m"]
+    assert thickness["after"] < 0.15
+    assert "cm thick" in ended.text
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [(["--mode", "localization"], "needs a map"), (["--map", "nowhere"], "holds no map"), (["--mode", "x"], "mode")],
+)
+def test_a_map_that_is_not_there_is_one_line(mini_bag: Path, tmp_path: Path, options: list[str], told: str) -> None:
+    assert told in only_line(umf("replay", mini_bag, "--out", tmp_path / "out", *options))
+    assert not (tmp_path / "out").exists()

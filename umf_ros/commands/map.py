@@ -106,3 +106,7 @@ def _tell(out: Path, summary: dict, console: Console) -> None:
         markup=False,
         soft_wrap=True,
     )
+    thickness = summary["thickness_m"]
+    if thickness["after"] is not None:
+        before, after = (f"{100 * thickness[when]:.1f}" for when in ("before", "after"))
+        console.print(f"surfaces that several sessions saw are {after} cm thick, by odometry alone {before} cm")

@@ -9,10 +9,10 @@ from typing import Any
 
 from umf_ros.config import Settings, dump_settings, load_settings
 from umf_ros.errors import UmfError, writing
+from umf_ros.places.database import PLACES_OF_MAP
 from umf_ros.runs.folder import write_atomically
 
 SCHEMA_VERSION = 1
-PLACES = "places.sqlite"
 BETWEEN = "closures_between.csv"
 _DAY_NS = 86_400 * 10**9
 APART_NS = 60 * 10**9
@@ -105,7 +105,7 @@ class MapFolder:
     @property
     def places(self) -> Path:
         """The store of places of all recordings, stamped by the map's clock."""
-        return self.path / PLACES
+        return self.path / PLACES_OF_MAP
 
     def folder_of(self, name: str) -> Path:
         """Run folder of a recording, stamped by its own clock."""

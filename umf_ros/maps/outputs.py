@@ -1,9 +1,11 @@
-"""What a solved map leaves in its folder: trajectories, graph, verdicts, picture and summary."""
+"""What a solved map leaves in its folder: trajectories, graph, verdicts, cloud, pictures and summary."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
+from dataclasses import asdict
+from math import isnan, nan
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,11 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from umf_ros.errors import writing
+from umf_ros.errors import UmfError, writing
 from umf_ros.geometry import Array
 from umf_ros.maps.joint_graph import JointMap, JointSession
 from umf_ros.maps.map_folder import MapFolder
+from umf_ros.maps.point_cloud import Crispness, write_cloud
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.export import verdict_table
 from umf_ros.runs.folder import write_atomically
@@ -41,15 +44,23 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
         write_tum(trajectories / f"{one.session.name}.tum", Trajectory(one.stamps, one.poses))
     joint.graph.write_g2o(path / "graph.g2o")
     _draw(path / "trajectories.png", joint)
-    summary = summarise(joint)
+    crispness = write_cloud(folder, joint) if folder.places.is_file() else Crispness(nan, nan)
+    summary = summarise(joint) | {"thickness_m": {name: _rounded(value) for name, value in asdict(crispness).items()}}
     write_atomically(path / "summary.json", json.dumps(summary, indent=2) + "\n")
     return summary
 
 
 def read_poses(path: Path) -> Trajectory:
-    """The poses of a map's places, on the map's clock."""
-    with np.load(path / POSES) as stored:
-        return Trajectory(stored["stamps"], stored["poses"])
+    """The poses of a map's places, on the map's clock.
+
+    Raises:
+        UmfError: the map has not been solved, or the file is damaged.
+    """
+    try:
+        with np.load(path / POSES) as stored:
+            return Trajectory(stored["stamps"], stored["poses"])
+    except (OSError, ValueError, KeyError):
+        raise UmfError(f"{path / POSES} cannot be read: umf map writes it when a map is solved") from None
 
 
 def summarise(joint: JointMap) -> dict[str, Any]:
@@ -66,6 +77,10 @@ def summarise(joint: JointMap) -> dict[str, Any]:
         "closures_within": _counts(joint.within),
         "closures_between": _counts(joint.between),
     }
+
+
+def _rounded(value: float) -> float | None:
+    return None if isnan(value) else round(value, 4)
 
 
 def _about(joint: JointMap, one: JointSession, ties: int) -> dict[str, Any]:

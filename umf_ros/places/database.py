@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from umf_ros.config import Database, Loop
+from umf_ros.errors import UmfError
 from umf_ros.frames import Candidate, Keyframe
 from umf_ros.keyframes import is_past
 from umf_ros.places.columns import Columns
@@ -20,6 +21,10 @@ VISITS = 4
 """A place is handed on from at most so many sessions (*by hand*): as many as get a metric pose."""
 WIDER = 10
 """So many times the candidates asked for are looked through for diverse ones (*by hand*)."""
+
+
+PLACES_OF_MAP = "places.sqlite"
+"""The store of places in the folder of a map."""
 
 
 class PlaceDatabase:
@@ -46,6 +51,18 @@ class PlaceDatabase:
         self._by_stamp: dict[int, tuple[int, ...]] = {}
         for entry in self._store.entries():
             self._register(entry)
+
+    @classmethod
+    def of_map(cls, folder: Path, embedder: str, dimension: int) -> PlaceDatabase:
+        """The places of a map, to be read only.
+
+        Raises:
+            UmfError: there is no map, or it was made with another embedder.
+        """
+        path = folder / PLACES_OF_MAP
+        if not path.is_file():
+            raise UmfError(f"{folder} holds no map: {PLACES_OF_MAP} is missing (umf map makes one)")
+        return cls(Database(path=str(path)), embedder, dimension, read_only=True)
 
     def __len__(self) -> int:
         return len(self._index)
