@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -93,20 +93,15 @@ def _match(target: MapFolder, name: str, console: Console) -> None:
         pass
 
 
-def _tell(out: Path, summary: dict, console: Console) -> None:
+def _tell(out: Path, summary: dict[str, Any], console: Console) -> None:
+    from umf_ros.maps.report import crispness, sentence
+
     for one in summary["sessions"]:
         tied = f"{one['closures_between']} ends of closures with others"
         joined = f"joined by {tied}" if one["joined"] else "not joined: nothing ties it to the map yet"
         way = f"{one['places']} places, {one['length_m']:.0f} m" + ("" if one["odometry"] else ", no odometry")
         console.print(f"  {one['name']}: {way}; {joined}", markup=False, soft_wrap=True)
-    between = summary["closures_between"]
-    console.print(
-        f"{out}: {summary['joined']} of {len(summary['sessions'])} sessions in one frame; closures between them: "
-        f"{between['accepted']} of {between['found']} believed",
-        markup=False,
-        soft_wrap=True,
-    )
-    thickness = summary["thickness_m"]
-    if thickness["after"] is not None:
-        before, after = (f"{100 * thickness[when]:.1f}" for when in ("before", "after"))
-        console.print(f"surfaces that several sessions saw are {after} cm thick, by odometry alone {before} cm")
+    console.print(f"{out}: {sentence(summary)}", markup=False, soft_wrap=True)
+    if told := crispness(summary):
+        console.print(told)
+    console.print(f"{out / 'report.html'}", markup=False, soft_wrap=True)
