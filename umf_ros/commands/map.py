@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from umf_ros.commands.recordings import ConfigPath, DatasetName, EmbedderName, WeightsPath, check_files
+from umf_ros.commands.recordings import (
+    ConfigPath,
+    DatasetName,
+    EmbedderName,
+    OdometryFrame,
+    WeightsPath,
+    check_files,
+    check_odometry_options,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -17,6 +25,10 @@ if TYPE_CHECKING:
 
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.")]
 MapPath = Annotated[Path, typer.Option("--out", help="Folder of the map, new or one to add to.")]
+OdometryFolder = Annotated[
+    Path | None,
+    typer.Option("--odometry", help="Folder of TUM files named like the recordings, where these have no odometry."),
+]
 
 
 def command(
@@ -26,13 +38,16 @@ def command(
     dataset: DatasetName = "auto",
     embedder: EmbedderName = None,
     weights: WeightsPath = None,
+    odometry: OdometryFolder = None,
+    odometry_frame: OdometryFrame = "",
 ) -> None:
     """Make one map of many recordings, or add recordings to one.
 
     Every recording is a session with its own odometry; closures within and between them make one pose graph.
     Recordings that the map has already are passed over, so that a new one costs itself alone.
     """
-    check_files(recordings[0], config)
+    check_files(recordings[0], config, odometry)
+    odometry_frame = check_odometry_options(odometry, odometry_frame)
 
     from rich.console import Console
 
@@ -43,7 +58,7 @@ def command(
 
     console = Console()
     check_writable(out)
-    opening = Opening(config, dataset, embedder, str(weights) if weights else None)
+    opening = Opening(config, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
     found = find_recordings(recordings)
     target = _open(out, opening, found[0])
     for recording in found:
