@@ -33,7 +33,6 @@ from umf_ros.config import Database, Loop, load_settings
 from umf_ros.frames import Embedding, LoopClosure
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.places.store import PlaceEntry
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
 SETTINGS = """/**: {ros__parameters: {embedding: {method: thumbnail}, loop: {min_time_gap_s: 8.0, min_travel_m: 10.0},
@@ -105,8 +104,11 @@ def many_places(count: int, rng: np.random.Generator) -> dict[str, float]:
     descriptors = rng.standard_normal((1000, 256)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     before = resident()
+    blank = some_keyframe(0, rng)
     for number in range(count):
-        places._register(PlaceEntry(number * 10**9, number // 1000, float(number), descriptors[number % 1000]))
+        seen = Embedding(descriptors[number % 1000])
+        stamp_ns, session = number * 10**9, number // 1000
+        places.add(replace(blank, stamp_ns=stamp_ns, embedding=seen, session=session, travelled_m=float(number)))
     used = resident() - before
     query = replace(some_keyframe(count * 10**9 + 10**12, rng), embedding=Embedding(descriptors[3]))
     times = []

@@ -31,6 +31,17 @@ def _known(name: str) -> str:
     return name
 
 
+class SecretError(ValueError):
+    """A value that must not be repeated."""
+
+
+def without_password(address: str) -> str:
+    """The address of a server, unless it holds a password, which would be written beside the results."""
+    if "password" in address.lower() or (":" in address.partition("://")[2].partition("@")[0] and "@" in address):
+        raise SecretError("the password belongs into ~/.pgpass or PGPASSWORD, not into the address")
+    return address
+
+
 Dataset = Annotated[str, AfterValidator(_known)]
 """Name of a data set that has a file in `config/datasets`."""
 
@@ -198,6 +209,16 @@ class Database(Group):
 
     path: str = Field("", description="file to keep places in, loaded when it exists; empty: a temporary file")
     cached_keyframes: int = Field(400, ge=20, description="keyframes whose local features stay in memory")
+    backend: Literal["sqlite", "postgres"] = Field(
+        "sqlite",
+        description="postgres: what is kept here goes to a fleet's server too, and others' places are asked for",
+    )
+    server: Annotated[str, AfterValidator(without_password)] = Field(
+        "", description="of a fleet, postgresql://ROVER@HOST/DATABASE; the password is in ~/.pgpass or PGPASSWORD"
+    )
+    fleet_candidates: int = Field(
+        5, ge=1, le=50, description="places of other rovers handed to verification, of each keyframe"
+    )
 
 
 class WorkerSettings(Group):
@@ -337,4 +358,6 @@ def _explain(problem: Any) -> str:
         return f"unknown parameter {name}"
     if problem["type"] == "missing":
         return f"{name} is missing"
+    if isinstance(problem.get("ctx", {}).get("error"), SecretError):
+        return f"{name}: {text}"
     return f"{name}: {text[0].lower()}{text[1:]} (got {problem['input']!r})"

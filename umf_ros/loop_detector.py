@@ -9,17 +9,21 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from umf_ros.config import Settings
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.depth import lift
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.errors import OutputError
+from umf_ros.errors import ConfigError, OutputError, UmfError
 from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure
 from umf_ros.keyframes import KeyframeSelector
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
 from umf_ros.verification import NO_DEPTH, Verdict, Verifier, thin_frame
+
+if TYPE_CHECKING:
+    from umf_ros.fleet.encounters import Encounter, Encounters
 
 logger = logging.getLogger(__name__)
 NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
@@ -59,6 +63,10 @@ class LoopDetector:
         settings: all settings.
         embedder: the network.
 
+    Attributes:
+        database: the rover's places.
+        encounters: with other rovers of a fleet; None of a rover on its own.
+
     Raises:
         UmfError: the place database of the settings belongs to another embedder.
     """
@@ -69,6 +77,7 @@ class LoopDetector:
         self._embedder = embedder
         self._verifier = Verifier(settings.verification)
         self.database = _open_places(settings, embedder)
+        self.encounters = _encounters(settings, self.database, embedder)
         self._map = range(self.database.next_session) if settings.localizing else None
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
         self._session: int | None = None
@@ -149,7 +158,9 @@ class LoopDetector:
             OutputError: the disk is full.
         """
         if not stored:
-            self.database.add(keyframe)
+            row = self.database.add(keyframe)
+            if self.encounters is not None:
+                self.encounters.link.remembered(row)
         self._submaps.remember(keyframe)
 
     def resume(self, frame: Frame) -> bool:
@@ -164,6 +175,16 @@ class LoopDetector:
         if known is not None:
             self._submaps.remember(self._go_on_from(frame, known))
         return True
+
+    def meet(self) -> Encounter | None:
+        """Verify what a fleet's server found for an earlier keyframe, if there is anything new."""
+        return self.encounters.next() if self.encounters is not None else None
+
+    def close(self) -> None:
+        """Leave the fleet's server, and release the database."""
+        if self.encounters is not None:
+            self.encounters.close()
+        self.database.close()
 
     def end_session(self) -> None:
         """End the session: the next frame begins a new one; every place is kept."""
@@ -223,6 +244,24 @@ def make_keyframe(frame: Frame, embedder: Embedder, travelled_m: float = float("
         body_T_lidar=frame.body_T_lidar,
         motion=motion,
     )
+
+
+def _encounters(settings: Settings, database: PlaceDatabase, embedder: Embedder) -> Encounters | None:
+    """The way to other rovers' places, where there is a fleet; what it takes is imported only then.
+
+    Raises:
+        ConfigError: the settings name no server.
+        UmfError: what it takes is not installed.
+    """
+    if settings.database.backend == "sqlite" or settings.localizing:
+        return None
+    if not settings.database.server:
+        raise ConfigError("database.backend: postgres needs database.server")
+    try:
+        from umf_ros.fleet.encounters import Encounters
+    except ModuleNotFoundError as error:
+        raise UmfError(f"{error.name} is not installed; database.backend: postgres needs umf_ros[fleet]") from None
+    return Encounters(settings, database.store, (embedder.name, embedder.dimension))
 
 
 def make_detector_embedder(settings: Settings) -> Embedder:

@@ -28,7 +28,7 @@ from umf_ros.geometry import Array
 from umf_ros.maps.follower import MapFollower
 from umf_ros.nodes import pose_graph_messages as messages
 from umf_ros.nodes.base_node import BaseNode
-from umf_ros.nodes.conversions import closure_from_message, parse_pair
+from umf_ros.nodes.conversions import closure_from_message, is_between_rovers, parse_pair
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import run
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
@@ -139,6 +139,8 @@ class PoseGraphNode(BaseNode):
             self._broadcast(transform)
 
     def _on_closure(self, message: Odometry) -> None:
+        if is_between_rovers(message):
+            return
         closure = closure_from_message(message)
         self._worker.submit(lambda: self._announce(self._durable.add_closure(closure)))
 
