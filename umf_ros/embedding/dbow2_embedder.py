@@ -9,7 +9,7 @@ import numpy as np
 
 from umf_ros.config import EmbeddingSettings
 from umf_ros.embedding.embedder import unit_descriptor
-from umf_ros.embedding.vocabulary import WordBag, Binary, Vocabulary
+from umf_ros.embedding.vocabulary import Binary, Vocabulary, WordBag
 from umf_ros.frames import Embedding, Frame, Image
 from umf_ros.networks.place_networks import locate_place_weights
 

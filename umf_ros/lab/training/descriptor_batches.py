@@ -79,7 +79,9 @@ class PlaceViews:
             views.append(self._varied(sequences[draw.sequence].sample(draw.index), draw.mirror, luck, rng))
         return PlaceBatch(stack(views, None), stack_images(views), keys, places_drawn(draws, sequences))
 
-    def _varied(self, sample: Sample, mirror: bool, luck: np.random.Generator, rng: np.random.Generator) -> PreparedView:
+    def _varied(
+        self, sample: Sample, mirror: bool, luck: np.random.Generator, rng: np.random.Generator
+    ) -> PreparedView:
         """`luck` varies the image, `rng` the scan."""
         sample = self._needed(sample)
         image = self._maker.varied(replace(sample, points=None), luck, mirror)
