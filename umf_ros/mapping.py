@@ -18,6 +18,7 @@ from shutil import rmtree
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
+from umf_ros.bags.trajectories import read_odometry
 from umf_ros.config import Database, Settings
 from umf_ros.errors import BagError, writing
 from umf_ros.frames import Keyframe
@@ -33,6 +34,7 @@ from umf_ros.runs.finished_run import describe_recording, remember_recording
 from umf_ros.runs.recorder import count_drops
 from umf_ros.runs.resumption import PLACES
 from umf_ros.runs.tables import CLOSURES, CsvTable, closure_row
+from umf_ros.trajectory import Trajectory
 
 Heard = Callable[[float, Detection], None]
 """Told of every frame: the part of the recording that is done, 0 to 1, and what became of it."""
@@ -41,12 +43,19 @@ RECORDINGS = (".mcap", ".db3", ".bag")
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """How recordings are opened, as by the options of `umf replay`."""
+    """How recordings are opened, as by the options of `umf replay`.
+
+    Attributes:
+        odometry: folder of TUM files named like the recordings, `NAME.tum` or `NAME.odometry.tum`; None: none.
+        odometry_frame: whose poses they hold.
+    """
 
     config: Path | None = None
     dataset: str = "auto"
     embedder: str | None = None
     weights: str | None = None
+    odometry: Path | None = None
+    odometry_frame: str = "body"
 
     def settings(self, bag: Bag) -> Settings:
         """The settings to read a recording with.
@@ -56,6 +65,17 @@ class Opening:
         """
         overrides = {"embedding__method": self.embedder, "embedding__weights": self.weights}
         return settings_for(bag, self.config, self.dataset, mode="mapping", **overrides)
+
+    def odometry_of(self, recording: Path, settings: Settings) -> Trajectory | None:
+        """The odometry of a recording from its file; None where there is no such file.
+
+        Raises:
+            BagError: the file is damaged, or its frame is not known.
+        """
+        folder = self.odometry
+        paths = [folder / f"{recording.stem}{ending}" for ending in (".tum", ".odometry.tum")] if folder else []
+        path = next((path for path in paths if path.is_file()), None)
+        return None if path is None else read_odometry(path, self.odometry_frame, settings)
 
 
 def find_recordings(paths: list[Path]) -> list[Path]:
@@ -99,7 +119,7 @@ def replay_session(recording: Path, opening: Opening, folder: Path, heard: Heard
         folder.mkdir(parents=True)
     store = Database(path=str(folder / PLACES), cached_keyframes=settings.database.cached_keyframes)
     settings = settings.model_copy(update={"database": store})
-    reader, log = FrameReader(bag, settings), OdometryLog()
+    reader, log = FrameReader(bag, settings, opening.odometry_of(recording, settings)), OdometryLog()
     replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
     for detection in replay.run(log.following(reader.stream())):
         heard(reader.progress, detection)

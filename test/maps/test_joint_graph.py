@@ -106,6 +106,9 @@ def test_results_say_whose_everything_is(tmp_path: Path) -> None:
     poses = read_poses(folder.path)
     assert len(poses) == 61 + 71 and poses.stamps_ns[-1] == made[1].stamp(80) + DAY_NS
     assert (folder.path / "trajectories.png").stat().st_size > 1000
+    page = (folder.path / "report.html").read_text()
+    assert "2 of 2 sessions in one frame" in page and page.count("data:image/png") == 1  # no scans, no ground
+    assert "<td>second</td>" in page
     lines = (folder.path / "trajectories" / "second.tum").read_text().splitlines()
     # in the recording's own clock
     assert len(lines) == 71 and lines[0].startswith(f"{made[1].stamp(10) // 10**9}.")

@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from umf_ros.commands.recordings import ConfigPath, DatasetName, EmbedderName, WeightsPath, check_files
+from umf_ros.commands.recordings import (
+    ConfigPath,
+    DatasetName,
+    EmbedderName,
+    OdometryFrame,
+    WeightsPath,
+    check_files,
+    check_odometry_options,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -23,6 +31,10 @@ RayAddress = Annotated[
     str | None, typer.Option("--ray", help="Spread them by Ray: address of a cluster that sees these files, or local.")
 ]
 MapPath = Annotated[Path, typer.Option("--out", help="Folder of the map, new or one to add to.")]
+OdometryFolder = Annotated[
+    Path | None,
+    typer.Option("--odometry", help="Folder of TUM files named like the recordings, where these have no odometry."),
+]
 
 
 def command(
@@ -34,13 +46,16 @@ def command(
     weights: WeightsPath = None,
     workers: Workers = 1,
     ray: RayAddress = None,
+    odometry: OdometryFolder = None,
+    odometry_frame: OdometryFrame = "",
 ) -> None:
     """Make one map of many recordings, or add recordings to one.
 
     Every recording is a session with its own odometry; closures within and between them make one pose graph.
     Recordings that the map has already are passed over, so that a new one costs itself alone.
     """
-    check_files(recordings[0], config)
+    check_files(recordings[0], config, odometry)
+    odometry_frame = check_odometry_options(odometry, odometry_frame)
 
     from rich.console import Console
 
@@ -52,7 +67,7 @@ def command(
 
     console = Console()
     check_writable(out)
-    opening = Opening(config, dataset, embedder, str(weights) if weights else None)
+    opening = Opening(config, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
     found = find_recordings(recordings)
     target = _open(out, opening, found[0])
     if ray is None and workers == 1:
@@ -146,20 +161,15 @@ def _match(target: MapFolder, name: str, console: Console) -> None:
         pass
 
 
-def _tell(out: Path, summary: dict, console: Console) -> None:
+def _tell(out: Path, summary: dict[str, Any], console: Console) -> None:
+    from umf_ros.maps.report import crispness, sentence
+
     for one in summary["sessions"]:
         tied = f"{one['closures_between']} ends of closures with others"
         joined = f"joined by {tied}" if one["joined"] else "not joined: nothing ties it to the map yet"
         way = f"{one['places']} places, {one['length_m']:.0f} m" + ("" if one["odometry"] else ", no odometry")
         console.print(f"  {one['name']}: {way}; {joined}", markup=False, soft_wrap=True)
-    between = summary["closures_between"]
-    console.print(
-        f"{out}: {summary['joined']} of {len(summary['sessions'])} sessions in one frame; closures between them: "
-        f"{between['accepted']} of {between['found']} believed",
-        markup=False,
-        soft_wrap=True,
-    )
-    thickness = summary["thickness_m"]
-    if thickness["after"] is not None:
-        before, after = (f"{100 * thickness[when]:.1f}" for when in ("before", "after"))
-        console.print(f"surfaces that several sessions saw are {after} cm thick, by odometry alone {before} cm")
+    console.print(f"{out}: {sentence(summary)}", markup=False, soft_wrap=True)
+    if told := crispness(summary):
+        console.print(told)
+    console.print(f"{out / 'report.html'}", markup=False, soft_wrap=True)

@@ -18,6 +18,7 @@ from umf_ros.geometry import Array
 from umf_ros.maps.joint_graph import JointMap, JointSession
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.point_cloud import Crispness, write_cloud
+from umf_ros.maps.report import write_report
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.export import verdict_table
 from umf_ros.runs.folder import write_atomically
@@ -47,6 +48,7 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     crispness = write_cloud(folder, joint) if folder.places.is_file() else Crispness(nan, nan)
     summary = summarise(joint) | {"thickness_m": {name: _rounded(value) for name, value in asdict(crispness).items()}}
     write_atomically(path / "summary.json", json.dumps(summary, indent=2) + "\n")
+    write_report(path, summary)
     return summary
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import threading
 from collections import OrderedDict
@@ -219,7 +220,9 @@ class KeyframeStore:
     def _open_to_read(self, identity: dict[str, str]) -> sqlite3.Connection:
         if self.path is None or not self.path.is_file():
             raise UmfError(f"there is no place database {self.path}")
-        connection = sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
+        # SQLite wants to write files of its own beside what it reads, unless nobody can
+        access = "mode=ro" if os.access(self.path.parent, os.W_OK) else "immutable=1"
+        connection = sqlite3.connect(f"{self.path.resolve().as_uri()}?{access}", uri=True, check_same_thread=False)
         self._take_up(connection, lambda: check_identity(connection, self._name, identity))
         return connection
 

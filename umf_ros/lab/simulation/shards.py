@@ -51,15 +51,15 @@ def write_shard(
     save(path, _arrays(survey, samples, setting))
 
 
-def write_world(task: tuple[Path, int]) -> None:
-    """The shard of a seed, by its plan, in a folder: a task of its own.
+def write_world(task: tuple[Path, int, int]) -> None:
+    """The shard of a seed, by its plan: a task of its own, of the file, the seed and every how manieth frame.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    folder, world = task
+    path, world, every = task
     family, setting = shard_plan(world)
-    write_shard(folder / f"world_{world:05d}.npz", survey_world(world, family, setting), setting, workers=1)
+    write_shard(path, survey_world(world, family, setting, every=every), setting, workers=1)
 
 
 def save(path: Path, arrays: dict[str, Array]) -> None:
