@@ -124,7 +124,7 @@ def test_what_is_not_python_is_installed_with_the_package(install: Path) -> None
 @pytest.mark.parametrize(
     ("wing", "lists"),
     [
-        ("runtime", ["requirements.txt", "requirements-fleet.txt"]),
+        ("runtime", ["requirements.txt", "requirements-fleet.txt", "requirements-rerun.txt"]),
         ("lab", ["requirements.txt", "requirements-lab.txt"]),
     ],
 )

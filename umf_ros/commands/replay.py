@@ -22,6 +22,7 @@ from umf_ros.commands.recordings import (
     open_frames,
     open_recording,
 )
+from umf_ros.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,6 +38,9 @@ MinProbability = Annotated[
 ]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Go on with the newest replay of this recording in --out that was cut off.")
+]
+RerunPath = Annotated[
+    Path | None, typer.Option("--rerun", help="Also write the run for the Rerun viewer: an .rrd file.")
 ]
 Mode = Annotated[str | None, typer.Option("--mode", help="mapping, or localization in the map that --map names.")]
 MapPath = Annotated[
@@ -56,6 +60,7 @@ def command(
     ground_truth: TruthPath = None,
     min_probability: MinProbability = None,
     resume: Resume = False,
+    rerun: RerunPath = None,
     mode: Mode = None,
     map_folder: MapPath = None,
 ) -> None:
@@ -77,6 +82,7 @@ def command(
     from umf_ros.replay import Replay
     from umf_ros.runs.recorder import count_drops
     from umf_ros.runs.report import finish_run
+    from umf_ros.runs.rerun_log import RerunLog
     from umf_ros.runs.resumption import ReplayFolder
 
     console = Console()
@@ -94,9 +100,12 @@ def command(
     reader = open_frames(recording, settings, inputs.warn, odometry, odometry_frame)
     if ground_truth is not None:
         read_ground_truth(recording, ground_truth)  # what is wrong with it is said now, not after the run
+    if settings.localizing and rerun:
+        raise ConfigError("--rerun shows a run that maps: leave it out with --map")
     network = make_detector_embedder(settings)
     if settings.localizing:
         raise typer.Exit(_localize(recording, settings, reader, network, out, inputs, console))
+    viewer = RerunLog(rerun) if rerun else None
     # a store that cannot be used is told before there is a folder
     detector = LoopDetector(settings, network) if settings.database.path else None
     folder = (ReplayFolder.resume if resume else ReplayFolder.create)(out, bag, settings)
@@ -104,8 +113,11 @@ def command(
     inputs.tell_absent(settings, odometry is not None)
     replay = Replay(folder.path, settings, detector, folder.resumed)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress:
-        for detection in replay.run(reader.stream()):
+        stream = reader.stream()
+        for detection in replay.run(viewer.watch(stream) if viewer else stream):
             progress.show(reader.progress, detection)
+            if viewer:
+                viewer.show(detection)
             if interrupted():
                 break
     if interrupted():
@@ -114,6 +126,8 @@ def command(
         replay.finish(count_drops(reader.counters))
         if not interrupted():
             folder.finish()
+        if viewer:
+            viewer.finish(folder.path)
         inputs.remember(folder.path, reader.counters, interrupted(), odometry, odometry_frame)
         verdict = finish_run(folder.path, recording, console, ground_truth, inputs.told)
     raise typer.Exit(verdict.exit_code)

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from torch import Tensor
+from torch import Tensor, nn
 
 from umf_ros.errors import WeightsError
 from umf_ros.networks.config import NetworkConfig
@@ -33,14 +33,14 @@ def load_weights(path: Path) -> UMF:
     Raises:
         WeightsError: missing, truncated or foreign file, not finite, or of another architecture.
     """
-    architecture, tensors = _read(path)
+    architecture, tensors = read_weights(path)
     network = UMF(NetworkConfig.from_dict(architecture))
     fill(network, tensors, path)
     channels_last(network)
     return network.eval()
 
 
-def fill(network: UMF, tensors: dict[str, Tensor], path: Path) -> None:
+def fill(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
     """Put tensors into a network of the same architecture.
 
     Raises:
@@ -59,7 +59,12 @@ def fill(network: UMF, tensors: dict[str, Tensor], path: Path) -> None:
     network.load_state_dict({name: value.to(wanted[name].dtype) for name, value in tensors.items()})
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """What a file says of the architecture, and its tensors.
+
+    Raises:
+        WeightsError: missing, truncated or foreign file.
+    """
     if not path.is_file():
         raise WeightsError(f"weights {path} do not exist")
     try:

@@ -20,7 +20,15 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, near, prior_sigmas
 from umf_ros.verification.meeting import meet, rivalry
-from umf_ros.verification.registration import NOMINAL, Alignment, CovarianceModel, PreparedScan, covariance_of, levelled
+from umf_ros.verification.registration import (
+    Alignment,
+    CovarianceModel,
+    PreparedScan,
+    covariance_of,
+    joint_blur,
+    levelled,
+    nominal_deviations,
+)
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
 from umf_ros.verification.scan_motion import closure_covariance
 from umf_ros.verification.views import ViewAlignment
@@ -211,11 +219,11 @@ def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) ->
     else:
         assert aligned.scans is not None
         fit = _measure_scans(known, alignment, *aligned.scans)
-    nominal = covariance_of(alignment.information, NOMINAL)
+    position_std_m, heading_std_deg = nominal_deviations(alignment.information)
     return replace(
         fit,
-        position_std_m=float(np.sqrt(np.linalg.eigvalsh(nominal[:3, :3])[-1])),
-        heading_std_deg=float(np.degrees(np.sqrt(nominal[5, 5]))),
+        position_std_m=position_std_m,
+        heading_std_deg=heading_std_deg,
         agreement_cloud=cloud_agreement(query, match, pose),
         prior_sigmas=prior_sigmas(query, match, pose, drift),
         support=memory.support(query, match, pose),
@@ -276,7 +284,7 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
         kind=SCAN,
         residual_m=float(np.median(size)),
         residual_p90_m=float(np.percentile(size, 90)),
-        noise_m=math.hypot(max(match.noise_m, const.MIN_SURFACE_NOISE_M), max(match.blur_m, query.blur_m)),
+        noise_m=math.hypot(max(match.noise_m, const.MIN_SURFACE_NOISE_M), joint_blur(match, query)),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),
         relief_m=shared_relief(match.elevation, query.elevation, level),

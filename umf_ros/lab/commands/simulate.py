@@ -42,6 +42,7 @@ def command(
         Path | None, typer.Option(help="Write training shards to this folder instead; those there are kept.")
     ] = None,
     worlds: Annotated[str, typer.Option(help="Seeds of the shards, as first:last+1.")] = "0:8",
+    every: Annotated[int, typer.Option(min=1, help="Every n-th sample of the shards' passes: a smaller set.")] = 1,
     sequences: Annotated[str, typer.Option(help="Shards of named sequences instead: etna (7) or thesis (13).")] = "",
     contact_sheet: Annotated[Path | None, typer.Option(help="Write a PNG of 24 frames and 6 scans instead.")] = None,
     workers: Annotated[int, typer.Option(min=1, max=64, help="Threads that render.")] = 2,
@@ -56,7 +57,7 @@ def command(
     if contact_sheet is not None:
         _write_contact_sheet(contact_sheet, seed, family or "etna", console)
     elif shards is not None:
-        _write_shards(shards, worlds, sequences, seed, workers, console)
+        _write_shards(shards, worlds, every, sequences, seed, workers, console)
     elif out is not None:
         _write_bag(out, preset, (seed, world), duration, family, aliasing, image_rate, truth, workers, console)
     else:
@@ -94,7 +95,9 @@ def _write_bag(
     console.print(f"{out}: {simulator.duration_s:.0f} s, {scans} scans, {size:.0f} MB", markup=False, soft_wrap=True)
 
 
-def _write_shards(folder: Path, worlds: str, sequences: str, seed: int, workers: int, console: Console) -> None:
+def _write_shards(
+    folder: Path, worlds: str, every: int, sequences: str, seed: int, workers: int, console: Console
+) -> None:
     from umf_ros.lab.simulation.sequences import SEQUENCES
     from umf_ros.lab.simulation.survey import shard_plan, survey_world
 
@@ -111,7 +114,7 @@ def _write_shards(folder: Path, worlds: str, sequences: str, seed: int, workers:
             family, setting = shard_plan(world)
             path = folder / f"world_{world:05d}.npz"
             if not path.exists():
-                _write_shard(path, survey_world(world, family, setting), setting, workers, progress)
+                _write_shard(path, survey_world(world, family, setting, every=every), setting, workers, progress)
 
 
 def _write_shard(path: Path, survey: Survey, setting: str, workers: int, progress: Progress) -> None:
