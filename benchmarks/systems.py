@@ -45,7 +45,7 @@ WINDOW_M = 25.0
 TRUE_M, TRUE_DEG = 3.0, 15.0
 PAIRED = 4
 """Every so many-th keyframe is a query of KISS-Matcher, which takes half a second for each."""
-PINNED = ("kiss-slam==0.0.2", "map-closures==2.2.0", "kiss-matcher==1.0.2", "small_gicp==1.0.1")
+PINNED = Path(__file__).parents[1] / "requirements-peers.txt"
 OURS: dict[str, dict[str, Any]] = {
     "fused": {},
     "lidar": {"topics": {"left_image": "/none/left", "right_image": ""}},
@@ -267,7 +267,7 @@ def peers_python(folder: Path) -> Path:
     python = folder / "bin" / "python"
     if not python.exists():
         subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
-        subprocess.run([str(python), "-m", "pip", "install", "--quiet", *PINNED], check=True)
+        subprocess.run([str(python), "-m", "pip", "install", "--quiet", "-r", str(PINNED)], check=True)
     return python
 
 
