@@ -248,7 +248,9 @@ def run_peer(name: str, drive: Drive, folder: Path, python: Path) -> SystemRun:
     script = Path(__file__).with_name("system_peers.py")
     command = [str(python), str(script), peer, str(drive.files), str(asked), str(answer)]
     clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=clean)
+    done = subprocess.run(command, capture_output=True, text=True, env=clean)  # they print much
+    if done.returncode:
+        raise typer.BadParameter(f"{name} failed: {done.stderr.strip()[-300:]}")
     told = json.loads(answer.read_text())
     closures = [
         FoundClosure(one["query"], one["match"], tuple(one["query_window"]), np.array(one["match_T_query"]))
