@@ -67,8 +67,8 @@ class Killer(threading.Thread):
         self.killed = 0
 
     def run(self) -> None:
-        """Look until there is one, for a minute."""
-        end = time.monotonic() + 60
+        """Look until there is one, for ten minutes at most."""
+        end = time.monotonic() + 600
         while not self.killed and time.monotonic() < end:
             time.sleep(0.05)
             for path in Path("/proc").glob("[0-9]*/fd/*"):
