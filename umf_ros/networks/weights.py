@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from umf_ros.errors import WeightsError
-from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import UMF, channels_last
-from umf_ros.resources import find
+from umf_ros.networks.weights_files import open_weights, parse_config
 
-SHIPPED = ("umf_scene", "umf_light")
-DEFAULT = "umf_scene"
 SCALE = ".scale"
 """End of the name of what the eight bits of another tensor are to be multiplied with."""
-
-
-def locate_weights(weights: Path | None) -> Path:
-    """A weights file: as given, one of the shipped by its name, or for None the shipped default."""
-    name = DEFAULT if weights is None else str(weights)
-    return find(f"models/{name}.safetensors") if name in SHIPPED else Path(name)
 
 
 def load_weights(path: Path) -> UMF:
@@ -33,8 +21,10 @@ def load_weights(path: Path) -> UMF:
     Raises:
         WeightsError: missing, truncated or foreign file, not finite, or of another architecture.
     """
-    architecture, tensors = _read(path)
-    network = UMF(NetworkConfig.from_dict(architecture))
+    with open_weights(path, "pt") as stream:
+        config = parse_config(path, stream)
+        tensors = _restore({name: stream.get_tensor(name) for name in stream.keys()})  # noqa: SIM118 (not a mapping)
+    network = UMF(config)
     fill(network, tensors, path)
     channels_last(network)
     return network.eval()
@@ -57,23 +47,6 @@ def fill(network: UMF, tensors: dict[str, Tensor], path: Path) -> None:
     if bad:
         raise WeightsError(f"{path} is damaged: {bad[0]} holds values that are not finite")
     network.load_state_dict({name: value.to(wanted[name].dtype) for name, value in tensors.items()})
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    if not path.is_file():
-        raise WeightsError(f"weights {path} do not exist")
-    try:
-        with safe_open(path, framework="pt") as stream:
-            metadata = stream.metadata() or {}
-            tensors = _restore({name: stream.get_tensor(name) for name in stream.keys()})  # noqa: SIM118 (not a mapping)
-    except (SafetensorError, OSError, ValueError) as error:
-        raise WeightsError(f"{path} is truncated or not a safetensors file: {' '.join(str(error).split())}") from None
-    if "architecture" not in metadata:
-        raise WeightsError(f"{path} holds weights of another architecture: it does not say which")
-    try:
-        return dict(json.loads(metadata["architecture"])), tensors
-    except (TypeError, ValueError):
-        raise WeightsError(f"{path} holds weights of another architecture: it does not say which clearly") from None
 
 
 def _restore(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
