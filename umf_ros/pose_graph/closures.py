@@ -73,6 +73,12 @@ class TrackedClosure:
         """Whether the closure shapes the map."""
         return self.verdict.state is State.ACCEPTED
 
+    def untried(self) -> TrackedClosure:
+        """The same closure before anything was decided."""
+        return TrackedClosure(
+            self.match, self.query, ClosureVerdict(self.closure, State.UNDECIDED, "new"), self.covariance
+        )
+
     def decide(self, state: State, reason: str, residual: float = np.nan, residual_m: float = np.nan) -> None:
         """Replace the verdict."""
         self.verdict = ClosureVerdict(self.closure, state, reason, residual, residual_m)

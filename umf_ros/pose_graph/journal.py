@@ -22,6 +22,9 @@ _TABLES = (
     "residual_m REAL, PRIMARY KEY (match_ns, query_ns))",
 )
 ODOMETRY, CLOSURE, REVOKED, DECIDED, STARTED = "odometry", "closure", "revoked", "decided", "started"
+UNSETTLED = "unsettled"
+JOURNAL = "pose_graph.sqlite"
+"""Name of the file in a folder of results."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +32,8 @@ class Event:
     """One thing that happened to the graph.
 
     Attributes:
-        kind: an odometry message came, a closure came, a pair of keyframes was revoked, what waited was decided, or
-            the process was started anew.
+        kind: an odometry message came, a closure came, a pair of keyframes was revoked, what waited was decided, the
+            process was started anew, or it ended before the graph was settled.
         first_ns: stamp of the odometry, or of the match.
         second_ns: stamp of the query.
         data: (16,) pose of the odometry; of a closure the pose, the covariance (36,) and the probability.
@@ -83,6 +86,11 @@ class GraphJournal:
                 yield Event(kind, first_ns, second_ns, np.frombuffer(data, np.float64))
         except (sqlite3.Error, ValueError) as error:
             raise UmfError(f"{self.path} is damaged: {error}") from None
+
+    def is_unsettled(self) -> bool:
+        """Whether the last thing that happened was an end without the time to settle the graph."""
+        row = self._connection.execute("SELECT kind FROM event ORDER BY id DESC LIMIT 1").fetchone()
+        return row is not None and row[0] == UNSETTLED
 
     def verdicts(self) -> dict[tuple[int, int], str]:
         """The latest state of every closure, by the stamps of match and query."""

@@ -15,7 +15,10 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from umf_ros.config import load_settings
 from umf_ros.errors import UmfError
+from umf_ros.pose_graph.journal import JOURNAL, GraphJournal
+from umf_ros.sensors.durable_graph import DurableGraph
 
 START_TIMEOUT_S = 180.0
 STOP_TIMEOUT_S = 60.0
@@ -127,6 +130,7 @@ class LiveGraph:
     ) -> bool:
         with self._console.status("Finishing"):
             self._stop_all()
+            settle_left(self._folder)
         if kind is KeyboardInterrupt:
             self._console.print("[yellow]Interrupted: the report covers what was done so far.")
             return True
@@ -176,6 +180,20 @@ class LiveGraph:
             if not node.stop():
                 self._console.print(f"[red]{node.name} did not finish and was killed; its results may be incomplete.")
         self._nodes = []
+
+
+def settle_left(folder: Path) -> None:
+    """Settle the graph of a run whose back-end had no time for it at its end."""
+    path = folder / JOURNAL
+    if not path.exists():
+        return
+    kept = GraphJournal(path)
+    unsettled = kept.is_unsettled()
+    kept.close()
+    if unsettled:
+        durable = DurableGraph(load_settings(folder / "config.yaml").pose_graph, path, lambda _: None)
+        durable.write_results(folder)
+        durable.close()
 
 
 def _environment() -> dict[str, str]:
