@@ -72,6 +72,7 @@ class LoopClosureNode(BaseNode):
         self._closures = 0
         self._last: Detection | None = None
         self._worker: Worker[Frame] = Worker(self._detect, self._complain, settings.worker.queue_size)
+        self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._complain, 1)
         self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._complain, INTAKE_QUEUE)
         hear_static_transforms(self, transforms)
         for name, topic in topics.model_dump().items():
@@ -89,10 +90,11 @@ class LoopClosureNode(BaseNode):
         for frame in self._synchronizer.flush():
             self._worker.submit(frame)
         self._worker.close(timeout_s=30.0)
+        self._writer.close()
         self._announcer.wait_until_heard()
         try:
+            self._write_summary()
             if self._recorder is not None:
-                self._recorder.write_summary(self._drops())
                 self._recorder.close()
         finally:
             self._detector.database.close()
@@ -132,6 +134,9 @@ class LoopClosureNode(BaseNode):
     def _tick(self) -> None:
         own = self._own_status()
         self._diagnose(own if self._paused else self._judge(own))
+        self._writer.submit(None)  # a slow disk is no matter of the executor
+
+    def _write_summary(self) -> None:
         if self._recorder is not None:
             self._recorder.write_summary(self._drops())
 

@@ -200,6 +200,8 @@ class PoseGraphNode(BaseNode):
         graph = self._durable.graph
         values: dict[str, object] = {**graph.counts, **self._faults, "queue_dropped": self._worker.dropped}
         values["odometry_out_of_line"] = self._durable.feed.dropped
+        values["odometry_held"] = self._durable.feed.held
+        values["queue_waiting"] = self._worker.waiting
         values["executor_stall_max_ms"] = self._heartbeat.longest_ms
         values |= {state.value: count for state, count in graph.verdict_counts().items()}
         trouble = self._worker.dropped or any(name.startswith("optimiser") for name in graph.counts)

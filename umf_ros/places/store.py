@@ -19,6 +19,7 @@ from umf_ros.errors import UmfError, writing
 from umf_ros.frames import Keyframe
 from umf_ros.locks import FileLock
 from umf_ros.places.packing import pack, unpack
+from umf_ros.sqlite_files import open_sqlite
 
 SCHEMA_VERSION = 3
 _TABLES = (
@@ -174,40 +175,26 @@ class KeyframeStore:
             raise UmfError(f"{self._name} is damaged at its keyframe {row}: {error}") from None
 
     def _open(self, identity: dict[str, str]) -> sqlite3.Connection:
-        with writing(self._name, sqlite3.Error):
+        def check(connection: sqlite3.Connection, tables: set[str]) -> None:
+            if tables:
+                self._check_identity(connection, tables, identity)
             if self.path is not None:
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-            # without a name SQLite keeps a file that no folder lists
-            connection = sqlite3.connect(self.path or "", check_same_thread=False)
+                self._file_lock = FileLock(self.path)
+
+        def make(connection: sqlite3.Connection) -> None:
+            for table in _TABLES:
+                connection.execute(table)
+            connection.execute("INSERT INTO about VALUES (?)", (json.dumps(identity),))
+
+        connection = open_sqlite(self.path, "place database", check, make)
         try:
-            self._prepare(connection, identity)
             self._rows = [row for (row,) in connection.execute("SELECT id FROM keyframe ORDER BY id")]
-        except UmfError:
-            connection.close()
-            raise
         except sqlite3.Error as error:
             connection.close()
-            raise UmfError(f"{self._name} cannot be used as a place database: {error}") from None
+            raise UmfError(f"{self._name} is damaged: {error}") from None
         return connection
 
-    def _prepare(self, connection: sqlite3.Connection, identity: dict[str, str]) -> None:
-        """Make an empty file a place database, and look at what others are before anything is changed."""
-        if _tables(connection):
-            self._check_identity(connection, identity)
-        if self.path is not None:
-            self._file_lock = FileLock(self.path)
-        # WAL without a sync per keyframe: safe against a crash of the process
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = NORMAL")
-        if not _tables(connection):
-            with connection:
-                connection.execute("BEGIN")
-                for table in _TABLES:
-                    connection.execute(table)
-                connection.execute("INSERT INTO about VALUES (?)", (json.dumps(identity),))
-
-    def _check_identity(self, connection: sqlite3.Connection, identity: dict[str, str]) -> None:
-        tables = _tables(connection)
+    def _check_identity(self, connection: sqlite3.Connection, tables: set[str], identity: dict[str, str]) -> None:
         if not {"about", "keyframe"} <= tables:
             raise UmfError(f"{self._name} is no place database, but another one with {', '.join(sorted(tables))}")
         about = connection.execute("SELECT content FROM about").fetchone()
@@ -219,7 +206,3 @@ class KeyframeStore:
         ]
         if wrong:
             raise UmfError(f"{self._name} was made with {'; '.join(wrong)}")
-
-
-def _tables(connection: sqlite3.Connection) -> set[str]:
-    return {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}

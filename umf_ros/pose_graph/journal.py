@@ -15,6 +15,7 @@ from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array
 from umf_ros.locks import FileLock
 from umf_ros.pose_graph.closures import ClosureVerdict
+from umf_ros.sqlite_files import open_sqlite
 
 _TABLES = (
     "CREATE TABLE event (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, first_ns INTEGER, second_ns INTEGER, data BLOB)",
@@ -139,24 +140,13 @@ class GraphJournal:
             self._connection.execute("INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)", values)
 
     def _open(self) -> sqlite3.Connection:
-        with writing(self.path, sqlite3.Error):
-            connection = sqlite3.connect(self.path, check_same_thread=False)
-        try:
-            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-            if tables and not {"event", "verdict"} <= tables:
-                raise UmfError(f"{self.path} holds no pose graph, but {', '.join(sorted(tables))}")
-            # WAL without a sync per event: safe against a crash of the process
-            connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute("PRAGMA synchronous = NORMAL")
-            if not tables:
-                with connection:
-                    connection.execute("BEGIN")
-                    for table in _TABLES:
-                        connection.execute(table)
-        except UmfError:
-            connection.close()
-            raise
-        except sqlite3.Error as error:
-            connection.close()
-            raise UmfError(f"{self.path} cannot be used as a pose graph: {error}") from None
-        return connection
+        return open_sqlite(self.path, "pose graph", self._check, _make)
+
+    def _check(self, _: sqlite3.Connection, tables: set[str]) -> None:
+        if tables and not {"event", "verdict"} <= tables:
+            raise UmfError(f"{self.path} holds no pose graph, but {', '.join(sorted(tables))}")
+
+
+def _make(connection: sqlite3.Connection) -> None:
+    for table in _TABLES:
+        connection.execute(table)
