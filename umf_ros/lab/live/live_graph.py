@@ -104,6 +104,9 @@ class LiveGraph:
         folder: run folder for results and logs.
         console: where closures are shown as they come.
         config: parameter file of both nodes; None: a recording of the simulator, received whole.
+
+    Attributes:
+        seconds_to_stop: of each node, once they have ended.
     """
 
     def __init__(self, folder: Path, console: Console, config: Path | None = None) -> None:
@@ -111,6 +114,12 @@ class LiveGraph:
         self._config = config
         self._console = console
         self._nodes: list[NodeProcess] = []
+        self.seconds_to_stop: dict[str, float] = {}
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the nodes have not been stopped."""
+        return bool(self._nodes)
 
     def __enter__(self) -> LiveGraph:
         (self._folder / "logs").mkdir(exist_ok=True)
@@ -177,7 +186,10 @@ class LiveGraph:
     def _stop_all(self) -> None:
         # the front-end first: its last closures still reach the back-end
         for node in self._nodes:
-            if not node.stop():
+            asked_s = time.monotonic()
+            finished = node.stop()
+            self.seconds_to_stop[node.name] = time.monotonic() - asked_s
+            if not finished:
                 self._console.print(f"[red]{node.name} did not finish and was killed; its results may be incomplete.")
         self._nodes = []
 
