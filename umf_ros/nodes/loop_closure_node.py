@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,7 @@ from umf_ros.loop_detector import Detection, LoopDetector, make_detector_embedde
 from umf_ros.nodes.announcer import Announcer
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
-from umf_ros.nodes.process import run
+from umf_ros.nodes.process import leave, run
 from umf_ros.nodes.qos import sensor_qos
 from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.nodes.worker import Worker
@@ -201,7 +200,7 @@ def _counts(synchronizer: Synchronizer) -> dict[str, int]:
 
 def main() -> None:
     """Entry point of `ros2 run umf_ros loop_closure_node`."""
-    sys.exit(run(LoopClosureNode))
+    leave(run(LoopClosureNode))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -29,7 +28,7 @@ from umf_ros.nodes import pose_graph_messages as messages
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import closure_from_message, parse_pair
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
-from umf_ros.nodes.process import run
+from umf_ros.nodes.process import leave, run
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
 from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.nodes.worker import Worker
@@ -275,7 +274,7 @@ def _broadcaster(node: Node) -> Callable[[TransformStamped], None] | None:
 
 def main() -> None:
     """Entry point of `ros2 run umf_ros pose_graph_node`."""
-    sys.exit(run(PoseGraphNode))
+    leave(run(PoseGraphNode))
 
 
 if __name__ == "__main__":

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import logging
+import os
 import signal
 import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from typing import NoReturn
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -64,6 +67,14 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
         node.destroy_node()
         rclpy.try_shutdown()
     return status
+
+
+def leave(status: int) -> NoReturn:
+    """End the process, whose results are written, at once: to take all libraries apart takes Python seconds."""
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 def _wait_until_ready(node: Node, executor: SingleThreadedExecutor, asked: list[int]) -> None:
