@@ -38,7 +38,7 @@ lint: install
 # every page and every link, as a site in build/site
 docs: install
 	@$(BIN)/python tools/parameters_doc.py --check
-	@$(BIN)/mkdocs build --quiet --strict
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 install: $(VENV)/.installed
 

@@ -35,7 +35,6 @@ from umf_ros.config import Database, Loop, load_settings
 from umf_ros.frames import Embedding
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.places.store import PlaceEntry
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
 Figures = dict[str, Any]
@@ -151,8 +150,11 @@ def many_places(rng: np.random.Generator, count: int = 100_000) -> Figures:
     descriptors = rng.standard_normal((1000, 256)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     before = resident()
+    blank = some_keyframe(0, rng)
     for number in range(count):
-        places._register(PlaceEntry(number * 10**9, number // 1000, float(number), descriptors[number % 1000]))
+        seen = Embedding(descriptors[number % 1000])
+        stamp_ns, session = number * 10**9, number // 1000
+        places.add(replace(blank, stamp_ns=stamp_ns, embedding=seen, session=session, travelled_m=float(number)))
     used = resident() - before
     query = replace(some_keyframe(count * 10**9 + 10**12, rng), embedding=Embedding(descriptors[3]))
     times = []

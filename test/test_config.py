@@ -104,3 +104,10 @@ def test_a_hostile_file_is_one_short_line(tmp_path: Path, text: str, message: st
     with pytest.raises(ConfigError, match=message) as caught:
         load_settings(tmp_path / "a.yaml")
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+def test_localization_needs_a_map() -> None:
+    with pytest.raises(ConfigError, match="mode localization needs a map"):
+        load_settings(None, mode="localization")
+    settings = load_settings(None, mode="localization", map="somewhere")
+    assert settings.localizing and not Settings().localizing

@@ -63,6 +63,20 @@ def test_the_contracts_hold() -> None:
     assert done.returncode == 0, done.stdout
 
 
+def test_a_rover_on_its_own_needs_nothing_of_a_fleet() -> None:
+    missing = ["psycopg", "pgvector", "faiss", "ray", "umf_ros.fleet"]
+    rooms = [
+        "loop_detector",
+        "places.database",
+        "replay",
+        "commands.replay",
+        "commands.fleet",
+        "nodes.loop_closure_node",
+    ]
+    statements = [without(missing), *(f"import umf_ros.{room}" for room in rooms)]
+    assert imported_after("\n".join(statements), [*missing, "umf_ros.replay"]) == ["umf_ros.replay"]
+
+
 def test_the_runtime_imports_without_the_lab() -> None:
     missing = ["umf_ros.lab", *lab_packages()]
     assert "open3d" in missing and "sklearn" in missing

@@ -123,7 +123,10 @@ def test_what_is_not_python_is_installed_with_the_package(install: Path) -> None
 
 @pytest.mark.parametrize(
     ("wing", "lists"),
-    [("runtime", ["requirements.txt"]), ("lab", ["requirements.txt", "requirements-lab.txt"])],
+    [
+        ("runtime", ["requirements.txt", "requirements-fleet.txt", "requirements-rerun.txt"]),
+        ("lab", ["requirements.txt", "requirements-lab.txt"]),
+    ],
 )
 def test_what_is_imported_is_required(wing: str, lists: list[str]) -> None:
     """Every distribution by its own name: what another one happens to bring along may be gone tomorrow."""

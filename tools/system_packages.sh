@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Install the system libraries that the lab's wheels need but do not bring along: open3d loads libusb-1.0 and libGL.
-# A rover, which does without open3d, needs none of them.
+# A rover, which does without open3d, needs none of them. With --browser also Chromium, which tests look at the report with.
 set -eu
 missing=()
 known=$(ldconfig -p 2>/dev/null || /sbin/ldconfig -p)
@@ -9,6 +9,10 @@ grep -q 'libGL\.so\.1' <<<"$known" || missing+=(libgl1)
 grep -q 'libEGL\.so\.1' <<<"$known" || missing+=(libegl1)
 grep -q 'libgomp\.so\.1' <<<"$known" || missing+=(libgomp1)
 grep -q 'libX11\.so\.6' <<<"$known" || missing+=(libx11-6)
+if [ "${1:-}" = --browser ]; then
+  command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null ||
+    missing+=(chromium)
+fi
 [ ${#missing[@]} -eq 0 ] && exit 0
 
 install="apt-get install -y --no-install-recommends ${missing[*]}"

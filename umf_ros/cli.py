@@ -13,7 +13,7 @@ import typer
 
 from umf_ros import __version__
 from umf_ros.errors import UmfError
-from umf_ros.resources import LAB_PACKAGES
+from umf_ros.resources import FLEET_PACKAGES, LAB_PACKAGES
 
 COMMANDS = {
     "demo": "umf_ros.lab.commands.demo",
@@ -21,6 +21,7 @@ COMMANDS = {
     "import": "umf_ros.lab.commands.import_data",
     "inspect": "umf_ros.commands.inspect",
     "replay": "umf_ros.commands.replay",
+    "map": "umf_ros.commands.map",
     "compare": "umf_ros.commands.compare",
     "play": "umf_ros.lab.commands.play",
     "report": "umf_ros.lab.commands.report",
@@ -30,10 +31,12 @@ COMMANDS = {
     "train": "umf_ros.lab.commands.train",
     "adapt": "umf_ros.lab.commands.adapt",
     "export": "umf_ros.lab.commands.export",
+    "bench": "umf_ros.lab.commands.bench",
     "doctor": "umf_ros.commands.doctor",
     "pretrain": "umf_ros.lab.commands.pretrain",
     "graph": "umf_ros.lab.commands.graph",
     "places": "umf_ros.commands.places",
+    "fleet": "umf_ros.commands.fleet",
 }
 """The module of every subcommand, by name: those of the lab are known here by their names alone."""
 
@@ -77,6 +80,8 @@ def _what_helps(package: str) -> str:
     """Where a missing package comes from."""
     if package in LAB_PACKAGES:
         return "the lab needs it: pip install 'umf_ros[lab]'"
+    if package in FLEET_PACKAGES:
+        return "pip install 'umf_ros[fleet]' brings it"
     return "umf doctor says what helps"
 
 

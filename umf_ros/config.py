@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from umf_ros.errors import ConfigError, either
 from umf_ros.resources import DEFAULT_DATASET, dataset_names, find
@@ -29,6 +29,17 @@ def _known(name: str) -> str:
         find("config/datasets")  # a broken installation lacks them all
         raise ValueError(f"Input should be {either([repr(one) for one in names])}")
     return name
+
+
+class SecretError(ValueError):
+    """A value that must not be repeated."""
+
+
+def without_password(address: str) -> str:
+    """The address of a server, unless it holds a password, which would be written beside the results."""
+    if "password" in address.lower() or (":" in address.partition("://")[2].partition("@")[0] and "@" in address):
+        raise SecretError("the password belongs into ~/.pgpass or PGPASSWORD, not into the address")
+    return address
 
 
 Dataset = Annotated[str, AfterValidator(_known)]
@@ -198,6 +209,16 @@ class Database(Group):
 
     path: str = Field("", description="file to keep places in, loaded when it exists; empty: a temporary file")
     cached_keyframes: int = Field(400, ge=20, description="keyframes whose local features stay in memory")
+    backend: Literal["sqlite", "postgres"] = Field(
+        "sqlite",
+        description="postgres: what is kept here goes to a fleet's server too, and others' places are asked for",
+    )
+    server: Annotated[str, AfterValidator(without_password)] = Field(
+        "", description="of a fleet, postgresql://ROVER@HOST/DATABASE; the password is in ~/.pgpass or PGPASSWORD"
+    )
+    fleet_candidates: int = Field(
+        5, ge=1, le=50, description="places of other rovers handed to verification, of each keyframe"
+    )
 
 
 class WorkerSettings(Group):
@@ -213,6 +234,10 @@ class Settings(Group):
         DEFAULT_DATASET, description="preset of calibration and topics, a file in `config/datasets` by its name"
     )
     calibration: str = Field("", description="calibration file (YAML); empty: the data set's")
+    mode: Literal["mapping", "localization"] = Field(
+        "mapping", description="remember new places, or say where the rover is in the map that `map` names"
+    )
+    map: str = Field("", description="folder of a map that `umf map` made, for mode localization; it stays as it is")
     topics: Topics = Topics()
     qos: Qos = Qos()
     sync: Sync = Sync()
@@ -224,6 +249,17 @@ class Settings(Group):
     frames: Frames = Frames()
     database: Database = Database()
     worker: WorkerSettings = WorkerSettings()
+
+    @model_validator(mode="after")
+    def _names_its_map(self) -> Settings:
+        if self.localizing and not self.map:
+            raise ValueError("mode localization needs a map: the parameter map names its folder")
+        return self
+
+    @property
+    def localizing(self) -> bool:
+        """Whether places are looked for in a map that stays as it is."""
+        return self.mode == "localization"
 
 
 def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:
@@ -322,4 +358,6 @@ def _explain(problem: Any) -> str:
         return f"unknown parameter {name}"
     if problem["type"] == "missing":
         return f"{name} is missing"
+    if isinstance(problem.get("ctx", {}).get("error"), SecretError):
+        return f"{name}: {text}"
     return f"{name}: {text[0].lower()}{text[1:]} (got {problem['input']!r})"

@@ -8,17 +8,22 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from umf_ros.config import Settings
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.depth import lift
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.errors import OutputError
+from umf_ros.errors import ConfigError, OutputError, UmfError
 from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure
 from umf_ros.keyframes import KeyframeSelector
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
 from umf_ros.verification import NO_DEPTH, Verdict, Verifier, thin_frame
+
+if TYPE_CHECKING:
+    from umf_ros.fleet.encounters import Encounter, Encounters
 
 logger = logging.getLogger(__name__)
 NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
@@ -52,11 +57,15 @@ class LoopDetector:
     """Finds loop closures in a stream of frames; the live node, the replay and the evaluation run this same class.
 
     `process` takes a frame through all stages: `select`, `embed`, `query`, `verify`, `look_around`,
-    `remember`.
+    `remember`. In a map that stays as it is, the last two have nothing to do.
 
     Args:
         settings: all settings.
         embedder: the network.
+
+    Attributes:
+        database: the rover's places.
+        encounters: with other rovers of a fleet; None of a rover on its own.
 
     Raises:
         UmfError: the place database of the settings belongs to another embedder.
@@ -67,7 +76,9 @@ class LoopDetector:
         self._selector = KeyframeSelector(settings.keyframe)
         self._embedder = embedder
         self._verifier = Verifier(settings.verification)
-        self.database = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
+        self.database = _open_places(settings, embedder)
+        self.encounters = _encounters(settings, self.database, embedder)
+        self._map = range(self.database.next_session) if settings.localizing else None
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
         self._session: int | None = None
         self._stored_session = self.database.next_session
@@ -92,20 +103,21 @@ class LoopDetector:
         latency = Stopwatch()
         with latency.measure("embed"):
             keyframe = self.embed(frame)
-        known = self.database.recognise(keyframe)
+        known = self.database.recognise(keyframe) if self._map is None else None
         if known is not None:
             keyframe = self._go_on_from(frame, known)
         with latency.measure("query"):
             candidates = self.query(keyframe)
         with latency.measure("verify"):
             verdicts = self.verify(keyframe, candidates)
-        with latency.measure("submaps"):
-            verdicts = self.look_around(keyframe, verdicts)
         fault = None
-        try:
-            self.remember(keyframe, known is not None)
-        except OutputError as error:
-            fault = error
+        if self._map is None:
+            with latency.measure("submaps"):
+                verdicts = self.look_around(keyframe, verdicts)
+            try:
+                self.remember(keyframe, known is not None)
+            except OutputError as error:
+                fault = error
         return Detection(frame.stamp_ns, keyframe, verdicts, latency.milliseconds, fault)
 
     def select(self, frame: Frame) -> bool:
@@ -121,7 +133,7 @@ class LoopDetector:
 
     def query(self, keyframe: Keyframe) -> list[Candidate]:
         """Remembered places that look like a keyframe, best first."""
-        return self.database.query(keyframe, self._rules)
+        return self.database.query(keyframe, self._rules, self._map)
 
     def verify(self, keyframe: Keyframe, candidates: Sequence[Candidate]) -> list[Verdict]:
         """Test the candidates geometrically."""
@@ -146,7 +158,9 @@ class LoopDetector:
             OutputError: the disk is full.
         """
         if not stored:
-            self.database.add(keyframe)
+            row = self.database.add(keyframe)
+            if self.encounters is not None:
+                self.encounters.link.remembered(row)
         self._submaps.remember(keyframe)
 
     def resume(self, frame: Frame) -> bool:
@@ -162,6 +176,16 @@ class LoopDetector:
             self._submaps.remember(self._go_on_from(frame, known))
         return True
 
+    def meet(self) -> Encounter | None:
+        """Verify what a fleet's server found for an earlier keyframe, if there is anything new."""
+        return self.encounters.next() if self.encounters is not None else None
+
+    def close(self) -> None:
+        """Leave the fleet's server, and release the database."""
+        if self.encounters is not None:
+            self.encounters.close()
+        self.database.close()
+
     def end_session(self) -> None:
         """End the session: the next frame begins a new one; every place is kept."""
         self._session = None
@@ -176,7 +200,7 @@ class LoopDetector:
         """A new way begins; where the clock was set back, what was stored later than now waits for its time."""
         self._session = frame.session
         self._stored_session, self._ahead_m = self.database.next_session, 0.0
-        if len(self.database):
+        if len(self.database) and self._map is None:
             logger.warning("a new session begins; the %d places known so far are kept", len(self.database))
         self._selector.reset()
         self._verifier.reset()
@@ -189,6 +213,13 @@ class LoopDetector:
         ahead_m = keyframe.travelled_m - self._selector.travelled_m(frame)
         self._ahead_m = 0.0 if math.isnan(ahead_m) else ahead_m
         return keyframe
+
+
+def _open_places(settings: Settings, embedder: Embedder) -> PlaceDatabase:
+    """The store of the settings, or that of the map to localise in."""
+    if settings.localizing:
+        return PlaceDatabase.of_map(Path(settings.map), embedder.name, embedder.dimension)
+    return PlaceDatabase(settings.database, embedder.name, embedder.dimension)
 
 
 def make_keyframe(frame: Frame, embedder: Embedder, travelled_m: float = float("nan"), session: int = 0) -> Keyframe:
@@ -213,6 +244,24 @@ def make_keyframe(frame: Frame, embedder: Embedder, travelled_m: float = float("
         body_T_lidar=frame.body_T_lidar,
         motion=motion,
     )
+
+
+def _encounters(settings: Settings, database: PlaceDatabase, embedder: Embedder) -> Encounters | None:
+    """The way to other rovers' places, where there is a fleet; what it takes is imported only then.
+
+    Raises:
+        ConfigError: the settings name no server.
+        UmfError: what it takes is not installed.
+    """
+    if settings.database.backend == "sqlite" or settings.localizing:
+        return None
+    if not settings.database.server:
+        raise ConfigError("database.backend: postgres needs database.server")
+    try:
+        from umf_ros.fleet.encounters import Encounters
+    except ModuleNotFoundError as error:
+        raise UmfError(f"{error.name} is not installed; database.backend: postgres needs umf_ros[fleet]") from None
+    return Encounters(settings, database.store, (embedder.name, embedder.dimension))
 
 
 def make_detector_embedder(settings: Settings) -> Embedder:

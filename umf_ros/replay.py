@@ -16,6 +16,8 @@ from umf_ros.sensors.odometry_feed import OdometryFeed
 
 WARM_UP = 12
 """So many of the last keyframes before an interruption are looked at again: twice what verification remembers."""
+FLEET_PATIENCE_S = 30.0
+"""So long a replay waits at its end until a fleet's server has its places; what it then has not is pushed next time."""
 
 
 class Replay:
@@ -62,6 +64,8 @@ class Replay:
             self._recorder.record(item, detection)
             for closure in detection.closures:
                 self._graph.add_closure(closure)
+            while (encounter := self._detector.meet()) is not None:
+                self._recorder.record_encounter(encounter)
             yield detection
             if detection.fault is not None:
                 raise detection.fault
@@ -82,9 +86,12 @@ class Replay:
 
     def finish(self, drops: Mapping[str, int]) -> bool:
         """Write the summary, and trajectories and graph where there was odometry; returns whether there was."""
+        if self._detector.encounters is not None:
+            for encounter in self._detector.encounters.rest(FLEET_PATIENCE_S):
+                self._recorder.record_encounter(encounter)
         self._recorder.write_summary(drops)
         self._recorder.close()
-        self._detector.database.close()
+        self._detector.close()
         if self._has_odometry:
             self._graph.write_results(self._folder)
         return self._has_odometry

@@ -8,20 +8,16 @@ from pathlib import Path
 
 from umf_ros.errors import UmfError, writing
 
+Step = Callable[[sqlite3.Connection], None]
 
-def open_sqlite(
-    path: Path | None,
-    kind: str,
-    check: Callable[[sqlite3.Connection, set[str]], None],
-    make: Callable[[sqlite3.Connection], None],
-) -> sqlite3.Connection:
-    """Open a file, or make it; for any thread of the process.
+
+def open_sqlite(path: Path | None, kind: str, step: Step) -> sqlite3.Connection:
+    """Open a file, or make it, for any thread of the process.
 
     Args:
         path: the file; None: a temporary one, which no end of the process leaves behind.
         kind: what it is to be, for error messages.
-        check: looks at the tables of a file before anything is changed, and raises a `UmfError` where it is another.
-        make: fills an empty file; it is there whole or not at all.
+        step: looks at it, and raises a `UmfError` where it is something else; then makes what is not there.
 
     Raises:
         UmfError: the file is something else, or damaged.
@@ -33,23 +29,30 @@ def open_sqlite(
             path.parent.mkdir(parents=True, exist_ok=True)
         # without a name SQLite keeps a file that no folder lists
         connection = sqlite3.connect(path or "", check_same_thread=False)
+    return take_up(connection, name, kind, step)
+
+
+def take_up(connection: sqlite3.Connection, name: str, kind: str, step: Step) -> sqlite3.Connection:
+    """A connection after its first step; where that fails it is closed, and the reason is one line.
+
+    Raises:
+        UmfError: the step's own, or the file is damaged.
+    """
     try:
-        tables = tables_of(connection)
-        check(connection, tables)
-        # WAL without a sync per row: safe against a crash of the process
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = NORMAL")
-        if not tables_of(connection):
-            with connection:
-                connection.execute("BEGIN")
-                make(connection)
-    except sqlite3.Error as error:
+        step(connection)
+    except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
         connection.close()
         raise UmfError(f"{name} cannot be used as a {kind}: {error}") from None
     except BaseException:
         connection.close()
         raise
     return connection
+
+
+def survive_crashes(connection: sqlite3.Connection) -> None:
+    """Write ahead, without a sync per row: a process that is killed loses nothing."""
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA synchronous = NORMAL")
 
 
 def tables_of(connection: sqlite3.Connection) -> set[str]:

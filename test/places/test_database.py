@@ -14,6 +14,7 @@ from umf_ros.errors import OutputError, UmfError
 from umf_ros.frames import Keyframe
 from umf_ros.places.database import VISITS, PlaceDatabase
 from umf_ros.places.packing import pack, unpack
+from umf_ros.places.upkeep import stored_identity
 
 RULES = Loop(min_similarity=-1, min_time_gap_s=20, min_travel_m=15, top_k=50)
 
@@ -163,3 +164,27 @@ def test_an_unwritable_copy_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         database().save(tmp_path / "file" / "copy.sqlite")
+
+
+def test_places_of_named_sessions_are_found_whatever_their_age(tmp_path: Path) -> None:
+    places = database(tmp_path / "a.sqlite")
+    for session, stamp in ((0, 500.0), (1, 10.0), (2, 900.0)):
+        places.add(make_keyframe(stamp, travelled_m=0.0, seed=session, session=session))
+    query = make_keyframe(20.0, travelled_m=0.0, seed=1, session=2)
+    assert [found.index for found in places.query(query, Loop())] == []
+    assert sorted(found.index for found in places.query(query, Loop(), range(2))) == [0, 1]
+    assert [found.index for found in places.query(query, Loop(), range(1, 2))] == [1]
+
+
+def test_a_store_that_is_only_read_may_be_open_elsewhere_and_stays(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    writer = database(path)
+    writer.add(make_keyframe(1.0))
+    reader = PlaceDatabase(Database(path=str(path)), *stored_identity(path), read_only=True)
+    assert reader[0].stamp_ns == 10**9 and len(reader) == 1
+    with pytest.raises(UmfError, match="read"):
+        reader.add(make_keyframe(2.0))
+    reader.close()
+    with pytest.raises(UmfError, match="there is no place database"):
+        PlaceDatabase(Database(path=str(tmp_path / "b.sqlite")), "x", 16, read_only=True)
+    assert not (tmp_path / "b.sqlite").exists()

@@ -49,17 +49,38 @@ def change(path: Path, statement: str, *values: object) -> None:
     connection.close()
 
 
-def test_entries_say_what_the_keyframes_say(tmp_path: Path) -> None:
-    path = filled(tmp_path / "map.sqlite")
-    opened = store(path)
-    entries = list(opened.entries())
-    assert len(entries) == len(opened) == 5
-    for i, entry in enumerate(entries):
+def test_keys_and_descriptors_are_those_of_the_keyframes(tmp_path: Path) -> None:
+    opened = store(filled(tmp_path / "map.sqlite"))
+    assert len(opened) == 5 and opened.keys["id"].tolist() == [1, 2, 3, 4, 5]
+    for i in range(5):
         keyframe = opened[i]
-        assert (entry.stamp_ns, entry.session) == (keyframe.stamp_ns, keyframe.session)
-        np.testing.assert_array_equal(entry.travelled_m, keyframe.travelled_m)
-        np.testing.assert_array_equal(entry.descriptor, keyframe.embedding.descriptor)
-        assert entry.descriptor.dtype == np.float32
+        assert (opened.keys["stamp_ns"][i], opened.keys["session"][i]) == (keyframe.stamp_ns, keyframe.session)
+        np.testing.assert_array_equal(opened.keys["travelled_m"][i], keyframe.travelled_m)
+    rows = np.array([4, 0, 2])
+    expected = np.stack([opened[i].embedding.descriptor for i in rows])
+    np.testing.assert_array_equal(opened.descriptors(rows), expected)
+    assert opened.descriptors(rows).dtype == np.float32
+
+
+def test_keyframes_are_found_by_stamp_also_those_of_a_clock_that_begins_at_0_each_time() -> None:
+    opened = store()
+    for session in (0, 1):
+        for i in range(4):
+            opened.add(make_keyframe(i, seed=i, session=session))
+    assert opened.rows_at(2 * 10**9) == [2, 6] and opened.rows_at(77) == []
+
+
+def test_a_file_without_the_index_by_stamp_gets_it(tmp_path: Path) -> None:
+    path = filled(tmp_path / "map.sqlite")
+    change(path, "DROP INDEX keyframe_by_stamp")
+    assert store(path).rows_at(3 * 10**9) == [3]
+
+
+def test_a_descriptor_of_another_length_is_damage(tmp_path: Path) -> None:
+    path = filled(tmp_path / "map.sqlite")
+    change(path, "UPDATE keyframe SET descriptor = ? WHERE id = 3", b"1234")
+    with pytest.raises(UmfError, match=r"map\.sqlite is damaged"):
+        database(path)
 
 
 def test_opening_does_not_read_the_keyframes_themselves(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def test_shipped_model_accepts_a_good_fit_and_rejects_a_bad_one(shipped: Accepta
 
 def test_good_features_on_bad_geometry_are_not_enough(shipped: AcceptanceModel) -> None:
     features = {name: GOOD.numbers[name] for name in ("similarity", "inliers_image", "inliers_cloud")}
-    assert shipped.probability(replace(BAD, **features, agreement_image=6.0, agreement_cloud=6.0)) < 0.5
+    assert shipped.probability(replace(BAD, **features, agreement_cloud=6.0)) < 0.5
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -71,8 +71,8 @@ def test_criterion_goes_from_its_worst_to_its_best_whichever_is_larger() -> None
 
 
 def test_missing_numbers_count_as_their_neutral_value() -> None:
-    found = scores(replace(GOOD, agreement_image=math.nan, prior_sigmas=math.nan))
-    assert found["image_agreement"] == 0.5
+    found = scores(replace(GOOD, agreement_cloud=math.nan, prior_sigmas=math.nan))
+    assert found["cloud_agreement"] == 0.5
     assert 0 < found["odometry_prior"] < 1
 
 

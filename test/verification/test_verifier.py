@@ -14,6 +14,9 @@ from umf_ros.config import Verification
 from umf_ros.frames import Candidate, Keyframe, ScanMotion
 from umf_ros.geometry import Array, make_pose, relative, rotation_angle
 from umf_ros.verification import NO_DEPTH, Verdict, Verifier
+from umf_ros.verification.constants import SAME_M, SAME_RAD
+from umf_ros.verification.hypotheses import near
+from umf_ros.verification.verifier import FOUND_BEFORE
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
@@ -229,3 +232,33 @@ def test_surfaces_that_do_not_coincide_are_no_closure_however_probable() -> None
     verdict = Verifier(Verification(min_probability=0.0)).verify(replace(query, points=bent), pair)[0]
     assert verdict.closure is None and "times their noise apart" in verdict.reason
     assert Verifier(Verification(min_probability=0.0)).verify(query, pair)[0].closure is not None
+
+
+def test_what_is_expected_and_found_needs_no_comparison_of_the_others(verifier: Verifier) -> None:
+    pairs = drive(np.eye(4))
+    for query, match in pairs[:2]:
+        assert verifier.verify(query, [*others(4), candidate(match)])[0].closure is not None
+    found, *rest = verifier.verify(pairs[2][0], [*others(4), candidate(pairs[2][1])])
+    assert found.closure is not None and found.closure.match_stamp_ns == pairs[2][1].stamp_ns
+    assert {verdict.reason for verdict in rest} == {FOUND_BEFORE} and len(rest) == 4
+    assert all(np.isnan(verdict.measurement.inliers_image) for verdict in rest)
+    several = Verifier(Verification(max_closures=3))
+    for query, match in pairs:
+        last = several.verify(query, [*others(4), candidate(match)])
+    assert FOUND_BEFORE not in {verdict.reason for verdict in last}  # more were asked for
+
+
+def test_hypotheses_that_end_at_one_pose_are_judged_once(verifier: Verifier) -> None:
+    query, match = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
+    judged = verifier.examine(query, [candidate(match)])
+    poses = [one.aligned.pose for one in judged]
+    assert poses
+    for number, pose in enumerate(poses):
+        assert not any(near(pose, other, SAME_M, SAME_RAD) for other in poses[:number])
+
+
+def test_a_verdict_tells_whether_the_images_agree(verifier: Verifier) -> None:
+    query, match = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
+    assert verifier.verify(query, [candidate(match)])[0].measurement.agreement_image > 5
+    blind = verifier.verify(without_image(query), [candidate(match)])[0]
+    assert np.isnan(blind.measurement.agreement_image) and blind.closure is not None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,12 +22,29 @@ from umf_ros.commands.recordings import (
     open_frames,
     open_recording,
 )
+from umf_ros.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from umf_ros.bags.frames import FrameReader
+    from umf_ros.bags.reader import Bag
+    from umf_ros.commands.inputs import InputConsole
+    from umf_ros.config import Settings
+    from umf_ros.embedding.embedder import Embedder
 
 MinProbability = Annotated[
     float | None, typer.Option("--min-probability", min=0, max=1, help="Publish closures from here on.")
 ]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Go on with the newest replay of this recording in --out that was cut off.")
+]
+RerunPath = Annotated[
+    Path | None, typer.Option("--rerun", help="Also write the run for the Rerun viewer: an .rrd file.")
+]
+Mode = Annotated[str | None, typer.Option("--mode", help="mapping, or localization in the map that --map names.")]
+MapPath = Annotated[
+    Path | None, typer.Option("--map", help="Map of umf map to find the rover in; implies --mode localization.")
 ]
 
 
@@ -43,6 +60,9 @@ def command(
     ground_truth: TruthPath = None,
     min_probability: MinProbability = None,
     resume: Resume = False,
+    rerun: RerunPath = None,
+    mode: Mode = None,
+    map_folder: MapPath = None,
 ) -> None:
     """Find loop closures in a recording as fast as the machine goes.
 
@@ -62,17 +82,30 @@ def command(
     from umf_ros.replay import Replay
     from umf_ros.runs.recorder import count_drops
     from umf_ros.runs.report import finish_run
+    from umf_ros.runs.rerun_log import RerunLog
     from umf_ros.runs.resumption import ReplayFolder
 
     console = Console()
     recording, settings = open_recording(
-        bag, config, dataset, embedder, weights, verification__min_probability=min_probability
+        bag,
+        config,
+        dataset,
+        embedder,
+        weights,
+        verification__min_probability=min_probability,
+        mode=mode or ("localization" if map_folder else None),
+        map=str(map_folder) if map_folder else None,
     )
     inputs = InputConsole(console, recording)
     reader = open_frames(recording, settings, inputs.warn, odometry, odometry_frame)
     if ground_truth is not None:
         read_ground_truth(recording, ground_truth)  # what is wrong with it is said now, not after the run
+    if settings.localizing and rerun:
+        raise ConfigError("--rerun shows a run that maps: leave it out with --map")
     network = make_detector_embedder(settings)
+    if settings.localizing:
+        raise typer.Exit(_localize(recording, settings, reader, network, out, inputs, console))
+    viewer = RerunLog(rerun) if rerun else None
     # a store that cannot be used is told before there is a folder
     detector = LoopDetector(settings, network) if settings.database.path else None
     folder = (ReplayFolder.resume if resume else ReplayFolder.create)(out, bag, settings)
@@ -80,8 +113,11 @@ def command(
     inputs.tell_absent(settings, odometry is not None)
     replay = Replay(folder.path, settings, detector, folder.resumed)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress:
-        for detection in replay.run(reader.stream()):
+        stream = reader.stream()
+        for detection in replay.run(viewer.watch(stream) if viewer else stream):
             progress.show(reader.progress, detection)
+            if viewer:
+                viewer.show(detection)
             if interrupted():
                 break
     if interrupted():
@@ -90,6 +126,50 @@ def command(
         replay.finish(count_drops(reader.counters))
         if not interrupted():
             folder.finish()
+        if viewer:
+            viewer.finish(folder.path)
         inputs.remember(folder.path, reader.counters, interrupted(), odometry, odometry_frame)
         verdict = finish_run(folder.path, recording, console, ground_truth, inputs.told)
     raise typer.Exit(verdict.exit_code)
+
+
+def _localize(
+    recording: Bag,
+    settings: Settings,
+    reader: FrameReader,
+    network: Embedder,
+    out: Path,
+    inputs: InputConsole,
+    console: Console,
+) -> int:
+    """Find the rover of a recording in a map; 3 where it was not found."""
+    from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.localization import LocalizingReplay
+    from umf_ros.loop_detector import LoopDetector
+    from umf_ros.runs.finished_run import remember_recording
+    from umf_ros.runs.folder import create_run_folder
+    from umf_ros.runs.recorder import count_drops
+
+    detector = LoopDetector(settings, network)  # a map that cannot be used is told before there is a folder
+    folder = create_run_folder(out)
+    inputs.tell_absent(settings, odometry_from_file=False)
+    replay = LocalizingReplay(folder, settings, detector)
+    with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress:
+        for detection in replay.run(reader.stream()):
+            progress.show(reader.progress, detection)
+            if interrupted():
+                break
+    newest = replay.newest
+    with undisturbed():
+        found = replay.finish(count_drops(reader.counters))
+        remember_recording(folder, recording)
+    counts = replay.counts
+    text = "not found in the map"
+    if found:
+        text = f"found after {counts.keyframes_until_found} keyframes, known at {counts.located} of {counts.keyframes}"
+    if newest is not None:
+        x, y, z = newest.map_T_body[:3, 3]
+        sigma_m = float(newest.covariance[:2, :2].trace() ** 0.5)
+        text += f"; at last at ({x:.1f}, {y:.1f}, {z:.1f}) m, +- {sigma_m:.2f} m, p = {newest.probability:.4f}"
+    console.print(f"{text}\n{folder}", markup=False, highlight=False, soft_wrap=True)
+    return 0 if found else 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import TYPE_CHECKING
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -19,6 +20,9 @@ from umf_ros.nodes import conversions
 from umf_ros.nodes.diagnostics import OK, WARN, status
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS
 from umf_ros.verification import Verdict
+
+if TYPE_CHECKING:
+    from umf_ros.fleet.encounters import Encounter
 
 # RViz redraws every line it is sent: a rover that runs for days shows its latest ones
 MAX_LINES = 500
@@ -62,6 +66,16 @@ class Announcer:
             self._candidates.publish(report)
             self._draw(keyframe, detection.verdicts, matches)
 
+    def announce_encounter(self, encounter: Encounter) -> None:
+        """Publish what was found of another rover's places: closures like any other, with the names of both rovers."""
+        for closure in encounter.closures:
+            self._closures.publish(conversions.closure_to_message(closure, encounter.own, encounter.robot))
+        report = DiagnosticArray(
+            status=[_describe(encounter.keyframe, one, encounter.robot) for one in encounter.verdicts]
+        )
+        report.header.stamp = conversions.to_time(encounter.keyframe.stamp_ns)
+        self._candidates.publish(report)
+
     def wait_until_heard(self) -> None:
         """Wait until whoever listens has the last closures, as far as they answer soon."""
         self._closures.wait_for_all_acked(Duration(seconds=1))
@@ -87,8 +101,8 @@ class Announcer:
         self._markers.publish(MarkerArray(markers=[conversions.to_lines(*item, header) for item in chosen.items()]))
 
 
-def _describe(keyframe: Keyframe, verdict: Verdict) -> DiagnosticStatus:
+def _describe(keyframe: Keyframe, verdict: Verdict, robot: str = "") -> DiagnosticStatus:
     accepted = verdict.closure is not None
-    name = f"{conversions.keyframe_frame(verdict.candidate.stamp_ns)} -> {keyframe.stamp_ns}"
+    name = f"{conversions.keyframe_frame(verdict.candidate.stamp_ns, robot)} -> {keyframe.stamp_ns}"
     numbers = {"similarity": verdict.candidate.similarity, **verdict.numbers}
     return status(OK if accepted else WARN, name, verdict.reason, numbers)

@@ -22,6 +22,7 @@ GREEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.5)
 LAST_STAMP_NS = 2**31 * 10**9
 """What a stamp with seconds of 32 bits stays below."""
+BETWEEN_FRAME = re.compile(r"keyframe/[^/]{1,63}/[0-9]{1,19}")
 KEYFRAME_FRAME = re.compile(r"keyframe/([0-9]{1,19})")
 
 
@@ -68,26 +69,31 @@ def to_lines(name: str, lines: Iterable[Iterable[Point]], header: Header) -> Mar
     return marker
 
 
-def keyframe_frame(stamp_ns: int) -> str:
-    """Frame name of a keyframe: its key is its sensor stamp."""
-    return f"keyframe/{stamp_ns}"
+def keyframe_frame(stamp_ns: int, robot: str = "") -> str:
+    """Frame name of a keyframe: its key is its sensor stamp, and in a fleet the rover's name before it."""
+    return f"keyframe/{robot}/{stamp_ns}" if robot else f"keyframe/{stamp_ns}"
 
 
-def closure_to_message(closure: LoopClosure) -> Odometry:
+def closure_to_message(closure: LoopClosure, query_robot: str = "", match_robot: str = "") -> Odometry:
     """A loop closure as odometry between two keyframes that are not consecutive.
 
     `header.frame_id` is the match, `child_frame_id` the query, `pose` is `match_T_query`, its
     covariance is in ROS order about the axes of the match body. There is no twist, as `twist.covariance[0] = -1` says;
-    `twist.covariance[1]` is the probability.
+    `twist.covariance[1]` is the probability. Between two rovers of a fleet both frames name theirs.
     """
-    message = Odometry(child_frame_id=keyframe_frame(closure.query_stamp_ns))
-    message.header = to_header(closure.query_stamp_ns, keyframe_frame(closure.match_stamp_ns))
+    message = Odometry(child_frame_id=keyframe_frame(closure.query_stamp_ns, query_robot))
+    message.header = to_header(closure.query_stamp_ns, keyframe_frame(closure.match_stamp_ns, match_robot))
     message.pose.pose = to_pose(closure.match_T_query)
     message.pose.covariance = np.asarray(closure.covariance, dtype=float).ravel()
     message.twist.covariance[0] = -1.0
     if not math.isnan(closure.probability):
         message.twist.covariance[1] = closure.probability
     return message
+
+
+def is_between_rovers(message: Odometry) -> bool:
+    """Whether the frames of a message of `loop_closures` name rovers: what one rover's graph has no poses for."""
+    return all(BETWEEN_FRAME.fullmatch(frame) for frame in (message.header.frame_id, message.child_frame_id))
 
 
 def closure_from_message(message: Odometry) -> LoopClosure:

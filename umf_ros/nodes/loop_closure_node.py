@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -29,6 +29,9 @@ from umf_ros.runs.recorder import RunRecorder, count_drops
 from umf_ros.sensors.intake import Intake, wanted_inputs
 from umf_ros.sensors.static_transforms import Mounting, OdometryFrames, StaticTransforms
 from umf_ros.sensors.synchronizer import Synchronizer
+
+if TYPE_CHECKING:
+    from umf_ros.fleet.encounters import Encounter
 
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
 INTAKE_QUEUE = 400
@@ -69,6 +72,7 @@ class LoopClosureNode(BaseNode):
         self._lock = threading.Lock()
         self._paused = False
         self._closures = 0
+        self._between = 0
         self._last: Detection | None = None
         self._worker: Worker[Frame] = Worker(self._detect, self._complain, settings.worker.queue_size)
         self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._complain, 1)
@@ -96,7 +100,7 @@ class LoopClosureNode(BaseNode):
             if self._recorder is not None:
                 self._recorder.close()
         finally:
-            self._detector.database.close()
+            self._detector.close()
 
     def _retune(self, settings: Settings) -> None:
         with self._lock:
@@ -126,6 +130,17 @@ class LoopClosureNode(BaseNode):
             self._complain(detection.fault)
         if self._recorder is not None:
             self._recorder.record(frame, detection)
+        with self._lock:
+            encounter = self._detector.meet()
+        if encounter is not None:
+            self._meet(encounter)
+
+    def _meet(self, encounter: Encounter) -> None:
+        """Tell of the closures with another rover of the fleet."""
+        self._announcer.announce_encounter(encounter)
+        self._between += len(encounter.closures)
+        if self._recorder is not None:
+            self._recorder.record_encounter(encounter)
 
     def _drops(self) -> dict[str, int]:
         return count_drops(self._synchronizer.counters, self._worker.dropped + self._decoder.dropped)
@@ -154,6 +169,7 @@ class LoopClosureNode(BaseNode):
             **{f"fault_{kind}": count for kind, count in self._faults.items()},
             **{f"dropped_{name}": count for name, count in self._drops().items()},
             **_counts(self._synchronizer),
+            **self._fleet(),
         }
         text = f"{self._closures} closures among {len(self._detector.database)} places"
         if self._paused:
@@ -163,6 +179,14 @@ class LoopClosureNode(BaseNode):
         if self._worker.dropped or self._decoder.dropped:
             return status(WARN, "detector", "too slow: messages are being dropped", values)
         return status(OK, "detector", text, values)
+
+    def _fleet(self) -> dict[str, Any]:
+        """How the fleet's server is doing, where there is one."""
+        if self._detector.encounters is None:
+            return {}
+        link = self._detector.encounters.link
+        known = {"fleet_connected": link.connected, "fleet_waiting": link.waiting(), "fleet_pushed": link.pushed}
+        return {**known, "fleet_closures": self._between, "fleet_trouble": link.trouble or "none"}
 
     def _save(self, _: Any) -> str:
         path = Path(self._settings.database.path or "places.sqlite").with_suffix(".saved.sqlite").resolve()

@@ -24,9 +24,10 @@ from umf_ros.bags.presets import topics_of
 from umf_ros.config import Settings
 from umf_ros.errors import UmfError
 from umf_ros.geometry import Array
+from umf_ros.maps.follower import MapFollower
 from umf_ros.nodes import pose_graph_messages as messages
 from umf_ros.nodes.base_node import BaseNode
-from umf_ros.nodes.conversions import closure_from_message, parse_pair
+from umf_ros.nodes.conversions import closure_from_message, is_between_rovers, parse_pair
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import leave, run
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
@@ -62,14 +63,18 @@ class PoseGraphNode(BaseNode):
         self._frames = settings.frames
         self._lock = threading.Lock()
         journal = Path(self._results) / JOURNAL if self._results else None
-        self._durable = DurableGraph(settings.pose_graph, journal, self._complain)
-        self._map_T_odom: Array = np.eye(4)
+        self._durable: DurableGraph | MapFollower = (
+            MapFollower(settings) if settings.localizing else DurableGraph(settings.pose_graph, journal, self._complain)
+        )
+        # None: in a map that is there, the rover may be anywhere
+        self._map_T_odom: Array | None = None if settings.localizing else np.eye(4)
         self._covariance: Array = np.zeros((6, 6))
         self._drawn = -1
         self._make_publishers()
-        if self._durable.taken_up or self._durable.feed.newest_ns >= 0:
-            self.get_logger().info(_taken_up(self._durable))
-            self._announce(self._durable.graph.closures())
+        kept = self._durable if isinstance(self._durable, DurableGraph) else None
+        if kept is not None and (kept.taken_up or kept.feed.newest_ns >= 0):
+            self.get_logger().info(_taken_up(kept))
+            self._announce(kept.graph.closures())
         self._worker: Worker[Callable[[], None]] = Worker(self._run, self._complain, QUEUE)
         if self._durable.unsettled:
             self._worker.submit(lambda: self._settle_left())
@@ -133,6 +138,8 @@ class PoseGraphNode(BaseNode):
         self._worker.submit(lambda: self._add_odometry(sample))
         # the newest correction, not the next: the pose never waits for the optimiser
         map_T_odom = self._map_T_odom
+        if map_T_odom is None:
+            return
         pose = messages.pose(sample.stamp_ns, map_T_odom @ sample.odom_T_body, self._covariance, self._frames)
         self._pose_publisher.publish(pose)
         transform = messages.transform(sample.stamp_ns, map_T_odom, self._frames)
@@ -141,6 +148,8 @@ class PoseGraphNode(BaseNode):
             self._broadcast(transform)
 
     def _on_closure(self, message: Odometry) -> None:
+        if is_between_rovers(message):
+            return
         closure = closure_from_message(message)
         self._worker.submit(lambda: self._announce(self._durable.add_closure(closure)))
 
@@ -156,6 +165,7 @@ class PoseGraphNode(BaseNode):
         reset = self._durable.take_odometry(sample.stamp_ns, sample.odom_T_body)
         if reset is not None:
             self.get_logger().warning(f"{reset.reason}: a new session begins")
+            self._correct()
 
     def _announce(self, verdicts: list[ClosureVerdict]) -> None:
         if not verdicts:
@@ -205,6 +215,9 @@ class PoseGraphNode(BaseNode):
         values |= {state.value: count for state, count in graph.verdict_counts().items()}
         trouble = self._worker.dropped or any(name.startswith("optimiser") for name in graph.counts)
         text = f"{values.get('accepted', 0)} closures accepted"
+        if isinstance(self._durable, MapFollower):
+            values["probability"] = self._durable.probability
+            text = "in the map" if self._map_T_odom is not None else "the rover is not found in the map yet"
         if values.get("waiting") and self._durable.feed.newest_ns < 0:
             trouble, text = True, f"{values['waiting']} closures wait for odometry, of which none has come"
         level = ERROR if self._cannot_write else WARN if trouble or self._faults else OK
@@ -230,7 +243,7 @@ class PoseGraphNode(BaseNode):
             if self._results:
                 self._durable.write_results(_numbered(Path(self._results)))
             kept = self._durable.end()
-        self._map_T_odom, self._drawn = np.eye(4), -1
+        self._map_T_odom, self._drawn = self._durable.graph.map_T_odom(), -1
         return "a new graph begins" + (f"; the old one is kept in {kept}" if kept else "")
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
+import os
 import sqlite3
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator
-from contextlib import closing
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,38 +18,17 @@ from safetensors import SafetensorError
 from umf_ros.errors import UmfError, writing
 from umf_ros.frames import Keyframe
 from umf_ros.locks import FileLock
+from umf_ros.places.columns import Columns
+from umf_ros.places.outbox import Outbox
 from umf_ros.places.packing import pack, unpack
-from umf_ros.sqlite_files import open_sqlite
+from umf_ros.places.schema import check_identity, prepare
+from umf_ros.sqlite_files import open_sqlite, take_up
 
-SCHEMA_VERSION = 3
-_TABLES = (
-    "CREATE TABLE about (content TEXT NOT NULL)",
-    # the blob comes last: whoever wants the columns before it does not read it
-    "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, stamp_ns INTEGER NOT NULL, session INTEGER NOT NULL, "
-    "travelled_m REAL, descriptor BLOB NOT NULL, data BLOB NOT NULL)",
-)
-
-
-@dataclass(frozen=True, slots=True)
-class PlaceEntry:
-    """What retrieval needs of a keyframe.
-
-    Attributes:
-        stamp_ns: key of the keyframe.
-        session: its session.
-        travelled_m: metres driven since the start of the session, NaN without odometry.
-        descriptor: (D,) float32, L2-normalised.
-    """
-
-    stamp_ns: int
-    session: int
-    travelled_m: float
-    descriptor: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, keyframe: Keyframe) -> PlaceEntry:
-        """The entry of a keyframe."""
-        return cls(keyframe.stamp_ns, keyframe.session, keyframe.travelled_m, keyframe.embedding.descriptor)
+Keys = Columns
+"""`id` in the file, `stamp_ns`, `session` and `travelled_m` of every keyframe; metres are NaN without odometry."""
+IDS_AT_ONCE = 1000
+KIND = "place database"
+_KEYS = np.dtype([("id", np.int64), ("stamp_ns", np.int64), ("session", np.int64), ("travelled_m", np.float64)])
 
 
 class KeyframeStore:
@@ -64,21 +43,32 @@ class KeyframeStore:
             behind.
         identity: what must agree with a stored file, such as the embedder's name and dimension.
         cached: keyframes kept in memory.
+        read_only: the file is there and stays as it is, whoever else has it.
+        outgoing: whether every keyframe has to be told to a fleet's server.
+
+    Attributes:
+        path: the file, or None.
+        keys: of all keyframes.
+        read_only: as above.
 
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use.
         OutputError: the file cannot be written.
     """
 
-    def __init__(self, path: Path | None, identity: dict[str, str], cached: int) -> None:
+    def __init__(
+        self, path: Path | None, identity: dict[str, str], cached: int, read_only: bool = False, outgoing: bool = False
+    ) -> None:
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, Keyframe] = OrderedDict()
         self._cached = cached
-        self.path = path
-        self._rows: list[int] = []
+        self.path, self.read_only = path, read_only
+        self._dimension = int(identity["dimension"])
+        self.keys = Columns(**{name: _KEYS[name] for name in _KEYS.names or ()})
         self._file_lock: FileLock | None = None
         try:
-            self._connection = self._open({"schema": str(SCHEMA_VERSION), **identity})
+            self._connection = self._open_to_read(identity) if read_only else self._open(identity)
+            self._outbox = Outbox(self._connection) if outgoing else None
         except BaseException:
             self._unlock()
             raise
@@ -88,7 +78,7 @@ class KeyframeStore:
         return str(self.path or "temporary place database")
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.keys)
 
     def __getitem__(self, index: int) -> Keyframe:
         """The keyframe of an index.
@@ -97,26 +87,39 @@ class KeyframeStore:
             UmfError: the file is damaged.
         """
         with self._lock:
-            row = self._rows[index]
+            row = int(self.keys["id"][index])
             if row not in self._cache:
                 self._remember(row, self._read(row))
             self._cache.move_to_end(row)
             return self._cache[row]
 
-    def entries(self) -> Iterator[PlaceEntry]:
-        """What retrieval needs of every keyframe, in their order; the keyframes themselves stay on disk.
+    def descriptors(self, rows: NDArray[np.intp]) -> NDArray[np.float32]:
+        """(N, D) float32 descriptors of some indices, in their order.
 
         Raises:
             UmfError: the file is damaged.
         """
-        columns = "SELECT stamp_ns, session, travelled_m, descriptor FROM keyframe ORDER BY id"
-        try:
-            for stamp_ns, session, travelled_m, descriptor in self._connection.execute(columns):
-                # SQLite keeps a NaN as NULL
-                metres = float("nan") if travelled_m is None else travelled_m
-                yield PlaceEntry(stamp_ns, session, metres, np.frombuffer(descriptor, np.float32))
-        except sqlite3.Error as error:
-            raise UmfError(f"{self._name} is damaged: {error}") from None
+        found = np.empty((len(rows), self._dimension), np.float32)
+        for first in range(0, len(rows), IDS_AT_ONCE):
+            part = rows[first : first + IDS_AT_ONCE]
+            ids = self.keys["id"][part].tolist()
+            statement = f"SELECT id, descriptor FROM keyframe WHERE id IN ({','.join('?' * len(ids))})"
+            with self._lock, self._reading():
+                blobs = dict(self._connection.execute(statement, ids).fetchall())
+                content = b"".join(blobs[one] for one in ids)
+                found[first : first + len(part)] = np.frombuffer(content, np.float32).reshape(len(part), -1)
+        return found
+
+    def rows_at(self, stamp_ns: int) -> list[int]:
+        """Indices of the keyframes of a stamp, in order.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        with self._lock, self._reading():
+            statement = "SELECT id FROM keyframe WHERE stamp_ns = ? ORDER BY id"
+            ids = [one for (one,) in self._connection.execute(statement, (stamp_ns,))]
+        return [int(row) for row in np.searchsorted(self.keys["id"], ids)]
 
     def add(self, keyframe: Keyframe) -> int:
         """Append a keyframe and return its index.
@@ -125,15 +128,48 @@ class KeyframeStore:
             OutputError: the file cannot be written.
         """
         with self._lock:
-            row = self._rows[-1] + 1 if self._rows else 1
-            entry = PlaceEntry.of(keyframe)
-            descriptor = np.ascontiguousarray(entry.descriptor, np.float32).tobytes()
-            values = (row, entry.stamp_ns, entry.session, entry.travelled_m, descriptor, pack(keyframe))
+            row = int(self.keys["id"][-1]) + 1 if len(self.keys) else 1
+            key = {"stamp_ns": keyframe.stamp_ns, "session": keyframe.session, "travelled_m": keyframe.travelled_m}
+            descriptor = np.ascontiguousarray(keyframe.embedding.descriptor, np.float32).tobytes()
+            values = (row, *key.values(), descriptor, pack(keyframe))
             with writing(self._name, sqlite3.Error), self._connection:
                 self._connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?, ?)", values)
-            self._rows.append(row)
+                if self._outbox is not None:
+                    self._outbox.put(row)
+            self.keys.append(id=row, **key)
             self._remember(row, keyframe)
-            return len(self._rows) - 1
+            return len(self.keys) - 1
+
+    @property
+    def store_id(self) -> UUID:
+        """What names the file among all those of a rover; only where keyframes go to a fleet's server."""
+        return self._the_outbox.store
+
+    def outgoing(self, count: int) -> list[int]:
+        """Indices of the first keyframes that a fleet's server does not have yet."""
+        with self._lock, self._reading():
+            ids = self._the_outbox.oldest(count)
+        return [int(row) for row in np.searchsorted(self.keys["id"], ids)]
+
+    def waiting(self) -> int:
+        """How many these are."""
+        with self._lock, self._reading():
+            return len(self._the_outbox)
+
+    def delivered(self, rows: Sequence[int]) -> None:
+        """Take note that a fleet's server has some keyframes.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        with self._lock, writing(self._name, sqlite3.Error):
+            self._the_outbox.remove(self.keys["id"][list(rows)].tolist())
+
+    @property
+    def _the_outbox(self) -> Outbox:
+        if self._outbox is None:
+            raise ValueError("this store tells no server")
+        return self._outbox
 
     def save(self, path: Path) -> None:
         """Write a copy to `path` while the store stays in use.
@@ -175,34 +211,40 @@ class KeyframeStore:
             raise UmfError(f"{self._name} is damaged at its keyframe {row}: {error}") from None
 
     def _open(self, identity: dict[str, str]) -> sqlite3.Connection:
-        def check(connection: sqlite3.Connection, tables: set[str]) -> None:
-            if tables:
-                self._check_identity(connection, tables, identity)
-            if self.path is not None:
-                self._file_lock = FileLock(self.path)
+        return open_sqlite(self.path, KIND, lambda connection: self._prepare(connection, identity))
 
-        def make(connection: sqlite3.Connection) -> None:
-            for table in _TABLES:
-                connection.execute(table)
-            connection.execute("INSERT INTO about VALUES (?)", (json.dumps(identity),))
+    def _open_to_read(self, identity: dict[str, str]) -> sqlite3.Connection:
+        if self.path is None or not self.path.is_file():
+            raise UmfError(f"there is no place database {self.path}")
+        # SQLite wants to write files of its own beside what it reads, unless nobody can
+        access = "mode=ro" if os.access(self.path.parent, os.W_OK) else "immutable=1"
+        connection = sqlite3.connect(f"{self.path.resolve().as_uri()}?{access}", uri=True, check_same_thread=False)
 
-        connection = open_sqlite(self.path, "place database", check, make)
+        def check(opened: sqlite3.Connection) -> None:
+            check_identity(opened, self._name, identity)
+            self._read_keys(opened)
+
+        return take_up(connection, self._name, KIND, check)
+
+    def _prepare(self, connection: sqlite3.Connection, identity: dict[str, str]) -> None:
+        """Look at what is there before anything is changed, and let nobody else write from then on."""
+        check_identity(connection, self._name, identity)
+        if self.path is not None:
+            self._file_lock = FileLock(self.path)
+        prepare(connection, identity)
+        self._read_keys(connection)
+
+    def _read_keys(self, connection: sqlite3.Connection) -> None:
+        # SQLite keeps a NaN as NULL; 9e999 is infinity
+        columns = "SELECT id, stamp_ns, session, ifnull(travelled_m, 9e999) FROM keyframe"
+        keys = np.fromiter(connection.execute(columns), _KEYS)
+        keys = keys[np.argsort(keys["id"])]
+        keys["travelled_m"][np.isinf(keys["travelled_m"])] = np.nan
+        self.keys.extend(**{name: keys[name] for name in _KEYS.names or ()})
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
         try:
-            self._rows = [row for (row,) in connection.execute("SELECT id FROM keyframe ORDER BY id")]
-        except sqlite3.Error as error:
-            connection.close()
+            yield
+        except (sqlite3.Error, ValueError, KeyError) as error:
             raise UmfError(f"{self._name} is damaged: {error}") from None
-        return connection
-
-    def _check_identity(self, connection: sqlite3.Connection, tables: set[str], identity: dict[str, str]) -> None:
-        if not {"about", "keyframe"} <= tables:
-            raise UmfError(f"{self._name} is no place database, but another one with {', '.join(sorted(tables))}")
-        about = connection.execute("SELECT content FROM about").fetchone()
-        stored = json.loads(about[0]) if about else {}
-        if stored.get("schema") != identity["schema"]:
-            raise UmfError(f"{self._name} was written by another version of umf_ros; name a new file (database.path)")
-        wrong = [
-            f"{name} {stored.get(name)}, not {value}" for name, value in identity.items() if stored.get(name) != value
-        ]
-        if wrong:
-            raise UmfError(f"{self._name} was made with {'; '.join(wrong)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager
@@ -39,6 +40,23 @@ def stored_sessions(path: Path) -> list[StoredSession]:
     with _told(path), closing(sqlite3.connect(path)) as connection:
         columns = "SELECT session, count(*), min(stamp_ns), max(stamp_ns) FROM keyframe GROUP BY session"
         return [StoredSession(*row) for row in connection.execute(columns)]
+
+
+def stored_identity(path: Path) -> tuple[str, int]:
+    """Embedder and numbers per descriptor of a store, also of one in use.
+
+    Raises:
+        UmfError: the file is missing or no place database.
+    """
+    if not path.is_file():
+        raise UmfError(f"there is no place database {path}")
+    with _told(path), closing(sqlite3.connect(path)) as connection:
+        about = connection.execute("SELECT content FROM about").fetchone()
+    stored = json.loads(about[0]) if about else {}
+    try:
+        return stored["embedder"], int(stored["dimension"])
+    except (KeyError, ValueError):
+        raise UmfError(f"{path} does not say which network it was made with") from None
 
 
 def delete_sessions(path: Path, numbers: Collection[int]) -> int:

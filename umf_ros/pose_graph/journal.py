@@ -15,7 +15,7 @@ from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array
 from umf_ros.locks import FileLock
 from umf_ros.pose_graph.closures import ClosureVerdict
-from umf_ros.sqlite_files import open_sqlite
+from umf_ros.sqlite_files import open_sqlite, survive_crashes, tables_of
 
 _TABLES = (
     "CREATE TABLE event (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, first_ns INTEGER, second_ns INTEGER, data BLOB)",
@@ -140,13 +140,15 @@ class GraphJournal:
             self._connection.execute("INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)", values)
 
     def _open(self) -> sqlite3.Connection:
-        return open_sqlite(self.path, "pose graph", self._check, _make)
+        return open_sqlite(self.path, "pose graph", self._prepare)
 
-    def _check(self, _: sqlite3.Connection, tables: set[str]) -> None:
+    def _prepare(self, connection: sqlite3.Connection) -> None:
+        tables = tables_of(connection)
         if tables and not {"event", "verdict"} <= tables:
             raise UmfError(f"{self.path} holds no pose graph, but {', '.join(sorted(tables))}")
-
-
-def _make(connection: sqlite3.Connection) -> None:
-    for table in _TABLES:
-        connection.execute(table)
+        survive_crashes(connection)
+        if not tables:
+            with connection:
+                connection.execute("BEGIN")
+                for table in _TABLES:
+                    connection.execute(table)

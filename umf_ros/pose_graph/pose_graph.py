@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from umf_ros.config import PoseGraphSettings
 from umf_ros.errors import GraphError, writing
@@ -259,6 +260,32 @@ class PoseGraph:
     def trajectory(self) -> tuple[Stamps, Array]:
         """Stamps (N,) in ns and `map_T_body` (N, 4, 4) of every keyframe that is joined to the map."""
         return self._keyframes(lambda session, chain: self._sessions.at(session, chain.stamps))
+
+    def poses_at(self, stamps: Stamps) -> tuple[Array, NDArray[np.bool_]]:
+        """(N, 4, 4) `map_T_body` at stamps, in the frame of the largest part of the map, and (N,) whether it has them.
+
+        The sessions of that part share its frame: that of the earliest of them.
+        """
+        self._refresh()
+        poses, known = np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps), bool)
+        for session in self.sessions_of_map():
+            chain = self._sessions.chains[session]
+            mine = ~known & np.fromiter((chain.covers(stamp) for stamp in stamps.tolist()), bool, len(stamps))
+            if mine.any():
+                poses[mine] = self._sessions.at(session, stamps[mine])
+                known |= mine
+        return poses, known
+
+    def sessions_of_map(self) -> list[int]:
+        """Numbers of the sessions in the largest part of the map, by the order in which they began."""
+        return self._sessions.members(self._sessions.largest)
+
+    def session_spans(self) -> list[tuple[int, int] | None]:
+        """First and last stamp of the odometry of every session; None without any."""
+        self._refresh()
+        chains = self._sessions.chains
+        spans = ((chain.oldest_ns, chain.newest_ns) for chain in chains)
+        return [None if first is None or last is None else (first, last) for first, last in spans]
 
     def odometry(self) -> tuple[Stamps, Array]:
         """Stamps (N,) in ns and `odom_T_body` (N, 4, 4) of the same keyframes as `trajectory`."""

@@ -148,7 +148,20 @@ class Sessions:
     @property
     def joined(self) -> list[int]:
         """Sessions with odometry that share the map of the first one."""
-        return [s for s, chain in enumerate(self.chains) if len(chain.stamps) and self.components[s] == 0]
+        return self.members(0)
+
+    def members(self, component: int) -> list[int]:
+        """Sessions with odometry of one component, which goes by the number of its earliest session."""
+        return [s for s, chain in enumerate(self.chains) if len(chain.stamps) and self.components[s] == component]
+
+    @property
+    def largest(self) -> int:
+        """The component with the longest way in it."""
+        way_m = np.zeros(len(self.chains))
+        for session, chain in enumerate(self.chains):
+            if len(chain.stamps):
+                way_m[self.components[session]] += chain.travel_at(chain.stamps[-1:]).item()
+        return int(np.argmax(way_m))
 
     def at(self, session: int, stamps: Stamps) -> Array:
         """(N, 4, 4) `map_T_body` of one session."""

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from umf_ros.errors import writing
+from umf_ros.errors import UmfError, writing
 from umf_ros.frames import Points
 
 NAME = "descriptors.f16"
@@ -49,15 +50,33 @@ class DescriptorFile:
         self._file.close()
 
 
+def all_descriptors(folder: Path) -> Points:
+    """Descriptors (N, D) float32 of all keyframes of a run, in order.
+
+    Raises:
+        UmfError: it has none.
+    """
+    rows = _read(folder)
+    if rows is None or not len(rows):
+        raise UmfError(f"{folder} holds no descriptors of keyframes")
+    return rows["descriptor"].astype(np.float32)
+
+
 def read_descriptors(folder: Path, stamps_ns: Sequence[int]) -> Points | None:
     """Descriptors (N, D) float32 of keyframes by their stamps; None where one has none, as of an older version."""
-    path = folder / NAME
-    content = path.read_bytes() if path.is_file() else b""
-    if len(content) < _HEAD.itemsize or not stamps_ns:
+    rows = _read(folder)
+    if rows is None or not stamps_ns:
         return None
-    kind = _record(int(np.frombuffer(content, _HEAD, 1)[0]))
-    rows = np.frombuffer(content, kind, (len(content) - _HEAD.itemsize) // kind.itemsize, _HEAD.itemsize)
     place = {int(stamp): row for row, stamp in enumerate(rows["stamp_ns"])}
     if any(stamp not in place for stamp in stamps_ns):
         return None
     return rows["descriptor"][[place[stamp] for stamp in stamps_ns]].astype(np.float32)
+
+
+def _read(folder: Path) -> NDArray[np.void] | None:
+    path = folder / NAME
+    content = path.read_bytes() if path.is_file() else b""
+    if len(content) < _HEAD.itemsize:
+        return None
+    kind = _record(int(np.frombuffer(content, _HEAD, 1)[0]))
+    return np.frombuffer(content, kind, (len(content) - _HEAD.itemsize) // kind.itemsize, _HEAD.itemsize)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -14,7 +13,8 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import Bag
 from umf_ros.config import Settings
 from umf_ros.frames import Frame, Image, Points
-from umf_ros.geometry import Array, transform
+from umf_ros.geometry import transform
+from umf_ros.runs.height_map import MAP_REACH_M, HeightMap
 from umf_ros.runs.sensor_check import SensorCheck, SensorReport
 from umf_ros.sensors.messages import OdometrySample
 from umf_ros.trajectory import Trajectory
@@ -22,7 +22,7 @@ from umf_ros.verification import thin_scan
 
 PHOTO_WIDTH, PHOTO_QUALITY = 360, 60  # by hand: rocks are still rocks, at some 15 kB
 SCAN_POINTS, SCAN_UNIT_M = 600, 0.02  # by hand: enough to see the ground, and what int16 counts in
-MAP_CELLS, MAP_REACH_M, MAP_POINTS = 700, 25.0, 4000  # by hand: bounds the picture
+MAP_POINTS = 4000  # by hand: of a scan
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,16 +133,11 @@ def _small_scan(points: Points) -> Points:
 
 
 class _Map:
-    """Heights of the ground in cells, seen from above."""
+    """The ground along a trajectory."""
 
     def __init__(self, drawn: Trajectory) -> None:
         self._drawn = drawn
-        way = drawn.poses[:, :2, 3]
-        self._lower = way.min(axis=0) - MAP_REACH_M
-        span = way.max(axis=0) + MAP_REACH_M - self._lower
-        self._cell = max(0.1, float(span.max()) / MAP_CELLS)
-        self._shape = tuple(math.ceil(side / self._cell) for side in span)
-        self._sum, self._count = np.zeros(self._shape), np.zeros(self._shape, np.int32)
+        self._heights = HeightMap(drawn.poses[:, :2, 3])
 
     def add(self, frame: Frame) -> None:
         """Lay one scan into the map."""
@@ -152,27 +147,13 @@ class _Map:
             return
         near = frame.points[:: max(1, len(frame.points) // MAP_POINTS)]
         near = near[np.linalg.norm(near, axis=1) < MAP_REACH_M]
-        points = transform(poses[0], near.astype(float))
-        column, row = np.floor((points[:, :2] - self._lower) / self._cell).astype(int).T
-        inside = (column >= 0) & (row >= 0) & (column < self._shape[0]) & (row < self._shape[1])
-        np.add.at(self._sum, (column[inside], row[inside]), points[inside, 2])
-        np.add.at(self._count, (column[inside], row[inside]), 1)
+        self._heights.add(transform(poses[0], near.astype(float)))
 
     def picture(self) -> MapPicture | None:
-        """Heights as colours, relief as light from the north-west, nothing where nothing was seen."""
-        seen = self._count > 0
-        if not seen.any():
+        """The map so far; None where nothing was seen."""
+        png = self._heights.png()
+        if png is None:
             return None
-        height: Array = np.where(seen, self._sum / np.maximum(self._count, 1), 0.0)
-        low, high = np.percentile(height[seen], [2, 98])
-        share = np.clip((height - low) / max(high - low, 0.1), 0, 1)
-        colours = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
-        slope = np.gradient(height, self._cell)
-        light = np.clip(0.85 + 0.6 * (slope[0] - slope[1]), 0.4, 1.15)
-        shaded = np.clip(colours * light[..., None], 0, 255).astype(np.uint8)
-        pixels = np.dstack([shaded, np.where(seen, 255, 0).astype(np.uint8)])
-        # columns of the array are y: a picture has y upwards along its rows
-        _, data = cv2.imencode(".png", np.ascontiguousarray(np.swapaxes(pixels, 0, 1)[::-1]))
-        upper = self._lower + np.array(self._shape) * self._cell
-        lower_left, upper_right = (tuple(float(value) for value in corner) for corner in (self._lower, upper))
-        return MapPicture(data_address("image/png", data.tobytes()), lower_left, upper_right)  # type: ignore[arg-type]
+        corners = (self._heights.lower, self._heights.upper)
+        lower_left, upper_right = (tuple(float(value) for value in corner) for corner in corners)
+        return MapPicture(data_address("image/png", png), lower_left, upper_right)  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from math import nan
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from umf_ros.runs.descriptors import DescriptorFile
 from umf_ros.runs.folder import write_atomically
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
+
+if TYPE_CHECKING:
+    from umf_ros.fleet.encounters import Encounter
 
 COUNTS = ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected")
 STAGES = tables.STAGES
@@ -66,6 +69,7 @@ class RunRecorder:
         self._closures = table("closures", tables.CLOSURES)
         self._candidates = table("candidates", tables.CANDIDATES)
         self._inliers = table("inliers", tables.INLIERS)
+        self._between: tables.CsvTable | None = None
         self._pairs = {(int(row["query_stamp_ns"]), int(row["match_stamp_ns"])) for row in self._closures.rows}
         self._latency = {stage: array("f") for stage in STAGES}
         self._counts = self._earlier_counts(resume)
@@ -105,6 +109,15 @@ class RunRecorder:
         for stage, milliseconds in detection.latency_ms.items():
             self._latency[stage].append(milliseconds)
 
+    def record_encounter(self, encounter: Encounter) -> None:
+        """Write down the closures with another rover of a fleet."""
+        if not encounter.closures:
+            return
+        if self._between is None:
+            self._between = tables.CsvTable(self.folder / "closures_between.csv", tables.CLOSURES_BETWEEN)
+        rows = [[encounter.robot, *tables.closure_row(closure, float("nan"))] for closure in encounter.closures]
+        self._between.append(rows)
+
     def count(self, frame: Frame) -> None:
         """Count a frame, also one that was dealt with before."""
         self._counts["frames"] += 1
@@ -137,6 +150,8 @@ class RunRecorder:
         """Close the tables."""
         for table in (self._closures, self._candidates, self._keyframes, self._latencies, self._inliers):
             table.close()
+        if self._between is not None:
+            self._between.close()
         self._descriptors.close()
 
     def _earlier_counts(self, resume: bool) -> dict[str, int]:

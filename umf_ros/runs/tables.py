@@ -24,6 +24,7 @@ POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
 SIGMA = ["sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"]
 COVARIANCE = "covariance"
 CLOSURES = ["query_stamp_ns", "match_stamp_ns", *POSE, *SIGMA, "probability", "similarity", COVARIANCE]
+CLOSURES_BETWEEN = ["match_robot", *CLOSURES]
 CANDIDATES = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "numbers"]
 KEYFRAMES = ["stamp_ns", "session", "travelled_m"]
 STAGES = ("embed", "query", "verify", "submaps", "total")

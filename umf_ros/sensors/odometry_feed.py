@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from umf_ros.geometry import Array
 from umf_ros.sensors.sessions import ODOMETRY, Arrival, Reset, SessionClock
 
-if TYPE_CHECKING:
-    from umf_ros.pose_graph.pose_graph import PoseGraph
+
+class OdometryTaker(Protocol):
+    """Who works with odometry in sessions: a pose graph, or a localizer."""
+
+    def begin_session(self) -> None:
+        """What follows does not go on from what was before."""
+
+    def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> bool:
+        """Take one message; returns whether it could be used."""
 
 
 GOES_ON_NS = 60_000_000_000
@@ -31,7 +38,7 @@ class OdometryFeed:
         dropped: messages that were out of line, and wrong.
     """
 
-    def __init__(self, graph: PoseGraph) -> None:
+    def __init__(self, graph: OdometryTaker) -> None:
         self.newest_ns = -1
         self.dropped = 0
         self._graph = graph

@@ -21,7 +21,7 @@ from umf_ros.verification.acceptance import Criterion, Logistic, log_ratio
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import TemporalMemory, prior_sigmas
 from umf_ros.verification.measurement import SUBMAP, Measurement
-from umf_ros.verification.registration import NOMINAL, Alignment, CovarianceModel, covariance_of, levelled
+from umf_ros.verification.registration import Alignment, CovarianceModel, covariance_of, levelled, nominal_deviations
 
 SHIPPED = "config/verification/submaps.json"
 
@@ -123,7 +123,7 @@ def measure_submaps(
     level = levelled(match.scan, query.scan, pose)
     fit = evaluate(theirs, ours, level)
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
-    nominal = covariance_of(alignment.information, NOMINAL)
+    position_std_m, heading_std_deg = nominal_deviations(alignment.information)
     return Measurement(
         kind=SUBMAP,
         similarity=float(query.keyframe.embedding.descriptor @ match.keyframe.embedding.descriptor),
@@ -134,8 +134,8 @@ def measure_submaps(
         terrain_correlation=fit.correlation,
         terrain_score=fit.score,
         terrain_rival=max(evaluate(theirs, ours, beside @ level).correlation for beside in _BESIDE),
-        position_std_m=float(np.sqrt(np.linalg.eigvalsh(nominal[:3, :3])[-1])),
-        heading_std_deg=float(np.degrees(np.sqrt(nominal[5, 5]))),
+        position_std_m=position_std_m,
+        heading_std_deg=heading_std_deg,
         prior_sigmas=prior_sigmas(query.keyframe, match.keyframe, pose, drift),
         support=memory.support(query.keyframe, match.keyframe, pose),
     )

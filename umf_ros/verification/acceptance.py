@@ -90,7 +90,6 @@ CRITERIA: dict[str, Criterion] = {
     "points": Criterion(lambda m: math.log(max(m.points, 1.0)), math.log(100), math.log(1000)),
     "position_known": Criterion(lambda m: math.log(m.position_std_m), math.log(1.0), math.log(0.05)),
     "heading_known": Criterion(lambda m: math.log(m.heading_std_deg), math.log(5.0), math.log(0.2)),
-    "image_agreement": Criterion(lambda m: m.agreement_image, 0.0, 6.0, KINDS, missing=0.5),
     "cloud_agreement": Criterion(lambda m: m.agreement_cloud, 0.0, 6.0, missing=0.5),
     "inliers": Criterion(lambda m: math.log1p(m.inliers_image + m.inliers_cloud), math.log(10), math.log(100), KINDS),
     "similarity": Criterion(lambda m: m.similarity, 0.3, 0.9, KINDS),

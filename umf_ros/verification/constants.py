@@ -113,6 +113,8 @@ RUNNER_UP_ROOM = 0.02  # by hand: shares nearer to nothing than this are alike
 MAX_MISFIT = 2.5  # measured: of 2,400 right poses one in 100 has more than 1.5, of wrong ones half have more than this
 MIN_RUNNER_UP = 0.1  # measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 86
 
+SAME_M, SAME_RAD = 0.05, 0.01  # geometry: of the error of a right pose; aligned hypotheses this near are one
+
 # covariance
 SEARCH_M, SEARCH_RAD = 3.0, 0.35  # what the search itself knows, standard deviation: nothing is wider than this
 NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG = 20.0, 0.01, 0.05  # by hand: a yardstick of nobody's data

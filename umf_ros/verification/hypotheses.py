@@ -6,12 +6,13 @@ A hypothesis is a pose worth a closer look; nothing is decided here.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from umf_ros.config import Verification
-from umf_ros.frames import Keyframe
+from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array, relative, rotation_angle
 from umf_ros.verification import constants as const
 from umf_ros.verification.all_round import Fit, TurnedSurroundings, scout, search
@@ -57,11 +58,12 @@ def find_hypotheses(
     views = None
     if settings.modalities != "cloud":
         views = PairedViews.of(query, ranked.keyframe, const.VIEW_NOISE[settings.features])
-    seen = views.best_pose() if views else None
     if turned is None or not match.usable:
+        seen = views.best_pose() if views else None
         return [Hypothesis(ranked, seen[0], float(seen[1]), views)] if seen else []
     from_points = pose_from_points(query, ranked, settings.ransac_iterations, settings.seed)
-    poses = [pose for pose in (from_points, seen[0] if seen else None) if pose is not None]
+    guesses = (from_points, views.any_pose() if views else None)
+    poses = [pose for pose in guesses if pose is not None]
     fits = [fit for pose in poses if (fit := scout(match, turned.scan, pose)).telling] + search(match, turned)
     fits.sort(key=lambda fit: -fit.score)
     return [Hypothesis(ranked, fit.pose, fit.score, views) for fit in _distinct(fits)]
@@ -119,11 +121,13 @@ class TemporalMemory:
                 return float(np.linalg.norm(carried[:3, 3]))
         return float("inf")
 
-    def expected(self, query: Keyframe, ranked: list[RankedCandidate]) -> list[RankedCandidate]:
+    def expected(
+        self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]
+    ) -> list[tuple[Candidate, Keyframe]]:
         """The candidate nearest to where earlier closures and odometry put the rover, if there is one within 4 m."""
-        distances = [self.expected_distance(query, item.keyframe) for item in ranked]
+        distances = [self.expected_distance(query, keyframe) for _, keyframe in candidates]
         nearest = int(np.argmin(distances)) if distances else 0
-        return [ranked[nearest]] if distances and distances[nearest] < const.EXPECTED_M else []
+        return [candidates[nearest]] if distances and distances[nearest] < const.EXPECTED_M else []
 
     def support(self, query: Keyframe, match: Keyframe, match_T_query: Array) -> float:
         """How many of the remembered keyframes found a pose that odometry carries over to this one."""

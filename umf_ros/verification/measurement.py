@@ -14,13 +14,21 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.frames import Keyframe, LocalFeatures, Points
+from umf_ros.frames import Candidate, Keyframe, LocalFeatures, Points
 from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, near, prior_sigmas
 from umf_ros.verification.meeting import meet, rivalry
-from umf_ros.verification.registration import NOMINAL, Alignment, CovarianceModel, PreparedScan, covariance_of, levelled
+from umf_ros.verification.registration import (
+    Alignment,
+    CovarianceModel,
+    PreparedScan,
+    covariance_of,
+    joint_blur,
+    levelled,
+    nominal_deviations,
+)
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
 from umf_ros.verification.scan_motion import closure_covariance
 from umf_ros.verification.views import ViewAlignment
@@ -68,7 +76,8 @@ class Measurement:
         two_way_m: distance of the poses that the query's depths and the match's give by themselves.
         position_std_m: standard deviation of the position along its least known direction, from the residuals.
         heading_std_deg: of the heading.
-        agreement_image: whether image features reappear where the pose says, standard deviations of chance.
+        agreement_image: whether image features reappear where the pose says, standard deviations of chance; a word
+            for people about the best hypothesis of a candidate, no part of the decision.
         agreement_cloud: the same of the scan's features.
         prior_sigmas: distance from what odometry predicts, in standard deviations of its drift.
         support: earlier keyframes, of the last few, that found a pose which odometry carries over to this one.
@@ -187,6 +196,14 @@ def measure_candidate(ranked: RankedCandidate) -> Measurement:
     )
 
 
+def uncompared(candidate: Candidate) -> Measurement:
+    """What is known of a candidate whose local features nobody looked at."""
+    unknown = math.nan
+    return Measurement(
+        similarity=candidate.similarity, inliers_image=unknown, inliers_cloud=unknown, superfeatures=unknown
+    )
+
+
 def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) -> Measurement:
     """Every test of one hypothesis.
 
@@ -202,12 +219,11 @@ def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) ->
     else:
         assert aligned.scans is not None
         fit = _measure_scans(known, alignment, *aligned.scans)
-    nominal = covariance_of(alignment.information, NOMINAL)
+    position_std_m, heading_std_deg = nominal_deviations(alignment.information)
     return replace(
         fit,
-        position_std_m=float(np.sqrt(np.linalg.eigvalsh(nominal[:3, :3])[-1])),
-        heading_std_deg=float(np.degrees(np.sqrt(nominal[5, 5]))),
-        agreement_image=image_agreement(query, match, pose),
+        position_std_m=position_std_m,
+        heading_std_deg=heading_std_deg,
         agreement_cloud=cloud_agreement(query, match, pose),
         prior_sigmas=prior_sigmas(query, match, pose, drift),
         support=memory.support(query, match, pose),
@@ -235,9 +251,9 @@ def image_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
     ours, theirs = strongest(ours, const.AGREEMENT_COMPARED), strongest(theirs, const.AGREEMENT_COMPARED)
     camera = match.camera
     pixels, depth = camera.project(transform(pose, ours.points.astype(float)), match.body_T_camera)
-    offset = pixels[:, None] - theirs.positions[None].astype(float)
-    distance = np.hypot(offset[..., 0], offset[..., 1])
-    peers = (np.abs(offset[..., 1]) < const.AGREEMENT_ROWS * camera.height) & (depth > 0)[:, None]
+    across, down = (pixels[:, None] - theirs.positions[None].astype(float)).transpose(2, 0, 1)
+    distance = np.sqrt(across**2 + down**2)
+    peers = (np.abs(down) < const.AGREEMENT_ROWS * camera.height) & (depth > 0)[:, None]
     return _rank_agreement(ours, theirs, distance, const.AGREEMENT_PIXELS * camera.width, peers)
 
 
@@ -268,7 +284,7 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
         kind=SCAN,
         residual_m=float(np.median(size)),
         residual_p90_m=float(np.percentile(size, 90)),
-        noise_m=math.hypot(max(match.noise_m, const.MIN_SURFACE_NOISE_M), max(match.blur_m, query.blur_m)),
+        noise_m=math.hypot(max(match.noise_m, const.MIN_SURFACE_NOISE_M), joint_blur(match, query)),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),
         relief_m=shared_relief(match.elevation, query.elevation, level),

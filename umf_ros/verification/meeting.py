@@ -14,7 +14,7 @@ from umf_ros.geometry import Array, invert, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.all_round import alternatives
 from umf_ros.verification.free_space import Sight, visible
-from umf_ros.verification.registration import SEARCHED, PreparedScan
+from umf_ros.verification.registration import SEARCHED, PreparedScan, joint_blur
 
 Mask = NDArray[np.bool_]
 
@@ -63,7 +63,7 @@ def meet(match: PreparedScan, query: PreparedScan, pose: Array) -> tuple[Meeting
     """What the match says of the query's points under `match_T_query`, and the query of the match's."""
     moved, back = transform(pose, query.sample), transform(invert(pose), match.sample)
     ours, theirs = match.nearest(moved), query.nearest(back)
-    blur_m = max(match.blur_m, query.blur_m)
+    blur_m = joint_blur(match, query)
     reach_ours, reach_theirs = _reach(query.spacing, blur_m), _reach(match.spacing, blur_m)
     return (
         Meeting(match.look_at(moved), np.sqrt(ours[1]) / reach_ours, _upright(match, ours[0])),
@@ -119,7 +119,7 @@ def _fit(match: PreparedScan, query: PreparedScan, poses: Array) -> Array:
 def _misfits(scan: PreparedScan, other: PreparedScan, moved: Array) -> Array:
     """(K,) mean misfit of the visible ones of points (K, N, 3); as bad as can be where few are."""
     points = moved.reshape(-1, 3)
-    reach = np.tile(_reach(other.spacing[:: const.RIVAL_EVERY], max(scan.blur_m, other.blur_m)), len(moved))
+    reach = np.tile(_reach(other.spacing[:: const.RIVAL_EVERY], joint_blur(scan, other)), len(moved))
     misfit = np.minimum(np.sqrt(scan.nearest(points)[1]) / reach, const.RIVAL_MISFIT)
     seen = visible(scan.look_at(points)).reshape(len(moved), -1)
     count = seen.sum(axis=1)

@@ -172,6 +172,11 @@ def prepare(keyframe: Keyframe) -> PreparedScan:
     return PreparedScan(keyframe.points, keyframe.body_T_lidar, const.BLUR_M if keyframe.motion is None else 0.0)
 
 
+def joint_blur(match: PreparedScan, query: PreparedScan) -> float:
+    """How far points of two scans may be off together because a LiDAR moved, m."""
+    return max(match.blur_m, query.blur_m)
+
+
 class ScanCache:
     """The most recently used scans; a cache, so it changes no result."""
 
@@ -231,8 +236,8 @@ def _diagonal(metres: float, degrees: float) -> Array:
 
 # information (6, 6) of the search itself: nothing is less known than that
 SEARCHED = np.diag([const.SEARCH_M**-2] * 3 + [const.SEARCH_RAD**-2] * 3)
-# a fixed yardstick of what a pose is known to: refitting the covariance must not move the decision
 NOMINAL = CovarianceModel(const.NOMINAL_INFLATION, const.NOMINAL_FLOOR_M, const.NOMINAL_FLOOR_DEG)
+"""A fixed yardstick of what a pose is known to: refitting the covariance must not move the decision."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,3 +328,13 @@ def covariance_of(found: Array, model: CovarianceModel, overlap: float | Array =
     inflation = np.asarray(model.inflation * np.exp(model.disorder * (1.0 - np.asarray(overlap, float))))
     covariance = np.linalg.inv(SEARCHED + found / inflation[..., None, None]) + model.floor
     return (covariance + covariance.swapaxes(-1, -2)) / 2
+
+
+def nominal_deviations(found: Array) -> tuple[float, float]:
+    """Nominal standard deviations of the position along its least known direction, m, and of the heading, deg.
+
+    Args:
+        found: information (6, 6) of the residuals.
+    """
+    nominal = covariance_of(found, NOMINAL)
+    return float(np.sqrt(np.linalg.eigvalsh(nominal[:3, :3])[-1])), float(np.degrees(np.sqrt(nominal[5, 5])))

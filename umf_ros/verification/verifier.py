@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,12 +15,21 @@ from umf_ros.geometry import heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
 from umf_ros.verification.all_round import TurnedSurroundings
-from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, find_hypotheses
-from umf_ros.verification.measurement import AlignedHypothesis, Measurement, beside, measure, measure_candidate
+from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, find_hypotheses, near
+from umf_ros.verification.measurement import (
+    AlignedHypothesis,
+    Measurement,
+    beside,
+    image_agreement,
+    measure,
+    measure_candidate,
+    uncompared,
+)
 from umf_ros.verification.registration import ScanCache, align_scans, levelled
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
 UNTESTED, NO_POSE = "less promising than others", "no pose fits, or others fit better"
+FOUND_BEFORE = "not compared: the expected place had been found"
 NO_DEPTH = "no depth: neither a scan nor a stereo pair"
 """Why there is nothing to judge about a candidate."""
 
@@ -63,6 +73,11 @@ class JudgedHypothesis:
         """Key of the matched keyframe."""
         return self.aligned.match.stamp_ns
 
+    def told_by_images(self) -> JudgedHypothesis:
+        """The same, knowing whether the images agree: for people, and too slow for every hypothesis."""
+        agreement = image_agreement(self.aligned.query, self.aligned.match, self.aligned.pose)
+        return replace(self, measurement=replace(self.measurement, agreement_image=agreement))
+
 
 class Verifier:
     """Decides which candidates of a query are the same place, and where the rover stood.
@@ -103,15 +118,25 @@ class Verifier:
             query: the newest keyframe.
             candidates: what the database returned, with their keyframes.
         """
-        start = time.perf_counter()
-        ranked = rerank(query, candidates, self._settings)
-        reranked = time.perf_counter()
-        judged, tested = self._test(query, ranked)
+        self.latency_ms = {"rerank": 0.0, "refine": 0.0}
+        with self._timed("refine"):
+            turned = self._turned(query) if candidates else None
+        # where odometry carries an accepted closure to is looked at first: most often that is all there is to do
+        expected = self._memory.expected(query, candidates)
+        ranked = self._rank(query, expected)
+        judged = self._refine(query, ranked, turned)
+        tested = {item.candidate.stamp_ns for item in ranked}
+        if self._wanting(judged):
+            ranked = self._rank(query, candidates)
+            chosen = select(ranked, self._settings.refine_best)
+            judged += self._refine(query, [one for one in chosen if one.candidate.stamp_ns not in tested], turned)
+            tested |= {item.candidate.stamp_ns for item in chosen}
         found = [(one.aligned.match, one.aligned.pose, one.probability >= self._threshold) for one in judged]
         self._memory.remember(query, found)
         verdicts = self._decide(query, ranked, judged, tested)
-        self.latency_ms = {"rerank": 1e3 * (reranked - start), "refine": 1e3 * (time.perf_counter() - reranked)}
-        return verdicts
+        known = {verdict.candidate.index for verdict in verdicts}
+        rest = [candidate for candidate, _ in candidates if candidate.index not in known]
+        return verdicts + [Verdict(one, FOUND_BEFORE, uncompared(one)) for one in rest]
 
     def examine(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[JudgedHypothesis]:
         """Every hypothesis about every candidate, without a decision: what the decision is fitted on."""
@@ -121,23 +146,27 @@ class Verifier:
         self._memory.remember(query, [(one.match, one.pose, False) for one in first.values()])
         return examined
 
-    def _test(self, query: Keyframe, ranked: list[RankedCandidate]) -> tuple[list[JudgedHypothesis], set[int]]:
-        """Judge the candidates worth it, the expected place first, until there are closures enough.
+    def _rank(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[RankedCandidate]:
+        with self._timed("rerank"):
+            return rerank(query, candidates, self._settings)
 
-        Also returns the stamps of the candidates that were tried.
-        """
-        judged: list[JudgedHypothesis] = []
-        tested: set[int] = set()
-        turned = self._turned(query) if ranked else None
-        for group in (self._memory.expected(query, ranked), select(ranked, self._settings.refine_best)):
-            fresh = [item for item in group if item.candidate.stamp_ns not in tested]
-            tested |= {item.candidate.stamp_ns for item in fresh}
-            hypotheses = self._hypotheses(query, fresh, turned)[: const.MAX_REFINED]
-            judged += self._judge(query, hypotheses)
-            accepted = {one.match_stamp_ns for one in judged if not self._objection(one)}
-            if len(accepted) >= self._settings.max_closures:
-                break
-        return judged, tested
+    def _refine(
+        self, query: Keyframe, ranked: list[RankedCandidate], turned: TurnedSurroundings | None
+    ) -> list[JudgedHypothesis]:
+        """The best hypotheses about some candidates, judged."""
+        with self._timed("refine"):
+            return self._judge(query, self._hypotheses(query, ranked, turned)[: const.MAX_REFINED])
+
+    def _wanting(self, judged: list[JudgedHypothesis]) -> bool:
+        """Whether more closures are asked for than were found."""
+        accepted = {one.match_stamp_ns for one in judged if not self._objection(one)}
+        return len(accepted) < self._settings.max_closures
+
+    @contextmanager
+    def _timed(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.latency_ms[name] += 1e3 * (time.perf_counter() - start)
 
     def _turned(self, query: Keyframe) -> TurnedSurroundings | None:
         return TurnedSurroundings(self._scans[query]) if self._scans[query].usable else None
@@ -153,13 +182,22 @@ class Verifier:
 
     def _judge(self, query: Keyframe, hypotheses: list[Hypothesis]) -> list[JudgedHypothesis]:
         """Align and measure hypotheses, and judge each knowing the others about its candidate."""
-        measured = [(one, self._measure(one)) for one in (self._align(query, hypothesis) for hypothesis in hypotheses)]
+        measured = [(one, self._measure(one)) for one in self._aligned(query, hypotheses)]
         judged = []
         for one, measurement in measured:
             others = [(other.pose, found) for other, found in measured if other.match is one.match]
             known = beside(measurement, one.pose, others)
             judged.append(JudgedHypothesis(one, known, self._acceptance.probability(known)))
         return judged
+
+    def _aligned(self, query: Keyframe, hypotheses: list[Hypothesis]) -> list[AlignedHypothesis]:
+        """Each aligned; of those that end at one pose only the first."""
+        kept: list[AlignedHypothesis] = []
+        for one in (self._align(query, hypothesis) for hypothesis in hypotheses):
+            others = (other.pose for other in kept if other.match is one.match)
+            if not any(near(one.pose, pose, const.SAME_M, const.SAME_RAD) for pose in others):
+                kept.append(one)
+        return kept
 
     def _align(self, query: Keyframe, hypothesis: Hypothesis) -> AlignedHypothesis:
         scans = self._scans[hypothesis.ranked.keyframe], self._scans[query]
@@ -182,7 +220,7 @@ class Verifier:
         for item in ranked:
             stamp = item.candidate.stamp_ns
             if stamp in best:
-                verdicts.append(self._verdict(item, best[stamp]))
+                verdicts.append(self._verdict(item, best[stamp].told_by_images()))
             else:
                 metric = query.has_depth or item.keyframe.has_depth
                 reason = (NO_POSE if metric else NO_DEPTH) if stamp in tested else UNTESTED

@@ -159,16 +159,29 @@ class PairedViews:
         return cls(CameraView.of(query, ours, pairs[:, 0], noise), CameraView.of(match, theirs, pairs[:, 1], noise))
 
     @cached_property
-    def poses(self) -> tuple[Array | None, Array | None]:
-        """`match_T_query` from the query's points in the match's image, and from the match's in the query's."""
-        forward, backward = _locate(self.query, self.match), _locate(self.match, self.query)
-        return forward, None if backward is None else invert(backward)
+    def forward(self) -> Array | None:
+        """`match_T_query` from the query's points in the match's image."""
+        return _locate(self.query, self.match)
+
+    @cached_property
+    def backward(self) -> Array | None:
+        """`match_T_query` from the match's points in the query's image."""
+        found = _locate(self.match, self.query)
+        return None if found is None else invert(found)
+
+    def any_pose(self) -> Array | None:
+        """A pose that enough features agree with: a guess for what sees better than cameras."""
+        ways = (getattr(self, name) for name in ("forward", "backward"))  # the second only where the first fails
+        return next((pose for pose in ways if self._agreeing(pose) >= const.MIN_PIXELS), None)
 
     def best_pose(self) -> tuple[Array, int] | None:
         """The pose that more features agree with, and how many do; None where too few do."""
-        counted = [(pose, int(self._compare(pose).agreeing.sum())) for pose in self.poses if pose is not None]
+        counted = [(pose, self._agreeing(pose)) for pose in (self.forward, self.backward) if pose is not None]
         best = max(counted, key=lambda one: one[1], default=None)
         return best if best is not None and best[1] >= const.MIN_PIXELS else None
+
+    def _agreeing(self, pose: Array | None) -> int:
+        return 0 if pose is None else int(self._compare(pose).agreeing.sum())
 
     def align(self, guess: Array) -> ViewAlignment:
         """Refine the pose `guess` by what both views measured: Gauss-Newton on reprojections, outliers weighed down."""
@@ -209,7 +222,7 @@ class PairedViews:
         return float(np.median(np.linalg.norm(gaps, axis=1))) if len(gaps) else float("nan")
 
     def _two_way(self) -> tuple[float, float]:
-        forward, backward = self.poses
+        forward, backward = self.forward, self.backward
         if forward is None or backward is None:
             return float("inf"), float("inf")
         gap = invert(forward) @ backward

@@ -34,10 +34,14 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "120"})
 
 
-def test_a_sound_graph_is_two_numbers_and_no_table(tmp_path: Path) -> None:
+def test_a_sound_graph_is_some_numbers_before_and_after_and_no_table(tmp_path: Path) -> None:
     result = run("optimize", write_world(tmp_path / "a.g2o", RIGHT))
     assert result.exit_code == 0
-    assert result.output.strip() == "200 poses, 15 closures: 15 accepted"
+    counts, *gaps = result.output.strip().splitlines()
+    assert counts == "200 poses, 15 closures: 15 accepted"
+    assert [line.split(":")[0] for line in gaps] == ["before", "after"]
+    before, after = (float(line.split(" m in the median")[0].split()[-1]) for line in gaps)
+    assert 0 < after < 0.5 * before
 
 
 def test_a_rejected_closure_is_named_by_the_ids_of_the_file(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -111,6 +112,35 @@ def tum_rgbd(root: Path) -> Path:
     return root
 
 
+def nuscenes(root: Path) -> Path:
+    turned = [0.7071067811865476, 0, 0, 0.7071067811865476]  # w first: the LiDAR looks to the left
+    ahead = [0.5, -0.5, 0.5, -0.5]
+    mounted = [
+        {"token": "c", "sensor_token": "1", "translation": [1.7, 0, 1.5], "rotation": ahead},
+        {"token": "l", "sensor_token": "2", "translation": [0.9, 0, 1.8], "rotation": turned},
+    ]
+    mounted[0]["camera_intrinsic"], mounted[1]["camera_intrinsic"] = [[50, 0, 32], [0, 50, 24], [0, 0, 1]], []
+    poses, taken = [], []
+    for i in range(COUNT):
+        micros = START_S * 10**6 + i * 100_000
+        poses.append({"token": f"e{i}", "translation": [100.0 + i, 5, 0], "rotation": [1, 0, 0, 0]})
+        picture(root / "samples" / "CAM_FRONT" / f"{i}.jpg", 20 * i)
+        points = scan(root / "sweeps" / "LIDAR_TOP" / f"{i}.pcd.bin", i)
+        np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(
+            root / "sweeps" / "LIDAR_TOP" / f"{i}.pcd.bin"
+        )
+        for sensor, name in (("c", f"samples/CAM_FRONT/{i}.jpg"), ("l", f"sweeps/LIDAR_TOP/{i}.pcd.bin")):
+            row = {"calibrated_sensor_token": sensor, "ego_pose_token": f"e{i}", "timestamp": micros, "filename": name}
+            taken.append(row)
+    taken.append({**taken[0], "filename": "samples/CAM_FRONT/of_another_blob.jpg"})
+    sensors = [{"token": "1", "channel": "CAM_FRONT"}, {"token": "2", "channel": "LIDAR_TOP"}]
+    tables = {"sensor": sensors, "calibrated_sensor": mounted, "ego_pose": poses, "sample_data": taken}
+    (root / "v1.0-mini").mkdir()
+    for name, rows in (tables | {"log": [{"token": "g", "location": "boston-seaport"}]}).items():
+        (root / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows))
+    return root
+
+
 def folder(root: Path) -> Path:
     rows = []
     for i in range(COUNT):
@@ -127,6 +157,7 @@ MADE: dict[str, Callable[[Path], Path]] = {
     "kitti-raw": kitti_raw,
     "euroc": euroc,
     "tum-rgbd": tum_rgbd,
+    "nuscenes": nuscenes,
     "folder": folder,
 }
 
@@ -145,7 +176,7 @@ def test_every_format_becomes_frames(kind: str, tmp_path: Path) -> None:
     assert len(frames) == COUNT
     assert [frame.left is not None for frame in frames] == [True] * COUNT
     assert all((frame.points is not None) == (kind != "euroc") for frame in frames)
-    assert all((frame.right is not None) == (kind != "tum-rgbd") for frame in frames)
+    assert all((frame.right is not None) == (kind not in ("tum-rgbd", "nuscenes")) for frame in frames)
     assert np.allclose(np.diff([frame.stamp_ns for frame in frames]), 50_000_000 if kind == "euroc" else 10**8)
     inspected = umf("inspect", tmp_path / "made.mcap")
     assert "no match is allowed" in inspected.text and inspected.text.count("fault") == 1  # half a second is too short
@@ -169,6 +200,31 @@ def test_depth_images_are_scans_ahead_of_the_camera(tmp_path: Path) -> None:
     assert len(frame.points) == 16 * 12
 
 
+def test_nuscenes_is_seen_from_its_ego_frame(tmp_path: Path) -> None:
+    frame = imported("nuscenes", tmp_path)[0]
+    np.testing.assert_allclose(frame.body_T_camera[:3, 2], [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(frame.body_T_camera[:3, 3], [1.7, 0, 1.5], atol=1e-9)
+    assert frame.points is not None and frame.points[:, 1].min() > 1  # what the LiDAR has ahead lies to the left
+    truth = read_ground_truth(open_bag(tmp_path / "made.mcap"))
+    assert truth is not None
+    np.testing.assert_allclose(truth.poses[:, :3, 3], [[100 + i, 5, 0] for i in range(COUNT)], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("table", "content", "message"),
+    [
+        ("log", [{"location": "boston"}, {"location": "singapore"}], "2 cities (boston, singapore)"),
+        ("ego_pose", {"no": "rows"}, "expected a list of rows"),
+        ("sensor", [{"token": 3}], "not the tables of nuScenes"),
+        ("sample_data", [], "neither images nor scans"),
+    ],
+)
+def test_tables_that_are_none_are_one_clear_line(tmp_path: Path, table: str, content: object, message: str) -> None:
+    source = nuscenes(tmp_path / "set")
+    (source / "v1.0-mini" / f"{table}.json").write_text(json.dumps(content))
+    assert message in only_line(umf("import", "nuscenes", source, tmp_path / "a.mcap"))
+
+
 def test_eurocs_pair_is_rectified(tmp_path: Path) -> None:
     assert imported("euroc", tmp_path)[0].camera.baseline == pytest.approx(0.2, abs=1e-6)
 
@@ -181,8 +237,8 @@ def test_the_command_knows_every_format() -> None:
     ("arguments", "message"),
     [
         (
-            ["nuscenes", ".", "a.mcap"],
-            "unknown kind 'nuscenes'; expected kitti-odometry, kitti-raw, euroc",
+            ["waymo", ".", "a.mcap"],
+            "unknown kind 'waymo'; expected kitti-odometry, kitti-raw, euroc",
         ),
         (["folder", "nowhere", "a.mcap"], "there is no folder nowhere"),
         (["folder", "{empty}", "a.bag"], "the name must end in .mcap"),
@@ -191,6 +247,7 @@ def test_the_command_knows_every_format() -> None:
         (["kitti-raw", "{empty}", "a.mcap"], "calib_cam_to_cam.txt"),
         (["euroc", "{empty}", "a.mcap"], "sensor.yaml"),
         (["tum-rgbd", "{empty}", "a.mcap"], "rgb.txt"),
+        (["nuscenes", "{empty}", "a.mcap"], "holds no tables: expected a folder v1.0-mini"),
     ],
 )
 def test_a_folder_of_another_format_is_one_clear_line(tmp_path: Path, arguments: list[str], message: str) -> None:

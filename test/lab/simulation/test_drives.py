@@ -10,7 +10,7 @@ from umf_ros.errors import ConfigError
 from umf_ros.geometry import heading, relative, rotation_angle, wrap_angle
 from umf_ros.lab.simulation.odometry import Drift, drifting
 from umf_ros.lab.simulation.passes import SETTINGS, plan_passes
-from umf_ros.lab.simulation.presets import DEMO, ETNA, find_preset
+from umf_ros.lab.simulation.presets import DEMO, ETNA, SESSION, find_preset
 from umf_ros.lab.simulation.route import Walker
 from umf_ros.lab.simulation.sequences import THESIS, first_samples, sampled
 from umf_ros.lab.simulation.simulator import Simulator
@@ -154,3 +154,16 @@ def test_impossible_durations_are_refused_before_the_world_is_built(duration):
 def test_an_unknown_preset_is_refused_by_name():
     with pytest.raises(ConfigError, match=r"olympus.*crater_inout"):
         find_preset("olympus")
+
+
+def test_sessions_of_one_world_drive_parts_of_one_way() -> None:
+    relief = ground(10_005, "etna", 1.0)
+    clearing = SESSION.clearing(relief, 10_006)
+    assert np.array_equal(clearing, SESSION.clearing(relief, 10_007))  # the same world, whoever drives
+    starts = []
+    for seed in (10_006, 10_007, 10_008):
+        path = SESSION.route(relief, seed).path
+        # 0.7 m beside it, and over the seam of a loop that is a little longer than it is asked for
+        assert cKDTree(clearing).query(path)[0].max() < 2.5
+        starts.append(path[0])
+    assert min(np.linalg.norm(starts[0] - other) for other in starts[1:]) > 3

@@ -92,6 +92,7 @@ def _report(console: Console, graph: PoseGraph, recording: GraphRecording) -> No
         console.print(
             f"stated standard deviations are wrong: odometry x {scale.odometry:.3g}, closures x {scale.closures:.3g}"
         )
+    _compare(console, graph, recording)
     bad = [verdict for verdict in graph.closures() if verdict.state is not State.ACCEPTED]
     if not bad:
         return
@@ -101,6 +102,28 @@ def _report(console: Console, graph: PoseGraph, recording: GraphRecording) -> No
     console.print(table)
     if len(bad) > MOST_ROWS:
         console.print(f"... and {len(bad) - MOST_ROWS} more (--verdicts FILE writes all)")
+
+
+def _compare(console: Console, graph: PoseGraph, recording: GraphRecording) -> None:
+    """Say how far the accepted closures and the path were apart before, and are after."""
+    import numpy as np
+
+    from umf_ros.pose_graph.closures import State
+
+    stamps, after = graph.trajectory()
+    row = {stamp: number for number, stamp in enumerate(stamps.tolist())}
+    closures = [verdict.closure for verdict in graph.closures() if verdict.state is State.ACCEPTED]
+    ends = np.array([[row[one.match_stamp_ns], row[one.query_stamp_ns]] for one in closures], int).reshape(-1, 2)
+    # chains that nothing but closures ties have no place to each other before
+    same = np.diff(recording.chain_of(stamps[ends]), axis=1).ravel() == 0
+    if not same.any():
+        return
+    told = np.stack([closure.match_T_query for closure in closures])[same]
+    for when, path in (("before", graph.odometry()[1]), ("after", after)):
+        found = np.linalg.inv(path[ends[same, 0]]) @ path[ends[same, 1]]
+        gap = np.linalg.norm((found - told)[:, :3, 3], axis=1)
+        off = f"off by {np.median(gap):.3g} m in the median, {gap.max():.3g} m at most"
+        console.print(f"{when + ':':8}accepted closures are {off}", highlight=False)
 
 
 def _row(verdict: ClosureVerdict, recording: GraphRecording) -> list[str]:

@@ -20,9 +20,14 @@ def command(
     out: Annotated[Path | None, typer.Argument(help="The .mcap to write.", show_default=False)] = None,
     preset: Annotated[
         str,
-        typer.Option(help="demo, vulcano, traverse_1, traverse_2, loops, crater, crater_inout, mapping or landmarks."),
+        typer.Option(
+            help="demo, vulcano, session, traverse_1, traverse_2, loops,  crater, crater_inout, mapping, landmarks."
+        ),
     ] = "demo",
     seed: Annotated[int, typer.Option(help="World, route, light and noise.")] = 1,
+    world: Annotated[
+        int | None, typer.Option(help="Seed of the world alone, for several drives through one; default: --seed.")
+    ] = None,
     duration: Annotated[float | None, typer.Option(help="Seconds; default: the whole drive.")] = None,
     family: Annotated[
         str | None,
@@ -53,7 +58,7 @@ def command(
     elif shards is not None:
         _write_shards(shards, worlds, sequences, seed, workers, console)
     elif out is not None:
-        _write_bag(out, preset, seed, duration, family, aliasing, image_rate, truth, workers, console)
+        _write_bag(out, preset, (seed, world), duration, family, aliasing, image_rate, truth, workers, console)
     else:
         raise ConfigError("say where to write: OUT.mcap, --shards DIR or --contact-sheet OUT.png")
 
@@ -61,7 +66,7 @@ def command(
 def _write_bag(
     out: Path,
     preset: str,
-    seed: int,
+    seeds: tuple[int, int | None],
     duration: float | None,
     family: str | None,
     aliasing: float | None,
@@ -80,7 +85,7 @@ def _write_bag(
     chosen = find_preset(preset)
     with BagWriter(out) as bag, _progress(console) as progress:
         task = progress.add_task("building the world", total=None)
-        simulator = Simulator(chosen, seed, duration, image_rate, family, aliasing)
+        simulator = Simulator(chosen, seeds[0], duration, image_rate, family, aliasing, seeds[1])
         progress.update(task, description="simulating scans", total=len(simulator.scan_stamps_ns))
         record(simulator, bag, workers, truth, lambda done: progress.update(task, completed=done))
     write_side_files(simulator, out)

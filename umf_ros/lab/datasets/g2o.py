@@ -167,6 +167,10 @@ class GraphRecording:
         """Id in the file of the vertex with a stamp."""
         return int(self.ids[stamp_ns // PERIOD_NS])
 
+    def chain_of(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+        """Number of the chain (...) that the vertices with these stamps (...) belong to."""
+        return np.searchsorted(self.chains, stamps_ns // PERIOD_NS, side="right") - 1
+
     def message(self, row: int) -> LoopClosure:
         """Closure `row` with stamps for keys."""
         edge = self.closures[row]

@@ -15,6 +15,7 @@ from umf_ros.errors import SensorFileError
 from umf_ros.geometry import Array, from_quaternion, invert
 from umf_ros.lab.importing.files import depth_of, entries_of, entry, lines_of, numbers_of, rigid, size_of
 from umf_ros.lab.importing.imported import OPTICAL, Imported, pinhole, pose_entry
+from umf_ros.lab.importing.nuscenes import nuscenes
 from umf_ros.sensors.messages import Cloud
 from umf_ros.sensors.scan_files import SUFFIXES, read_scan
 from umf_ros.sensors.snapshots import IMAGE_SUFFIXES
@@ -126,6 +127,7 @@ FORMATS: dict[str, Callable[[Path], Imported]] = {
     "kitti-raw": kitti_raw,
     "euroc": euroc,
     "tum-rgbd": tum_rgbd,
+    "nuscenes": nuscenes,
     "folder": folder,
 }
 

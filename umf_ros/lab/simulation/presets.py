@@ -17,6 +17,8 @@ from umf_ros.lab.simulation.rig import Layout
 from umf_ros.lab.simulation.route import Route, Walker
 from umf_ros.lab.simulation.seeds import check_seed
 
+SESSION_LOOP_M = 100.0
+"""Length of the way that all sessions of a world share, each a part of it."""
 Plan = Callable[[Relief, np.random.Generator], Walker]
 
 
@@ -38,6 +40,7 @@ class Preset:
         drift: how the odometry goes wrong.
         layout: what the cameras publish.
         shared: whether its world holds all of S3LI Etna's sequences.
+        ways: lays all that drives of different seeds follow through one world; None: each has its own.
     """
 
     summary: str
@@ -53,6 +56,7 @@ class Preset:
     drift: Drift = field(default_factory=Drift)
     layout: Layout = rig.ETNA
     shared: bool = False
+    ways: Plan | None = None
 
     def route(self, relief: Relief, seed: int) -> Route:
         """The route on a relief."""
@@ -61,12 +65,24 @@ class Preset:
 
     def clearing(self, relief: Relief, seed: int) -> Array:
         """(N, 2) places that no rock may block."""
+        if self.ways is not None:
+            return self.ways(relief, np.random.default_rng(0)).route(0.0).path
         drives = ETNA.values() if self.shared else (self,)
         return np.concatenate([drive.route(relief, seed).path for drive in drives])
 
 
 def _demo(relief: Relief, rng: np.random.Generator) -> Walker:
     return Walker(gentle_loop(relief, 44.0, rng), rng).forward(42).forward(58, lateral_m=0.7)
+
+
+def _session(relief: Relief, rng: np.random.Generator) -> Walker:
+    loop = gentle_loop(relief, SESSION_LOOP_M, np.random.default_rng(0))  # of the world, whatever the drive
+    start = int(rng.integers(len(loop)))
+    return Walker(np.roll(loop, -start, axis=0), rng).forward(75, lateral_m=0.7)
+
+
+def _session_ways(relief: Relief, rng: np.random.Generator) -> Walker:
+    return Walker(gentle_loop(relief, SESSION_LOOP_M, rng), rng).forward(SESSION_LOOP_M)
 
 
 def _traverse_1(relief: Relief, rng: np.random.Generator) -> Walker:
@@ -113,6 +129,18 @@ DEMO = Preset(
     drift=Drift(scale=0.03, turn_deg_m=0.3, walk_deg_sqrt_m=0.6, height_sqrt_m=0.01),
 )
 
+SESSION = Preset(
+    "a part of a way that all drives through a world share",
+    _session,
+    length_m=75,
+    samples=150,
+    aliasing=1.0,
+    speed_m_s=1.3,
+    swing_deg=4.0,
+    sun_deg=20,
+    ways=_session_ways,
+)
+
 ETNA = {
     name: Preset(summary, plan, length_m, samples, shared=True)
     for name, summary, plan, length_m, samples in (
@@ -154,7 +182,7 @@ def _steepness(relief: Relief, curve: Array) -> float:
 
 VULCANO = replace(DEMO, summary="the demo's loop with raw colour cameras that distort", layout=rig.VULCANO)
 
-PRESETS: dict[str, Preset] = {"demo": DEMO, "vulcano": VULCANO, **ETNA}
+PRESETS: dict[str, Preset] = {"demo": DEMO, "vulcano": VULCANO, "session": SESSION, **ETNA}
 
 
 def find_preset(name: str) -> Preset:

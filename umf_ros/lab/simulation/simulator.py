@@ -66,16 +66,18 @@ class Simulator:
         image_rate_hz: float | None = None,
         family: str | None = None,
         aliasing: float | None = None,
+        world_seed: int | None = None,
     ) -> None:
         """Build the world and plan the drive.
 
         Args:
             preset: what to drive.
-            seed: world, route, light and noise.
+            seed: route, light and noise.
             duration_s: cut the recording here; None drives the whole route.
             image_rate_hz: images per second; None takes one near each scan.
             family: kind of world; None takes the preset's.
             aliasing: 0 to 1; None takes the preset's.
+            world_seed: of the world, where several drives go through one; None takes `seed`.
 
         Raises:
             ConfigError: negative seed, unknown family, or a duration or image rate that cannot be.
@@ -84,11 +86,12 @@ class Simulator:
             raise ConfigError(f"image rate {image_rate_hz:g} Hz is not between 0.1 and {FASTEST_HZ:g}")
         family, aliasing = family or preset.family, preset.aliasing if aliasing is None else aliasing
         self.preset, self.seed = preset, seed
-        relief = ground(seed, family, aliasing)
+        world_seed = seed if world_seed is None else world_seed
+        relief = ground(world_seed, family, aliasing)
         self.route: Route = preset.route(relief, seed)
         self.motion = Motion(relief, self.route, preset.speed_m_s, preset.tilt_deg, seed)
         self.duration_s = self._checked(duration_s)
-        self.world = World(seed, family, aliasing, preset.clearing(relief, seed), relief)
+        self.world = World(world_seed, family, aliasing, preset.clearing(relief, seed), relief)
         self.calibration = preset.layout.load()
         self._eyes, self._lidar = eyes(self.world, preset.layout, self.calibration), Lidar(self.world)
         self._sun = self._morning()

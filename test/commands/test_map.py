@@ -1,0 +1,152 @@
+"""`umf map` as a user runs it: a simulated drive, and the same drive again without odometry."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import Ended, only_line, umf
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from umf_ros.bags.reader import open_bag
+from umf_ros.bags.trajectories import read_ground_truth, read_tum
+from umf_ros.maps.map_folder import MapFolder
+from umf_ros.runs.tables import read_closures
+from umf_ros.runs.truth import trajectory_error
+from umf_ros.sensors.pcd import parse_pcd
+from umf_ros.sensors.ply import parse_ply
+
+
+def without_odometry(bag: Path, path: Path) -> Path:
+    """The recording, less its odometry."""
+    with bag.open("rb") as source, path.open("wb") as target:
+        writer = Writer(target)
+        writer.start("ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.topic == "/odom" or schema is None:
+                continue
+            if channel.id not in channels:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return path
+
+
+@pytest.fixture(scope="module")
+def blind(mini_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return without_odometry(mini_bag, tmp_path_factory.mktemp("blind") / "blind.mcap")
+
+
+@pytest.fixture(scope="module")
+def made(
+    mini_bag: Path, blind: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Ended]:
+    out = tmp_path_factory.mktemp("maps") / "map"
+    return out, umf("map", mini_bag, blind, "--config", mini_config, "--out", out)
+
+
+def test_both_are_in_one_frame_and_right(made: tuple[Path, Ended], mini_bag: Path) -> None:
+    out, ended = made
+    assert ended.status == 0, ended.text
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["joined"] == 2 and summary["closures_between"]["accepted"] >= 4
+    assert [one["odometry"] for one in summary["sessions"]] == [True, False]
+    truth = read_ground_truth(open_bag(mini_bag))
+    assert truth is not None
+    for name in ("mini", "blind"):
+        assert trajectory_error(read_tum(out / "trajectories" / f"{name}.tum"), truth) < 0.4
+    # in one frame: at one moment they are at one place
+    first, second = (read_tum(out / "trajectories" / f"{name}.tum") for name in ("mini", "blind"))
+    there, known = first.at(second.stamps_ns)
+    apart = np.linalg.norm(there[known, :3, 3] - second.poses[known, :3, 3], axis=1)
+    assert known.sum() > 10 and np.median(apart) < 0.3
+    assert "2 of 2 sessions in one frame" in ended.text
+
+
+def test_closures_between_are_those_of_the_later_one_with_the_earlier(made: tuple[Path, Ended]) -> None:
+    folder = MapFolder.open(made[0])
+    closures = read_closures(folder.folder_of("blind") / "closures_between.csv")
+    assert not read_closures(folder.folder_of("mini") / "closures_between.csv")
+    for closure in closures:
+        assert folder.session_at(closure.query_stamp_ns) is folder.sessions[1]
+        assert folder.session_at(closure.match_stamp_ns) is folder.sessions[0]
+
+
+def test_what_is_in_the_map_costs_nothing_again(made: tuple[Path, Ended], mini_bag: Path, tmp_path: Path) -> None:
+    out, _ = made
+    before = {path: path.stat().st_mtime_ns for path in (out / "sessions").rglob("*.csv")}
+    moved = tmp_path / "moved.mcap"
+    moved.symlink_to(mini_bag)
+    ended = umf("map", moved, "--out", out)
+    assert ended.status == 0 and "in the map already, as mini" in ended.text
+    assert {path: path.stat().st_mtime_ns for path in (out / "sessions").rglob("*.csv")} == before
+
+
+def test_a_map_that_was_cut_off_while_it_compared_goes_on(made: tuple[Path, Ended], mini_bag: Path) -> None:
+    folder = MapFolder.open(made[0])
+    path = folder.folder_of("blind") / "closures_between.csv"
+    before = path.read_text()
+    path.unlink()
+    assert umf("map", mini_bag, "--out", made[0]).status == 0
+    assert path.read_text() == before
+
+
+def wrong_calls(tmp_path: Path) -> Iterator[tuple[list[Path], str]]:
+    (tmp_path / "empty").mkdir()
+    yield [tmp_path / "missing.mcap"], "there is no recording"
+    yield [tmp_path / "empty"], "holds no recording"
+
+
+def test_what_a_user_gets_wrong_is_one_line(tmp_path: Path) -> None:
+    for recordings, told in wrong_calls(tmp_path):
+        assert told in only_line(umf("map", *recordings, "--out", tmp_path / "map"))
+    assert not (tmp_path / "map").exists() or not list((tmp_path / "map").iterdir())
+
+
+def test_a_rover_finds_itself_in_the_map_which_stays_as_it_is(
+    made: tuple[Path, Ended], mini_bag: Path, mini_config: Path, tmp_path: Path
+) -> None:
+    out, _ = made
+    before = {path: path.read_bytes() for path in (out / "places.sqlite", out / "poses.npz", out / "map.json")}
+    ended = umf("replay", mini_bag, "--config", mini_config, "--map", out, "--out", tmp_path)
+    assert ended.status == 0, ended.text
+    assert "found after" in ended.text
+    summary = json.loads((tmp_path / "latest" / "summary.json").read_text())
+    about = summary["localization"]
+    assert about["keyframes_until_found"] <= 20 and about["relocalised"] == 1 and about["contradicted"] <= 1
+    found, known = read_tum(tmp_path / "latest" / "trajectory_in_map.tum"), read_tum(out / "trajectories" / "mini.tum")
+    there, both = known.at(found.stamps_ns)
+    apart = np.linalg.norm(found.poses[both, :3, 3] - there[both, :3, 3], axis=1)
+    assert both.sum() > 5 and apart.max() < 0.5
+    with (tmp_path / "latest" / "localization.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == about["located"] and all(float(row["probability"]) > 0.99 for row in rows)
+    assert all(0 < float(row["sigma_x_m"]) < 1 for row in rows)
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_the_map_is_a_point_cloud_too(made: tuple[Path, Ended]) -> None:
+    out, ended = made
+    columns = parse_ply((out / "map.ply").read_bytes())
+    assert len(columns["x"]) > 5000 and set(columns["session"].tolist()) == {0, 1}
+    assert len(parse_pcd((out / "map.pcd").read_bytes())["x"]) == len(columns["x"])
+    assert (out / "map.png").read_bytes().startswith(b"\x89PNG")
+    thickness = json.loads((out / "summary.json").read_text())["thickness_m"]
+    assert thickness["after"] < 0.15
+    assert "cm thick" in ended.text
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [(["--mode", "localization"], "needs a map"), (["--map", "nowhere"], "holds no map"), (["--mode", "x"], "mode")],
+)
+def test_a_map_that_is_not_there_is_one_line(mini_bag: Path, tmp_path: Path, options: list[str], told: str) -> None:
+    assert told in only_line(umf("replay", mini_bag, "--out", tmp_path / "out", *options))
+    assert not (tmp_path / "out").exists()

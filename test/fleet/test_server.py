@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+from uuid import UUID, uuid4
+
+import numpy as np
+import psycopg
+import pytest
+from conftest import make_keyframe
+from fleets import IDENTITY, administrator, stored
+from postgres import PASSWORD, PostgresServer, free_port
+
+from umf_ros.errors import UmfError
+from umf_ros.fleet.migrations import MIGRATIONS, add_rover, migrate
+from umf_ros.fleet.server import FleetServer, LinkError, OutgoingPlace
+from umf_ros.places.packing import pack, unpack
+
+STORE = uuid4()
+
+
+def place(second: int, session: int = 0) -> OutgoingPlace:
+    keyframe = make_keyframe(second, seed=second, session=session)
+    descriptor = keyframe.embedding.descriptor
+    return OutgoingPlace(session, keyframe.stamp_ns, keyframe.travelled_m, descriptor, pack(keyframe))
+
+
+def connect(server: PostgresServer, rover: str, store: UUID = STORE) -> FleetServer:
+    return FleetServer(server.address(rover), store, IDENTITY)
+
+
+def test_what_one_rover_pushes_the_other_finds_and_reads(server: PostgresServer) -> None:
+    ada, bea = connect(server, "ada"), connect(server, "bea")
+    ada.push([place(second) for second in range(20)])
+    found = bea.nearest(place(7).descriptor, 3)
+    key, similarity = found[0]
+    assert (key.robot, key.stamp_ns, key.store) == ("ada", 7 * 10**9, STORE) and len(found) == 3
+    assert similarity == pytest.approx(1, abs=2e-3)
+    data = bea.data(key)
+    assert data is not None and unpack(data).stamp_ns == 7 * 10**9
+    assert ada.nearest(place(7).descriptor, 3) == []  # nobody else has been there
+    assert ada.robot == "ada"
+
+
+def test_pushing_twice_stores_once_and_two_stores_of_one_rover_are_kept_apart(server: PostgresServer) -> None:
+    ada = connect(server, "ada")
+    ada.push([place(1), place(2)])
+    ada.push([place(2), place(3)])
+    assert stored(server) == [("ada", 1), ("ada", 2), ("ada", 3)]
+    connect(server, "ada", uuid4()).push([place(3)])  # its clock began at 0 again
+    assert len(stored(server)) == 4
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "INSERT INTO place SELECT 'ada', gen_random_uuid(), 0, 5, 0, descriptor FROM place LIMIT 1",
+        "INSERT INTO place_data SELECT 'ada', store, session, stamp_ns, '' FROM place LIMIT 1",
+        "UPDATE place SET travelled_m = 0",
+        "DELETE FROM place",
+        "TRUNCATE place CASCADE",
+        "DROP TABLE place",
+        "SET ROLE ada",
+        "ALTER TABLE place DISABLE ROW LEVEL SECURITY",
+        "UPDATE fleet SET embedder = 'mine'",
+    ],
+)
+def test_a_rover_changes_nothing_of_anybody(server: PostgresServer, statement: str) -> None:
+    connect(server, "ada").push([place(1)])
+    with psycopg.connect(server.address("bea")) as connection, pytest.raises(psycopg.errors.InsufficientPrivilege):
+        connection.execute(statement)
+    assert stored(server) == [("ada", 1)]
+
+
+def test_passwords_reach_neither_log_nor_message(server: PostgresServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    with administrator(server) as connection:
+        add_rover(connection, "ada", "secret of ada")  # again: a new password
+    connect(server, "ada").close()
+    assert "CREATE ROLE" in server.log and "secret of" not in server.log and PASSWORD not in server.log
+    monkeypatch.setenv("PGPASSWORD", "wrong, and secret")
+    with pytest.raises(LinkError, match="password authentication failed") as caught:
+        connect(server, "bea")
+    assert "wrong, and secret" not in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_server_that_is_not_there_is_one_line() -> None:
+    with pytest.raises(LinkError, match="cannot be reached") as caught:
+        FleetServer(f"postgresql://ada@127.0.0.1:{free_port()}/postgres", STORE, IDENTITY)
+    assert "\n" not in str(caught.value)
+
+
+def test_rovers_of_another_network_are_refused(server: PostgresServer) -> None:
+    with pytest.raises(UmfError, match=r"are of \('test', 16\), not of \('other', 16\)"):
+        FleetServer(server.address("ada"), STORE, ("other", 16))
+
+
+def test_migrating_twice_does_nothing_and_a_later_version_is_refused(server: PostgresServer) -> None:
+    with administrator(server) as connection:
+        assert migrate(connection, *IDENTITY) == (len(MIGRATIONS), len(MIGRATIONS))
+        connection.execute("INSERT INTO fleet_version VALUES (99)")
+        with pytest.raises(UmfError, match="tables of version 99"):
+            migrate(connection, *IDENTITY)
+        with pytest.raises(UmfError, match="tables of version 99, not"):
+            connect(server, "ada")
+        connection.execute("DELETE FROM fleet_version WHERE version = 99")
+
+
+def test_the_graph_finds_what_an_exhaustive_search_finds(server: PostgresServer, rng: np.random.Generator) -> None:
+    rows = rng.standard_normal((2000, 16)).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    ada, bea = connect(server, "ada"), connect(server, "bea")
+    ada.push([OutgoingPlace(0, i, float("nan"), row, b"") for i, row in enumerate(rows[:1000])])
+    bea.push([OutgoingPlace(0, i, 1.0, row, b"") for i, row in enumerate(rows[1000:])])
+    hits = 0
+    for query in rows[:20]:
+        true = set(np.argsort(-(rows[1000:] @ query))[:10].tolist())
+        hits += len(true & {key.stamp_ns for key, _ in ada.nearest(query, 10)})
+    assert hits >= 190

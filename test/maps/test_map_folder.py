@@ -1,0 +1,51 @@
+from pathlib import Path
+
+import pytest
+from maps_made import MadeSession, made_map
+
+from umf_ros.config import Settings, load_settings
+from umf_ros.errors import UmfError
+from umf_ros.maps.map_folder import APART_NS, MapFolder
+
+DAY_NS = 86_400 * 10**9
+
+
+def test_clocks_that_coincide_are_moved_apart_by_whole_days(tmp_path: Path) -> None:
+    folder = made_map(tmp_path / "map", [MadeSession(name, 0, 30) for name in "abc"])
+    assert [session.shift_ns for session in folder.sessions] == [0, DAY_NS, 2 * DAY_NS]
+    assert folder.session_at(folder.sessions[1].first_ns + DAY_NS) is folder.sessions[1]
+    assert folder.session_at(folder.sessions[0].last_ns + APART_NS) is None
+
+
+def test_a_recording_made_later_keeps_its_clock(tmp_path: Path) -> None:
+    folder = made_map(tmp_path / "map", [MadeSession("a", 0, 30)])
+    assert folder.shift_for(folder.sessions[0].last_ns + APART_NS) == 0
+    assert folder.shift_for(folder.sessions[0].last_ns + APART_NS - 1) == DAY_NS
+    assert folder.shift_for(folder.sessions[0].first_ns - 10 * DAY_NS) == 11 * DAY_NS  # an older one, added later
+
+
+def test_a_map_is_read_back_and_knows_its_recordings(tmp_path: Path) -> None:
+    made = made_map(tmp_path / "map", [MadeSession("a", 0, 30), MadeSession("b", 0, 20)])
+    folder = MapFolder.open(tmp_path / "map")
+    assert folder.sessions == made.sessions
+    moved = folder.sessions[1].recording | {"path": "elsewhere.mcap"}
+    assert folder.knows(moved) == folder.sessions[1]
+    assert folder.knows(moved | {"messages": {"a": 7}}) is None
+    assert folder.free_name(Path("c.mcap")) == "c" and folder.free_name(Path("x/a.mcap")) == "a_2"
+
+
+def test_settings_of_the_first_recording_stay(tmp_path: Path) -> None:
+    MapFolder.open_or_create(tmp_path, load_settings(None, loop__top_k=7))
+    again = MapFolder.open_or_create(tmp_path, Settings())
+    assert again.settings.loop.top_k == 7
+
+
+def test_what_is_no_map_is_told_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UmfError, match="holds no map"):
+        MapFolder.open(tmp_path)
+    (tmp_path / "map.json").write_text("{")
+    with pytest.raises(UmfError, match="damaged"):
+        MapFolder.open(tmp_path)
+    (tmp_path / "map.json").write_text('{"schema": 99, "sessions": []}')
+    with pytest.raises(UmfError, match="another version"):
+        MapFolder.open(tmp_path)

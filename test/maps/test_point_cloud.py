@@ -1,0 +1,59 @@
+from pathlib import Path
+
+import numpy as np
+
+from umf_ros.maps.point_cloud import MapCloud, write_pcd, write_ply
+from umf_ros.runs.height_map import HeightMap
+from umf_ros.sensors.pcd import parse_pcd
+from umf_ros.sensors.ply import parse_ply
+
+
+def ground(offset_m: float, noise_m: float = 0.01) -> MapCloud:
+    """A rolling ground that two sessions saw, the second one lifted."""
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(0, 8, (2, 6000, 2))
+    z = 0.3 * np.sin(xy[..., 0]) + noise_m * rng.standard_normal(xy.shape[:2]) + np.array([[0.0], [offset_m]])
+    points = np.concatenate([xy, z[..., None]], axis=-1).reshape(-1, 3).astype(np.float32)
+    return MapCloud(points, np.repeat(np.array([0, 1], np.uint8), 6000))
+
+
+def test_sessions_that_lie_beside_each_other_make_thick_surfaces() -> None:
+    together, apart = ground(0.0).thickness(), ground(0.3).thickness()
+    assert together < 0.06 < 0.12 < apart
+
+
+def test_what_one_session_alone_saw_says_nothing_about_alignment() -> None:
+    cloud = ground(0.0)
+    alone = MapCloud(cloud.points, np.zeros(len(cloud.points), np.uint8))
+    assert np.isnan(alone.thickness())
+    assert np.isnan(MapCloud(np.empty((0, 3), np.float32), np.empty(0, np.uint8)).thickness())
+
+
+def test_thinning_leaves_one_point_a_voxel() -> None:
+    cloud = ground(0.0)
+    thin = cloud.thinned(0.5)
+    cells = np.floor(thin.points / 0.5).astype(int)
+    assert len(np.unique(cells, axis=0)) == len(thin.points) < 800
+    assert len(np.unique(np.floor(cloud.points / 0.5).astype(int), axis=0)) == len(thin.points)
+    empty = MapCloud(np.empty((0, 3), np.float32), np.empty(0, np.uint8)).thinned()
+    assert len(empty.points) == 0
+
+
+def test_files_are_read_back_as_they_were(tmp_path: Path) -> None:
+    cloud = ground(0.0)
+    write_ply(tmp_path / "a.ply", cloud)
+    write_pcd(tmp_path / "a.pcd", cloud)
+    for columns in (parse_ply((tmp_path / "a.ply").read_bytes()), parse_pcd((tmp_path / "a.pcd").read_bytes())):
+        found = np.stack([columns[name] for name in "xyz"], axis=1)
+        np.testing.assert_array_equal(found, cloud.points)
+        np.testing.assert_array_equal(columns["session"], cloud.sessions)
+
+
+def test_the_picture_shows_what_was_seen() -> None:
+    heights = HeightMap(np.array([[0.0, 0.0], [10.0, 4.0]]))
+    assert heights.png() is None
+    heights.add(ground(0.0).points.astype(float))
+    png = heights.png()
+    assert png is not None and png.startswith(b"\x89PNG")
+    heights.add(np.array([[1e6, 0, 0.0]]))  # far outside: left out
+    assert heights.png() == png

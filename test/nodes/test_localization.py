@@ -1,0 +1,120 @@
+"""The live back-end in mode localization over real DDS: a rover that wakes up in a map that is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from maps_made import COVARIANCE, MadeSession, made_map, on_circle
+from nav_msgs.msg import Odometry
+from processes import Process, wait_until
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from std_srvs.srv import Trigger
+
+from umf_ros.frames import LoopClosure
+from umf_ros.geometry import relative
+from umf_ros.maps.joint_graph import solve
+from umf_ros.maps.outputs import read_poses, write_results
+from umf_ros.nodes.announcer import CLOSURES_QOS
+from umf_ros.nodes.conversions import closure_to_message, to_pose, to_time
+from umf_ros.sensors.messages import decode_pose
+
+MODULE = "umf_ros.nodes.pose_graph_node"
+LATER_NS = 1_800_000_000 * 10**9
+STEP_NS = 500_000_000
+
+
+class Rover(Node):
+    """Odometry from an origin of its own, closures with the map, and ears."""
+
+    def __init__(self) -> None:
+        super().__init__("rover")
+        self.odometry = self.create_publisher(Odometry, "/odom", 50)
+        self.closures = self.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS)
+        self.poses: list[PoseWithCovarianceStamped] = []
+        self.transforms: list[TransformStamped] = []
+        self.status: dict[str, str] = {}
+        near = qos_profile_sensor_data
+        self.create_subscription(PoseWithCovarianceStamped, "/pose_graph_node/pose", self.poses.append, near)
+        self.create_subscription(TransformStamped, "/pose_graph_node/map_to_odom", self.transforms.append, near)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
+
+    def _hear(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == "pose_graph_node: pose graph":
+                self.status = {pair.key: pair.value for pair in status.values} | {"message": status.message}
+
+    def until(self, condition: Callable[[], object]) -> bool:
+        return wait_until(lambda: bool(condition()), 40.0, lambda: rclpy.spin_once(self, timeout_sec=0.02))
+
+    def moved(self, stamp_ns: int, pose: np.ndarray) -> None:
+        message = Odometry(child_frame_id="base_link")
+        message.header.stamp, message.header.frame_id = to_time(stamp_ns), "odom"
+        message.pose.pose = to_pose(pose)
+        self.odometry.publish(message)
+
+
+@pytest.fixture
+def rover(ros_context: None) -> Iterator[Rover]:
+    node = Rover()
+    yield node
+    node.destroy_node()
+
+
+@pytest.fixture(scope="module")
+def map_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = made_map(tmp_path_factory.mktemp("maps") / "map", [MadeSession("one", 0, 90)])
+    write_results(folder, solve(folder))
+    return folder.path
+
+
+def test_pose_and_transform_come_once_the_rover_is_found(rover: Rover, map_folder: Path, tmp_path: Path) -> None:
+    poses = read_poses(map_folder)
+    process = Process(
+        MODULE, tmp_path / "node.log", "mode:=localization", f"map:={map_folder}", f"results_dir:={tmp_path / 'out'}"
+    )
+    process.wait_for("ready")
+    assert rover.until(lambda: rover.odometry.get_subscription_count() and rover.closures.get_subscription_count())
+    assert rover.until(lambda: rover.status.get("message", "").startswith("the rover is not found"))
+    first = on_circle(np.array([30.0]))[0]
+    for step in range(30):
+        stamp, here = LATER_NS + step * STEP_NS, on_circle(np.array([30 + step / 2]))[0]
+        rover.moved(stamp, relative(first, here))
+        if step == 4:
+            wait_until(lambda: False, 0.5, lambda: rclpy.spin_once(rover, timeout_sec=0.02))
+            assert not rover.poses and not rover.transforms  # nothing is claimed before it is known
+        if step % 2 == 0:
+            row = 30 + step // 2
+            match_T_query = relative(on_circle(np.array([row]))[0], here)
+            closure = LoopClosure(stamp, int(poses.stamps_ns[row]), match_T_query, COVARIANCE, 0.99)
+            rover.closures.publish(closure_to_message(closure))
+        wait_until(lambda: False, 0.05, lambda: rclpy.spin_once(rover, timeout_sec=0.02))
+    stamp = LATER_NS + 30 * STEP_NS
+    rover.moved(stamp, relative(first, on_circle(np.array([45.0]))[0]))
+    assert rover.until(lambda: rover.poses and rover.poses[-1].header.stamp == to_time(stamp))
+    assert rover.poses[-1].header.frame_id == "map"
+    found = decode_pose(rover.poses[-1].pose.pose)
+    assert np.linalg.norm(found[:3, 3] - poses.poses[45][:3, 3]) < 0.3
+    covariance = np.array(rover.poses[-1].pose.covariance).reshape(6, 6)
+    assert 0 < covariance[0, 0] < 0.1
+    assert rover.until(lambda: float(rover.status.get("probability", 0)) > 0.99)
+    assert rover.status["message"].startswith("in the map")
+    client = rover.create_client(Trigger, "/pose_graph_node/reset")
+    assert client.wait_for_service(20.0)
+    future = client.call_async(Trigger.Request())
+    assert rover.until(future.done)
+    assert rover.until(lambda: rover.status["message"].startswith("the rover is not found"))
+    assert process.interrupt() == 0
+    assert (tmp_path / "out" / "trajectory_in_map.tum").is_file()
+
+
+def test_a_map_that_is_none_is_told_in_one_line(tmp_path: Path) -> None:
+    process = Process(MODULE, tmp_path / "node.log", "mode:=localization", f"map:={tmp_path}")
+    assert wait_until(lambda: process.exit_code is not None, 60.0) and process.exit_code == 1
+    assert "umf map writes it" in (tmp_path / "node.log").read_text()

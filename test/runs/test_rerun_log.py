@@ -1,0 +1,70 @@
+"""The recording for the Rerun viewer: written by the real package, read back by it."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import landscape, pose_at, take
+
+from umf_ros.config import Verification
+from umf_ros.errors import ConfigError, OutputError
+from umf_ros.frames import Candidate, Frame, Keyframe
+from umf_ros.loop_detector import Detection
+from umf_ros.runs.rerun_log import RerunLog
+from umf_ros.verification import Verifier
+
+pytest.importorskip("rerun")
+GROUND = landscape(20)
+
+
+def seen(keyframe: Keyframe) -> Frame:
+    image = np.full((48, 64), 90, np.uint8)
+    return Frame(keyframe.stamp_ns, keyframe.camera, keyframe.body_T_camera, keyframe.body_T_lidar, left=image)
+
+
+def run(path: Path, folder: Path) -> None:
+    there, here = pose_at(GROUND, -15.0, 0.0, 0.0), pose_at(GROUND, -14.0, 1.2, 6.0)
+    first, again = take(GROUND, there, 10.0, odom=there), take(GROUND, here, 100.0, odom=here)
+    verdicts = Verifier(Verification()).verify(again, [(Candidate(0, first.stamp_ns, 0.7), first)])
+    assert verdicts[0].closure is not None
+    log = RerunLog(path)
+    for item, detection in zip(
+        log.watch([seen(first), seen(again)]),
+        [Detection(first.stamp_ns, first), Detection(again.stamp_ns, again, verdicts)],
+        strict=True,
+    ):
+        assert isinstance(item, Frame)
+        log.show(detection)
+    log.finish(folder)
+
+
+def logged(path: Path) -> set[str]:
+    viewer = Path(sys.executable).parent / "rerun"
+    assert subprocess.run([viewer, "rrd", "verify", path]).returncode == 0
+    printed = subprocess.run([viewer, "rrd", "print", "-v", path], capture_output=True, text=True, check=True).stdout
+    return set(re.findall(r"(/[\w/]+)", printed))
+
+
+def test_what_was_seen_and_found_is_in_the_file(tmp_path: Path) -> None:
+    (tmp_path / "trajectory_odometry.tum").write_text("10.0 0 0 0 0 0 0 1\n100.0 1 0 0 0 0 0 1\n")
+    run(tmp_path / "run.rrd", tmp_path)
+    found = logged(tmp_path / "run.rrd")
+    assert {"/camera/left", "/rover", "/rover/scan", "/trajectory/odometry"} <= found
+    assert sum(name.startswith("/closures/") for name in found) == 1
+    assert "/trajectory/optimized" not in found  # the run has none
+
+
+def test_without_the_package_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(ConfigError, match=r"pip install 'umf_ros\[rerun\]'"):
+        RerunLog(tmp_path / "run.rrd")
+
+
+def test_a_file_that_cannot_be_written_is_told_before_the_run(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="cannot write"):
+        RerunLog(tmp_path / "nowhere" / "run.rrd")

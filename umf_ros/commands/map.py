@@ -1,0 +1,122 @@
+"""`umf map`: many recordings in one map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from umf_ros.commands.recordings import (
+    ConfigPath,
+    DatasetName,
+    EmbedderName,
+    OdometryFrame,
+    WeightsPath,
+    check_files,
+    check_odometry_options,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from umf_ros.mapping import Opening
+    from umf_ros.maps.map_folder import MapFolder
+
+Recordings = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.")]
+MapPath = Annotated[Path, typer.Option("--out", help="Folder of the map, new or one to add to.")]
+OdometryFolder = Annotated[
+    Path | None,
+    typer.Option("--odometry", help="Folder of TUM files named like the recordings, where these have no odometry."),
+]
+
+
+def command(
+    recordings: Recordings,
+    out: MapPath = Path("map"),
+    config: ConfigPath = None,
+    dataset: DatasetName = "auto",
+    embedder: EmbedderName = None,
+    weights: WeightsPath = None,
+    odometry: OdometryFolder = None,
+    odometry_frame: OdometryFrame = "",
+) -> None:
+    """Make one map of many recordings, or add recordings to one.
+
+    Every recording is a session with its own odometry; closures within and between them make one pose graph.
+    Recordings that the map has already are passed over, so that a new one costs itself alone.
+    """
+    check_files(recordings[0], config, odometry)
+    odometry_frame = check_odometry_options(odometry, odometry_frame)
+
+    from rich.console import Console
+
+    from umf_ros.mapping import Opening, find_recordings, unmatched
+    from umf_ros.maps.joint_graph import solve
+    from umf_ros.maps.outputs import write_results
+    from umf_ros.runs.folder import check_writable
+
+    console = Console()
+    check_writable(out)
+    opening = Opening(config, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
+    found = find_recordings(recordings)
+    target = _open(out, opening, found[0])
+    for recording in found:
+        _add(target, recording, opening, console)
+    for session in unmatched(target):
+        _match(target, session.name, console)
+    with console.status("Solving the joint graph"):
+        summary = write_results(target, solve(target))
+    _tell(out, summary, console)
+
+
+def _open(out: Path, opening: Opening, first: Path) -> MapFolder:
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.maps.map_folder import MapFolder
+
+    return MapFolder.open_or_create(out, opening.settings(open_bag(first)))
+
+
+def _add(target: MapFolder, recording: Path, opening: Opening, console: Console) -> None:
+    """Replay a recording into the map, unless it is there."""
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.commands.progress import FrameProgress
+    from umf_ros.mapping import add_session, replay_session
+    from umf_ros.runs.finished_run import describe_recording
+
+    known = target.knows(describe_recording(open_bag(recording)))
+    if known is not None:
+        console.print(f"{recording}: in the map already, as {known.name}", markup=False, soft_wrap=True)
+        return
+    name = target.free_name(recording)
+    console.print(f"{recording}: session {name}", markup=False, soft_wrap=True)
+    with FrameProgress(console) as progress:
+        replay_session(recording, opening, target.folder_of(name), progress.show)
+    add_session(target, name, recording)
+    _match(target, name, console)
+
+
+def _match(target: MapFolder, name: str, console: Console) -> None:
+    """Compare a session with those before it."""
+    from rich.progress import track
+
+    from umf_ros.mapping import match_session
+
+    session = next(one for one in target.sessions if one.name == name)
+    matches = match_session(target, session)
+    for _ in track(matches, f"Comparing {name} with the map", session.places, console=console, transient=True):
+        pass
+
+
+def _tell(out: Path, summary: dict[str, Any], console: Console) -> None:
+    from umf_ros.maps.report import crispness, sentence
+
+    for one in summary["sessions"]:
+        tied = f"{one['closures_between']} ends of closures with others"
+        joined = f"joined by {tied}" if one["joined"] else "not joined: nothing ties it to the map yet"
+        way = f"{one['places']} places, {one['length_m']:.0f} m" + ("" if one["odometry"] else ", no odometry")
+        console.print(f"  {one['name']}: {way}; {joined}", markup=False, soft_wrap=True)
+    console.print(f"{out}: {sentence(summary)}", markup=False, soft_wrap=True)
+    if told := crispness(summary):
+        console.print(told)
+    console.print(f"{out / 'report.html'}", markup=False, soft_wrap=True)

@@ -1,0 +1,191 @@
+"""The thread that tells a fleet's server what the rover stores, and asks it what others have seen there."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import OrderedDict, deque
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from umf_ros.config import Database
+from umf_ros.fleet.server import FleetKey, FleetServer, LinkError, OutgoingPlace
+from umf_ros.frames import Candidate, Keyframe
+from umf_ros.places.packing import pack, unpack
+from umf_ros.places.store import KeyframeStore
+
+logger = logging.getLogger(__name__)
+
+BATCH = 16
+"""Keyframes of one transaction."""
+ASKS_KEPT = 1000
+"""Keyframes that wait to be asked about while the link is cut: ten minutes of driving; the oldest give way."""
+ANSWERS_KEPT = 20
+"""Answers that wait for verification; while there are more, places are pushed and nothing is asked."""
+CACHED = 100
+"""Keyframes of others kept in memory."""
+RETRY_S = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+"""After so long a server that is gone is looked for again."""
+
+
+class Answer(NamedTuple):
+    """Places of one session of another rover that look like a keyframe of this one.
+
+    Attributes:
+        keyframe: of this rover.
+        robot: the other's name.
+        found: what looks alike, with the other's keyframes; their session has a number below 0 here.
+    """
+
+    keyframe: Keyframe
+    robot: str
+    found: list[tuple[Candidate, Keyframe]]
+
+
+class FleetLink:
+    """Pushes what the store's outbox holds, in order, and asks about every keyframe of this run.
+
+    Nothing here makes the rover wait: a link that is cut is looked for again and again, and meanwhile the outbox grows.
+
+    Args:
+        store: the rover's places, with an outbox.
+        settings: address of the server, and how many candidates to ask for.
+        identity: name of the embedder and its dimension.
+
+    Attributes:
+        robot: the rover's name on the server; empty until the first contact.
+        connected: whether the server answered last.
+        pushed: places it has got from here in this run.
+        trouble: what went wrong last, in one line; empty when nothing is.
+    """
+
+    def __init__(self, store: KeyframeStore, settings: Database, identity: tuple[str, int]) -> None:
+        self._store, self._settings, self._identity = store, settings, identity
+        self.robot, self.connected, self.pushed, self.trouble = "", False, 0, ""
+        self._server: FleetServer | None = None
+        self._asks: deque[int] = deque(maxlen=ASKS_KEPT)
+        self._answers: deque[Answer] = deque()
+        self._cache: OrderedDict[FleetKey, Keyframe] = OrderedDict()
+        self._sessions: dict[tuple[str, object, int], int] = {}
+        self._asking = False
+        self._work, self._end = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
+        self._thread.start()
+
+    def remembered(self, row: int) -> None:
+        """A keyframe was stored: push it, and ask about it."""
+        self._asks.append(row)
+        self._work.set()
+
+    def answer(self) -> Answer | None:
+        """What came first of all that was not taken yet."""
+        if not self._answers:
+            return None
+        self._work.set()
+        return self._answers.popleft()
+
+    def waiting(self) -> int:
+        """How many places the server does not have yet."""
+        return self._store.waiting()
+
+    def drain(self, timeout_s: float) -> bool:
+        """Wait until all is pushed and asked; returns whether it is. Answers have to be taken meanwhile."""
+        end = time.monotonic() + timeout_s
+        while self._asks or self._asking or self._store.waiting():
+            if time.monotonic() > end:
+                return False
+            time.sleep(0.02)
+        return True
+
+    def close(self) -> None:
+        """Leave the server; what was not pushed is at the next start."""
+        self._end.set()
+        self._work.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        failures = 0
+        while not self._end.is_set():
+            try:
+                busy = self._step()
+                failures = 0
+            except Exception as error:  # a thread that ended would lose places without a word
+                self._lose(error)
+                self._end.wait(RETRY_S[min(failures, len(RETRY_S) - 1)])
+                failures += 1
+                continue
+            if not busy:
+                self._work.wait(1.0)
+                self._work.clear()
+        if self._server is not None:
+            self._server.close()
+
+    def _step(self) -> bool:
+        """Do the next thing; returns whether there was any."""
+        if self._server is None:
+            self._server = FleetServer(self._settings.server, self._store.store_id, self._identity)
+            self.robot, self.connected, self.trouble = self._server.robot, True, ""
+        rows = self._store.outgoing(BATCH)
+        if rows:
+            self._server.push([_outgoing(self._store[row]) for row in rows])
+            self._store.delivered(rows)
+            self.pushed += len(rows)
+            return True
+        if self._asks and len(self._answers) < ANSWERS_KEPT:
+            self._asking = True
+            row = self._asks.popleft()
+            try:
+                self._ask(self._server, row)
+            except LinkError:
+                self._asks.appendleft(row)
+                raise
+            finally:
+                self._asking = False
+            return True
+        return False
+
+    def _ask(self, server: FleetServer, row: int) -> None:
+        keyframe = self._store[row]
+        by_session: dict[tuple[str, int], list[tuple[Candidate, Keyframe]]] = {}
+        for key, similarity in server.nearest(keyframe.embedding.descriptor, self._settings.fleet_candidates):
+            match = self._keyframe(server, key)
+            if match is not None:
+                found = by_session.setdefault((key.robot, match.session), [])
+                found.append((Candidate(-1, key.stamp_ns, similarity), match))
+        self._answers.extend(Answer(keyframe, robot, found) for (robot, _), found in by_session.items())
+
+    def _keyframe(self, server: FleetServer, key: FleetKey) -> Keyframe | None:
+        if key not in self._cache:
+            data = server.data(key)
+            if data is None:
+                return None
+            try:
+                keyframe = unpack(data)
+            except Exception as error:  # whatever another rover wrote there
+                logger.warning("%s of %s cannot be read: %s", key.stamp_ns, key.robot, error)
+                return None
+            # two rovers may have sessions of one number, and even keyframes of one stamp
+            name = key.robot, key.store, key.session
+            session = self._sessions.setdefault(name, -1 - len(self._sessions))
+            self._cache[key] = replace(keyframe, stamp_ns=key.stamp_ns, session=session)
+            while len(self._cache) > CACHED:
+                self._cache.popitem(last=False)
+        self._cache.move_to_end(key)
+        return self._cache[key]
+
+    def _lose(self, error: Exception) -> None:
+        """The link is cut, or something worse; told when it is new."""
+        if str(error) != self.trouble:
+            logger.warning("%s; %d places wait for it", error, self._store.waiting())
+        self.trouble, self.connected = str(error), False
+        if self._server is not None and isinstance(error, LinkError):
+            self._server.close()
+            self._server = None
+
+
+def _outgoing(keyframe: Keyframe) -> OutgoingPlace:
+    descriptor = np.asarray(keyframe.embedding.descriptor, np.float32)
+    return OutgoingPlace(keyframe.session, keyframe.stamp_ns, keyframe.travelled_m, descriptor, pack(keyframe))

@@ -1,0 +1,107 @@
+"""The joint pose graph of a map: every session's odometry, closures within and between, solved together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.frames import LoopClosure
+from umf_ros.geometry import Array
+from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
+from umf_ros.maps.odometry_log import OdometryLog
+from umf_ros.pose_graph.closures import ClosureVerdict, State
+from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.runs.tables import read_closures, read_keyframes
+
+Stamps = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class JointSession:
+    """A recording in the solved map.
+
+    Attributes:
+        session: the recording.
+        joined: whether it shares the map's frame.
+        stamps: (N,) of its keyframes with a pose in the map, ns of its own clock.
+        poses: (N, 4, 4) `map_T_body` there.
+        odometry: (N, 4, 4) `odom_T_body` there.
+    """
+
+    session: MapSession
+    joined: bool
+    stamps: Stamps
+    poses: Array
+    odometry: Array
+
+
+@dataclass(frozen=True)
+class JointMap:
+    """A solved map.
+
+    Attributes:
+        graph: of everything, on the map's clock.
+        sessions: its recordings.
+        within: verdicts on closures inside a recording.
+        between: those on closures between two.
+    """
+
+    graph: PoseGraph
+    sessions: list[JointSession]
+    within: list[ClosureVerdict]
+    between: list[ClosureVerdict]
+
+    def accepted_between(self) -> list[LoopClosure]:
+        """The closures that tie recordings together."""
+        return [verdict.closure for verdict in self.between if verdict.state is State.ACCEPTED]
+
+
+def solve(folder: MapFolder) -> JointMap:
+    """Build and settle the joint graph of a map from what its sessions left.
+
+    Closures between recordings are judged by the same outlier rejection as those within: two sessions that nothing
+    joins yet are joined once closures of several places are consistent with each other.
+
+    Raises:
+        UmfError: a file of the map is missing or damaged.
+    """
+    graph = PoseGraph(folder.settings.pose_graph)
+    logs = {}
+    for number, session in enumerate(folder.sessions):
+        run = folder.folder_of(session.name)
+        if number:
+            graph.begin_session()
+        logs[session.name] = OdometryLog.load(run)
+        logs[session.name].feed(graph, session.shift_ns)
+    # after all odometry: a closure may name any session
+    for session in folder.sessions:
+        run = folder.folder_of(session.name)
+        graph.add_closures(
+            [_shifted(one, session.shift_ns) for one in read_closures(run / "closures.csv")]
+            + read_closures(run / BETWEEN)
+        )
+    graph.settle()
+    verdicts: tuple[list[ClosureVerdict], list[ClosureVerdict]] = ([], [])
+    for verdict in graph.closures():
+        ends = (verdict.closure.query_stamp_ns, verdict.closure.match_stamp_ns)
+        query, match = (folder.session_at(stamp) for stamp in ends)
+        verdicts[query is not match].append(verdict)
+    sessions = [_placed(folder, session, graph, logs[session.name]) for session in folder.sessions]
+    return JointMap(graph, sessions, *verdicts)
+
+
+def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, log: OdometryLog) -> JointSession:
+    """Where the keyframes of a recording are in the solved map."""
+    rows = read_keyframes(folder.folder_of(session.name) / "keyframes.csv")
+    stamps = np.array([row.stamp_ns for row in rows], np.int64)
+    poses, known = graph.poses_at(stamps + session.shift_ns)
+    odometry, _ = log.trajectory.at(stamps[known])
+    return JointSession(session, bool(known.any()), stamps[known], poses[known], odometry)
+
+
+def _shifted(closure: LoopClosure, shift_ns: int) -> LoopClosure:
+    """A closure inside a recording, on the map's clock."""
+    query_ns, match_ns = closure.query_stamp_ns + shift_ns, closure.match_stamp_ns + shift_ns
+    return replace(closure, query_stamp_ns=query_ns, match_stamp_ns=match_ns)

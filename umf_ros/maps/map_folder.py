@@ -1,0 +1,156 @@
+"""The folder of a map: which recordings it was made of, and where everything about them lies."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from umf_ros.config import Settings, dump_settings, load_settings
+from umf_ros.errors import UmfError, writing
+from umf_ros.places.database import PLACES_OF_MAP
+from umf_ros.runs.folder import write_atomically
+
+SCHEMA_VERSION = 1
+BETWEEN = "closures_between.csv"
+_DAY_NS = 86_400 * 10**9
+APART_NS = 60 * 10**9
+"""Sessions lie at least this far apart on the map's clock: further than odometry is ever interpolated."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapSession:
+    """One recording of a map.
+
+    Attributes:
+        name: also of its folder.
+        recording: what tells it from any other, as in the summary of a run.
+        shift_ns: from its own clock to the map's, on which no two recordings overlap.
+        first_ns, last_ns: the time it covers, own clock.
+        first_place, places: its rows in the store of places.
+        first_number, numbers: its sessions in the store of places: one, or more where odometry began anew.
+        odometry: whether it has some of its own; else its scans were followed from one keyframe to the next.
+    """
+
+    name: str
+    recording: dict[str, Any]
+    shift_ns: int
+    first_ns: int
+    last_ns: int
+    first_place: int
+    places: int
+    first_number: int
+    numbers: int
+    odometry: bool
+
+    def covers(self, map_ns: int) -> bool:
+        """Whether a stamp of the map's clock is of this recording."""
+        return self.first_ns <= map_ns - self.shift_ns <= self.last_ns
+
+
+class MapFolder:
+    """A map on disk: `map.json` says what it is made of.
+
+    Attributes:
+        path: the folder.
+        sessions: recordings in the order in which they were added.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.sessions: list[MapSession] = []
+
+    @classmethod
+    def open(cls, path: Path) -> MapFolder:
+        """A map that is there.
+
+        Raises:
+            UmfError: there is none, or it was written by another version.
+        """
+        folder = cls(path)
+        if not folder.exists:
+            raise UmfError(f"{path} holds no map: map.json is missing (umf map makes one)")
+        folder._read()
+        return folder
+
+    @classmethod
+    def open_or_create(cls, path: Path, settings: Settings) -> MapFolder:
+        """A map that is there, or a new one with these settings.
+
+        Raises:
+            UmfError: it was written by another version.
+            OutputError: it cannot be written.
+        """
+        folder = cls(path)
+        if folder.exists:
+            folder._read()
+            return folder
+        with writing(f"to {path}"):
+            path.mkdir(parents=True, exist_ok=True)
+        write_atomically(path / "config.yaml", dump_settings(settings))
+        folder._write()
+        return folder
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is a map."""
+        return (self.path / "map.json").is_file()
+
+    @property
+    def settings(self) -> Settings:
+        """Those of its first recording: it is verified and solved by them."""
+        return load_settings(self.path / "config.yaml")
+
+    @property
+    def places(self) -> Path:
+        """The store of places of all recordings, stamped by the map's clock."""
+        return self.path / PLACES_OF_MAP
+
+    def folder_of(self, name: str) -> Path:
+        """Run folder of a recording, stamped by its own clock."""
+        return self.path / "sessions" / name
+
+    def session_at(self, map_ns: int) -> MapSession | None:
+        """The recording that covers a stamp of the map's clock."""
+        return next((session for session in self.sessions if session.covers(map_ns)), None)
+
+    def knows(self, recording: dict[str, Any]) -> MapSession | None:
+        """The session of this recording, wherever its file lay then."""
+        keys = "start_ns", "end_ns", "messages"
+        same = (s for s in self.sessions if all(s.recording[key] == recording[key] for key in keys))
+        return next(same, None)
+
+    def free_name(self, path: Path) -> str:
+        """A name for a recording's session that none has."""
+        taken = {session.name for session in self.sessions}
+        names = (path.stem if number == 1 else f"{path.stem}_{number}" for number in range(1, len(taken) + 2))
+        return next(name for name in names if name not in taken)
+
+    def shift_for(self, first_ns: int) -> int:
+        """By how much a recording that begins then has to be moved to lie behind all others; whole days, or none."""
+        newest = max((session.last_ns + session.shift_ns for session in self.sessions), default=None)
+        missing = 0 if newest is None else newest + APART_NS - first_ns
+        return 0 if missing <= 0 else -(-missing // _DAY_NS) * _DAY_NS
+
+    def add(self, session: MapSession) -> None:
+        """Remember a recording that is in the store of places by now.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        self.sessions.append(session)
+        self._write()
+
+    def _write(self) -> None:
+        content = {"schema": SCHEMA_VERSION, "sessions": [asdict(session) for session in self.sessions]}
+        write_atomically(self.path / "map.json", json.dumps(content, indent=1) + "\n")
+
+    def _read(self) -> None:
+        try:
+            content = json.loads((self.path / "map.json").read_text(encoding="utf-8"))
+            if content["schema"] != SCHEMA_VERSION:
+                raise UmfError(f"{self.path} is a map of another version of umf_ros; make it anew from its recordings")
+            self.sessions = [MapSession(**session) for session in content["sessions"]]
+        except (OSError, ValueError, KeyError, TypeError):
+            raise UmfError(f"{self.path / 'map.json'} is damaged") from None

@@ -1,0 +1,162 @@
+"""The map as a point cloud: aligned scans, thinned by voxels, and how crisp their surfaces are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from umf_ros.errors import writing
+from umf_ros.frames import Points
+from umf_ros.geometry import Array, invert, transform
+from umf_ros.maps.joint_graph import JointMap
+from umf_ros.maps.map_folder import MapFolder
+from umf_ros.places.database import PlaceDatabase
+from umf_ros.places.upkeep import stored_identity
+from umf_ros.runs.height_map import HeightMap
+
+VOXEL_M = 0.1
+REACH_M = 25.0  # by hand: beyond, a scan's points lie too thin to show whether it is aligned
+_NEIGHBOURS_M, _FEWEST = 0.5, 12
+_MOST_PROBED = 20_000
+_RECORD = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("session", "u1")])
+
+
+@dataclass(frozen=True)
+class MapCloud:
+    """Points of a map.
+
+    Attributes:
+        points: (N, 3) float32, m, map frame.
+        sessions: (N,) number of the recording that saw each; counts from 0, and again from 0 after 255.
+    """
+
+    points: Points
+    sessions: NDArray[np.uint8]
+
+    def thinned(self, voxel_m: float = VOXEL_M) -> MapCloud:
+        """One point for each voxel: the first of those in it."""
+        cells = np.floor(self.points / voxel_m).astype(np.int64)
+        cells -= cells.min(axis=0, initial=0)
+        size = cells.max(axis=0, initial=0) + 1
+        _, first = np.unique((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_index=True)
+        return MapCloud(self.points[first], self.sessions[first])
+
+    def thickness(self) -> float:
+        """Median thickness in m of the surfaces that at least two recordings saw: the less, the crisper the map.
+
+        Around points all over the map, the standard deviation across the plane through the neighbours within half a
+        metre [after the mean plane variance of Razlaw 2015]; NaN where no two recordings meet.
+        """
+        tree = cKDTree(self.points)
+        rows = np.unique(np.linspace(0, len(self.points) - 1, min(len(self.points), _MOST_PROBED)).astype(int))
+        found = []
+        for near in tree.query_ball_point(self.points[rows], _NEIGHBOURS_M) if len(rows) else []:
+            if len(near) >= _FEWEST and len(set(self.sessions[near].tolist())) > 1:
+                spread = np.cov(self.points[near].T.astype(float))
+                found.append(np.sqrt(max(np.linalg.eigvalsh(spread)[0], 0.0)))
+        return float(np.median(found)) if found else float("nan")
+
+
+@dataclass(frozen=True)
+class Crispness:
+    """Thickness of surfaces, m, by the odometry of every session from where it began, and by the joint graph."""
+
+    before: float
+    after: float
+
+
+def gather(folder: MapFolder, joint: JointMap, optimised: bool = True) -> MapCloud:
+    """The scans of all joined recordings where the map puts them, or their odometry from where each began."""
+    points, sessions = [np.empty((0, 3), np.float32)], [np.empty(0, np.uint8)]
+    for number, scan in _scans(folder, joint, optimised):
+        points.append(scan)
+        sessions.append(np.full(len(scan), number % 256, np.uint8))
+    return MapCloud(np.concatenate(points), np.concatenate(sessions))
+
+
+def write_cloud(folder: MapFolder, joint: JointMap) -> Crispness:
+    """Write `map.ply`, `map.pcd` and the picture `map.png`; returns how crisp the map is.
+
+    Raises:
+        OutputError: a file cannot be written.
+        UmfError: the map's places cannot be read.
+    """
+    cloud = gather(folder, joint)
+    thin = cloud.thinned()
+    write_ply(folder.path / "map.ply", thin)
+    write_pcd(folder.path / "map.pcd", thin)
+    _draw(folder.path / "map.png", joint, cloud)
+    return Crispness(gather(folder, joint, optimised=False).thinned().thickness(), thin.thickness())
+
+
+def write_ply(path: Path, cloud: MapCloud) -> None:
+    """Write a binary PLY file of x, y, z and session.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud.points)}\nproperty float x\n"
+        "property float y\nproperty float z\nproperty uchar session\nend_header\n"
+    )
+    _write(path, header, cloud)
+
+
+def write_pcd(path: Path, cloud: MapCloud) -> None:
+    """Write a binary PCD file of x, y, z and session.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    count = len(cloud.points)
+    header = (
+        "VERSION 0.7\nFIELDS x y z session\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+        f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n"
+    )
+    _write(path, header, cloud)
+
+
+def _write(path: Path, header: str, cloud: MapCloud) -> None:
+    records = np.empty(len(cloud.points), _RECORD)
+    records["x"], records["y"], records["z"] = cloud.points.T
+    records["session"] = cloud.sessions
+    with writing(path):
+        path.write_bytes(header.encode("ascii") + records.tobytes())
+
+
+def _scans(folder: MapFolder, joint: JointMap, optimised: bool) -> Iterator[tuple[int, Points]]:
+    """Number of the recording and (N, 3) points in the map's frame, keyframe by keyframe."""
+    identity = stored_identity(folder.places)
+    with closing(PlaceDatabase.of_map(folder.path, *identity)) as places:
+        for number, one in enumerate(joint.sessions):
+            poses = one.poses if optimised else _by_odometry(one.poses, one.odometry)
+            known = dict(zip((one.stamps + one.session.shift_ns).tolist(), poses, strict=True))
+            for row in range(one.session.first_place, one.session.first_place + one.session.places):
+                keyframe = places[row]
+                pose = known.get(keyframe.stamp_ns)
+                if pose is not None:
+                    near = keyframe.points[np.linalg.norm(keyframe.points, axis=1) < REACH_M]
+                    yield number, transform(pose, near)
+
+
+def _by_odometry(poses: Array, odometry: Array) -> Array:
+    """Where odometry alone would have led from the first pose."""
+    return poses if not len(poses) else poses[0] @ invert(odometry[0]) @ odometry
+
+
+def _draw(path: Path, joint: JointMap, cloud: MapCloud) -> None:
+    way = np.concatenate([np.empty((0, 2)), *(one.poses[:, :2, 3] for one in joint.sessions)])
+    if not len(way):
+        return
+    heights = HeightMap(way)
+    heights.add(cloud.points)
+    png = heights.png()
+    if png is not None:
+        with writing(path):
+            path.write_bytes(png)
