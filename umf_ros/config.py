@@ -100,8 +100,11 @@ class KeyframePolicy(Group):
 class EmbeddingSettings(Group):
     """The network that turns a frame into a descriptor and local features."""
 
-    method: str = Field("umf", description="embedder by name: umf, or a baseline")
-    weights: str = Field("", description="safetensors file, or umf_scene or umf_light; empty: umf_scene")
+    method: str = Field("umf", description="embedder by name: umf, or another of docs/benchmarks.md")
+    weights: str = Field(
+        "",
+        description="safetensors file, or umf_scene or umf_light; empty: umf_scene, or another method's own",
+    )
     runtime: Literal["auto", "torch", "openvino"] = Field("auto", description="what runs the network")
     device: str = Field("cpu", description="torch device")
     threads: int = Field(0, ge=0, le=64, description="threads of the network; 0: as many as there are cores")

@@ -207,6 +207,19 @@ def match_session(target: MapFolder, session: MapSession) -> Iterator[Match]:
         part.replace(path)  # it is there when it is whole
 
 
+def replay_task(task: tuple[Path, Opening, Path]) -> None:
+    """`replay_session` where nobody listens."""
+    replay_session(*task)
+
+
+def match_task(task: tuple[Path, str]) -> None:
+    """`match_session` of a map's folder and the name of one of its sessions, where nobody listens."""
+    target = MapFolder.open(task[0])
+    session = next(one for one in target.sessions if one.name == task[1])
+    for _ in match_session(target, session):
+        pass
+
+
 def unmatched(target: MapFolder) -> list[MapSession]:
     """Sessions that were added, but not compared with those before them to the end."""
     return [session for session in target.sessions if not (target.folder_of(session.name) / BETWEEN).is_file()]

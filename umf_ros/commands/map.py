@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,6 +26,10 @@ if TYPE_CHECKING:
     from umf_ros.maps.map_folder import MapFolder
 
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.")]
+Workers = Annotated[int, typer.Option(min=1, max=256, help="Processes that replay and compare recordings.")]
+RayAddress = Annotated[
+    str | None, typer.Option("--ray", help="Spread them by Ray: address of a cluster that sees these files, or local.")
+]
 MapPath = Annotated[Path, typer.Option("--out", help="Folder of the map, new or one to add to.")]
 OdometryFolder = Annotated[
     Path | None,
@@ -38,6 +44,8 @@ def command(
     dataset: DatasetName = "auto",
     embedder: EmbedderName = None,
     weights: WeightsPath = None,
+    workers: Workers = 1,
+    ray: RayAddress = None,
     odometry: OdometryFolder = None,
     odometry_frame: OdometryFrame = "",
 ) -> None:
@@ -55,14 +63,18 @@ def command(
     from umf_ros.maps.joint_graph import solve
     from umf_ros.maps.outputs import write_results
     from umf_ros.runs.folder import check_writable
+    from umf_ros.spread import spread
 
     console = Console()
     check_writable(out)
     opening = Opening(config, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
     found = find_recordings(recordings)
     target = _open(out, opening, found[0])
-    for recording in found:
-        _add(target, recording, opening, console)
+    if ray is None and workers == 1:
+        for recording in found:
+            _add(target, recording, opening, console)
+    else:
+        _add_all(target, found, opening, partial(spread, workers=workers, ray=ray), console)
     for session in unmatched(target):
         _match(target, session.name, console)
     with console.status("Solving the joint graph"):
@@ -75,6 +87,47 @@ def _open(out: Path, opening: Opening, first: Path) -> MapFolder:
     from umf_ros.maps.map_folder import MapFolder
 
     return MapFolder.open_or_create(out, opening.settings(open_bag(first)))
+
+
+def _add_all(
+    target: MapFolder, recordings: list[Path], opening: Opening, spread: Callable[..., None], console: Console
+) -> None:
+    """Replay all recordings at once, then compare all with those before them; the same map as one after the other."""
+    from umf_ros.mapping import add_session, match_task, replay_task, unmatched
+
+    new = _new_ones(target, recordings, console)
+    tasks = [(recording, opening, target.folder_of(name)) for name, recording in new.items()]
+    _with_bar(console, "Replaying", len(tasks), lambda done: spread(replay_task, tasks, done=done))
+    for name, recording in new.items():
+        add_session(target, name, recording)
+    names = [(target.path, session.name) for session in unmatched(target)]
+    _with_bar(console, "Comparing with the map", len(names), lambda done: spread(match_task, names, done=done))
+
+
+def _new_ones(target: MapFolder, recordings: list[Path], console: Console) -> dict[str, Path]:
+    """The recordings that are not in the map yet, by the names of their sessions to be."""
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.runs.finished_run import describe_recording
+
+    new: dict[str, Path] = {}
+    described = []
+    for recording in recordings:
+        about = describe_recording(open_bag(recording)) | {"path": ""}
+        if target.knows(about) is not None or about in described:
+            console.print(f"{recording}: in the map already", markup=False, soft_wrap=True)
+            continue
+        described.append(about)
+        new[target.free_name(recording, new)] = recording
+    return new
+
+
+def _with_bar(console: Console, what: str, total: int, run: Callable[[Callable[[int], None]], None]) -> None:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("recordings")
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(what, total=total)
+        run(lambda done: progress.update(task, completed=done))
 
 
 def _add(target: MapFolder, recording: Path, opening: Opening, console: Console) -> None:

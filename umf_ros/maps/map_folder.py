@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -121,9 +122,9 @@ class MapFolder:
         same = (s for s in self.sessions if all(s.recording[key] == recording[key] for key in keys))
         return next(same, None)
 
-    def free_name(self, path: Path) -> str:
-        """A name for a recording's session that none has."""
-        taken = {session.name for session in self.sessions}
+    def free_name(self, path: Path, promised: Collection[str] = ()) -> str:
+        """A name for a recording's session that none has, and that is promised to none."""
+        taken = {session.name for session in self.sessions} | set(promised)
         names = (path.stem if number == 1 else f"{path.stem}_{number}" for number in range(1, len(taken) + 2))
         return next(name for name in names if name not in taken)
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from umf_ros.errors import WeightsError
+from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import UMF, channels_last
-from umf_ros.networks.weights_files import open_weights, parse_config
+from umf_ros.networks.weights_files import open_weights, parse_architecture
 
 SCALE = ".scale"
 """End of the name of what the eight bits of another tensor are to be multiplied with."""
@@ -21,16 +23,14 @@ def load_weights(path: Path) -> UMF:
     Raises:
         WeightsError: missing, truncated or foreign file, not finite, or of another architecture.
     """
-    with open_weights(path, "pt") as stream:
-        config = parse_config(path, stream)
-        tensors = _restore({name: stream.get_tensor(name) for name in stream.keys()})  # noqa: SIM118 (not a mapping)
-    network = UMF(config)
+    architecture, tensors = read_weights(path)
+    network = UMF(NetworkConfig.from_dict(architecture))
     fill(network, tensors, path)
     channels_last(network)
     return network.eval()
 
 
-def fill(network: UMF, tensors: dict[str, Tensor], path: Path) -> None:
+def fill(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
     """Put tensors into a network of the same architecture.
 
     Raises:
@@ -47,6 +47,17 @@ def fill(network: UMF, tensors: dict[str, Tensor], path: Path) -> None:
     if bad:
         raise WeightsError(f"{path} is damaged: {bad[0]} holds values that are not finite")
     network.load_state_dict({name: value.to(wanted[name].dtype) for name, value in tensors.items()})
+
+
+def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """What a file says of the architecture, and its tensors.
+
+    Raises:
+        WeightsError: missing, truncated or foreign file.
+    """
+    with open_weights(path, "pt") as stream:
+        tensors = _restore({name: stream.get_tensor(name) for name in stream.keys()})  # noqa: SIM118 (not a mapping)
+        return parse_architecture(path, stream), tensors
 
 
 def _restore(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -31,7 +31,7 @@ def read_config(path: Path) -> NetworkConfig:
         WeightsError: missing, truncated or foreign file, or of another architecture.
     """
     with open_weights(path, "numpy") as stream:
-        return parse_config(path, stream)
+        return NetworkConfig.from_dict(parse_architecture(path, stream))
 
 
 @contextmanager
@@ -46,17 +46,16 @@ def open_weights(path: Path, framework: str) -> Iterator[Any]:
         raise WeightsError(f"{path} is truncated or not a safetensors file: {' '.join(str(error).split())}") from None
 
 
-def parse_config(path: Path, stream: Any) -> NetworkConfig:
-    """The sizes that an open weights file states.
+def parse_architecture(path: Path, stream: Any) -> dict[str, Any]:
+    """What an open weights file states of its network.
 
     Raises:
-        WeightsError: none, or none that can be.
+        WeightsError: it states nothing, or nothing that can be read.
     """
     metadata = stream.metadata() or {}
     if "architecture" not in metadata:
         raise WeightsError(f"{path} holds weights of another architecture: it does not say which")
     try:
-        architecture = dict(json.loads(metadata["architecture"]))
+        return dict(json.loads(metadata["architecture"]))
     except (TypeError, ValueError):
         raise WeightsError(f"{path} holds weights of another architecture: it does not say which clearly") from None
-    return NetworkConfig.from_dict(architecture)

@@ -28,9 +28,7 @@ class Projection:
     def __init__(self, table: CodeTable) -> None:
         self._table = table
         rows = np.linspace(0, len(table) - 1, min(SAMPLE, len(table))).astype(np.intp)
-        sample = table.descriptors(rows)
-        _, axes = np.linalg.eigh(sample.T @ sample)
-        self._axes = np.ascontiguousarray(axes[:, ::-1][:, :DIRECTIONS], np.float32)
+        self._axes = principal_axes(table.descriptors(rows), DIRECTIONS)
         self._columns = Columns(inside=(np.float32, (self._axes.shape[1],)), outside=np.float32)
         self.extend()
 
@@ -53,6 +51,12 @@ class Projection:
         inside = descriptors @ self._axes
         rest = (descriptors**2).sum(axis=1) - (inside**2).sum(axis=1)
         return inside, np.sqrt(np.maximum(rest, 0)) + np.float32(1e-3)
+
+
+def principal_axes(descriptors: Scores, count: int) -> Scores:
+    """(D, K) orthonormal axes along which (N, D) descriptors are longest, `count` at most, the longest first."""
+    _, axes = np.linalg.eigh(descriptors.T @ descriptors)
+    return np.ascontiguousarray(axes[:, ::-1][:, :count], np.float32)
 
 
 def promising(score: Scores, rows: Rows, count: int) -> Rows:

@@ -43,11 +43,11 @@ class PlaceSearch:
         self._exact = DescriptorIndex(self._table, store.descriptors)
         self._builder = Builder()
         self._approximate: ApproximateIndex | None = None
-        self._file = self._cells_path = None
+        self._file = self._many_path = None
         if store.path is not None:
             self._file = CodeFile(store.path.with_name(store.path.name + ".codes"), dimension)
-            self._cells_path = store.path.with_name(store.path.name + ".faiss")
-        self._saved_cells = 0
+            self._many_path = store.path.with_name(store.path.name + ".faiss")
+        self._saved_many = 0
         self._open()
 
     def __call__(self, descriptor: Scores, wanted: int, admissible: Admissible) -> Found:
@@ -83,15 +83,15 @@ class PlaceSearch:
         """Take up the descriptor of the keyframe that was added last."""
         self._table.extend(descriptor[None])
         if len(self._table) % ADDED_EVERY == 0:
-            self._look_after_cells()
+            self._look_after_many()
         if len(self._table) % SAVED_EVERY == 0:
             self._save()
 
     def prepare(self) -> None:
         """Wait until the approximate index is made, where there are places enough."""
-        self._look_after_cells()
+        self._look_after_many()
         self._builder.wait()
-        self._look_after_cells()
+        self._look_after_many()
 
     def close(self) -> None:
         """Write what the next opening needs."""
@@ -99,37 +99,36 @@ class PlaceSearch:
 
     def _open(self) -> None:
         known = self._file.load(self._table, self._store.keys, self._store.descriptors) if self._file else 0
-        if known and self._cells_path is not None:
-            self._approximate = ApproximateIndex.load(self._cells_path, self._table)
-            self._saved_cells = len(self._approximate or ())
+        if known and self._many_path is not None:
+            self._approximate = ApproximateIndex.load(self._many_path, self._table)
+            self._saved_many = len(self._approximate or ())
         for first in range(known, len(self._store), SAVED_EVERY):
             rows = np.arange(first, min(first + SAVED_EVERY, len(self._store)))
             self._table.extend(self._store.descriptors(rows))
-        self._look_after_cells()
+        self._look_after_many()
 
-    def _look_after_cells(self) -> None:
-        """Take up what is new; make the cells when there are places enough, or too many for them."""
+    def _look_after_many(self) -> None:
+        """Take up what is new; make the approximate index when there are places enough."""
         count = len(self._table)
         made = self._builder.take()
         if made is not None:
-            self._approximate, self._saved_cells = made, 0
+            self._approximate, self._saved_many = made, 0
         if self._approximate is not None:
             self._approximate.extend(self._table, count)
-        most = APPROXIMATE_FROM if self._approximate is None else self._approximate.suits
-        if count > most and has_faiss():
+        elif count > APPROXIMATE_FROM and has_faiss():
             self._builder.start(self._table)
 
     def _save(self, last: bool = False) -> None:
         if self._file is None or self._store.read_only or not len(self._table):
             return
         self._file.save(self._table, self._store.keys)
-        cells = self._approximate
-        # a tenth of them is soon taken up again
-        if cells is None or len(cells) < (1.0 if last else 1.1) * self._saved_cells + 1:
+        many = self._approximate
+        # a tenth of it is soon taken up again
+        if many is None or len(many) < (1.0 if last else 1.1) * self._saved_many + 1:
             return
-        if self._cells_path is not None and self._file.whole:
+        if self._many_path is not None and self._file.whole:
             try:
-                cells.save(self._cells_path)
+                many.save(self._many_path)
             except OutputError as error:
-                logger.warning("%s; they are made anew at the next opening", error)
-            self._saved_cells = len(cells)
+                logger.warning("%s; it is made anew at the next opening", error)
+            self._saved_many = len(many)

@@ -41,6 +41,9 @@ _WRONG_BEFORE, _RIGHT_BEFORE = 1, 4
 # what looks alike does so for a while, so wrong closures seldom come alone: of those left undecided at the end of
 # drives in worlds 10200-10473 of benchmarks/pose_graph.py 1 of 67 wrong ones was alone and 59 of 213 right ones
 _WRONG_ALONE = 0.1
+# a wrong closure between sessions that nothing joins is contradicted by nothing: at last two places have to agree, 2.5
+# nats at least (*by hand*; benchmarks/aliased_sessions.py: without, one group of wrong closures joined 4 of 40 graphs)
+_WRONG_BETWEEN = 10.0
 _EVEN = 0.5
 _AGREES = "agrees with the map"
 _SUPPORTED = "supported by other places"
@@ -59,12 +62,14 @@ class MapComparisons(NamedTuple):
         misfits_m: (N,) metres.
         false_alarms: (N,) probabilities that a wrong closure passes for a right one here.
         ratios: (N,) how much likelier a wrong closure misses the map by this than a right one.
+        joined: (N,) whether the map says anything about the pair at all.
     """
 
     distances: Array
     misfits_m: Array
     false_alarms: Array
     ratios: Array
+    joined: NDArray[np.bool_]
 
 
 class OutlierRejection:
@@ -86,6 +91,7 @@ class OutlierRejection:
         self._changed: set[int] = set()
         self._revoked: set[int] = set()
         self._too_far: set[int] = set()
+        self._unjoined: set[int] = set()
         self._ratios: dict[int, float] = {}
         self._brought_close: list[int] = []
         self.scale = NoiseScale()
@@ -207,7 +213,9 @@ class OutlierRejection:
         if not open_rows:
             return []
         found = self._compare(open_rows)
-        numbers = zip(open_rows, *(column.tolist() for column in found), strict=True)
+        numbers = zip(open_rows, *(column.tolist() for column in found[:4]), strict=True)
+        self._unjoined -= set(open_rows)
+        self._unjoined |= {row for row, joined in zip(open_rows, found.joined, strict=True) if not joined}
         return [row for row, *rest in numbers if self._agrees(row, *rest)]
 
     def _agrees(self, row: int, distance: float, misfit_m: float, false_alarm: float, ratio: float) -> bool:
@@ -233,7 +241,7 @@ class OutlierRejection:
         predicted = self._map.predict(*((end["session"][chosen], end["stamp"][chosen]) for end in ends))
         misfits = invert(self._arrays["pose"][chosen]) @ predicted.poses
         covariances = predicted.covariances + self.scale.closures**2 * self._arrays["covariance"][chosen]
-        known = np.isfinite(covariances).all(axis=(1, 2))
+        known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
         distances, metres = np.zeros(len(chosen)), np.zeros(len(chosen))
         false_alarms, ratios = np.ones(len(chosen)), np.ones(len(chosen))
         if known.any():
@@ -241,7 +249,7 @@ class OutlierRejection:
             metres[known] = np.linalg.norm(misfits[known, :3, 3], axis=1)
             false_alarms[known] = false_alarm_probability(covariances[known], self._settings)
             ratios[known] = likelihood_ratio(false_alarms[known], distances[known], self._settings)
-        return MapComparisons(distances, metres, false_alarms, ratios)
+        return MapComparisons(distances, metres, false_alarms, ratios, known)
 
     def _supported_sets(self, rows: Iterable[int], state: State) -> list[list[int]]:
         """Consistency sets among the closures of one state, each with one of `rows`, that no chance explains."""
@@ -327,6 +335,8 @@ class OutlierRejection:
         rejected, accepted = (int((self._table["state"] == state).sum()) for state in (State.REJECTED, State.ACCEPTED))
         prior = (_WRONG_BEFORE + rejected) / (_RIGHT_BEFORE + accepted)
         _, evidence = self._consistency.consistency_set(place[0], self._in_state(State.UNDECIDED))
+        if place[0] in self._unjoined:
+            return odds * max(prior, _WRONG_BEFORE / _RIGHT_BEFORE) * np.exp(-evidence) * _WRONG_BETWEEN
         return odds * prior * np.exp(-evidence) * (_WRONG_ALONE if len(place) == 1 else 1.0)
 
     def _credible(self) -> NDArray[np.bool_]:

@@ -76,7 +76,7 @@ def world(name: str, recall1: float, yaw: list[YawBin], **others: Scores) -> Wor
 def summary() -> WorldsSummary:
     etna = world("etna 1", 0.6, [YawBin("0-10 deg", 30, 0.9), YawBin("20-30 deg", 0, math.nan)])
     moon = world("moon 2", 0.8, [YawBin("0-10 deg", 10, 0.5), YawBin("20-30 deg", 4, 0.25)], ransac_both=scores(0.9))
-    return WorldsSummary([etna, moon], {"thumbnail": [scores(0.3), scores(0.5)]}, COST)
+    return WorldsSummary([etna, moon], COST)
 
 
 def rows_of(summary: WorldsSummary, title: str) -> dict[str, list[str]]:
@@ -111,12 +111,6 @@ def test_bins_of_heading_weigh_worlds_by_their_queries(summary: WorldsSummary) -
     assert rows == {"0-10 deg": ["40", "80.0"], "20-30 deg": ["4", "25.0"]}
 
 
-def test_other_methods_and_chance(summary: WorldsSummary) -> None:
-    rows = rows_of(summary, "Other methods")
-    assert rows["thumbnail"] == ["40.0", "45.0", "50.0", "30.0", "20.0", "10.0"]
-    assert rows["chance"][0] == "7.0" and set(rows["chance"][1:]) == {""}
-
-
 def test_every_world_has_a_row_of_its_own(summary: WorldsSummary) -> None:
     rows = rows_of(summary, "Worlds")
     assert rows["etna 1"] == ["858", "10", "60.0", "60.0", "60.0", "60.0", "60.0"]
@@ -133,7 +127,7 @@ def test_costs_are_sizes_times_and_ratios(summary: WorldsSummary) -> None:
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_world_without_revisits_is_left_out_wherever_it_stands(order: tuple[int, int]) -> None:
     worlds = [world("etna 1", 0.6, []), world("empty", math.nan, [])]
-    summary = WorldsSummary([worlds[i] for i in order], {}, COST)
+    summary = WorldsSummary([worlds[i] for i in order], COST)
     figures = summary.figures()
     assert figures["recall1_fused_mean"] == figures["recall1_fused_worst"] == pytest.approx(0.6)
     assert rows_of(summary, "Modalities")["fused"][:2] == ["60.0", "60.0"]
@@ -141,7 +135,7 @@ def test_a_world_without_revisits_is_left_out_wherever_it_stands(order: tuple[in
 
 
 def test_without_any_revisit_there_is_no_figure() -> None:
-    figures = WorldsSummary([world("empty", math.nan, [])], {}, COST).figures()
+    figures = WorldsSummary([world("empty", math.nan, [])], COST).figures()
     assert figures["recall1_fused_mean"] is None and figures["recall1_fused_worst"] is None
     assert figures["parameters_default"] == 2**20
 

@@ -24,9 +24,9 @@ from umf_ros.lab.commands import train as train_command
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.lab.training.distributed import Team, choose_device, join_team
 from umf_ros.lab.training.metric_objective import MetricObjective
-from umf_ros.lab.training.networks import PRESETS, read_card, save_weights
+from umf_ros.lab.training.networks import PRESETS, make_network, read_card, save_weights
 from umf_ros.lab.training.progress import Progress, append_row, learning_rate, resuming, save_checkpoint
-from umf_ros.lab.training.run import load_run, make_network
+from umf_ros.lab.training.run import load_run
 from umf_ros.lab.training.trainer import Trainer
 from umf_ros.lab.training.validation import describe, figures, mean_of, validate
 from umf_ros.networks.umf import UMF

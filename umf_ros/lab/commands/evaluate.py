@@ -15,17 +15,12 @@ from umf_ros.commands.recordings import (
     RunsFolder,
     TruthPath,
     WeightsPath,
-    check_odometry_options,
-    open_frames,
-    open_recording,
 )
 from umf_ros.embedding import CHOICES
 from umf_ros.errors import ConfigError
+from umf_ros.lab.commands.evaluation_inputs import RecordingOptions, choose_worlds, note_on_worlds, progress_bar
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.progress import Progress
-
     from umf_ros.lab.evaluation.results import Figures
 
 Optional = typer.Option
@@ -40,9 +35,13 @@ def command(
         ),
     ] = None,
     worlds: Annotated[str | None, Optional(help="Instead of a recording: test or validation worlds.")] = None,
-    seed: Annotated[int | None, Optional(min=0, help="First of the four worlds' seeds.")] = None,
+    seed: Annotated[int | None, Optional(min=0, help="First of the worlds' seeds.")] = None,
+    count: Annotated[int, Optional(min=1, max=8, help="How many worlds, of different families.")] = 4,
     quick: Annotated[bool, Optional("--quick", help="A smaller sample of every world.")] = False,
-    methods: Annotated[str, Optional(help="umf, or all: methods that need no training too.")] = "umf",
+    methods: Annotated[str, Optional(help="umf, or all: every method of docs/benchmarks.md beside it.")] = "umf",
+    trained: Annotated[
+        Path | None, Optional(help="With --methods all, a folder of other methods' weights: NAME/NAME.safetensors.")
+    ] = None,
     weights: WeightsPath = None,
     json_file: Annotated[Path | None, Optional("--json", help="Write the figures here too.")] = None,
     out: RunsFolder = Path("results"),
@@ -61,6 +60,7 @@ def command(
     a second drive on an offset path under another sun is asked for the first; the default seeds of the
     test worlds are never trained or tuned on.
     """
+    from umf_ros.lab.commands.evaluate_all import EveryMethod
     from umf_ros.lab.datasets.listed import is_list
     from umf_ros.lab.evaluation.places import lists_place_sets
 
@@ -68,23 +68,28 @@ def command(
         raise ConfigError("expected either a recording or --worlds test|validation")
     if methods not in ("umf", "all"):
         raise ConfigError(f"--methods: expected umf or all, not {methods!r}")
-    of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick, "--methods": methods != "umf"}
+    if trained is not None and methods == "umf":
+        raise ConfigError("--trained names weights of other methods, and without --methods all there are none")
+    of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick, "--count": count != 4}
     of_lists: dict[str, object] = {"--rule": rule != "s3li"}
     of_recordings: dict[str, object] = {"--config": config, "--dataset": dataset != "auto", "--embedder": embedder}
     of_recordings |= {"--odometry": odometry, "--ground-truth": ground_truth}
+    every = EveryMethod(weights, trained, quick, out) if methods == "all" else None
     if data is None:
         _refuse("simulated worlds", of_lists | of_recordings)
-        figures = _on_worlds(str(worlds), seed, quick, methods == "all", weights, out)
+        chosen = str(worlds), seed, count
+        figures = every.worlds(*chosen) if every else _on_worlds(*chosen, quick, weights, out)
     elif is_list(data) and lists_place_sets(data):
-        others = {name: value for name, value in of_recordings.items() if name != "--embedder"}
+        others = {name: value for name, value in of_recordings.items() if name != "--embedder" or every}
         _refuse("a list of place sets", of_worlds | of_lists | others)
-        figures = _on_places(data, embedder, weights, out)
+        figures = every.places(data) if every else _on_places(data, embedder, weights, out)
     elif is_list(data):
         _refuse("a list of sequences", of_worlds | of_recordings)
-        figures = _on_sequences(data, rule, weights, out)
+        figures = every.sequences(data, rule) if every else _on_sequences(data, rule, weights, out)
     else:
-        _refuse("a recording", of_worlds | of_lists)
-        figures = _on_recording(data, config, dataset, embedder, weights, odometry, odometry_frame, ground_truth, out)
+        _refuse("a recording", of_worlds | of_lists | ({"--embedder": embedder} if every else {}))
+        opened = RecordingOptions(data, config, dataset, embedder, odometry, odometry_frame, ground_truth)
+        figures = every.recording(opened) if every else _on_recording(opened, weights, out)
     if json_file is not None:
         import json
 
@@ -100,69 +105,45 @@ def _refuse(data: str, options: Mapping[str, object]) -> None:
         raise ConfigError(f"{data} {'has' if data.startswith('a ') else 'have'} no use for {', '.join(given)}")
 
 
-def _on_worlds(name: str, seed: int | None, quick: bool, others: bool, weights: Path | None, out: Path) -> Figures:
+def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
-    from umf_ros.lab.evaluation.worlds import FIRST_SEEDS, FULL, QUICK, test_worlds
     from umf_ros.lab.evaluation.worlds_run import WorldsRun, work
     from umf_ros.runs.folder import create_run_folder
 
-    if name not in FIRST_SEEDS:
-        raise ConfigError(f"--worlds: expected {' or '.join(FIRST_SEEDS)}, not {name!r}")
     console = Console()
-    chosen = test_worlds(FIRST_SEEDS[name] if seed is None else seed, QUICK if quick else FULL)
-    with _bar(console) as bar:
+    chosen = choose_worlds(name, seed, quick, count)
+    with progress_bar(console) as bar:
         task = bar.add_task("", total=sum(work(world) for world in chosen))
 
         def progress(what: str, done: int) -> None:
             bar.update(task, description=what, advance=done)
 
-        run = WorldsRun(weights, chosen, 3 if quick else 10, others, progress)
+        run = WorldsRun(weights, chosen, 3 if quick else 10, progress)
         folder = create_run_folder(out)
         summary = run.run()
-        names = ", ".join(world.name for world in chosen)
-        notes = [
-            f"Worlds: {names}; hard setting (offset path up to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing)"
-            f"{', quick' if quick else ''}. A match is true within 12 m and 30 deg [UMF 5.1.2]. Times are "
-            "medians on this machine, as busy as it was."
-        ]
-        report = run.write(summary, folder, notes)
+        report = run.write(
+            summary, folder, [note_on_worlds(chosen, quick) + " Times are medians on this machine, as busy as it was."]
+        )
     report.show(console, folder)
     return report.figures
 
 
-def _on_recording(
-    bag: Path,
-    config: Path | None,
-    dataset: str,
-    embedder: str | None,
-    weights: Path | None,
-    odometry: Path | None,
-    odometry_frame: str,
-    ground_truth: Path | None,
-    out: Path,
-) -> Figures:
+def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
-    frame_of_odometry = check_odometry_options(odometry, odometry_frame)
-
-    from umf_ros.bags.trajectories import read_ground_truth
-    from umf_ros.commands.progress import WARNING
     from umf_ros.embedding import make_embedder
     from umf_ros.frames import Frame
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
     from umf_ros.runs.folder import create_run_folder
 
     console = Console()
-    recording, settings = open_recording(bag, config, dataset, embedder, weights)
-    truth = read_ground_truth(recording, ground_truth)
-    if truth is None:
-        raise ConfigError(f"{bag} holds no ground truth; name a file with --ground-truth")
-    frames = open_frames(recording, settings, lambda text: console.print(text, **WARNING), odometry, frame_of_odometry)
+    opened = options.open(console, weights)
+    settings, bag = opened.settings, options.bag
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, True, settings.verification.features))
     folder = create_run_folder(out)
-    with _bar(console) as bar:
-        task = bar.add_task("embedding", total=recording.duration_s)
+    with progress_bar(console) as bar:
+        task = bar.add_task("embedding", total=opened.duration_s)
         start_ns: list[int] = []
 
         def show(frame: Frame, keyframes: int) -> None:
@@ -170,15 +151,15 @@ def _on_recording(
             done_s = (frame.stamp_ns - start_ns[0]) * 1e-9
             bar.update(task, completed=done_s, description=f"{keyframes} keyframes")
 
-        evaluation.remember(frames, show)
+        evaluation.remember(opened.frames, show)
         bar.update(task, description="reranking")
-        result = evaluation.judge(truth)
+        result = evaluation.judge(opened.truth)
     notes = [
         f"{bag}: every keyframe against those at least {settings.loop.min_time_gap_s:g} s older and "
         f"{settings.loop.min_travel_m:g} m back along the path. {result.keyframes} keyframes with a true pose, "
         f"{result.scores['fused'].queries} of them revisits; the others can only be wrong."
     ]
-    if not truth.has_orientation:
+    if not opened.truth.has_orientation:
         notes.append("The truth has no headings: a match is true within 12 m, whatever its heading.")
     report = result.write(folder, notes)
     report.show(console, folder)
@@ -228,10 +209,3 @@ def _on_places(listing: Path, embedder: str | None, weights: Path | None, out: P
     report.write(folder)
     report.show(console, folder)
     return report.figures
-
-
-def _bar(console: Console) -> Progress:
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %")
-    return Progress(*columns, TimeRemainingColumn(), console=console, transient=True)

@@ -42,9 +42,13 @@ def command(
         Path | None, typer.Option(help="Write training shards to this folder instead; those there are kept.")
     ] = None,
     worlds: Annotated[str, typer.Option(help="Seeds of the shards, as first:last+1.")] = "0:8",
+    every: Annotated[int, typer.Option(min=1, help="Every n-th sample of the shards' passes: a smaller set.")] = 1,
     sequences: Annotated[str, typer.Option(help="Shards of named sequences instead: etna (7) or thesis (13).")] = "",
     contact_sheet: Annotated[Path | None, typer.Option(help="Write a PNG of 24 frames and 6 scans instead.")] = None,
     workers: Annotated[int, typer.Option(min=1, max=64, help="Threads that render.")] = 2,
+    ray: Annotated[
+        str | None, typer.Option(help="Spread --shards by Ray: address of a cluster that sees their folder, or local.")
+    ] = None,
 ) -> None:
     """Simulate a rover with S3LI's sensors: stereo, LiDAR, IMU, odometry, GNSS and ground truth.
 
@@ -56,7 +60,10 @@ def command(
     if contact_sheet is not None:
         _write_contact_sheet(contact_sheet, seed, family or "etna", console)
     elif shards is not None:
-        _write_shards(shards, worlds, sequences, seed, workers, console)
+        if ray is None:
+            _write_shards(shards, worlds, every, sequences, seed, workers, console)
+        else:
+            _spread_shards(shards, worlds, every, sequences, workers, ray, console)
     elif out is not None:
         _write_bag(out, preset, (seed, world), duration, family, aliasing, image_rate, truth, workers, console)
     else:
@@ -94,7 +101,9 @@ def _write_bag(
     console.print(f"{out}: {simulator.duration_s:.0f} s, {scans} scans, {size:.0f} MB", markup=False, soft_wrap=True)
 
 
-def _write_shards(folder: Path, worlds: str, sequences: str, seed: int, workers: int, console: Console) -> None:
+def _write_shards(
+    folder: Path, worlds: str, every: int, sequences: str, seed: int, workers: int, console: Console
+) -> None:
     from umf_ros.lab.simulation.sequences import SEQUENCES
     from umf_ros.lab.simulation.survey import shard_plan, survey_world
 
@@ -111,7 +120,22 @@ def _write_shards(folder: Path, worlds: str, sequences: str, seed: int, workers:
             family, setting = shard_plan(world)
             path = folder / f"world_{world:05d}.npz"
             if not path.exists():
-                _write_shard(path, survey_world(world, family, setting), setting, workers, progress)
+                _write_shard(path, survey_world(world, family, setting, every=every), setting, workers, progress)
+
+
+def _spread_shards(
+    folder: Path, worlds: str, every: int, sequences: str, workers: int, ray: str, console: Console
+) -> None:
+    from umf_ros.lab.simulation.shards import write_world
+    from umf_ros.spread import spread
+
+    if sequences:
+        raise ConfigError("--ray spreads --worlds, not --sequences")
+    paths = {world: folder / f"world_{world:05d}.npz" for world in _seed_range(worlds)}
+    missing = [(path, world, every) for world, path in paths.items() if not path.exists()]
+    with _progress(console) as progress:
+        task = progress.add_task("worlds", total=len(missing))
+        spread(write_world, missing, workers, ray, lambda done: progress.update(task, completed=done))
 
 
 def _write_shard(path: Path, survey: Survey, setting: str, workers: int, progress: Progress) -> None:

@@ -16,6 +16,10 @@ def command(
     train: Annotated[str, typer.Argument(help="Folder of simulated worlds, or a YAML file that lists sequences.")],
     out: Annotated[Path, typer.Option(help="Folder of the run: weights, card, log, checkpoint.")] = Path("runs/train"),
     validation: Annotated[str | None, typer.Option(help="The same, for validation.")] = None,
+    method: Annotated[
+        str | None,
+        typer.Option(help="What learns: metric (UMF), netvlad, minkloc_fusion, dbow2, ... (docs/training.md)."),
+    ] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of training settings.")] = None,
     preset: Annotated[str | None, typer.Option(help="Network: umf_light, umf_scene, umf_lite0, umf_resnet50.")] = None,
     steps: Annotated[int | None, typer.Option(help="Optimiser steps in all.")] = None,
@@ -28,11 +32,33 @@ def command(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
 ) -> None:
     """Train a network; under torchrun, on several processes or GPUs."""
+    if method == "dbow2":
+        _grow_vocabulary(config, train, seed, out)
+        return
     from umf_ros.lab.training.run import load_run
 
-    chosen = {"preset": preset, "steps": steps, "seed": seed, "loss": loss, "start": start}
+    chosen: dict[str, object] = {
+        "method": method,
+        "preset": preset,
+        "steps": steps,
+        "seed": seed,
+        "loss": loss,
+        "start": start,
+    }
     chosen |= {"threads": threads, "workers": workers, "device": device, "validation": validation, "train": train}
     train_with_bar(load_run(config, **chosen), out, resume)
+
+
+def _grow_vocabulary(config: Path | None, train: str, seed: int | None, out: Path) -> None:
+    from rich.console import Console
+
+    from umf_ros.lab.training.vocabulary_fit import fit_vocabulary, vocabulary_settings
+
+    settings = vocabulary_settings(config, train=train, seed=seed)
+    console = Console()
+    with console.status("reading") as status:
+        weights = fit_vocabulary(settings, out, status.update)
+    typer.echo(f"weights: {weights}")
 
 
 def train_with_bar(settings: RunSettings, out: Path, resume: bool) -> None:

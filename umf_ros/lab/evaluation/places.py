@@ -130,22 +130,31 @@ def score_places(
     Raises:
         UmfError: something of the set is missing or damaged.
     """
-    calibration = load_calibration(places.calibration) if places.calibration else None
-    queries, references = (places.frames(folder, calibration) for folder in (places.queries, places.references))
-    positive = read_truth(places.truth, len(queries), len(references))
+    frames, task = read_set(places)
     found = PlaceCollection(embedder)
-    for frame in [*queries, *references]:
+    for frame in frames:
         found.add(frame)
         report()
-    descriptors, asked = found.descriptors("fused"), len(queries)
-    similarity = descriptors[:asked] @ descriptors[asked:].T
-    task, ranking = _task(positive), rank(similarity)
+    descriptors, asked, references = found.descriptors("fused"), len(task.queries), len(task.references)
+    similarity = descriptors[task.queries] @ descriptors[task.references].T
+    ranking = rank(similarity)
     plain = score(task, ranking)
     if not any(keyframe.embedding.image or keyframe.embedding.cloud for keyframe in found.keyframes):
-        return PlaceScores(places.name, len(references), plain, None)
+        return PlaceScores(places.name, references, plain, None)
     ours, theirs = found.keyframes[:asked], found.keyframes[asked:]
     reranking = rerank_all(ours, theirs, ranking, similarity, settings, report)
-    return PlaceScores(places.name, len(references), plain, score(task, reranking.after(RERANKER)))
+    return PlaceScores(places.name, references, plain, score(task, reranking.after(RERANKER)))
+
+
+def read_set(places: PlaceSet) -> tuple[list[Frame], RetrievalTask]:
+    """The queries and then the references of a set, and which of them belong together.
+
+    Raises:
+        UmfError: something of the set is missing or damaged.
+    """
+    calibration = load_calibration(places.calibration) if places.calibration else None
+    queries, references = (places.frames(folder, calibration) for folder in (places.queries, places.references))
+    return [*queries, *references], _task(read_truth(places.truth, len(queries), len(references)))
 
 
 def read_truth(path: Path, queries: int, references: int) -> Mask:
@@ -197,6 +206,7 @@ def _below(base: Path, places: PlaceSet) -> PlaceSet:
 def _task(positive: Mask) -> RetrievalTask:
     """Sets say what is true, and nothing of distance and heading."""
     queries, references = (np.arange(count) for count in positive.shape)
+    references = references + len(queries)
     everything, unknown = np.ones_like(positive), np.zeros(positive.shape)
     return RetrievalTask(queries, references, everything, positive, positive, unknown, unknown)
 

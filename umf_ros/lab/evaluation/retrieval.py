@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -157,8 +157,9 @@ def rerank_all(
     similarity: Array,
     settings: Verification,
     report: Callable[[], None] = lambda: None,
+    ways: Mapping[str, tuple[str, str]] = METHODS,
 ) -> Reranking:
-    """Rerank the candidates of every query with the verifier's reranker, in each of the `METHODS`.
+    """Rerank the candidates of every query with the verifier's reranker, in each of some `METHODS`.
 
     Args:
         queries: Q keyframes.
@@ -167,23 +168,25 @@ def rerank_all(
         similarity: (Q, R) of the global descriptors.
         settings: of the reranker.
         report: called after every query.
+        ways: the methods wanted.
     """
     heads = ranking.order[:, :TOP_K]
-    ways = {name: settings.model_copy(update={"rerank": r, "modalities": m}) for name, (r, m) in METHODS.items()}
-    scores: dict[str, Array] = {method: np.zeros(heads.shape) for method in METHODS}
-    took: dict[str, list[float]] = {method: [] for method in METHODS}
+    chosen = {name: settings.model_copy(update={"rerank": r, "modalities": m}) for name, (r, m) in ways.items()}
+    scores: dict[str, Array] = {method: np.zeros(heads.shape) for method in ways}
+    took: dict[str, list[float]] = {method: [] for method in ways}
     for row, (query, head) in enumerate(zip(queries, heads, strict=True)):
         candidates = [
             (Candidate(column, references[index].stamp_ns, float(similarity[row, index])), references[index])
             for column, index in enumerate(head)
             if index != NOTHING
         ]
-        for method, way in ways.items():
+        for method, way in chosen.items():
             started = time.perf_counter()
             ranked = rerank(query, candidates, way)
             took[method].append(1e3 * (time.perf_counter() - started))
             for item in ranked:
                 scores[method][row, item.candidate.index] = item.order
         report()
-    medians = {reranker: float(np.median(took[f"{reranker} both"])) for reranker in RERANKERS if len(heads)}
+    timed = {reranker: took.get(f"{reranker} both", []) for reranker in RERANKERS}
+    medians = {reranker: float(np.median(each)) for reranker, each in timed.items() if each}
     return Reranking(ranking, scores, medians)

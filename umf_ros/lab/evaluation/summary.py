@@ -100,12 +100,10 @@ class WorldsSummary:
 
     Attributes:
         results: one per world.
-        baselines: scores of other methods, by name and world.
         cost: of the evaluated weights.
     """
 
     results: Sequence[WorldResult]
-    baselines: dict[str, list[Scores]]
     cost: Cost
 
     def of(self, name: str, figure: str = "recall1") -> list[float]:
@@ -135,7 +133,6 @@ class WorldsSummary:
             "Reranking (as UMF table 5.7; its Etna recall@1 beside)": self._reranking(),
             "Lost modalities and unchanged light": self._recalls(["fused", "image black", "cloud empty", "same light"]),
             "Recall@1 by difference of heading": self._yaw(),
-            "Other methods": self._baselines(),
             "Worlds": self._worlds(),
             "Cost": self._costs(),
         }
@@ -156,10 +153,6 @@ class WorldsSummary:
             found = sum(item.recall1 * item.queries for item in bins if item.queries)
             rows.append([bins[0].name, str(queries), percent(found / queries if queries else math.nan)])
         return ["heading differs by", "queries", "recall@1"], rows
-
-    def _baselines(self) -> TextTable:
-        head, rows = scores_table(self.baselines)
-        return head, [*rows, ["chance", percent(mean(self.of("fused", "chance"))), *[""] * (len(head) - 2)]]
 
     def _worlds(self) -> TextTable:
         shown = ["fused", "image", "lidar", "superfeatures both", "ransac both"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,7 +12,7 @@ from umf_ros.frames import Frame, ScanMotion
 from umf_ros.geometry import Array
 from umf_ros.lab.simulation.camera import resized
 from umf_ros.lab.simulation.families import FAMILIES
-from umf_ros.lab.simulation.passes import SETTINGS, Pass, plan_passes
+from umf_ros.lab.simulation.passes import SETTINGS, Pass, plan_passes, thinned
 from umf_ros.lab.simulation.seeds import TEST, VALIDATION
 from umf_ros.lab.simulation.survey import Survey, SurveyFrame
 from umf_ros.lab.simulation.world import World, ground
@@ -85,16 +85,24 @@ class TestWorld:
 
     def __iter__(self) -> Iterator[Visit]:
         """Build the world and drive; takes some seconds before the first frame."""
+        return self.driven(range(len(self.passes)))
+
+    def driven(self, wanted: Collection[int]) -> Iterator[Visit]:
+        """The same, of some passes alone."""
         path = np.concatenate([drive.path for drive in self.passes])
         world = World(self.seed, self.family, SETTINGS["hard"].aliasing, path)
         calibration = load_calibration("simulated")
-        for stamp, sample in enumerate(Survey(world, self.passes, calibration)):
-            yield _visit(stamp, sample, calibration)
+        drives = [
+            drive if number in wanted else thinned(drive, len(drive.path)) for number, drive in enumerate(self.passes)
+        ]
+        for stamp, sample in enumerate(Survey(world, drives, calibration)):
+            if sample.pass_index in wanted:
+                yield _visit(stamp, sample, calibration)
 
 
-def test_worlds(first_seed: int, sampling: Sampling) -> list[TestWorld]:
-    """Four worlds of different families, made from `first_seed` on."""
-    return [TestWorld(first_seed + number, sampling) for number in range(WORLDS)]
+def test_worlds(first_seed: int, sampling: Sampling, count: int = WORLDS) -> list[TestWorld]:
+    """So many worlds of different families, made from `first_seed` on."""
+    return [TestWorld(first_seed + number, sampling) for number in range(count)]
 
 
 def _drives(seed: int, family: str, sampling: Sampling) -> list[Pass]:
@@ -104,14 +112,10 @@ def _drives(seed: int, family: str, sampling: Sampling) -> list[Pass]:
     same_light = replace(offset, label="same light", sun=first.sun)
     return [
         first,
-        _every(offset, sampling.revisit),
-        _every(same_light, sampling.same_light),
-        _every(opposite, sampling.opposite),
+        thinned(offset, sampling.revisit),
+        thinned(same_light, sampling.same_light),
+        thinned(opposite, sampling.opposite),
     ]
-
-
-def _every(drive: Pass, stride: int) -> Pass:
-    return replace(drive, path=drive.path[::stride], yaw=drive.yaw[::stride], tilt=drive.tilt[::stride])
 
 
 def _visit(stamp: int, sample: SurveyFrame, calibration: Calibration) -> Visit:

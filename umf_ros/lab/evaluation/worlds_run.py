@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from umf_ros.config import EmbeddingSettings, Verification
-from umf_ros.embedding import DEFAULT, make_embedder
-from umf_ros.embedding import METHODS as EMBEDDERS
+from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.errors import ConfigError
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array
 from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures
@@ -104,14 +101,6 @@ class WorldEvaluation:
             examples=self._examples(task, reranking.after("ransac both")),
         )
 
-    def compare(self, embedder: Embedder) -> Scores:
-        """Score another embedder on the same frames, after `run`."""
-        rows, places = self._rows((REVISIT,)), PlaceCollection(embedder)
-        for row in rows:
-            places.add(self._frames[row])
-        task, found = self._task(rows), places.descriptors("fused")
-        return score(task, rank(found[task.queries] @ found[task.references].T))
-
     def _remember(self, visit: Visit) -> None:
         modes = {FIRST: ("image", "lidar"), REVISIT: tuple(MODES)}.get(visit.pass_index, ())
         self._places.add(visit.frame, modes)
@@ -158,7 +147,6 @@ class WorldsRun:
         weights: safetensors file or name of shipped weights, or None for the default.
         worlds: to drive through.
         repeats: how often each frame is embedded when time is taken.
-        others: whether to compare with the methods that need no training.
         report: called with the name of what is worked on, and 1 for every frame or query done.
     """
 
@@ -167,7 +155,6 @@ class WorldsRun:
         weights: Path | None,
         worlds: list[TestWorld],
         repeats: int,
-        others: bool,
         report: Callable[[str, int], None],
     ) -> None:
         self._weights = locate_weights(weights)
@@ -175,21 +162,17 @@ class WorldsRun:
         self._settings = Verification()
         wanted = EmbeddingSettings(weights=str(self._weights))
         self._embedder = make_embedder(wanted, super_features=True, features=self._settings.features)
-        self._others = _untrained() if others else {}
 
     def run(self) -> WorldsSummary:
         """Drive through all worlds, then take times."""
         results: list[WorldResult] = []
-        baselines: dict[str, list[Scores]] = {name: [] for name in self._others}
         for world in self._worlds:
             evaluation = WorldEvaluation(world, self._embedder, self._settings, lambda: self._report(world.name, 1))  # noqa: B023
             results.append(evaluation.run())
-            for name, embedder in self._others.items():
-                baselines[name].append(evaluation.compare(embedder))
         self._report("taking times", 0)
         seen = [frame for result in results for pair in result.examples for frame in pair]
         frames = [at_full_size(frame) for frame in seen[:TIMED_FRAMES]]
-        return WorldsSummary(results, baselines, cost_of_weights(self._weights, frames, self._repeats))
+        return WorldsSummary(results, cost_of_weights(self._weights, frames, self._repeats))
 
     def write(self, summary: WorldsSummary, folder: Path, notes: list[str]) -> EvaluationReport:
         """Write tables, figures and pictures.
@@ -219,16 +202,6 @@ class WorldsRun:
         plot_embeddings(folder / "embeddings.png", first.descriptors, first.world_T_body, first.pass_index, first.name)
         pairs = [result.examples[len(result.examples) // 2] for result in results if result.examples]
         _draw_attention(folder, self._weights, self._embedder, pairs)
-
-
-def _untrained() -> dict[str, Embedder]:
-    """The other methods, but for those that need weights which are not shipped."""
-    found: dict[str, Embedder] = {}
-    for name in EMBEDDERS:
-        with suppress(ConfigError):
-            if name != DEFAULT:
-                found[name] = make_embedder(EmbeddingSettings(method=name))
-    return found
 
 
 def _draw_attention(folder: Path, weights: Path, embedder: Embedder, pairs: list[tuple[Frame, Frame]]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,6 +54,11 @@ class Pass:
     tilt: Array
     sun: Sun
     exposure: float
+
+
+def thinned(drive: Pass, every: int) -> Pass:
+    """Every n-th sample of a pass."""
+    return replace(drive, path=drive.path[::every], yaw=drive.yaw[::every], tilt=drive.tilt[::every])
 
 
 def plan_passes(trail: Array, labels: tuple[str, ...], setting: Setting, step_m: float, seed: int) -> list[Pass]:

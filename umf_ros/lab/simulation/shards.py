@@ -22,7 +22,7 @@ import numpy as np
 
 from umf_ros.errors import OutputError
 from umf_ros.geometry import Array
-from umf_ros.lab.simulation.survey import Survey, SurveyFrame
+from umf_ros.lab.simulation.survey import Survey, SurveyFrame, shard_plan, survey_world
 
 
 def write_shard(
@@ -49,6 +49,17 @@ def write_shard(
         samples.append(sample)
         progress(len(samples))
     save(path, _arrays(survey, samples, setting))
+
+
+def write_world(task: tuple[Path, int, int]) -> None:
+    """The shard of a seed, by its plan: a task of its own, of the file, the seed and every how manieth frame.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    path, world, every = task
+    family, setting = shard_plan(world)
+    write_shard(path, survey_world(world, family, setting, every=every), setting, workers=1)
 
 
 def save(path: Path, arrays: dict[str, Array]) -> None:

@@ -14,7 +14,7 @@ from umf_ros.geometry import Array, transform
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, Rendering, resized
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.lidar import Lidar
-from umf_ros.lab.simulation.passes import SETTINGS, Pass, plan_passes
+from umf_ros.lab.simulation.passes import SETTINGS, Pass, plan_passes, thinned
 from umf_ros.lab.simulation.pool import ahead
 from umf_ros.lab.simulation.rover import stand
 from umf_ros.lab.simulation.world import World, ground
@@ -87,15 +87,17 @@ class Survey:
         return SurveyFrame(picture.image, points, depth, pose.astype(np.float32), index, sun)
 
 
-def survey_world(seed: int, family: str, setting: str, calibration: Calibration | None = None) -> Survey:
-    """The passes that a shard holds: two or three, at 1.2 or 1.6 m steps."""
+def survey_world(
+    seed: int, family: str, setting: str, calibration: Calibration | None = None, every: int = 1
+) -> Survey:
+    """The passes that a shard holds: two or three, at `every` times 1.2 or 1.6 m steps."""
     chosen = SETTINGS[setting]
     rng = np.random.default_rng([seed, 5])
     labels, step = _itinerary(rng)
     relief = ground(seed, family, chosen.aliasing)
     passes = plan_passes(relief.trail, labels, chosen, step, seed)
     world = World(seed, family, chosen.aliasing, np.concatenate([drive.path for drive in passes]), relief)
-    return Survey(world, passes, calibration)
+    return Survey(world, [thinned(drive, every) for drive in passes], calibration)
 
 
 def _itinerary(rng: np.random.Generator) -> tuple[tuple[str, ...], float]:

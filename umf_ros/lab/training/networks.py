@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,10 +12,12 @@ from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from umf_ros.errors import OutputError, WeightsError
+from umf_ros.errors import ConfigError, OutputError, WeightsError
 from umf_ros.networks.config import NetworkConfig
-from umf_ros.networks.umf import UMF
-from umf_ros.networks.weights import SCALE
+from umf_ros.networks.image_encoder import ResidualBlock
+from umf_ros.networks.umf import UMF, channels_last
+from umf_ros.networks.voxel_encoder import ResidualBlock3d
+from umf_ros.networks.weights import SCALE, load_weights
 
 Precision = Literal["half", "int8"]
 SMALL = 4096
@@ -64,6 +67,57 @@ def fine_layers(network: UMF) -> list[nn.Module]:
     return [pyramid.fine, pyramid.laterals[0], pyramid.laterals[1], voxels.fine, voxels.up_fine]
 
 
+def make_network(preset: str, start: str, image_size: tuple[int, int] | None = None) -> UMF:
+    """A fresh network to train, or one that starts from weights.
+
+    The weights may be those of another image size, and of fewer residual blocks: the further ones begin
+    by changing nothing.
+
+    Args:
+        preset: its name.
+        start: weights file; empty: none.
+        image_size: height and width of the input; None: the preset's.
+
+    Raises:
+        ConfigError: the preset is unknown, or the weights are those of another one.
+        WeightsError: they cannot be read.
+    """
+    if preset not in PRESETS:
+        raise ConfigError(f"preset: unknown network {preset}; known: {', '.join(PRESETS)}")
+    config = PRESETS[preset]
+    if image_size:
+        config = replace(config, image_size=image_size)
+    network = UMF(config)
+    if start:
+        trained = load_weights(Path(start))
+        grown = {name: getattr(config, name) for name in ("image_size", "backbone", "voxel_blocks")}
+        if replace(trained.config, **grown) != config or not _grow(network, trained):
+            raise ConfigError(f"start: {start} is not a {preset}")
+    channels_last(network)
+    return network.train()
+
+
+def _grow(network: UMF, trained: UMF) -> bool:
+    """Fill a network from one that may lack some of its residual blocks; False where more differs than that."""
+    known, wanted = trained.state_dict(), network.state_dict()
+    new = []
+    for name, module in network.named_modules():
+        if isinstance(module, ResidualBlock | ResidualBlock3d) and not any(key.startswith(f"{name}.") for key in known):
+            new.append(f"{name}.")
+            _silence(module)
+    old = {key for key in wanted if not key.startswith(tuple(new))}
+    if known.keys() != old or any(known[key].shape != wanted[key].shape for key in known):
+        return False
+    network.load_state_dict(known, strict=False)
+    return True
+
+
+def _silence(block: ResidualBlock | ResidualBlock3d) -> None:
+    """Make a residual block the identity: its last normalisation lets nothing through."""
+    norms = [layer for layer in block.layers.modules() if isinstance(layer, nn.BatchNorm2d | nn.BatchNorm3d)]
+    nn.init.zeros_(norms[-1].weight)
+
+
 def save_weights(network: UMF, path: Path, card: dict[str, Any], precision: Precision = "half") -> None:
     """Write the weights, rounded, and `<name>.json` with the card and the architecture.
 
@@ -77,7 +131,17 @@ def save_weights(network: UMF, path: Path, card: dict[str, Any], precision: Prec
     Raises:
         OutputError: the files cannot be written.
     """
-    architecture = network.config.as_dict()
+    save_tensors(network, path, card, network.config.as_dict(), precision)
+
+
+def save_tensors(
+    network: nn.Module, path: Path, card: dict[str, Any], architecture: dict[str, Any], precision: Precision
+) -> None:
+    """The same for any network, of which `architecture` says what is to be built before they are read.
+
+    Raises:
+        OutputError: the files cannot be written.
+    """
     tensors: dict[str, Tensor] = {}
     for name, value in network.state_dict().items():
         coarse = precision == "int8" and value.is_floating_point() and value.ndim > 1 and value.numel() >= SMALL

@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from umf_ros.errors import ConfigError
 from umf_ros.lab import training
 from umf_ros.lab.datasets.sample import SampleSequence
+from umf_ros.lab.training.networks import Precision, make_network, save_weights
 from umf_ros.lab.training.settings import RunSettings
-from umf_ros.networks.umf import UMF
 
 SUFFIX = "_objective"
 
@@ -63,10 +63,29 @@ class Objective(nn.Module, ABC):
     """
 
     settings_type: ClassVar[type[RunSettings]]
+    network: Any
 
-    def __init__(self, network: UMF, settings: Any) -> None:
+    def __init__(self, network: nn.Module, settings: Any) -> None:
         super().__init__()
         self.network = network
+
+    @classmethod
+    def make_network(cls, settings: Any) -> nn.Module:
+        """The network that the settings ask for, fresh or from weights.
+
+        Raises:
+            ConfigError: there is no such network.
+            WeightsError: the weights to start from cannot be used.
+        """
+        return make_network(settings.preset, settings.start, settings.image_size)
+
+    def save(self, path: Path, card: dict[str, Any], precision: Precision) -> None:
+        """Write the weights and their card.
+
+        Raises:
+            OutputError: they cannot be written.
+        """
+        save_weights(self.network, path, card, precision)
 
     @abstractmethod
     def batch_maker(self, sequences: Sequence[SampleSequence], rank: int) -> Callable[[int], Batch]:

@@ -6,7 +6,6 @@ import platform
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +17,12 @@ from umf_ros.config import problems
 from umf_ros.errors import ConfigError
 from umf_ros.lab.datasets.listed import Source, open_source
 from umf_ros.lab.training.distributed import join_team
-from umf_ros.lab.training.networks import PRESETS, read_card, save_weights
+from umf_ros.lab.training.networks import read_card
 from umf_ros.lab.training.objective import find_objective
 from umf_ros.lab.training.progress import Progress
 from umf_ros.lab.training.settings import RunSettings, write_settings
 from umf_ros.lab.training.trainer import Trainer
-from umf_ros.networks.image_encoder import ResidualBlock
-from umf_ros.networks.umf import UMF, channels_last, count_parameters
-from umf_ros.networks.voxel_encoder import ResidualBlock3d
-from umf_ros.networks.weights import load_weights
+from umf_ros.networks.umf import count_parameters
 from umf_ros.yaml_files import read_values
 
 
@@ -70,9 +66,9 @@ def train(settings: RunSettings, output: Path, resume: bool, report: Callable[[P
     torch.manual_seed(settings.seed)
     data = _open_data(settings.train)
     earlier = earlier_runs(settings.start)
-    weights = output / f"{settings.preset}{settings.weights_suffix}.safetensors"
+    weights = output / f"{settings.weights_name}.safetensors"
     with join_team(settings.device) as team:
-        network = make_network(settings.preset, settings.start, settings.image_size)
+        network = objective_type.make_network(settings)
         objective = objective_type(network, settings)
         write_settings(settings, output / "training.yaml")
         trainer = Trainer(objective, data.refresh, settings, output, team)
@@ -81,7 +77,7 @@ def train(settings: RunSettings, output: Path, resume: bool, report: Callable[[P
 
         def keep() -> None:
             card = _card(settings, weights.stem, network, data, trainer.progress)
-            save_weights(network, weights, card | {"earlier_runs": earlier} | objective.card(), settings.stored)
+            objective.save(weights, card | {"earlier_runs": earlier} | objective.card(), settings.stored)
 
         trainer.run(report, keep)
     return weights
@@ -93,57 +89,6 @@ def _open_data(where: str) -> Source:
     if not source.refresh():
         raise ConfigError(f"train: there are no worlds in {where}")
     return source
-
-
-def make_network(preset: str, start: str, image_size: tuple[int, int] | None = None) -> UMF:
-    """A fresh network to train, or one that starts from weights.
-
-    The weights may be those of another image size, and of fewer residual blocks: the further ones begin
-    by changing nothing.
-
-    Args:
-        preset: its name.
-        start: weights file; empty: none.
-        image_size: height and width of the input; None: the preset's.
-
-    Raises:
-        ConfigError: the preset is unknown, or the weights are those of another one.
-        WeightsError: they cannot be read.
-    """
-    if preset not in PRESETS:
-        raise ConfigError(f"preset: unknown network {preset}; known: {', '.join(PRESETS)}")
-    config = PRESETS[preset]
-    if image_size:
-        config = replace(config, image_size=image_size)
-    network = UMF(config)
-    if start:
-        trained = load_weights(Path(start))
-        grown = {name: getattr(config, name) for name in ("image_size", "backbone", "voxel_blocks")}
-        if replace(trained.config, **grown) != config or not _grow(network, trained):
-            raise ConfigError(f"start: {start} is not a {preset}")
-    channels_last(network)
-    return network.train()
-
-
-def _grow(network: UMF, trained: UMF) -> bool:
-    """Fill a network from one that may lack some of its residual blocks; False where more differs than that."""
-    known, wanted = trained.state_dict(), network.state_dict()
-    new = []
-    for name, module in network.named_modules():
-        if isinstance(module, ResidualBlock | ResidualBlock3d) and not any(key.startswith(f"{name}.") for key in known):
-            new.append(f"{name}.")
-            _silence(module)
-    old = {key for key in wanted if not key.startswith(tuple(new))}
-    if known.keys() != old or any(known[key].shape != wanted[key].shape for key in known):
-        return False
-    network.load_state_dict(known, strict=False)
-    return True
-
-
-def _silence(block: ResidualBlock | ResidualBlock3d) -> None:
-    """Make a residual block the identity: its last normalisation lets nothing through."""
-    norms = [layer for layer in block.layers.modules() if isinstance(layer, nn.BatchNorm2d | nn.BatchNorm3d)]
-    nn.init.zeros_(norms[-1].weight)
 
 
 def earlier_runs(start: str) -> list[dict[str, Any]]:
@@ -162,7 +107,7 @@ def earlier_runs(start: str) -> list[dict[str, Any]]:
     return [*card.get("earlier_runs", []), {name: card.get(name) for name in told}]
 
 
-def _card(settings: RunSettings, name: str, network: UMF, data: Source, progress: Progress) -> dict[str, Any]:
+def _card(settings: RunSettings, name: str, network: nn.Module, data: Source, progress: Progress) -> dict[str, Any]:
     """What every card says; of folders and files only the names, in the command too."""
     words = [re.sub(r"[^=]*/", "", word.rstrip("/")) for word in sys.argv[1:]]
     said = settings.model_dump()

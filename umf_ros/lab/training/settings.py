@@ -41,6 +41,38 @@ class RunSettings(Group):
     workers: int = Field(0, ge=0, description="processes that prepare batches ahead; 0: the training one itself")
     device: str = Field("auto", description="torch device; auto: a GPU when there is one")
 
+    @property
+    def weights_name(self) -> str:
+        """Of the weights file."""
+        return f"{self.preset}{self.weights_suffix}"
+
+
+class DescriptorSettings(RunSettings):
+    """Training of another method's network."""
+
+    method: str = Field(description="whose network")
+    validation: str = Field("", description="as train, for validation; empty: the latest weights are kept")
+    warmup_steps: int = Field(20, ge=0, description="linear warm-up")
+    steps: int = Field(600, ge=1, description="optimiser steps in all")
+    epoch_steps: int = Field(25, ge=1, description="steps between validations; new worlds are picked up there")
+    batch: int = Field(48, ge=4, description="frames per step, half of them positives of the others")
+    batch_limit: int = Field(96, ge=4, description="largest batch")
+    batch_growth: float = Field(1.4, ge=1, description="factor when too few triplets are active")
+    active_share: float = Field(0.7, ge=0, le=1, description="share of active triplets below which the batch grows")
+    loss: Literal["neighbourhood", "triplet"] = Field(
+        "neighbourhood",
+        description="as UMF learns, from batches all over one world; or batch-hard triplets, half along one stretch",
+    )
+    margin: float = Field(0.2, gt=0, description="of the triplet loss")
+    patience: int = Field(6, ge=0, description="validations without progress before stopping; 0: never")
+    variants: int = Field(2, ge=1, description="augmentations of every image, whose early maps are remembered")
+    half: bool = Field(False, description="bfloat16 mixed precision")
+
+    @property
+    def weights_name(self) -> str:
+        """Of the weights file."""
+        return self.method
+
 
 class MetricSettings(RunSettings):
     """Metric learning of one network."""

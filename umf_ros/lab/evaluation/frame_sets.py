@@ -1,0 +1,105 @@
+"""What all methods are asked: simulated worlds, sequences, a recording, still images and scans, as frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from umf_ros.config import Database, Settings
+from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.errors import UmfError
+from umf_ros.frames import Frame, ScanMotion
+from umf_ros.geometry import Array
+from umf_ros.lab.datasets.labels import Rule
+from umf_ros.lab.datasets.sample import SampleSequence
+from umf_ros.lab.evaluation.methods_run import FrameSet
+from umf_ros.lab.evaluation.places import PlaceSet, read_set
+from umf_ros.lab.evaluation.protocol import RetrievalTask, loop_closure, place_recognition, revisits
+from umf_ros.lab.evaluation.worlds import FIRST, REVISIT, TestWorld
+from umf_ros.lab.simulation.camera import resized
+from umf_ros.loop_detector import LoopDetector
+from umf_ros.trajectory import Trajectory
+
+
+def world_set(world: TestWorld) -> FrameSet:
+    """The first drive and the one on an offset path under another sun."""
+    poses: list[Array] = []
+    passes: list[int] = []
+
+    def frames() -> Iterator[Frame]:
+        for visit in world.driven((FIRST, REVISIT)):
+            poses.append(visit.world_T_body)
+            passes.append(visit.pass_index)
+            yield visit.frame
+
+    return FrameSet(world.name, frames(), lambda: place_recognition(np.stack(poses), np.array(passes)))
+
+
+def sequence_set(sequence: SampleSequence, rule: Rule) -> FrameSet:
+    """A sequence: in a simulated world later passes are asked for the first, in a recording for all earlier ones."""
+    protocol = revisits if sequence.setting == "real" else place_recognition
+
+    def frames() -> Iterator[Frame]:
+        for index in range(len(sequence)):
+            yield _frame(sequence, index)
+
+    def task() -> RetrievalTask:
+        return protocol(np.asarray(sequence.world_T_body), np.asarray(sequence.pass_index), rule)
+
+    return FrameSet(sequence.name, frames(), task)
+
+
+def recording_set(name: str, frames: Iterable[Frame], truth: Trajectory, settings: Settings) -> FrameSet:
+    """The keyframes that the detector would choose, each asked for its own past.
+
+    Its task raises:
+        UmfError: the truth covers none of them.
+    """
+    kept: list[tuple[int, float]] = []
+    # who embeds is of no account: nothing is asked of the detector but which frames it keeps
+    detector = LoopDetector(settings.model_copy(update={"database": Database()}), ThumbnailEmbedder())
+
+    def keyframes() -> Iterator[Frame]:
+        for frame in frames:
+            if frame.session:
+                return
+            if detector.select(frame) and truth.at(np.array([frame.stamp_ns]))[1][0]:
+                kept.append((frame.stamp_ns, detector.embed(frame).travelled_m))
+                yield frame
+
+    def task() -> RetrievalTask:
+        if not kept:
+            raise UmfError("the ground truth covers none of the keyframes; do the clocks agree?")
+        stamps, travelled = np.array([one[0] for one in kept], np.int64), np.array([one[1] for one in kept])
+        return loop_closure(stamps, truth.at(stamps)[0], travelled, settings.loop, truth.has_orientation)
+
+    return FrameSet(name, keyframes(), task, unanswerable_count=True)
+
+
+def still_set(places: PlaceSet) -> FrameSet:
+    """Queries, then references, of a set of still images or scans.
+
+    Raises:
+        UmfError: something of the set is missing or damaged.
+    """
+    frames, task = read_set(places)
+    return FrameSet(places.name, frames, lambda: task)
+
+
+def _frame(sequence: SampleSequence, index: int) -> Frame:
+    sample = sequence.sample(index)
+    camera = sample.camera
+    if sample.image is not None:
+        height, width = sample.image.shape
+        camera = resized(camera, width, height)
+    return Frame(
+        stamp_ns=index,
+        camera=camera,
+        body_T_camera=sample.body_T_camera,
+        body_T_lidar=np.eye(4),
+        left=sample.image,
+        points=sample.points,
+        intensity=sample.intensity,
+        motion=None if sample.points is None else ScanMotion.none(len(sample.points)),
+    )

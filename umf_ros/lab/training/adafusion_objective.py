@@ -1,0 +1,26 @@
+"""AdaFusion, as its network in `umf_ros.networks` says what it reads."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from umf_ros.lab.training.descriptors import DescriptorObjective
+from umf_ros.lab.training.settings import DescriptorSettings
+
+
+class AdaFusionSettings(DescriptorSettings):
+    """What it was trained with."""
+
+    method: Literal["adafusion"] = "adafusion"
+    learning_rate: float = Field(5e-4, gt=0, description="peak of the cosine schedule")
+
+
+class AdaFusionObjective(DescriptorObjective):
+    """Nothing of its own."""
+
+    settings_type = AdaFusionSettings
+
+
+OBJECTIVE = AdaFusionObjective

@@ -1,0 +1,216 @@
+"""Training of other methods' networks: by UMF's own loss, or by batch-hard triplets [Komorowski 2021].
+
+The early stages of an image trunk are frozen, so their maps are computed once for each variant of an image and
+remembered: what learns is small, and learns in minutes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from umf_ros.embedding.place_inputs import stack, stack_images
+from umf_ros.lab.datasets.labels import Rule
+from umf_ros.lab.datasets.listed import open_source
+from umf_ros.lab.datasets.sample import Sample, SampleSequence
+from umf_ros.lab.evaluation.protocol import place_recognition
+from umf_ros.lab.evaluation.results import mean
+from umf_ros.lab.evaluation.retrieval import rank
+from umf_ros.lab.evaluation.scores import score
+from umf_ros.lab.training.descriptor_batches import Key, PlaceBatch, PlaceViews
+from umf_ros.lab.training.losses import batch_hard_triplet, neighbourhood_components
+from umf_ros.lab.training.metric_loss import Bank, Relations, relate
+from umf_ros.lab.training.networks import Precision, save_tensors
+from umf_ros.lab.training.objective import Judgement, Objective, generator
+from umf_ros.lab.training.sampler import PairSampler
+from umf_ros.lab.training.settings import DescriptorSettings, RunSettings
+from umf_ros.networks.place_network import PlaceInput, PlaceNetwork
+from umf_ros.networks.place_networks import load_place_network, make_place_network
+from umf_ros.networks.weights import load_weights
+from umf_ros.networks.weights_files import locate_weights
+
+RULE = Rule(negative_m=20.0, negative_deg=40.0, between_passes=True)
+"""A later pass looks for itself in an earlier one."""
+TRUNK_FROM = "umf_scene"
+"""Shipped weights that hold the published trunk."""
+
+
+class DescriptorObjective(Objective):
+    """Trains one of `umf_ros.networks.place_networks`.
+
+    Args:
+        network: trained in place.
+        settings: of the run.
+    """
+
+    settings_type: ClassVar[type[RunSettings]] = DescriptorSettings
+    network: PlaceNetwork
+
+    def __init__(self, network: PlaceNetwork, settings: DescriptorSettings) -> None:
+        super().__init__(network, settings)
+        self._settings = settings
+        self._validation = open_source(Path(settings.validation)).refresh if settings.validation else list
+        self._sequences: Sequence[SampleSequence] = []
+        self._sampler: PairSampler | None = None
+        self._maps: dict[Key, Tensor] = {}
+        self._plain: dict[str, tuple[PlaceInput, Tensor]] = {}
+        self._views = PlaceViews(network.reads)
+        self.batch_size, self.best, self.stale = settings.batch, -1.0, 0
+        self.untrained: dict[str, float] = {}
+
+    @classmethod
+    def make_network(cls, settings: DescriptorSettings) -> PlaceNetwork:
+        """A fresh network on the published trunk, or one that starts from weights."""
+        if settings.start:
+            return load_place_network(settings.method, Path(settings.start))
+        network = make_place_network(settings.method)
+        if network.trunk is not None:
+            scene = load_weights(locate_weights(Path(TRUNK_FROM))).scene
+            assert scene is not None
+            network.trunk.network.load_state_dict(scene.trunk.state_dict())
+        return network
+
+    def save(self, path: Path, card: dict[str, Any], precision: Precision) -> None:
+        """Write the weights and their card."""
+        save_tensors(self.network, path, card, {"method": self._settings.method}, precision)
+
+    def batch_maker(self, sequences: Sequence[SampleSequence], rank: int) -> Callable[[int], PlaceBatch]:
+        """What makes the batch of a step: pairs of views.
+
+        Raises:
+            ConfigError: no place of these sequences is visited twice.
+        """
+        if self._sampler is None or len(self._sequences) != len(sequences):  # to find all revisits takes its time
+            self._sampler = PairSampler(sequences, RULE, whole=self._settings.loss == "neighbourhood")
+        sampler, self._sequences = self._sampler, sequences
+        if not self.untrained:
+            self.begin()
+            self.settle()
+            self.untrained = self.recalls()
+        pairs, seed = self.batch_size // 2, self._settings.seed
+
+        def make(step: int) -> PlaceBatch:
+            rng = generator(seed, step, rank)
+            drawn = sampler.draw(pairs, rng)
+            draws = [anchor for anchor, _ in drawn] + [positive for _, positive in drawn]
+            return self._views.batch(sequences, draws, self._settings, rng)
+
+        return make
+
+    def begin(self) -> None:
+        """Prepare a fresh network, before its first step."""
+
+    def settle(self) -> None:
+        """Fit what is not learned, before the network is judged."""
+
+    def forward(self, batch: PlaceBatch) -> dict[str, Tensor]:
+        """The losses of the descriptor and of the modalities that have one of their own."""
+        found = self.network(self._with_maps(batch))
+        relations = relate(batch.places, Bank(0, 1).places, RULE, found["descriptor"].device)
+        image, cloud = self.network.weight_image, self.network.weight_cloud
+        weights = {"descriptor": 1 - image - cloud, "image": image, "cloud": cloud}
+        losses, active = {}, found["descriptor"].new_zeros(())
+        for name, weight in weights.items():
+            if not weight:
+                continue
+            unit = F.normalize(found[name].float(), dim=1)
+            loss, share = self._loss(unit @ unit.T, relations)
+            losses[name], active = loss, share if name == "descriptor" else active
+        total = sum((weights[name] * loss for name, loss in losses.items()), start=active.new_zeros(()))
+        return losses | {"total": total, "active": active}
+
+    def _loss(self, similarity: Tensor, relations: Relations) -> tuple[Tensor, Tensor]:
+        """The loss, and the share of rows that have something to learn."""
+        positive, negative = relations.positive, relations.negative
+        if self._settings.loss == "triplet":
+            return batch_hard_triplet(similarity, positive, negative, self._settings.margin)
+        best = similarity.masked_fill(~positive, -1.0).amax(1)
+        worst = similarity.masked_fill(~negative, -1.0).amax(1)
+        return neighbourhood_components(similarity, positive, negative), (best < worst).float().mean()
+
+    def finish_epoch(self, losses: Mapping[str, float]) -> None:
+        """Let the batches of the triplet loss grow while too few triplets are active."""
+        settings = self._settings
+        if settings.loss == "triplet" and losses["active"] < settings.active_share:
+            self.batch_size = min(int(self.batch_size * settings.batch_growth) // 2 * 2, settings.batch_limit)
+
+    def judge(self, step: int, folder: Path) -> Judgement:
+        """Recall on the validation worlds."""
+        self.settle()
+        found = self.recalls()
+        better = not found or found["recall1"] > self.best
+        self.best = max(self.best, found.get("recall1", -1.0))
+        self.stale = 0 if better else self.stale + 1
+        stop = bool(self._settings.patience) and self.stale >= self._settings.patience
+        return Judgement(better, stop, found | {f"{name}_untrained": value for name, value in self.untrained.items()})
+
+    def card(self) -> dict[str, Any]:
+        """How good it was before and is now."""
+        return {"untrained": self.untrained, "validation_recall1": round(self.best, 4)}
+
+    def recalls(self) -> dict[str, float]:
+        """Mean recall at one and five of later passes of the validation worlds, asked for the first."""
+        worlds = self._validation()
+        results = []
+        for world in worlds:
+            task = place_recognition(np.asarray(world.world_T_body), np.asarray(world.pass_index))
+            found = self.describe(world)
+            results.append(score(task, rank(found[task.queries] @ found[task.references].T)))
+        if not results:
+            return {}
+        return {name: mean([getattr(one, name) for one in results]) for name in ("recall1", "recall5")}
+
+    def describe(self, world: SampleSequence) -> np.ndarray:
+        """Unit descriptors (N, D) of all samples of a world, as they are in use."""
+        self.network.eval()
+        if world.name not in self._plain:
+            views = [self._views.plain(world.sample(index)) for index in range(len(world))]
+            self._plain[world.name] = stack(views, None), self._see(stack_images(views)).half()
+        whole, maps = self._plain[world.name]
+        device = next(self.network.parameters()).device
+        parts = []
+        for start in range(0, len(world), 32):
+            rows = slice(start, start + 32)
+            batch = PlaceInput(*(part[rows] for part in whole))._replace(maps=maps[rows].float())
+            with torch.inference_mode():
+                parts.append(F.normalize(self.network(batch.to(device))["descriptor"].float(), dim=1).cpu())
+        return torch.cat(parts).numpy()
+
+    def early_maps(self, samples: Sequence[Sample]) -> Tensor:
+        """Maps (N, 80, 10, 14) of some samples as they are."""
+        return self._see(stack_images([self._views.plain(sample) for sample in samples]))
+
+    def _with_maps(self, batch: PlaceBatch) -> PlaceInput:
+        if "image" not in self.network.reads:
+            return batch.input
+        new = [row for row, key in enumerate(batch.keys) if key not in self._maps]
+        if new:
+            for row, found in zip(new, self._see(batch.images[new]), strict=True):
+                self._maps[batch.keys[row]] = found.half()
+        maps = torch.stack([self._maps[key] for key in batch.keys]).float()
+        return batch.input._replace(maps=maps.to(batch.input.maps.device))
+
+    def _see(self, images: Tensor) -> Tensor:
+        """Early maps of images, on the CPU."""
+        trunk = self.network.trunk
+        if trunk is None or "image" not in self.network.reads:
+            return torch.zeros(len(images), 0)
+        device = next(trunk.parameters()).device
+        with torch.no_grad():
+            return torch.cat([trunk.early(part.to(device)).cpu() for part in images.split(16)])
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """For a checkpoint: what is not a weight."""
+        names = ("batch_size", "best", "stale", "untrained")
+        return {name: getattr(self, name) for name in names}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Inverse of `get_extra_state`."""
+        for name, value in state.items():
+            setattr(self, name, value)

@@ -1,0 +1,26 @@
+"""MinkLoc++'s image branch alone, as its network in `umf_ros.networks` says what it reads."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from umf_ros.lab.training.descriptors import DescriptorObjective
+from umf_ros.lab.training.settings import DescriptorSettings
+
+
+class MinkLocVisualSettings(DescriptorSettings):
+    """What it was trained with."""
+
+    method: Literal["minkloc_visual"] = "minkloc_visual"
+    learning_rate: float = Field(3e-4, gt=0, description="peak of the cosine schedule")
+
+
+class MinkLocVisualObjective(DescriptorObjective):
+    """Nothing of its own."""
+
+    settings_type = MinkLocVisualSettings
+
+
+OBJECTIVE = MinkLocVisualObjective
