@@ -11,7 +11,9 @@ from umf_ros.config import Database, Loop, Verification
 from umf_ros.geometry import invert, relative, rotation_angle
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
+from umf_ros.submaps.proposals import Proposal
 from umf_ros.verification import Verdict
+from umf_ros.verification.constants import SUBMAP_NEAR_M
 
 
 def replay(outing: Drive, database: PlaceDatabase, **settings: float) -> Iterator[tuple[int, list[Verdict]]]:
@@ -35,6 +37,26 @@ def test_a_way_driven_back_is_recognised_with_the_right_pose(outing: Drive, data
             closed.add(i)
     back = range(len(outing.truth) // 2 + 14, len(outing.truth))
     assert len(closed & set(back)) > 0.8 * len(back)
+
+
+def test_stops_far_apart_are_not_joined_however_well_they_fit(outing: Drive, database: PlaceDatabase) -> None:
+    finder = SubmapFinder(Verification(), Loop(), database)
+    query, true = outing.keyframes[-8], outing.truth[-8]
+    for keyframe in outing.keyframes[:-8]:
+        database.add(keyframe)
+        finder.remember(keyframe)
+    stamps = {keyframe.stamp_ns: i for i, keyframe in enumerate(outing.keyframes)}
+    accepted, refused = [], []
+    for row, stop in enumerate(finder.trail.stops[: len(finder.trail.stops) // 2]):
+        pose = relative(outing.truth[stamps[stop.stamp_ns]], true)
+        tested = finder.test(query, Proposal(row, pose))
+        if tested is not None and np.linalg.norm(pose[:3, 3]) < 8:
+            verdict = finder._judge(tested)
+            (accepted if verdict.closure else refused).append((np.linalg.norm(pose[:3, 3]), verdict.reason))
+    assert accepted and max(metres for metres, _ in accepted) <= SUBMAP_NEAR_M
+    far = [reason for metres, reason in refused if metres > SUBMAP_NEAR_M + 0.5]
+    assert far and all("m apart, more than 5" in reason or "probability" in reason for reason in far)
+    assert any("m apart" in reason for reason in far)
 
 
 def test_a_limit_on_the_turn_is_kept(outing: Drive, database: PlaceDatabase) -> None:

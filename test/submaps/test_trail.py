@@ -53,18 +53,19 @@ def test_odometry_carries_a_closure_to_the_next_keyframes(trail: Trail, outing: 
     query, later = outing.keyframes[80], outing.keyframes[84]
     match, odometry = outing.keyframes[30], invert(outing.keyframes[30].odom_T_body) @ query.odom_T_body
     off = odometry.copy()
-    off[:3, 3] += 3.0
+    off[:3, 3] += 2.0
     expectation.latest = Found(query, match, off)
     proposal = expectation.propose(later)
     assert proposal is not None
     where = trail.stops[proposal.row].odom_T_body @ proposal.pose
-    assert where[:3, 3] == pytest.approx(match.odom_T_body[:3, :3] @ [3, 3, 3] + later.odom_T_body[:3, 3], abs=0.1)
+    assert where[:3, 3] == pytest.approx(match.odom_T_body[:3, :3] @ [2, 2, 2] + later.odom_T_body[:3, 3], abs=0.1)
 
 
 def test_without_a_closure_odometry_alone_is_believed_for_a_while(trail: Trail, outing: Drive) -> None:
     middle = Expectation(trail, Loop()).propose(outing.keyframes[80])
     assert middle is not None and np.linalg.norm(middle.pose[:2, 3]) < 3
-    last = Expectation(trail, Loop()).propose(outing.keyframes[-1])
+    late = outing.keyframes[-5]
+    last = Expectation(trail, Loop()).propose(late)
     assert last is not None  # the stops at the start would be nearer
-    way_m = outing.keyframes[-1].travelled_m - trail.stops[last.row].travelled_m
+    way_m = late.travelled_m - trail.stops[last.row].travelled_m
     assert const.ODOMETRY_ALONE_M - 2 < way_m <= const.ODOMETRY_ALONE_M

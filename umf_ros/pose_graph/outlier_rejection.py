@@ -41,6 +41,9 @@ _WRONG_BEFORE, _RIGHT_BEFORE = 1, 4
 # what looks alike does so for a while, so wrong closures seldom come alone: of those left undecided at the end of
 # drives in worlds 10200-10473 of benchmarks/pose_graph.py 1 of 67 wrong ones was alone and 59 of 213 right ones
 _WRONG_ALONE = 0.1
+# a wrong closure between sessions that nothing joins is contradicted by nothing: at last two places have to agree, 2.5
+# nats at least (*by hand*; benchmarks/aliased_sessions.py: without, one group of wrong closures joined 4 of 40 graphs)
+_WRONG_BETWEEN = 10.0
 _EVEN = 0.5
 _AGREES = "agrees with the map"
 _SUPPORTED = "supported by other places"
@@ -59,12 +62,14 @@ class MapComparison(NamedTuple):
         misfit_m: metres.
         false_alarm: probability that a wrong closure passes for a right one here.
         ratio: how much likelier a wrong closure misses the map by this than a right one.
+        joined: whether the map says anything about the pair at all.
     """
 
     distance: float
     misfit_m: float
     false_alarm: float
     ratio: float
+    joined: bool = True
 
 
 class OutlierRejection:
@@ -86,6 +91,7 @@ class OutlierRejection:
         self._changed: set[int] = set()
         self._revoked: set[int] = set()
         self._too_far: set[int] = set()
+        self._unjoined: set[int] = set()
         self._ratios: dict[int, float] = {}
         self._brought_close: list[int] = []
         self.scale = NoiseScale()
@@ -209,6 +215,7 @@ class OutlierRejection:
                 continue
             found = self._compare(row)
             self._too_far.discard(row)
+            (self._unjoined.discard if found.joined else self._unjoined.add)(row)
             self._ratios[row] = 1.0
             if self._settings.reject_outliers and found.distance > self._settings.gate_chi2:
                 self._note(row, State.REJECTED, _CONTRADICTS, found.distance, found.misfit_m)
@@ -231,7 +238,7 @@ class OutlierRejection:
             tracked.match, tracked.closure.match_stamp_ns, tracked.query, tracked.closure.query_stamp_ns
         )
         if predicted.covariance is None:
-            return MapComparison(0.0, 0.0, 1.0, 1.0)
+            return MapComparison(0.0, 0.0, 1.0, 1.0, joined=False)
         misfit = invert(tracked.closure.match_T_query) @ predicted.pose
         covariance = (predicted.covariance + self.scale.closures**2 * tracked.covariance)[None]
         distance = squared_mahalanobis(logmap(misfit[None]), covariance)
@@ -322,6 +329,8 @@ class OutlierRejection:
         rejected, accepted = (int((self._table["state"] == state).sum()) for state in (State.REJECTED, State.ACCEPTED))
         prior = (_WRONG_BEFORE + rejected) / (_RIGHT_BEFORE + accepted)
         _, evidence = self._consistency.consistency_set(place[0], self._in_state(State.UNDECIDED))
+        if place[0] in self._unjoined:
+            return odds * max(prior, _WRONG_BEFORE / _RIGHT_BEFORE) * np.exp(-evidence) * _WRONG_BETWEEN
         return odds * prior * np.exp(-evidence) * (_WRONG_ALONE if len(place) == 1 else 1.0)
 
     def _credible(self) -> NDArray[np.bool_]:

@@ -180,8 +180,9 @@ class SubmapFinder:
             return f"only {tested.common:.0%} of the submap in common"
         if 0 < self._settings.max_turn_deg < turn_deg:
             return f"turned by {turn_deg:.0f} deg, more than {self._settings.max_turn_deg:g}"
-        if shift_m > self._settings.max_shift_m:
-            return f"{shift_m:.1f} m apart, more than {self._settings.max_shift_m:g}"
+        most_m = min(self._settings.max_shift_m, const.SUBMAP_NEAR_M)
+        if shift_m > most_m:
+            return f"{shift_m:.1f} m apart, more than {most_m:g}"
         return ""
 
 
