@@ -45,7 +45,9 @@ setup(
     ],
     python_requires=">=3.11",
     install_requires=required("requirements.txt"),
-    extras_require={extra: required(f"requirements-{extra}.txt") for extra in ("ros", "lab", "fleet", "rerun", "dev")},
+    extras_require={
+        extra: required(f"requirements-{extra}.txt") for extra in ("ros", "lab", "fleet", "rerun", "peers", "dev")
+    },
     zip_safe=True,
     description="Multimodal place recognition and loop closure for rovers with a camera and a LiDAR",
     license="Apache-2.0",

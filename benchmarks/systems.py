@@ -45,7 +45,7 @@ WINDOW_M = 25.0
 TRUE_M, TRUE_DEG = 3.0, 15.0
 PAIRED = 4
 """Every so many-th keyframe is a query of KISS-Matcher, which takes half a second for each."""
-PINNED = ("kiss-slam==0.0.2", "map-closures==2.2.0", "kiss-matcher==1.0.2", "small_gicp==1.0.1")
+PINNED = Path(__file__).parents[1] / "requirements-peers.txt"
 OURS: dict[str, dict[str, Any]] = {
     "fused": {},
     "lidar": {"topics": {"left_image": "/none/left", "right_image": ""}},
@@ -248,7 +248,9 @@ def run_peer(name: str, drive: Drive, folder: Path, python: Path) -> SystemRun:
     script = Path(__file__).with_name("system_peers.py")
     command = [str(python), str(script), peer, str(drive.files), str(asked), str(answer)]
     clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=clean)
+    done = subprocess.run(command, capture_output=True, text=True, env=clean)  # they print much
+    if done.returncode:
+        raise typer.BadParameter(f"{name} failed: {done.stderr.strip()[-300:]}")
     told = json.loads(answer.read_text())
     closures = [
         FoundClosure(one["query"], one["match"], tuple(one["query_window"]), np.array(one["match_T_query"]))
@@ -267,7 +269,7 @@ def peers_python(folder: Path) -> Path:
     python = folder / "bin" / "python"
     if not python.exists():
         subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
-        subprocess.run([str(python), "-m", "pip", "install", "--quiet", *PINNED], check=True)
+        subprocess.run([str(python), "-m", "pip", "install", "--quiet", "-r", str(PINNED)], check=True)
     return python
 
 

@@ -79,9 +79,7 @@ class Killer(threading.Thread):
                         return
 
 
-@pytest.mark.parametrize("way", [("--workers", "2"), ("--ray", "local", "--workers", "2")])
-def test_the_same_map_though_a_worker_is_killed(
-    way: tuple[str, ...],
+def test_ray_makes_the_same_map_though_a_worker_is_killed(
     recordings: list[Path],
     mini_config: Path,
     alone: Path,
@@ -92,6 +90,7 @@ def test_the_same_map_though_a_worker_is_killed(
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (here, os.environ.get("PYTHONPATH", "")))))
     killer = Killer(tmp_path / "map" / "sessions")
     killer.start()
+    way = "--ray", "local", "--workers", "2"
     ended = umf("map", *recordings, "--config", mini_config, "--out", tmp_path / "map", *way)
     assert ended.status == 0, ended.text
     assert killer.killed

@@ -20,11 +20,12 @@ from scipy.spatial.transform import Rotation
 from visualization_msgs.msg import Marker, MarkerArray
 
 from umf_ros.config import Frames
+from umf_ros.fleet.encounters import Encounter
 from umf_ros.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.geometry import Array, make_pose
 from umf_ros.loop_detector import Detection
 from umf_ros.nodes.announcer import MAX_LINES, Announcer
-from umf_ros.nodes.conversions import from_time
+from umf_ros.nodes.conversions import closure_to_message, from_time, is_between_rovers
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS
 from umf_ros.verification import Measurement, Verdict
 
@@ -109,6 +110,21 @@ def test_a_closure_goes_out_as_it_is_documented(talk: Talk) -> None:
     # row by row: x y z rx ry rz
     np.testing.assert_array_equal(message.pose.covariance, COVARIANCE.ravel())
     assert message.twist.covariance[0] == -1.0 and message.twist.twist.linear.x == 0.0
+
+
+def test_a_closure_with_another_rover_names_both(talk: Talk) -> None:
+    found, waiting = accepted(), replace(accepted(8), reason="waits")
+    closure = found.closure
+    assert closure is not None
+    keyframe = at(QUERY_NS, 4.0, 2.0)
+    talk.announcer.announce_encounter(Encounter(keyframe, "ada", "bea", [found, waiting], [closure]))
+    (message,) = talk.hear("/loop_closures")
+    assert message.header.frame_id == f"keyframe/bea/{MATCH_NS}"
+    assert message.child_frame_id == f"keyframe/ada/{QUERY_NS}"
+    assert is_between_rovers(message)
+    (report,) = talk.hear("/front_end/candidates")
+    assert [status.name for status in report.status] == [f"keyframe/bea/{n} -> {QUERY_NS}" for n in (MATCH_NS, 8)]
+    assert not is_between_rovers(closure_to_message(closure))
 
 
 def test_what_was_rejected_is_reported_and_never_published_as_a_closure(talk: Talk) -> None:
