@@ -1,11 +1,11 @@
 """What the package survives: kill -9, damaged input, long drives. Prints a table and writes it as JSON.
 
-    python benchmarks/endurance.py --json endurance.json            (hours)
-    python benchmarks/endurance.py --json endurance.json --quick    (minutes)
+    python benchmarks/endurance.py --json endurance.json --quick              (a quarter of an hour)
+    python benchmarks/endurance.py --json endurance.json --folder endurance   (hours)
 
-Replays are killed at random moments and resumed; the back-end is killed over DDS and started again; inputs are damaged
-in a process of its own with 2 GB of memory. `live_p50_ms` and `live_p95_ms` need a recording played to both nodes and a
-machine with nothing else to do: with --live.
+Replays and both live nodes are killed at random moments and go on; two robots live at once; inputs are damaged in a
+process of their own with 2 GB of memory. Each part is done in steps, and what a step found is kept in the folder: a
+run that was cut off goes on where it was, and several at once may do different parts (--only) in one folder.
 """
 
 from __future__ import annotations
@@ -19,26 +19,69 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 from endurance_fuzz import some_keyframe
-from endurance_live import kill_back_end, play_live
+from endurance_live import fuzz_back_end, fuzz_front_end, kill_back_end, kill_front_end, play_live, two_robots
 from rich.console import Console
+from rich.table import Table
 
 from umf_ros.config import Database, Loop, load_settings
-from umf_ros.frames import Embedding, LoopClosure
+from umf_ros.frames import Embedding
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
-SETTINGS = """/**: {ros__parameters: {embedding: {method: thumbnail}, loop: {min_time_gap_s: 8.0, min_travel_m: 10.0},
-keyframe: {min_translation_m: 0.2}}}
-"""
+Figures = dict[str, Any]
+KEYS = "kills lost_keyframes duplicate_closures backend_kills lost_verdicts fuzz_messages fuzz_bags fuzz_files"
+KEYS += " fuzz_crashes fuzz_uncounted rss_bytes_per_keyframe live_p50_ms live_p95_ms executor_stall_max_ms shutdown_s"
+KEYS += " event_ms_20k query_ms_100k"
+OFTEN = "loop: {min_time_gap_s: 8.0, min_travel_m: 10.0}"
+"""Loops are closed within seconds, so that a short recording has some."""
+LIGHT = (
+    f"/**: {{ros__parameters: {{embedding: {{method: thumbnail}}, {OFTEN}, keyframe: {{min_translation_m: 0.2}}}}}}\n"
+)
+WHOLE = f"/**: {{ros__parameters: {{{OFTEN}, qos: {{reliability: reliable, depth: 200}}}}}}\n"
 FUZZ = Path(__file__).with_name("endurance_fuzz.py")
+
+
+@dataclass(frozen=True)
+class Task:
+    """Where a part works, and on what.
+
+    Attributes:
+        folder: for what it leaves.
+        bag: a short simulated recording.
+        live_bag: the same with images at 30 Hz.
+        light, whole: parameter files, without and with the network.
+    """
+
+    folder: Path
+    bag: Path
+    live_bag: Path
+    light: Path
+    whole: Path
+
+
+@dataclass(frozen=True)
+class Part:
+    """One thing that is tried, in steps.
+
+    Attributes:
+        step: does so many at once and says what was found.
+        quick, full: how many are wanted.
+        at_once: of a step.
+    """
+
+    step: Callable[[Task, int, np.random.Generator], Figures]
+    quick: int
+    full: int
+    at_once: int
 
 
 def umf(*words: str | Path) -> subprocess.Popen[bytes]:
@@ -53,44 +96,47 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def kill_replays(bag: Path, folder: Path, kills: int, rng: np.random.Generator) -> dict[str, int]:
+def kill_replays(task: Task, kills: int, rng: np.random.Generator) -> Figures:
     """Kill a replay at random moments, resume it, and compare what it leaves with an undisturbed run."""
-    config = folder / "settings.yaml"
-    config.write_text(SETTINGS)
-    start = time.monotonic()
-    assert umf("replay", bag, "--config", config, "--out", folder / "whole").wait() == 0
-    whole_s = time.monotonic() - start
-    expected = folder / "whole" / "latest"
-    lost = duplicates = killed = 0
-    while killed < kills:
-        out = folder / f"cut_{killed}"
-        while True:
-            process = umf("replay", bag, "--config", config, "--out", out, "--resume")
-            try:
-                process.wait(whole_s * rng.uniform(0.2, 1.0) if killed < kills else None)
-                break
-            except subprocess.TimeoutExpired:
-                os.kill(process.pid, signal.SIGKILL)
-                process.wait()
-                killed += 1
-        found = out / "latest"
-        stamps = {row["stamp_ns"] for row in rows(found / "keyframes.csv")}
-        lost += len({row["stamp_ns"] for row in rows(expected / "keyframes.csv")} - stamps)
-        pairs = Counter((row["query_stamp_ns"], row["match_stamp_ns"]) for row in rows(found / "closures.csv"))
-        duplicates += pairs.total() - len(pairs)
-        duplicates += len(rows(found / "keyframes.csv")) - len(stamps)
-    return {"kills": killed, "lost_keyframes": lost, "duplicate_closures": duplicates}
+    whole = task.folder / "whole"
+    known = whole / "seconds.txt"
+    if not known.exists():
+        start = time.monotonic()
+        assert umf("replay", task.bag, "--config", task.light, "--out", whole).wait() in (0, 3)
+        known.write_text(str(time.monotonic() - start))
+    expected, whole_s = whole / "latest", float(known.read_text())
+    out = task.folder / f"cut_{int(rng.integers(10**9))}"
+    killed = 0
+    while True:
+        process = umf("replay", task.bag, "--config", task.light, "--out", out, "--resume")
+        try:
+            process.wait(whole_s * rng.uniform(0.2, 1.0) if killed < kills else None)
+            break
+        except subprocess.TimeoutExpired:
+            os.kill(process.pid, signal.SIGKILL)
+            process.wait()
+            killed += 1
+    found = out / "latest"
+    stamps = {row["stamp_ns"] for row in rows(found / "keyframes.csv")}
+    lost = len({row["stamp_ns"] for row in rows(expected / "keyframes.csv")} - stamps)
+    pairs = Counter((row["query_stamp_ns"], row["match_stamp_ns"]) for row in rows(found / "closures.csv"))
+    missing = {(row["query_stamp_ns"], row["match_stamp_ns"]) for row in rows(expected / "closures.csv")} - set(pairs)
+    doubled = pairs.total() - len(pairs) + len(rows(found / "keyframes.csv")) - len(stamps)
+    return {"kills": killed, "lost_keyframes": lost, "duplicate_closures": doubled, "missing_closures": len(missing)}
 
 
-def fuzz(part: str, count: int, folder: Path, *more: Path) -> Counter[str]:
+def fuzz(part: str, task: Task, count: int, rng: np.random.Generator) -> Figures:
     """Damage inputs in a process of their own; its sudden end is a crash."""
-    command = [sys.executable, str(FUZZ), part, str(count), "1", str(folder / part), *map(str, more)]
+    seed = int(rng.integers(10**9))
+    folder = task.folder / f"{part}_{seed}"
+    command = [sys.executable, str(FUZZ), part, str(count), str(seed), str(folder)]
+    command += [] if part == "files" else [str(task.bag)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        sys.stderr.write(done.stderr[-2000:])
-        return Counter(crashes=1)
-    sys.stderr.write(done.stderr)
-    return Counter(json.loads(done.stdout))
+    sys.stderr.write(done.stderr[-2000:])
+    outcome = Counter(json.loads(done.stdout) if done.returncode == 0 else {"crashes": 1})
+    subprocess.run(["rm", "-rf", str(folder)], check=True)
+    crashes = outcome["crashes"] + outcome["hangs"]
+    return {f"fuzz_{part}": count, "fuzz_crashes": crashes, "fuzz_uncounted": outcome["uncounted"]}
 
 
 def resident() -> int:
@@ -98,7 +144,7 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def many_places(count: int, rng: np.random.Generator) -> dict[str, float]:
+def many_places(rng: np.random.Generator, count: int = 100_000) -> Figures:
     """Memory per place, and the time of a query among them."""
     places = PlaceDatabase(Database(), "noise", 256)
     descriptors = rng.standard_normal((1000, 256)).astype(np.float32)
@@ -119,59 +165,110 @@ def many_places(count: int, rng: np.random.Generator) -> dict[str, float]:
     return {"rss_bytes_per_keyframe": round(used / count), "query_ms_100k": round(float(np.median(times)), 2)}
 
 
-def long_graph(poses: int) -> float:
-    """Milliseconds, p50, of a closure that comes to a graph of so many poses."""
+def long_graph(poses: int = 20_000) -> Figures:
+    """Milliseconds, p50, of a closure that comes to a graph of so many poses; in the order of a drive at its end."""
     world = rover_loops(poses, 10005)
     graph = PoseGraph(load_settings().pose_graph.model_copy(update={"max_gap_s": 3.0}))
     for k, pose in enumerate(world.odometry):
         graph.add_odometry(k * PERIOD_NS, pose)
-    closures: list[LoopClosure] = [world.message(row) for row in range(len(world.closures))]
-    graph.add_closures(closures[:-20])
+    closures = [world.message(row) for row in range(len(world.closures))]
+    graph.add_closures(closures[:-40])
+    for _ in range(20):  # what the moved map comes close to is looked at with the next call
+        if not graph.update():
+            break
     times = []
-    for closure in closures[-20:]:
+    for closure in closures[-40:]:
         start = time.perf_counter()
         graph.add_closure(closure)
         times.append(1e3 * (time.perf_counter() - start))
-    return round(float(np.median(times)), 1)
+    return {"event_ms_20k": round(float(np.median(times[20:])), 1)}
+
+
+PARTS = {
+    "replay": Part(kill_replays, 4, 200, 4),
+    "front_end": Part(lambda task, n, rng: kill_front_end(task.folder, n, task.bag, task.light, rng), 2, 40, 4),
+    "back_end": Part(lambda task, n, rng: kill_back_end(task.folder, n, rng), 3, 40, 5),
+    "wire_front": Part(lambda task, n, rng: fuzz_front_end(task.folder, n, task.light, rng), 120, 1000, 500),
+    "wire_back": Part(lambda task, n, rng: fuzz_back_end(task.folder, n, rng), 120, 1000, 500),
+    "robots": Part(lambda task, _, __: two_robots(task.folder, task.bag, task.light), 1, 1, 1),
+    "messages": Part(lambda task, n, rng: fuzz("messages", task, n, rng), 1000, 20_000, 2000),
+    "bags": Part(lambda task, n, rng: fuzz("bags", task, n, rng), 24, 500, 25),
+    "files": Part(lambda task, n, rng: fuzz("files", task, n, rng), 48, 300, 60),
+    "places": Part(lambda _, __, rng: many_places(rng), 1, 1, 1),
+    "graph": Part(lambda _, __, ___: long_graph(), 1, 1, 1),
+    "live": Part(lambda task, _, __: play_live(task.folder, task.live_bag, task.whole), 1, 1, 1),
+}
+
+
+def together(one: Figures, other: Figures) -> Figures:
+    """The figures of two steps: counts add up, of times the longest counts."""
+    merged = dict(one)
+    for name, value in other.items():
+        if name not in merged or merged[name] is None:
+            merged[name] = value
+        elif value is not None:
+            merged[name] = max(merged[name], value) if name.endswith(("_ms", "_s", "_mb")) else merged[name] + value
+    return merged
+
+
+def run_part(name: str, wanted: int, task: Task, seed: int, console: Console) -> Figures:
+    """Do what is left of a part; every step is kept before the next begins."""
+    kept = task.folder / f"part_{name}.json"
+    state: Figures = json.loads(kept.read_text()) if kept.exists() else {"done": 0, "figures": {}}
+    while state["done"] < wanted:
+        count = min(PARTS[name].at_once, wanted - state["done"])
+        start = time.monotonic()
+        found = PARTS[name].step(task, count, np.random.default_rng([seed, state["done"], len(name)]))
+        state = {"done": state["done"] + count, "figures": together(state["figures"], found)}
+        kept.with_suffix(".part").write_text(json.dumps(state))
+        kept.with_suffix(".part").replace(kept)
+        console.print(f"{name}: {state['done']} of {wanted} ({time.monotonic() - start:.0f} s): {found}", markup=False)
+    return dict(state["figures"])
+
+
+def make_task(folder: Path, bag: Path | None, live_bag: Path | None) -> Task:
+    """The recordings and parameter files; recordings that are not given are made once."""
+    made = []
+    for name, given, more in (("short", bag, ()), ("live", live_bag, ("--image-rate", "30"))):
+        path = given or folder / f"{name}.mcap"
+        if not path.exists():
+            assert umf("simulate", path, "--duration", "40", "--seed", "3", *more).wait() == 0
+        made.append(path)
+    files = [folder / "light.yaml", folder / "whole.yaml"]
+    for path, text in zip(files, (LIGHT, WHOLE), strict=True):
+        path.write_text(text)
+    return Task(folder, *made, *files)
 
 
 def main(
     json_file: Annotated[Path, typer.Option("--json", help="Where the figures go.")],
     quick: Annotated[bool, typer.Option("--quick", help="A few of everything.")] = False,
+    folder: Annotated[
+        Path | None, typer.Option(help="Keeps what was found, to go on; default: a temporary one.")
+    ] = None,
+    only: Annotated[list[str] | None, typer.Option(help=f"Parts: {', '.join(PARTS)}. Default: all.")] = None,
     bag: Annotated[Path | None, typer.Option(help="A short simulated recording; default: one is made.")] = None,
-    live: Annotated[bool, typer.Option("--live", help="Play it to both nodes too, and measure.")] = False,
+    live_bag: Annotated[Path | None, typer.Option(help="One with 30 images per second; default: one is made.")] = None,
     seed: Annotated[int, typer.Option(help="Of kills and damage.")] = 1,
 ) -> None:
     """Measure what the package survives."""
-    console = Console()
-    rng = np.random.default_rng(seed)
-    figures: dict[str, Any] = {}
+    console = Console(soft_wrap=True)
+    figures: Figures = {"fuzz_crashes": 0, "fuzz_uncounted": 0}
     with tempfile.TemporaryDirectory(prefix="umf_endurance_") as name:
-        folder = Path(name)
-        if bag is None:
-            bag = folder / "short.mcap"
-            assert umf("simulate", bag, "--duration", "30", "--seed", "3").wait() == 0
-        figures |= kill_replays(bag, folder, 6 if quick else 200, rng)
-        console.print(figures)
-        figures |= kill_back_end(folder, 3 if quick else 40, 200 if quick else 2000, rng)
-        console.print(figures)
-        sizes = (
-            {"messages": 2000, "bags": 60, "files": 60} if quick else {"messages": 20_000, "bags": 500, "files": 300}
-        )
-        outcomes = {
-            part: fuzz(part, count, folder, *([bag] if part != "files" else [])) for part, count in sizes.items()
-        }
-        console.print(outcomes)
-        figures |= {f"fuzz_{part}": count for part, count in sizes.items()}
-        figures["fuzz_messages"] += figures.pop("fuzz_over_dds")
-        figures["fuzz_crashes"] = sum(found["crashes"] + found["hangs"] for found in outcomes.values())
-        figures["fuzz_crashes"] += figures.pop("crashes_over_dds")
-        figures["fuzz_uncounted"] = outcomes["messages"]["uncounted"] + figures.pop("uncounted_over_dds")
-        figures |= many_places(100_000, rng)
-        figures["event_ms_20k"] = long_graph(20_000)
-        figures |= play_live(bag, folder) if live else {"live_p50_ms": None, "live_p95_ms": None}
-    console.print(figures)
-    json_file.write_text(json.dumps(figures, indent=2) + "\n")
+        place = folder or Path(name)
+        place.mkdir(parents=True, exist_ok=True)
+        task = make_task(place.resolve(), bag, live_bag)
+        for part in only or PARTS:
+            wanted = PARTS[part].quick if quick else PARTS[part].full
+            figures = together(figures, run_part(part, wanted, task, seed, console))
+    table = Table("figure", "value")
+    for key in [*KEYS.split(), *sorted(figures.keys() - set(KEYS.split()))]:
+        table.add_row(key if key in KEYS.split() else f"({key})", str(figures.get(key)))
+    console.print(table)
+    json_file.write_text(json.dumps({key: figures.get(key) for key in KEYS.split()}, indent=2) + "\n")
+    if figures.get("crossed_closures") or figures.get("missing_closures"):
+        console.print("[red]closures crossed between robots, or were missing after a resumed replay")
+        raise typer.Exit(1)
 
 
 if __name__ == "__main__":

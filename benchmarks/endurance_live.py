@@ -1,177 +1,343 @@
-"""The nodes as processes over DDS, for `endurance.py`: killed, fed with nonsense, and timed."""
+"""What the live nodes survive, for `endurance.py`: kill -9, nonsense, each other; and how fast they are."""
 
 from __future__ import annotations
 
 import csv
-import os
-import signal
-import subprocess
-import sys
+import sqlite3
 import threading
-import time
-from collections.abc import Callable
+from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from endurance_nodes import BACK_END, FRONT_END, Ears, NodeUnderTest, own_domain, play
 from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from rich.console import Console
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import String
 
+from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import open_bag
+from umf_ros.config import load_settings
 from umf_ros.lab.live.live_graph import LiveGraph
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
 from umf_ros.nodes.conversions import closure_to_message, from_time, to_pose, to_time
 from umf_ros.nodes.qos import CLOSURES_QOS
-from umf_ros.pose_graph.journal import GraphJournal
+from umf_ros.pose_graph.journal import JOURNAL, GraphJournal
 
+Figures = dict[str, Any]
 ODD = [float("nan"), float("inf"), -1.0, 1e300, 1e-300, 0.0]
 TEXTS = ["keyframe/" + "9" * 5000 + " keyframe/1", "", "keyframe/-1 keyframe/2", "x" * 100_000, "keyframe/1 keyframe/2"]
 FRAMES = ["keyframe/" + "9" * 5000, "", "keyframe/99999999999999999999", "keyframe/1", "odom", "\u2603"]
+SECONDS = [0, 5, 2**31 - 1, -1]
+SIZES = [0, 1, 688, 512, 2**31, 2**32 - 1]
+MANY = QoSProfile(depth=500)
+FIRST_LOOP = 215
+"""Poses until the first loops of the world are closed."""
 
 
-class Rover(Node):
-    """Odometry and front-end of a rover; knows which closures the back-end has decided about."""
+class Rover:
+    """Odometry and front-end of a rover."""
 
-    def __init__(self, world: GraphWorld) -> None:
-        super().__init__("endurance")
-        self.world = world
-        self.odometry = self.create_publisher(Odometry, "/odom", 500)
-        self.closures = self.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS)
-        self.reject = self.create_publisher(String, "/pose_graph_node/reject_edge", 500)
-        self.decided: set[str] = set()
-        self.values: dict[str, str] = {}
-        self.create_subscription(DiagnosticArray, "/pose_graph_node/verdicts", self._hear, CLOSURES_QOS)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
-
-    def _hear(self, message: DiagnosticArray) -> None:
-        self.decided |= {status.name for status in message.status}
-
-    def _diagnose(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name == "pose_graph_node: pose graph":
-                self.values = {pair.key: pair.value for pair in status.values}
-
-    def until(self, condition: Callable[[], bool], timeout_s: float = 60.0) -> bool:
-        """Spin until something holds; False when it does not in time."""
-        deadline = time.monotonic() + timeout_s
-        while not condition() and time.monotonic() < deadline:
-            rclpy.spin_once(self, timeout_sec=0.02)
-        return condition()
-
-    def is_heard(self) -> bool:
-        """Whether the back-end is connected."""
-        return min(self.odometry.get_subscription_count(), self.closures.get_subscription_count()) > 0
+    def __init__(self, ears: Ears, world: GraphWorld) -> None:
+        self._ears, self._world = ears, world
+        self._odometry = ears.create_publisher(Odometry, "/odom", MANY)
+        self._closures = ears.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS)
 
     def drive(self, first: int, last: int) -> None:
         """Publish a part of the drive, with the closures that end there."""
         for k in range(first, last):
             message = Odometry(child_frame_id="base_link")
             message.header.stamp, message.header.frame_id = to_time((k + 1) * PERIOD_NS), "odom"
-            message.pose.pose = to_pose(self.world.odometry[k])
-            self.odometry.publish(message)
-            for row, closure in enumerate(self.world.closures):
+            message.pose.pose = to_pose(self._world.odometry[k])
+            self._odometry.publish(message)
+            for row, closure in enumerate(self._world.closures):
                 if closure.second == k:
-                    self.closures.publish(closure_to_message(self.world.message(row)))
-            rclpy.spin_once(self, timeout_sec=0.005)
-
-    def nonsense(self, count: int, rng: np.random.Generator) -> None:
-        """Publish messages that nobody sends."""
-        for number in range(count):
-            if number % 3 == 0:
-                self.reject.publish(String(data=TEXTS[rng.integers(len(TEXTS))]))
-                continue
-            message = Odometry(child_frame_id=FRAMES[rng.integers(len(FRAMES))])
-            message.header.frame_id = FRAMES[rng.integers(len(FRAMES))]
-            message.header.stamp.sec = int(rng.choice([0, 5, 2**31 - 1, -1]))
-            message.pose.pose.position.x = ODD[rng.integers(len(ODD))]
-            message.pose.pose.orientation.w = ODD[rng.integers(len(ODD))]
-            message.pose.covariance = np.full(36, ODD[rng.integers(len(ODD))])
-            (self.closures if number % 3 == 1 else self.odometry).publish(message)
-            rclpy.spin_once(self, timeout_sec=0.002)
+                    self._closures.publish(closure_to_message(self._world.message(row)))
+            self._ears.spin_once(0.002)
 
 
-def start(results: Path, log: Path) -> subprocess.Popen[bytes]:
-    """The back-end as a process of its own."""
-    words = ["-p", f"results_dir:={results}", "-p", "pose_graph.max_gap_s:=3.0", "-p", "qos.reliability:=reliable"]
-    command = [sys.executable, "-m", "umf_ros.nodes.pose_graph_node", "--ros-args", *words]
-    with log.open("ab") as file:
-        return subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
-
-
-def kill_back_end(folder: Path, kills: int, nonsense: int, rng: np.random.Generator) -> dict[str, Any]:
+def kill_back_end(folder: Path, kills: int, rng: np.random.Generator) -> Figures:
     """Kill the back-end while it works, start it again, and look for every verdict that it had given."""
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    rclpy.init()
-    rover = Rover(with_wrong_closures(rover_loops(40 * (kills + 2), 10003), 0.2, "groups", 1))
-    results, log = folder / "back_end", folder / "back_end.log"
+    seed = int(rng.integers(10_000, 20_000))
+    results = folder / f"back_end_{seed}"
+    world = with_wrong_closures(rover_loops(FIRST_LOOP + 40 * (kills + 1), seed), 0.2, "groups", 1)
+    cuts = [0, *range(FIRST_LOOP, FIRST_LOOP + 40 * (kills + 1), 40)]
     crashes = 0
-    for number in range(kills + 1):
-        process = start(results, log)
-        heard = rover.until(rover.is_heard)
-        rover.drive(40 * number, 40 * (number + 1))
-        if number < kills:
-            rover.until(lambda: False, float(rng.uniform(0.0, 1.5)))
-            crashes += process.poll() is not None or not heard
-            process.kill()
-            process.wait()
-            rover.until(lambda: rover.odometry.get_subscription_count() == 0, 30.0)
-    before = dict(rover.values)
-    rover.nonsense(nonsense, rng)
-    rover.values.clear()
-    rover.until(lambda: bool(rover.values), 30.0)
-    refused = "closure refused", "reject_edge", "closure_frame", "pose", "stamp", "frame", "GraphError", "closure twice"
-    counted = sum(int(float(count)) for name, count in rover.values.items() if name.startswith(refused))
-    counted -= sum(int(float(count)) for name, count in before.items() if name.startswith(refused))
-    counted += sum(int(float(rover.values.get(name, 0))) for name in ("odometry_out_of_line", "accepted", "waiting"))
-    stall_ms = float(rover.values.get("executor_stall_max_ms", "nan"))
-    crashes += process.poll() is not None
-    asked = time.monotonic()
-    process.send_signal(signal.SIGINT)
-    crashes += process.wait(60) != 0
-    shutdown_s = time.monotonic() - asked
-    crashes += log.read_text(errors="replace").count("Traceback")
-    kept = GraphJournal(results / "pose_graph.sqlite")
-    stored = {f"keyframe/{match} keyframe/{query}" for match, query in kept.verdicts()}
+    with own_domain():
+        ears = Ears()
+        rover = Rover(ears, world)
+        for number in range(kills + 1):
+            node = NodeUnderTest(BACK_END, results, {"pose_graph.max_gap_s": 3.0})
+            crashes += not ears.anew(BACK_END)
+            ears.wait(0.5)  # the other way round, discovery may take a little longer
+            rover.drive(cuts[number], cuts[number + 1])
+            if number < kills:
+                ears.wait(float(rng.uniform(0.0, 1.5)))
+                crashes += not node.is_alive
+                node.kill()
+        ears.wait(2.0)
+        shutdown_s, status = node.stop()
+        ears.destroy_node()
+    crashes += (status != 0) + node.tracebacks()
+    kept = GraphJournal(results / JOURNAL)
+    stored = set(kept.verdicts())
     kept.close()
-    with (results / "graph_verdicts.csv").open() as file:
-        written = {f"keyframe/{row['match_stamp_ns']} keyframe/{row['query_stamp_ns']}" for row in csv.DictReader(file)}
-    rover.destroy_node()
-    rclpy.shutdown()
+    with (results / "graph_verdicts.csv").open(newline="") as file:
+        written = {(int(row["match_stamp_ns"]), int(row["query_stamp_ns"])) for row in csv.DictReader(file)}
     return {
         "backend_kills": kills,
-        "lost_verdicts": len(rover.decided - (stored & written)),
-        "fuzz_over_dds": nonsense,
-        "crashes_over_dds": crashes,
-        "uncounted_over_dds": max(0, nonsense - counted),
-        "executor_stall_max_ms": round(stall_ms, 1),
+        "verdicts": len(ears.verdicts),
+        "lost_verdicts": len(ears.verdicts - (stored & written)),
+        "fuzz_crashes": crashes,
         "shutdown_s": round(shutdown_s, 2),
     }
 
 
-def play_live(bag: Path, folder: Path) -> dict[str, float | None]:
+def kill_front_end(folder: Path, kills: int, bag: Path, config: Path, rng: np.random.Generator) -> Figures:
+    """Kill the front-end while a recording is played over and over; all that it announced has to be on disk."""
+    results = folder / f"front_end_{int(rng.integers(10**9))}"
+    parameters: dict[str, object] = {"database.path": results / "places.sqlite"}
+    crashes = 0
+    with own_domain():
+        ears = Ears()
+        player = play(bag, "--loop", "--rate", "2")
+        for number in range(kills + 1):
+            node = NodeUnderTest(FRONT_END, results, parameters, config=config)
+            crashes += not ears.anew(FRONT_END)
+            enough = len(ears.keyframes) + 5
+            crashes += not ears.until(partial(ears.has_heard, enough), 60.0)
+            ears.wait(float(rng.uniform(0.0, 4.0)))
+            if number < kills:
+                crashes += not node.is_alive
+                node.kill()
+        shutdown_s, status = node.stop()
+        player.kill()
+        player.wait()
+        ears.wait(0.5)
+        ears.destroy_node()
+    crashes += (status != 0) + node.tracebacks()
+    with (results / "keyframes.csv").open(newline="") as file:
+        rows = Counter((int(row["stamp_ns"]), row["session"]) for row in csv.DictReader(file))
+    with (results / "closures.csv").open(newline="") as file:
+        pairs = Counter((row["match_stamp_ns"], row["query_stamp_ns"]) for row in csv.DictReader(file))
+    stored = {stamp for stamp, _ in rows} | _stored_places(results / "places.sqlite")
+    return {
+        "kills": kills,
+        "keyframes": len(ears.keyframes),
+        "lost_keyframes": len(ears.keyframes - stored),
+        "duplicate_closures": pairs.total() - len(pairs) + rows.total() - len(rows),
+        "fuzz_crashes": crashes,
+        "shutdown_s": round(shutdown_s, 2),
+    }
+
+
+def _stored_places(path: Path) -> set[int]:
+    with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as connection:
+        return {stamp for (stamp,) in connection.execute("SELECT stamp_ns FROM keyframe")}
+
+
+def fuzz_back_end(folder: Path, count: int, rng: np.random.Generator) -> Figures:
+    """Messages to the back-end that nobody sends: each has to show in the diagnostics, by what became of it."""
+    with own_domain():
+        ears = Ears()
+        publishers: list[Any] = [
+            ears.create_publisher(Odometry, "/odom", MANY),
+            ears.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS),
+            ears.create_publisher(String, f"/{BACK_END}/reject_edge", MANY),
+        ]
+        node = NodeUnderTest(BACK_END, folder / f"fuzz_{BACK_END}", {})
+        crashes = 0 if ears.anew(BACK_END) else 1
+        ears.until(lambda: all(publisher.get_subscription_count() for publisher in publishers), 10.0)
+        sent: Counter[str] = Counter()
+        for number in range(count):
+            kind = ("odometry", "closures", "reject")[number % 3]
+            message = String(data=TEXTS[rng.integers(len(TEXTS))]) if kind == "reject" else _odd_odometry(rng)
+            publishers[number % 3].publish(message)
+            sent[kind] += 1
+            ears.wait(0.002)
+        ears.wait(5.0)
+        fate = ears.values.get(BACK_END, {}).get("pose graph", {})
+        graph = {name: float(value) for name, value in fate.items() if value.replace(".", "").isdigit()}
+        states = ("accepted", "rejected", "undecided", "waiting", "refused")
+        odometry = sum(value for name, value in graph.items() if name.startswith("odometry"))
+        odometry += ears.value(BACK_END, "input odometry", "refused")
+        closures = sum(graph.get(name, 0) for name in (*states, "closure twice"))
+        closures += ears.value(BACK_END, "input closures", "refused")
+        rejects = graph.get("reject_edge", 0) + graph.get("GraphError", 0)
+        found = {"odometry": odometry, "closures": closures, "reject": rejects}
+        missing = {kind: abs(sent[kind] - found[kind]) for kind in sent}
+        crashes += not node.is_alive
+        shutdown_s, status = node.stop()
+        ears.destroy_node()
+    if any(missing.values()):
+        Console(stderr=True).print(f"back-end: sent {dict(sent)}, found {found} in {fate}", markup=False)
+    crashes += (status != 0) + node.tracebacks()
+    return {
+        "fuzz_messages": count,
+        "fuzz_crashes": crashes,
+        "fuzz_uncounted": round(sum(missing.values())),
+        "shutdown_s": round(shutdown_s, 2),
+    }
+
+
+def fuzz_front_end(folder: Path, count: int, config: Path, rng: np.random.Generator) -> Figures:
+    """Messages to the front-end that nobody sends: each has to show in the diagnostics of its input."""
+    topics = topics_of(load_settings())
+    kinds = {"left_image": Image, "right_image": Image, "left_info": CameraInfo, "right_info": CameraInfo}
+    kinds |= {"cloud": PointCloud2, "odometry": Odometry}
+    with own_domain():
+        ears = Ears()
+        publishers = {name: ears.create_publisher(kind, getattr(topics, name), MANY) for name, kind in kinds.items()}
+        node = NodeUnderTest(FRONT_END, folder / f"fuzz_{FRONT_END}", {}, config=config)
+        crashes = 0 if ears.anew(FRONT_END) else 1
+        ears.until(lambda: all(publisher.get_subscription_count() for publisher in publishers.values()), 10.0)
+        sent: Counter[str] = Counter()
+        for number in range(count):
+            name = list(kinds)[number % len(kinds)]
+            publishers[name].publish(_odd(kinds[name], rng))
+            sent[name] += 1
+            ears.wait(0.002)
+        ears.wait(5.0)
+        missing = 0.0
+        decoded = {"left_image": "left", "right_image": "right", "cloud": "cloud", "odometry": "odometry"}
+        for name in kinds:
+            missing += abs(sent[name] - ears.value(FRONT_END, f"input {name}", "received"))
+            if name in decoded:  # and once more, by its fate
+                held = 1  # the newest may wait for one that agrees with it
+                counted = ears.value(FRONT_END, "detector", f"{decoded[name]}_received")
+                missing += max(0.0, abs(sent[name] - counted) - held)
+        crashes += not node.is_alive
+        shutdown_s, status = node.stop()
+        ears.destroy_node()
+    if missing:
+        Console(stderr=True).print(f"front-end: sent {dict(sent)}, found {ears.values.get(FRONT_END)}", markup=False)
+    crashes += (status != 0) + node.tracebacks()
+    return {
+        "fuzz_messages": count,
+        "fuzz_crashes": crashes,
+        "fuzz_uncounted": round(missing),
+        "shutdown_s": round(shutdown_s, 2),
+    }
+
+
+def _odd_odometry(rng: np.random.Generator) -> Odometry:
+    message = Odometry(child_frame_id=FRAMES[rng.integers(len(FRAMES))])
+    message.header.frame_id = FRAMES[rng.integers(len(FRAMES))]
+    message.header.stamp.sec = int(rng.choice(SECONDS))
+    message.pose.pose.position.x = ODD[rng.integers(len(ODD))]
+    message.pose.pose.orientation.w = ODD[rng.integers(len(ODD))]
+    message.pose.covariance = np.full(36, ODD[rng.integers(len(ODD))])
+    return message
+
+
+def _odd(kind: type, rng: np.random.Generator) -> Any:
+    """A message of a sensor with sizes, kinds and numbers that nobody sends."""
+    if kind is Odometry:
+        return _odd_odometry(rng)
+    message = kind()
+    message.header.frame_id = FRAMES[rng.integers(len(FRAMES))]
+    message.header.stamp.sec = int(rng.choice(SECONDS))
+    message.height, message.width = (int(size) for size in rng.choice(SIZES, 2))
+    if kind is CameraInfo:
+        message.k = np.full(9, ODD[rng.integers(len(ODD))])
+        message.p = np.full(12, ODD[rng.integers(len(ODD))])
+        return message
+    message.data = rng.integers(0, 256, int(rng.integers(0, 5000)), np.uint8).tobytes()
+    if kind is Image:
+        message.encoding = str(rng.choice(["mono8", "", "bgr8", "mono16", "yuv422", "x" * 9999]))
+        message.step = int(rng.choice(SIZES))
+    else:
+        names, datatypes = ["x", "y", "z", "t"], rng.integers(0, 12, 4)
+        message.fields = [
+            PointField(name=name, offset=int(rng.choice(SIZES)), datatype=int(datatype), count=int(rng.choice([0, 1])))
+            for name, datatype in zip(names, datatypes, strict=True)
+        ]
+        message.point_step, message.row_step = int(rng.choice(SIZES)), int(rng.choice(SIZES))
+    return message
+
+
+def two_robots(folder: Path, bag: Path, config: Path) -> Figures:
+    """Two whole robots live at once, with keyframes of their own: no closure may cross."""
+    topics = tuple(topic for topic in topics_of(load_settings()).model_dump().values() if topic)
+    with own_domain():
+        ears = {name: Ears(name) for name in ("red", "blue")}
+        nodes = [
+            NodeUnderTest(kind, folder / name / kind, {"keyframe.min_translation_m": apart_m}, name, config)
+            for name, apart_m in zip(ears, (0.2, 0.33), strict=True)
+            for kind in (FRONT_END, BACK_END)
+        ]
+        together = next(iter(ears.values()))
+        names = [f"{name}/{kind}" for name in ears for kind in (FRONT_END, BACK_END)]
+        crashes = int(not together.until(lambda: all(name in together.values for name in names)))
+        rates = zip(ears, ("1", "1.5"), strict=True)
+        players = [play(bag, "--rate", rate, moved_to=name, topics=topics) for name, rate in rates]
+        while any(player.poll() is None for player in players):
+            for one in ears.values():
+                one.wait(0.05)
+        for one in ears.values():
+            one.wait(2.0)
+        crashes += sum(node.stop()[1] != 0 for node in nodes)
+        for one in ears.values():
+            one.wait(0.5)
+            one.destroy_node()
+    crossed = sum(len(one.verdicts - one.closures) for one in ears.values())
+    return {
+        "fuzz_crashes": crashes,
+        "crossed_closures": crossed,
+        "red_closures": len(ears["red"].closures),
+        "blue_closures": len(ears["blue"].closures),
+        "red_verdicts": len(ears["red"].verdicts),
+        "blue_verdicts": len(ears["blue"].verdicts),
+    }
+
+
+def play_live(folder: Path, bag: Path, config: Path) -> Figures:
     """Milliseconds from the stamp of a scan to its closure, by the recording's clock, at its own pace."""
     run = folder / "live"
-    run.mkdir()
-    rclpy.init()
-    ears = Node("endurance_ears", parameter_overrides=[Parameter("use_sim_time", value=True)])
+    run.mkdir(exist_ok=True)
     delays_ms: list[float] = []
+    with own_domain():
+        ears = Ears()
+        clock = Node("endurance_clock", parameter_overrides=[Parameter("use_sim_time", value=True)])
 
-    def hear(message: Odometry) -> None:
-        delays_ms.append((ears.get_clock().now().nanoseconds - from_time(message.header.stamp)) * 1e-6)
+        def hear(message: Odometry) -> None:
+            delays_ms.append((clock.get_clock().now().nanoseconds - from_time(message.header.stamp)) * 1e-6)
 
-    ears.create_subscription(Odometry, "/loop_closures", hear, CLOSURES_QOS)
-    spinning = threading.Thread(target=rclpy.spin, args=(ears,), daemon=True)
-    spinning.start()
-    with LiveGraph(run, Console(stderr=True)) as graph:
-        graph.play(bag, open_bag(bag).duration_s, 1.0)
-    rclpy.shutdown()
-    if not delays_ms:
-        return {"live_p50_ms": None, "live_p95_ms": None}
-    p50, p95 = np.percentile(delays_ms, [50, 95])
-    return {"live_p50_ms": round(float(p50), 1), "live_p95_ms": round(float(p95), 1)}
+        clock.create_subscription(Odometry, "/loop_closures", hear, CLOSURES_QOS)
+        executor = SingleThreadedExecutor()
+        executor.add_node(clock)
+        threading.Thread(target=executor.spin, daemon=True).start()
+        with LiveGraph(run, Console(stderr=True, quiet=True), config) as graph:
+            listening = threading.Thread(target=ears.until, args=(lambda: not graph.is_running, 3600.0), daemon=True)
+            listening.start()
+            graph.play(bag, open_bag(bag).duration_s, 1.0)
+        listening.join()
+        seconds = graph.seconds_to_stop
+    figures: Figures = {"live_p50_ms": None, "live_p95_ms": None}
+    if delays_ms:
+        p50, p95 = np.percentile(delays_ms, [50, 95])
+        figures = {"live_p50_ms": round(float(p50), 1), "live_p95_ms": round(float(p95), 1)}
+    stalls = {"front_end": ears.value(FRONT_END, "detector", "executor_stall_max_ms")}
+    stalls["back_end"] = ears.value(BACK_END, "pose graph", "executor_stall_max_ms")
+    return figures | {
+        "live_closures": len(delays_ms),
+        "front_end_memory_mb": round(ears.value(FRONT_END, "detector", "memory_mb")),
+        "keyframe_p50_ms": _median_ms(run / "latencies.csv"),
+        "front_end_stall_ms": round(stalls["front_end"], 1),
+        "back_end_stall_ms": round(stalls["back_end"], 1),
+        "executor_stall_max_ms": round(max(stalls.values()), 1),
+        "shutdown_s": round(max(seconds.values(), default=float("nan")), 2),
+    }
+
+
+def _median_ms(path: Path) -> float:
+    """Median of the milliseconds of a keyframe, of those that had candidates."""
+    with path.open(newline="") as file:
+        times = [float(row["total"]) for row in csv.DictReader(file) if float(row["verify"]) > 1.0]
+    return round(float(np.median(times)), 1) if times else float("nan")

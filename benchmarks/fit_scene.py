@@ -24,7 +24,8 @@ from umf_ros.lab.training.scene_fit import PooledWorld, SceneFit, fit_scene, poo
 from umf_ros.networks.efficientnet import pretrained_trunk
 from umf_ros.networks.scene import DEPTH
 from umf_ros.networks.umf import UMF, count_parameters
-from umf_ros.networks.weights import load_weights, locate_weights
+from umf_ros.networks.weights import load_weights
+from umf_ros.networks.weights_files import locate_weights
 
 VIEWS = ("plain", "mirrored")
 ORIGIN = {

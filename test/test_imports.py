@@ -114,6 +114,13 @@ def test_help_imports_nothing_heavy() -> None:
     assert imported_after(show_help, ["torch", "open3d", "gtsam", "cv2", "matplotlib", "rclpy", "scipy"]) == []
 
 
+def test_a_rover_with_openvino_carries_no_torch() -> None:
+    """Two hundred megabytes of the live front-end were a library that computed nothing."""
+    statement = "import umf_ros.nodes.loop_closure_node, umf_ros.commands.replay, umf_ros.embedding.umf_embedder"
+    statement += ", umf_ros.embedding.image_features, openvino"
+    assert imported_after(statement, ["torch", "matplotlib", "open3d", "gtsam"]) == []
+
+
 def test_only_nodes_and_the_player_import_rclpy() -> None:
     for path in PACKAGE.rglob("*.py"):
         if path.parent != PACKAGE / "nodes" and path != PACKAGE / "lab" / "live" / "bag_player_node.py":

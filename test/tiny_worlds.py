@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from umf_ros.embedding.inputs import pack, prepare_scan
+from umf_ros.embedding.torch_runtimes import to_tensors
 from umf_ros.frames import StereoCamera
 from umf_ros.geometry import make_pose
 from umf_ros.lab.datasets.sample import Sample
@@ -48,7 +49,7 @@ def some_input(config: NetworkConfig = TINY, count: int = 2, trim: bool = False)
     rng = np.random.default_rng(5)
     images = [rng.normal(size=config.image_size).astype(np.float32) for _ in range(count)]
     scans = [prepare_scan(some_scan(seed), None, config) for seed in range(count)]
-    return pack(images, scans, config, trim)
+    return to_tensors(pack(images, scans, config, trim))
 
 
 def pose_at(x: float, y: float, yaw_deg: float = 0.0) -> np.ndarray:

@@ -26,7 +26,8 @@ def level(points: Points) -> Array:
     Args:
         points: (N, 3) m, body frame; any N, any that are not finite.
     """
-    known = points[np.isfinite(points).all(axis=1)].astype(float)
+    finite = np.isfinite(points)
+    known = (points if finite.all() else points[finite.all(axis=1)]).astype(float)
     if len(known) < MIN_GROUND_POINTS:
         return np.eye(4)
     cloud = small_gicp.voxelgrid_sampling(known, CELL_M)

@@ -15,6 +15,7 @@ from tiny_worlds import TINY, some_scan
 from umf_ros import embedding
 from umf_ros.config import EmbeddingSettings
 from umf_ros.embedding import make_embedder
+from umf_ros.embedding.embedder import Asked
 from umf_ros.embedding.gradients_embedder import GradientsEmbedder
 from umf_ros.embedding.scan_context_embedder import ScanContextEmbedder
 from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
@@ -48,7 +49,7 @@ def own_cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def embedder(weights):
-    return UmfEmbedder(weights, "torch", threads=1, super_features=True)
+    return UmfEmbedder(weights, EmbeddingSettings(runtime="torch", threads=1), Asked(supers=True))
 
 
 def test_what_comes_out(embedder):
@@ -107,9 +108,9 @@ def test_positions_belong_to_the_image_given(embedder, shape):
 
 def test_openvino_agrees_with_torch_and_is_kept(tmp_path):
     """With the shipped weights: OpenVINO's CPU plugin hangs on networks as narrow as the tests' own."""
-    plain = UmfEmbedder(None, "torch", threads=1, super_features=True)
-    fast = UmfEmbedder(None, "openvino", threads=1, super_features=True)
-    kept = UmfEmbedder(None, "openvino", threads=1, super_features=True)
+    plain = UmfEmbedder(None, EmbeddingSettings(runtime="torch", threads=1), Asked(supers=True))
+    fast = UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), Asked(supers=True))
+    kept = UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), Asked(supers=True))
     assert len(list((tmp_path / "cache" / "umf_ros").glob("*.xml"))) == 1
     for frame in (some_frame(), some_frame(1, left=None), some_frame(2, points=None, intensity=None)):
         wanted = plain.embed(frame)
@@ -117,6 +118,17 @@ def test_openvino_agrees_with_torch_and_is_kept(tmp_path):
             assert wanted.descriptor @ other.descriptor > 0.9999
             if wanted.cloud is not None:
                 assert len(wanted.cloud.positions) == len(other.cloud.positions)
+
+
+def test_what_is_not_asked_for_is_left_out_and_changes_nothing_else():
+    whole, bare = (
+        UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), Asked(image)) for image in (True, False)
+    )
+    one, other = whole.embed(some_frame()), bare.embed(some_frame())
+    assert one.image is not None and other.image is None and one.cloud is not None and other.cloud is not None
+    np.testing.assert_array_equal(one.descriptor, other.descriptor)
+    np.testing.assert_array_equal(one.cloud.positions, other.cloud.positions)
+    np.testing.assert_array_equal(one.cloud.descriptors, other.cloud.descriptors)
 
 
 def test_shipped_weights_load():
@@ -200,7 +212,9 @@ def test_the_name_tells_weights_apart(weights, tmp_path):
     other = tmp_path / weights.name
     torch.manual_seed(1)
     save_weights(UMF(TINY), other, {})
-    names = [UmfEmbedder(path, "torch", threads=1).name for path in (weights, other, weights)]
+    names = [
+        UmfEmbedder(path, EmbeddingSettings(runtime="torch", threads=1)).name for path in (weights, other, weights)
+    ]
     assert names[0] == names[2] != names[1]
     assert all(name.startswith("tiny-") for name in names)
 
@@ -297,7 +311,7 @@ def test_the_untrained_trunk_needs_its_published_weights_and_sees_the_image_alon
 
 def test_the_mount_of_the_lidar_changes_neither_descriptor_nor_where_features_lie(weights):
     """Scans are set upright on their ground before the network reads them."""
-    embedder = UmfEmbedder(weights, "torch", threads=1)
+    embedder = UmfEmbedder(weights, EmbeddingSettings(runtime="torch", threads=1))
     x, y = np.random.default_rng(3).uniform([[1.0], [-18.0]], [[38.0], [18.0]], (2, 20_000))
     rocks = 1.5 * (np.sin(2 * x) * np.cos(1.5 * y) > 0.9)
     points = np.column_stack([x, y, rocks]).astype(np.float32)

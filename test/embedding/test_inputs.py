@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-import torch
 from tiny_worlds import TINY, some_scan
 
 from umf_ros.embedding.inputs import blank_input, is_blank, pack, prepare_image, prepare_scan, shrink, standardise
@@ -98,7 +97,7 @@ def test_a_batch_says_what_is_missing():
     assert not batch.image[0].any() and batch.image[1].all()
     assert batch.coarse_mask.any(1).tolist() == batch.fine_mask.any(1).tolist() == [True, False]
     assert batch.grid.shape == (2, 20, 20, 20, 48) and not batch.grid[1].any()
-    assert batch.fine_index.dtype == torch.int64
+    assert batch.fine_index.dtype == np.int64
 
 
 @pytest.mark.parametrize("counts", [(30, 60), (0, 0)], ids=["short", "empty"])
@@ -108,7 +107,7 @@ def test_only_padding_is_trimmed(counts):
     assert whole.fine_index.shape == (2, TINY.fine_voxels)
     longest = max(1, int(whole.fine_mask.sum(1).max()))
     assert trimmed.fine_index.shape == trimmed.fine_mask.shape == (2, longest)
-    assert torch.equal(whole.fine_index[:, :longest], trimmed.fine_index)
+    assert np.array_equal(whole.fine_index[:, :longest], trimmed.fine_index)
     assert trimmed.coarse_mask.sum() == whole.coarse_mask.sum()
 
 

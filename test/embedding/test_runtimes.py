@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import openvino
 import pytest
 import torch
-from tiny_worlds import TINY, some_input
+from tiny_worlds import TINY, some_scan
 from torch import Tensor, nn
 
+from umf_ros.config import EmbeddingSettings
+from umf_ros.embedding.embedder import Asked
 from umf_ros.embedding.export import cached, convert, kept_or_made, save
-from umf_ros.embedding.inputs import blank_input
-from umf_ros.embedding.runtimes import OUTPUTS, SUPERS, TorchRuntime, make_runtime
+from umf_ros.embedding.inputs import pack, prepare_scan
+from umf_ros.embedding.runtimes import OUTPUTS, SUPERS, make_runtime, outputs_of
+from umf_ros.embedding.torch_runtimes import TorchRuntime, to_tensors
 from umf_ros.errors import ConfigError, OutputError
 from umf_ros.networks.umf import UMF
+from umf_ros.networks.weights_files import locate_weights
 
 
 class Scale(nn.Module):
@@ -44,9 +47,10 @@ def network() -> UMF:
 
 
 def test_torch_says_by_name_what_the_network_says(network):
-    batch = some_input(TINY, 1)
-    found = TorchRuntime(network, "cpu", 1, super_features=True).run(batch)
-    wanted = network.eval()(batch, super_features=True)
+    image = np.random.default_rng(0).normal(size=TINY.image_size).astype(np.float32)
+    batch = pack([image], [prepare_scan(some_scan(0), None, TINY)], TINY)
+    found = TorchRuntime(network, "cpu", 1, (*OUTPUTS, *SUPERS)).run(batch)
+    wanted = network.eval()(to_tensors(batch), super_features=True)
     assert set(found) == {*OUTPUTS, *SUPERS}
     np.testing.assert_allclose(found["descriptor"], wanted.descriptor[0].detach(), atol=1e-6)
     np.testing.assert_allclose(found["cloud_saliency"], wanted.cloud.saliency[0].detach(), atol=1e-6)
@@ -54,14 +58,16 @@ def test_torch_says_by_name_what_the_network_says(network):
     assert {values.dtype for values in found.values()} == {np.dtype(np.float32)}
 
 
-def test_super_features_are_left_out_unless_wanted(network):
-    assert set(TorchRuntime(network, "cpu", 1, False).run(blank_input(TINY))) == set(OUTPUTS)
+def test_only_what_is_asked_for_is_computed():
+    assert outputs_of(Asked()) == OUTPUTS
+    assert outputs_of(Asked(supers=True)) == (*OUTPUTS, *SUPERS)
+    assert outputs_of(Asked(image=False)) == ("descriptor", "cloud", "cloud_saliency")
 
 
 @pytest.mark.parametrize(("runtime", "device"), [("openvino", "cuda"), ("torch", "abacus"), ("auto", "abacus")])
-def test_what_cannot_run_is_refused_in_one_line(network, runtime, device):
+def test_what_cannot_run_is_refused_in_one_line(runtime, device):
     with pytest.raises(ConfigError, match="embedding") as raised:
-        make_runtime(runtime, network, Path("none"), device, 1, False)
+        make_runtime(locate_weights(None), EmbeddingSettings(runtime=runtime, device=device), Asked())
     assert "\n" not in str(raised.value)
 
 
@@ -101,10 +107,10 @@ def test_new_weights_and_other_outputs_are_kept_apart(tmp_path, monkeypatch):
     one, other = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
     one.write_bytes(b"one")
     other.write_bytes(b"other")
-    paths = {cached(one, False), cached(one, True), cached(other, False)}
+    paths = {cached(one), cached(one, OUTPUTS), cached(other)}
     assert len(paths) == 3 and {path.parent for path in paths} == {tmp_path / "cache" / "umf_ros"}
     other.write_bytes(b"one")
-    assert cached(other, False) == cached(one, False)  # the content counts, not the name
+    assert cached(other) == cached(one)  # the content counts, not the name
 
 
 def test_ctrl_c_after_networks_came_and_went_is_survived() -> None:

@@ -13,7 +13,8 @@ from umf_ros.errors import WeightsError
 from umf_ros.lab.training.networks import PRESETS, read_card, save_weights
 from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import UMF
-from umf_ros.networks.weights import SHIPPED, load_weights, locate_weights
+from umf_ros.networks.weights import load_weights
+from umf_ros.networks.weights_files import SHIPPED, locate_weights
 
 
 @pytest.fixture

@@ -66,6 +66,7 @@ def test_a_topic_that_talks_is_fine_and_has_its_rate(node: Node, clock: Clock) -
         "topic": TOPIC,
         "rate_hz": "4.5",
         "received": "9",
+        "refused": "0",
         "lost_on_the_wire": "0",
         "last_stamp_ns": str(10**18 + 8),
     }

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from umf_ros.config import PoseGraphSettings
+from umf_ros.config import PoseGraphSettings, Settings, dump_settings
 from umf_ros.errors import OutputError, UmfError
 from umf_ros.frames import LoopClosure
+from umf_ros.lab.live.live_graph import settle_left
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
+from umf_ros.pose_graph.journal import JOURNAL
 from umf_ros.sensors.durable_graph import DurableGraph
 
 SETTINGS = PoseGraphSettings(max_gap_s=3)
@@ -138,3 +140,17 @@ def test_a_closure_from_before_the_first_odometry_is_told_soon(world: GraphWorld
     drive(graph, world, 160, 175)
     (verdict,) = [v for v in graph.graph.closures() if v.closure.match_stamp_ns == world.message(0).match_stamp_ns]
     assert (verdict.state.value, verdict.reason) == ("refused", "no odometry at its keyframes: it began later")
+
+
+def test_what_was_not_settled_in_time_is_known_to_be_and_settled_later(tmp_path: Path, world: GraphWorld) -> None:
+    durable = made(tmp_path / JOURNAL)
+    drive(durable, world, 0, 300)
+    assert not durable.write_results(tmp_path, within_s=-1.0) and durable.unsettled
+    hasty = (tmp_path / "trajectory_optimized.tum").read_text()
+    durable.close()
+    (tmp_path / "config.yaml").write_text(dump_settings(Settings(pose_graph=SETTINGS)))
+    settle_left(tmp_path)
+    assert (tmp_path / "trajectory_optimized.tum").read_text() != hasty
+    again = made(tmp_path / JOURNAL)
+    assert not again.unsettled
+    again.close()

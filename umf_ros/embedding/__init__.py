@@ -46,8 +46,11 @@ def make_embedder(settings: EmbeddingSettings, super_features: bool = False, fea
     """
     if settings.method not in METHODS:
         raise ConfigError(f"embedding.method: unknown method {settings.method!r}; known: {', '.join(METHODS)}")
-    embedder: Embedder = import_module(f"{__name__}.{settings.method}{SUFFIX}").make(settings, super_features)
-    if features == OWN_FEATURES:
+    from umf_ros.embedding.embedder import Asked
+
+    asked = Asked(image=features == OWN_FEATURES, supers=super_features)
+    embedder: Embedder = import_module(f"{__name__}.{settings.method}{SUFFIX}").make(settings, asked)
+    if asked.image:
         return embedder
     from umf_ros.embedding.image_features import with_xfeat
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.embedder import unit_descriptor
+from umf_ros.embedding.embedder import Asked, unit_descriptor
 from umf_ros.embedding.vocabulary import Binary, Vocabulary, WordBag
 from umf_ros.frames import Embedding, Frame, Image
 from umf_ros.networks.place_networks import locate_place_weights
@@ -57,7 +57,7 @@ class Dbow2Embedder:
         return self._vocabulary.bag(self._orb.of(image))
 
 
-def make(settings: EmbeddingSettings, super_features: bool) -> Dbow2Embedder:
+def make(settings: EmbeddingSettings, asked: Asked) -> Dbow2Embedder:
     """With the vocabulary that the settings name, or the shipped one.
 
     Raises:

@@ -27,12 +27,20 @@ MAX_CLIMB, MAX_DRIFT = 1.0, 3.0  # pixels, across the rows and from what block m
 def lift(frame: Frame, embedding: Embedding) -> Embedding:
     """The embedding with a 3-D point (body frame, m) for each image feature whose depth is known.
 
+    Features whose depth is known already keep it.
+    """
+    features = embedding.image
+    if features is None or np.isfinite(features.points).any():
+        return embedding
+    return dataclasses.replace(embedding, image=lift_features(frame, features))
+
+
+def lift_features(frame: Frame, features: LocalFeatures) -> LocalFeatures:
+    """The features of a frame's left image with a 3-D point for each whose depth is known.
+
     LiDAR depth comes first (2 cm, day and night); stereo fills in outside the scan or without one.
     """
-    if embedding.image is None:
-        return embedding
-    image = dataclasses.replace(embedding.image, points=_locate(frame, embedding.image))
-    return dataclasses.replace(embedding, image=image)
+    return dataclasses.replace(features, points=_locate(frame, features))
 
 
 def disparities(left: Image, right: Image, pixels: Array, camera: StereoCamera) -> Array:

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from umf_ros.frames import Embedding, Frame, Points
 from umf_ros.geometry import Array
+
+
+class Asked(NamedTuple):
+    """Which local features an embedder is asked for, of those that it has; what is not asked for costs nothing.
+
+    Attributes:
+        image: those of the image.
+        supers: super-features.
+    """
+
+    image: bool = True
+    supers: bool = False
 
 
 class Embedder(Protocol):

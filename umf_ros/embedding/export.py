@@ -8,13 +8,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
-
-from torch import nn
+from typing import TYPE_CHECKING, Any
 
 from umf_ros.errors import OutputError
 
-FORMAT = 1
+if TYPE_CHECKING:
+    from torch import nn
+
+FORMAT = 2
 """Of what is kept; another number makes all anew."""
 
 
@@ -71,11 +72,11 @@ def kept_or_made(path: Path, make: Callable[[], Any]) -> Any:
     return model
 
 
-def cached(weights: Path, super_features: bool) -> Path:
-    """Where the converted model of a weights file is kept: a new file for new weights or a new OpenVINO."""
+def cached(weights: Path, outputs: tuple[str, ...] = ()) -> Path:
+    """Where the converted model of a weights file is kept: another file for other outputs, weights or OpenVINO."""
     import openvino
 
     digest = hashlib.sha256(weights.read_bytes())
-    digest.update(f"{openvino.__version__} {super_features} {FORMAT}".encode())
+    digest.update(f"{openvino.__version__} {' '.join(outputs)} {FORMAT}".encode())
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(home) / "umf_ros" / f"{digest.hexdigest()[:20]}.xml"

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.embedder import unit_descriptor
+from umf_ros.embedding.embedder import Asked, unit_descriptor
 from umf_ros.embedding.inputs import shrink
 from umf_ros.frames import Embedding, Frame, Image
 from umf_ros.geometry import Array
@@ -41,6 +41,6 @@ def _histograms(image: Image) -> Array:
     return scaled.ravel()
 
 
-def make(settings: EmbeddingSettings, super_features: bool) -> GradientsEmbedder:
+def make(settings: EmbeddingSettings, asked: Asked) -> GradientsEmbedder:
     """It has no settings."""
     return GradientsEmbedder()

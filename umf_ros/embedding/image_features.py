@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.config import EmbeddingSettings
+from umf_ros.embedding.depth import lift_features
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.inputs import is_blank
 from umf_ros.embedding.runtimes import XFeatRuntime, make_xfeat_runtime
 from umf_ros.frames import Embedding, Frame, Image, LocalFeatures, Points
 from umf_ros.geometry import Array
-from umf_ros.networks.xfeat import CELL, COARSEST
+from umf_ros.networks.config import XFEAT_CELL, XFEAT_STRIDE
 from umf_ros.resources import find
 
 WEIGHTS = "models/xfeat.safetensors"
@@ -46,7 +48,7 @@ class XFeatExtractor:
         shrunk = image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         descriptors, corners, reliability = self._runtime.run(shrunk.astype(np.float32))
         pixels, score = key_points(corners, reliability)
-        found = sample(descriptors, (pixels + 0.5) / CELL - 0.5)
+        found = sample(descriptors, (pixels + 0.5) / XFEAT_CELL - 0.5)
         found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
         positions = (pixels + 0.5) * (np.array([width, height]) / size) - 0.5
         unknown = np.full((len(pixels), 3), np.nan, np.float32)
@@ -66,13 +68,18 @@ class WithXFeat:
         self.name = f"{embedder.name}+{extractor.name}"
         self.dimension = embedder.dimension
         self._embedder, self._extractor = embedder, extractor
+        # both networks let go of the interpreter while they run
+        self._beside = ThreadPoolExecutor(1, "xfeat")
 
     def embed(self, frame: Frame) -> Embedding:
-        """As the embedder, with other features of the image."""
-        embedding = self._embedder.embed(frame)
+        """As the embedder, with other features of the image, their depths found."""
         if frame.left is None or is_blank(frame.left):
-            return embedding
-        return replace(embedding, image=self._extractor.extract(frame.left))
+            return self._embedder.embed(frame)
+        image = self._beside.submit(self._look, frame, frame.left)
+        return replace(self._embedder.embed(frame), image=image.result())
+
+    def _look(self, frame: Frame, image: Image) -> LocalFeatures:
+        return lift_features(frame, self._extractor.extract(image))
 
 
 def with_xfeat(embedder: Embedder, settings: EmbeddingSettings) -> WithXFeat:
@@ -84,7 +91,7 @@ def with_xfeat(embedder: Embedder, settings: EmbeddingSettings) -> WithXFeat:
 def network_size(width: int, height: int) -> tuple[int, int]:
     """Width and height of what the network sees of an image: multiples of 32 pixels, at most 512."""
     scale = min(1.0, LONGEST / max(width, height))
-    across, down = (max(1, round(side * scale / COARSEST)) * COARSEST for side in (width, height))
+    across, down = (max(1, round(side * scale / XFEAT_STRIDE)) * XFEAT_STRIDE for side in (width, height))
     return across, down
 
 
@@ -100,7 +107,7 @@ def key_points(corners: Points, reliability: Points) -> tuple[Array, Points]:
     peak[[0, -1]] = peak[:, [0, -1]] = False
     rows, columns = np.nonzero(peak)
     pixels = np.column_stack([columns, rows]).astype(float)
-    score = corners[rows, columns] * sample(reliability[None], (pixels + 0.5) / CELL - 0.5)[:, 0]
+    score = corners[rows, columns] * sample(reliability[None], (pixels + 0.5) / XFEAT_CELL - 0.5)[:, 0]
     best = np.argsort(-score, kind="stable")[:LIMIT]
     rows, columns = rows[best], columns[best]
     shifts = [_vertex(corners, rows, columns, *step) for step in ((0, 1), (1, 0))]

@@ -1,26 +1,36 @@
-"""From preprocessed images and scans to the tensors the network reads."""
+"""From preprocessed images and scans to the arrays the network reads."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from umf_ros.embedding.voxels import VoxelScan, voxelise
 from umf_ros.frames import Frame, Image, Points
 from umf_ros.geometry import transform
 from umf_ros.levelling import level
 from umf_ros.networks.config import NetworkConfig
-from umf_ros.networks.umf import NetworkInput
+
+
+class InputArrays(NamedTuple):
+    """A batch as arrays: the fields of `NetworkInput` in their order, without torch."""
+
+    image: NDArray[np.float32]
+    image_present: NDArray[np.bool_]
+    grid: NDArray[np.float32]
+    coarse_index: NDArray[np.int64]
+    coarse_mask: NDArray[np.bool_]
+    fine_index: NDArray[np.int64]
+    fine_mask: NDArray[np.bool_]
 
 
 def pack(
     images: Sequence[NDArray[np.float32] | None], scans: Sequence[VoxelScan], config: NetworkConfig, trim: bool = False
-) -> NetworkInput:
+) -> InputArrays:
     """Stack preprocessed frames.
 
     Args:
@@ -35,12 +45,12 @@ def pack(
         longest = max(1, *(int(getattr(scan, f"{size}_mask").sum()) for scan in scans)) if trim else None
         lengths |= {f"{size}_index": longest, f"{size}_mask": longest}
 
-    def gather(name: str) -> Tensor:
-        return torch.from_numpy(np.stack([getattr(scan, name)[: lengths[name]] for scan in scans]))
+    def gather(name: str) -> NDArray:
+        return np.stack([getattr(scan, name)[: lengths[name]] for scan in scans])
 
-    return NetworkInput(
-        image=torch.from_numpy(np.stack([blank if image is None else image for image in images]))[:, None],
-        image_present=torch.tensor([image is not None for image in images]),
+    return InputArrays(
+        image=np.stack([blank if image is None else image for image in images])[:, None],
+        image_present=np.array([image is not None for image in images]),
         **{name: gather(name) for name in lengths},
     )
 
@@ -57,14 +67,14 @@ def prepare_scan(points: Points | None, intensity: Points | None, config: Networ
     return voxelise(points, intensity, config.coarse_voxels, config.fine_voxels)
 
 
-def read_frame(frame: Frame, config: NetworkConfig) -> NetworkInput:
+def read_frame(frame: Frame, config: NetworkConfig) -> InputArrays:
     """A batch of one frame as the network reads it: a black image is none, a scan stands upright on its ground."""
     image = None if frame.left is None or is_blank(frame.left) else prepare_image(frame.left, config)
     points = None if frame.points is None else transform(level(frame.points), frame.points)
     return pack([image], [prepare_scan(points, frame.intensity, config)], config)
 
 
-def blank_input(config: NetworkConfig) -> NetworkInput:
+def blank_input(config: NetworkConfig) -> InputArrays:
     """A batch of one frame without image and scan, for its shapes."""
     return pack([None], [prepare_scan(None, None, config)], config)
 
@@ -74,7 +84,7 @@ DARK_STD = 2.0
 
 def is_blank(image: Image) -> bool:
     """Whether an image shows nothing: a rover in the dark, or a covered lens."""
-    return float(image.std()) < DARK_STD
+    return float(cv2.meanStdDev(image)[1].max()) < DARK_STD
 
 
 def shrink(image: Image, size: tuple[int, int]) -> Image:

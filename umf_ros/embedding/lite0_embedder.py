@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from umf_ros.config import EmbeddingSettings
+from umf_ros.embedding.embedder import Asked
 from umf_ros.embedding.inputs import shrink, standardise
 from umf_ros.errors import ConfigError
 from umf_ros.frames import Embedding, Frame, Image, Points
@@ -48,7 +49,7 @@ class Lite0Embedder:
         return (found / np.linalg.norm(found)).astype(np.float32)
 
 
-def make(settings: EmbeddingSettings, super_features: bool, mean: bool = False) -> Lite0Embedder:
+def make(settings: EmbeddingSettings, asked: Asked, mean: bool = False) -> Lite0Embedder:
     """With the published weights that the settings name.
 
     Raises:

@@ -7,12 +7,13 @@ from pathlib import Path
 import torch
 
 from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.embedder import unit_descriptor
+from umf_ros.embedding.embedder import Asked, unit_descriptor
 from umf_ros.embedding.inputs import is_blank, shrink, standardise
 from umf_ros.frames import Embedding, Frame
 from umf_ros.networks.place_network import IMAGE_SIZE, LATE, Gem, ImageTrunk
 from umf_ros.networks.umf import count_parameters
-from umf_ros.networks.weights import load_weights, locate_weights
+from umf_ros.networks.weights import load_weights
+from umf_ros.networks.weights_files import locate_weights
 
 TRUNK_FROM = Path("umf_scene")
 
@@ -41,6 +42,6 @@ class Lite0GemEmbedder:
         return Embedding(unit_descriptor(found.numpy()))
 
 
-def make(settings: EmbeddingSettings, super_features: bool) -> Lite0GemEmbedder:
+def make(settings: EmbeddingSettings, asked: Asked) -> Lite0GemEmbedder:
     """With the trunk of the shipped weights."""
     return Lite0GemEmbedder()

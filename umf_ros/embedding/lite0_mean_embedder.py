@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from umf_ros.config import EmbeddingSettings
 from umf_ros.embedding import lite0_embedder
+from umf_ros.embedding.embedder import Asked
 from umf_ros.embedding.lite0_embedder import Lite0Embedder
 
 
-def make(settings: EmbeddingSettings, super_features: bool) -> Lite0Embedder:
+def make(settings: EmbeddingSettings, asked: Asked) -> Lite0Embedder:
     """With the published weights that the settings name.
 
     Raises:
         ConfigError: they name none.
     """
-    return lite0_embedder.make(settings, super_features, mean=True)
+    return lite0_embedder.make(settings, asked, mean=True)

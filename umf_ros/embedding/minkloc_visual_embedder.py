@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from umf_ros.config import EmbeddingSettings
+from umf_ros.embedding.embedder import Asked
 from umf_ros.embedding.place_networks import NetworkEmbedder, make_network_embedder
 
 
-def make(settings: EmbeddingSettings, super_features: bool) -> NetworkEmbedder:
+def make(settings: EmbeddingSettings, asked: Asked) -> NetworkEmbedder:
     """With the weights that the settings name, or the shipped ones.
 
     Raises:

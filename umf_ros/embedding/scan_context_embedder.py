@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.embedder import unit_descriptor
+from umf_ros.embedding.embedder import Asked, unit_descriptor
 from umf_ros.frames import Embedding, Frame, Points
 
 
@@ -40,6 +40,6 @@ class ScanContextEmbedder:
         return np.concatenate([layer.ravel() for layer in maps])
 
 
-def make(settings: EmbeddingSettings, super_features: bool) -> ScanContextEmbedder:
+def make(settings: EmbeddingSettings, asked: Asked) -> ScanContextEmbedder:
     """It has no settings."""
     return ScanContextEmbedder()

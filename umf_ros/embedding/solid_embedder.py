@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.embedder import unit_descriptor
+from umf_ros.embedding.embedder import Asked, unit_descriptor
 from umf_ros.frames import Embedding, Frame, Points
 from umf_ros.geometry import invert, transform
 
@@ -41,6 +41,6 @@ class SolidEmbedder:
         return count @ ((total - total.min(initial=0)) / spread if spread > 0 else total)
 
 
-def make(settings: EmbeddingSettings, super_features: bool) -> SolidEmbedder:
+def make(settings: EmbeddingSettings, asked: Asked) -> SolidEmbedder:
     """It has no settings."""
     return SolidEmbedder()

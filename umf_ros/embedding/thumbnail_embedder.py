@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.embedder import unit_descriptor
+from umf_ros.embedding.embedder import Asked, unit_descriptor
 from umf_ros.frames import Embedding, Frame, Image, Points
 
 
@@ -29,6 +29,6 @@ def _thumbnail(image: Image) -> Points:
     return values - values.mean()
 
 
-def make(settings: EmbeddingSettings, super_features: bool) -> ThumbnailEmbedder:
+def make(settings: EmbeddingSettings, asked: Asked) -> ThumbnailEmbedder:
     """It has no settings."""
     return ThumbnailEmbedder()

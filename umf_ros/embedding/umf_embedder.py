@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from umf_ros.config import EmbeddingSettings
+from umf_ros.embedding.embedder import Asked
 from umf_ros.embedding.inputs import is_blank, pack, prepare_image, prepare_scan
 from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_salient
 from umf_ros.embedding.runtimes import Outputs, make_runtime
@@ -15,7 +16,7 @@ from umf_ros.embedding.voxels import VoxelScan
 from umf_ros.frames import Embedding, Frame, LocalFeatures, Points, SuperFeatures
 from umf_ros.geometry import Array, invert, transform
 from umf_ros.levelling import level
-from umf_ros.networks.weights import load_weights, locate_weights
+from umf_ros.networks.weights_files import locate_weights, read_config
 
 KEYPOINTS = 400
 # of the fair share of attention; the cap decides in a rich view, this in a poor one
@@ -31,10 +32,8 @@ class UmfEmbedder:
 
     Args:
         weights: safetensors file or name of shipped weights, or None for the default.
-        runtime: auto, torch or openvino.
-        device: torch device.
-        threads: of the network; 0: as many as there are cores.
-        super_features: whether to compute them.
+        settings: runtime, device and threads.
+        asked: which local features to compute.
 
     Raises:
         WeightsError: the weights cannot be used.
@@ -44,21 +43,18 @@ class UmfEmbedder:
     def __init__(
         self,
         weights: Path | None = None,
-        runtime: str = "auto",
-        device: str = "cpu",
-        threads: int = 0,
-        super_features: bool = False,
+        settings: EmbeddingSettings | None = None,
+        asked: Asked = Asked(),  # noqa: B008 (a tuple)
     ) -> None:
         path = locate_weights(weights)
-        network = load_weights(path)
+        self._config = read_config(path)
         # descriptors of other weights, or of scans read otherwise, are another language: the name tells them apart
         self.name = f"{path.stem}-{hashlib.sha256(path.read_bytes() + READ_AS).hexdigest()[:8]}"
-        self._config = network.config
-        self.dimension = network.config.length
-        self._super_features = super_features
-        rows, columns = (side // 4 for side in network.config.image_size)
+        self.dimension = self._config.length
+        self._asked = asked
+        rows, columns = (side // 4 for side in self._config.image_size)
         self._regions = cell_regions(rows, columns)
-        self._runtime = make_runtime(runtime, network, path, device, threads, super_features)
+        self._runtime = make_runtime(path, settings or EmbeddingSettings(), asked)
 
     def embed(self, frame: Frame) -> Embedding:
         """Embed one frame; a black image and an empty scan count as missing."""
@@ -67,10 +63,10 @@ class UmfEmbedder:
         points = None if frame.points is None else transform(level_T_body, frame.points)
         scan = prepare_scan(points, frame.intensity, self._config)
         found = self._runtime.run(pack([prepare_image(image, self._config)], [scan], self._config))
-        supers = self._supers(found) if self._super_features else (None, None)
+        supers = self._supers(found) if self._asked.supers else (None, None)
         return Embedding(
             descriptor=found["descriptor"],
-            image=None if image is None else self._image_features(found, image.shape[:2]),
+            image=self._image_features(found, image.shape[:2]) if self._asked.image and image is not None else None,
             cloud=self._cloud_features(found, scan, level_T_body) if scan.fine_mask.any() else None,
             super_image=None if image is None else supers[0],
             super_cloud=supers[1] if scan.fine_mask.any() else None,
@@ -96,10 +92,9 @@ class UmfEmbedder:
         return image, SuperFeatures(found["super_cloud"].astype(np.float16), found["super_cloud_strength"])
 
 
-def make(settings: EmbeddingSettings, super_features: bool) -> UmfEmbedder:
+def make(settings: EmbeddingSettings, asked: Asked) -> UmfEmbedder:
     """With the weights that the settings name."""
-    weights = Path(settings.weights) if settings.weights else None
-    return UmfEmbedder(weights, settings.runtime, settings.device, settings.threads, super_features)
+    return UmfEmbedder(Path(settings.weights) if settings.weights else None, settings, asked)
 
 
 def _features(

@@ -40,6 +40,7 @@ class MapFollower:
     """
 
     taken_up = changed = 0
+    unsettled = False
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -76,6 +77,9 @@ class MapFollower:
     def update(self) -> list[ClosureVerdict]:
         """There is nothing that waits for a decision."""
         return []
+
+    def prepare(self, within_s: float) -> None:
+        """There is nothing to settle."""
 
     def revoke(self, match_ns: int, query_ns: int) -> list[ClosureVerdict]:
         """No closure stays, so none can be taken out.
@@ -121,8 +125,8 @@ class MapFollower:
         """How many closures had which verdict."""
         return Counter(self._verdicts)
 
-    def write_results(self, folder: str | Path) -> None:
-        """Write where the rover went, `trajectory_in_map.tum`.
+    def write_results(self, folder: str | Path, within_s: float = float("inf")) -> bool:
+        """Write where the rover went, `trajectory_in_map.tum`; there is always the time for that.
 
         Raises:
             OutputError: it cannot be written.
@@ -131,6 +135,7 @@ class MapFollower:
         with writing(f"to {folder}"):
             Path(folder).mkdir(parents=True, exist_ok=True)
         write_tum(Path(folder) / "trajectory_in_map.tum", Trajectory(stamps, poses))
+        return True
 
     def _begin(self) -> None:
         self._localizer = Localizer(read_poses(Path(self._settings.map)), self._settings.pose_graph)

@@ -7,6 +7,10 @@ from typing import Any, Literal, get_args
 
 from umf_ros.errors import WeightsError
 
+XFEAT_CELL = 8
+"""Pixels along a side of the cell that one descriptor of XFeat stands for."""
+XFEAT_STRIDE = 32
+"""Of its deepest layer: images are cut to multiples of this many pixels."""
 Backbone = Literal["resnet18", "resnet34", "resnet50", "efficientnet_lite0"]
 
 

@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from umf_ros.errors import WeightsError
 from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import UMF, channels_last
-from umf_ros.resources import find
+from umf_ros.networks.weights_files import open_weights, parse_architecture
 
-SHIPPED = ("umf_scene", "umf_light")
-DEFAULT = "umf_scene"
 SCALE = ".scale"
 """End of the name of what the eight bits of another tensor are to be multiplied with."""
-
-
-def locate_weights(weights: Path | None) -> Path:
-    """A weights file: as given, one of the shipped by its name, or for None the shipped default."""
-    name = DEFAULT if weights is None else str(weights)
-    return find(f"models/{name}.safetensors") if name in SHIPPED else Path(name)
 
 
 def load_weights(path: Path) -> UMF:
@@ -65,20 +55,9 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     Raises:
         WeightsError: missing, truncated or foreign file.
     """
-    if not path.is_file():
-        raise WeightsError(f"weights {path} do not exist")
-    try:
-        with safe_open(path, framework="pt") as stream:
-            metadata = stream.metadata() or {}
-            tensors = _restore({name: stream.get_tensor(name) for name in stream.keys()})  # noqa: SIM118 (not a mapping)
-    except (SafetensorError, OSError, ValueError) as error:
-        raise WeightsError(f"{path} is truncated or not a safetensors file: {' '.join(str(error).split())}") from None
-    if "architecture" not in metadata:
-        raise WeightsError(f"{path} holds weights of another architecture: it does not say which")
-    try:
-        return dict(json.loads(metadata["architecture"])), tensors
-    except (TypeError, ValueError):
-        raise WeightsError(f"{path} holds weights of another architecture: it does not say which clearly") from None
+    with open_weights(path, "pt") as stream:
+        tensors = _restore({name: stream.get_tensor(name) for name in stream.keys()})  # noqa: SIM118 (not a mapping)
+        return parse_architecture(path, stream), tensors
 
 
 def _restore(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

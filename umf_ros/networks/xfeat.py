@@ -11,11 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from umf_ros.errors import WeightsError
+from umf_ros.networks.config import XFEAT_CELL
 
-CELL = 8
-"""Pixels along a side of the cell that one descriptor stands for."""
-COARSEST = 32
-"""Images are cut to multiples of this many pixels: the stride of the deepest layer."""
 DESCRIPTOR = 64
 
 
@@ -38,7 +35,7 @@ class XFeat(nn.Module):
         self.fusion = nn.Sequential(*_conv(64, 64), *_conv(64, 64), nn.Conv2d(64, DESCRIPTOR, 1))
         self.reliability = nn.Sequential(*_conv(64, 64, 1), *_conv(64, 64, 1), nn.Conv2d(64, 1, 1), nn.Sigmoid())
         self.corners = nn.Sequential(
-            *_conv(CELL**2, 64, 1), *_conv(64, 64, 1), *_conv(64, 64, 1), nn.Conv2d(64, CELL**2 + 1, 1)
+            *_conv(XFEAT_CELL**2, 64, 1), *_conv(64, 64, 1), *_conv(64, 64, 1), nn.Conv2d(64, XFEAT_CELL**2 + 1, 1)
         )
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -61,10 +58,10 @@ class XFeat(nn.Module):
         raised = [functional.interpolate(level, eighth.shape[-2:], mode="bilinear") for level in deep]
         features = self.fusion(eighth + raised[0] + raised[1])
         # the last of the 65 says that there is no key point in the square
-        corners = self.corners(functional.pixel_unshuffle(image, CELL)).softmax(1)[:, : CELL**2]
+        corners = self.corners(functional.pixel_unshuffle(image, XFEAT_CELL)).softmax(1)[:, : XFEAT_CELL**2]
         return (
             functional.normalize(features, dim=1),
-            functional.pixel_shuffle(corners, CELL),
+            functional.pixel_shuffle(corners, XFEAT_CELL),
             self.reliability(features),
         )
 

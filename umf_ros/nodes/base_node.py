@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -28,7 +29,7 @@ HEARTBEAT_S = 0.05
 SIM_TIME_SILENT = "use_sim_time is set, but nothing comes on /clock: stamps of messages count, the pose's age does not"
 
 
-class BaseNode(LifecycleNode):
+class BaseNode(LifecycleNode, ABC):
     """A managed node with the package's settings as its parameters, and a folder for results.
 
     What a node does it sets up in `_open` and ends in `_finish`. With `autostart`, the default, it is configured and
@@ -114,21 +115,21 @@ class BaseNode(LifecycleNode):
         """Whether nothing more is to be waited for after Ctrl-C."""
         return True
 
+    @abstractmethod
     def _open(self) -> None:
         """Make everything that the node needs."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _finish(self) -> None:
         """Finish the work in hand, write the results, let go of everything."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _retune(self, settings: Settings) -> None:
         """Take over settings that may change while the node runs."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _tick(self) -> None:
         """Once per second of the machine's clock."""
-        raise NotImplementedError
 
     def _configure(self) -> None:
         if self._results:
@@ -185,8 +186,13 @@ class BaseNode(LifecycleNode):
 
         def receive(message: Any) -> None:
             watch.saw(from_time(message.header.stamp))
-            if self._active:
+            if not self._active:
+                return
+            try:
                 take(message)
+            except Exception:
+                watch.refused += 1
+                raise
 
         def lose(event: Any) -> None:
             watch.lost += event.total_count_change

@@ -91,6 +91,7 @@ class InputWatch:
         self.name = name
         self.topic = topic
         self.received = 0
+        self.refused = 0
         self.lost = 0
         self.warning = ""
         self.last_stamp_ns: int | None = None
@@ -114,6 +115,7 @@ class InputWatch:
             "topic": self.topic,
             "rate_hz": round(rate, 2),
             "received": self.received,
+            "refused": self.refused,
             "lost_on_the_wire": self.lost,
             "last_stamp_ns": "none" if self.last_stamp_ns is None else self.last_stamp_ns,
         }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,7 @@ from umf_ros.loop_detector import Detection, LoopDetector, make_detector_embedde
 from umf_ros.nodes.announcer import Announcer
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
-from umf_ros.nodes.process import run
+from umf_ros.nodes.process import leave, run
 from umf_ros.nodes.qos import sensor_qos
 from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.nodes.worker import Worker
@@ -76,6 +75,7 @@ class LoopClosureNode(BaseNode):
         self._between = 0
         self._last: Detection | None = None
         self._worker: Worker[Frame] = Worker(self._detect, self._complain, settings.worker.queue_size)
+        self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._complain, 1)
         self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._complain, INTAKE_QUEUE)
         hear_static_transforms(self, transforms)
         for name, topic in topics.model_dump().items():
@@ -93,10 +93,11 @@ class LoopClosureNode(BaseNode):
         for frame in self._synchronizer.flush():
             self._worker.submit(frame)
         self._worker.close(timeout_s=30.0)
+        self._writer.close()
         self._announcer.wait_until_heard()
         try:
+            self._write_summary()
             if self._recorder is not None:
-                self._recorder.write_summary(self._drops())
                 self._recorder.close()
         finally:
             self._detector.close()
@@ -147,6 +148,9 @@ class LoopClosureNode(BaseNode):
     def _tick(self) -> None:
         own = self._own_status()
         self._diagnose(own if self._paused else self._judge(own))
+        self._writer.submit(None)  # a slow disk is no matter of the executor
+
+    def _write_summary(self) -> None:
         if self._recorder is not None:
             self._recorder.write_summary(self._drops())
 
@@ -220,7 +224,7 @@ def _counts(synchronizer: Synchronizer) -> dict[str, int]:
 
 def main() -> None:
     """Entry point of `ros2 run umf_ros loop_closure_node`."""
-    sys.exit(run(LoopClosureNode))
+    leave(run(LoopClosureNode))
 
 
 if __name__ == "__main__":

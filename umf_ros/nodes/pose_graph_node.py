@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -30,11 +29,12 @@ from umf_ros.nodes import pose_graph_messages as messages
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import closure_from_message, is_between_rovers, parse_pair
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
-from umf_ros.nodes.process import run
+from umf_ros.nodes.process import leave, run
 from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
 from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.nodes.worker import Worker
 from umf_ros.pose_graph.closures import ClosureVerdict, State
+from umf_ros.pose_graph.journal import JOURNAL
 from umf_ros.sensors.durable_graph import DurableGraph
 from umf_ros.sensors.messages import OdometrySample, decode_odometry
 from umf_ros.sensors.static_transforms import OdometryFrames, StaticTransforms
@@ -42,9 +42,11 @@ from umf_ros.sensors.static_transforms import OdometryFrames, StaticTransforms
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works
 QUEUE = 100_000
-JOURNAL = "pose_graph.sqlite"
 FRONT_END = "loop_closure_node"
-GRACE_S = 1.0
+SETTLE_S, PREPARE_S = 1.0, 0.2
+"""Longest time to settle the graph at the end, and to work ahead for that once per second."""
+UNSETTLED = "no time to settle the graph: results as they stand; they are settled when this folder is used next"
+GRACE_S = 0.5
 """A front-end that was asked to end together with us says so within this."""
 
 
@@ -74,6 +76,8 @@ class PoseGraphNode(BaseNode):
             self.get_logger().info(_taken_up(kept))
             self._announce(kept.graph.closures())
         self._worker: Worker[Callable[[], None]] = Worker(self._run, self._complain, QUEUE)
+        if self._durable.unsettled:
+            self._worker.submit(lambda: self._settle_left())
         topics, transforms = topics_of(settings), StaticTransforms()
         self._odometry_frames = OdometryFrames(settings.frames, transforms, self.get_logger().warning)
         hear_static_transforms(self, transforms)
@@ -92,8 +96,8 @@ class PoseGraphNode(BaseNode):
         """Take in what is queued, settle the graph and write the results."""
         self._worker.close(timeout_s=60.0)
         try:
-            if self._results:
-                self._durable.graph.write_results(self._results)
+            if self._results and not self._durable.write_results(Path(self._results), SETTLE_S):
+                self.get_logger().warning(UNSETTLED)
         finally:
             self._durable.close()
 
@@ -105,6 +109,11 @@ class PoseGraphNode(BaseNode):
         if not self._opened or not self.count_publishers("loop_closures"):
             return True
         return not self._front_end_busy and now_s - self._asked_s > GRACE_S
+
+    def _settle_left(self) -> None:
+        """Finish what the process before had no time for."""
+        self._durable.write_results(Path(self._results))
+        self._announce(self._durable.graph.closures())
 
     def _retune(self, settings: Settings) -> None:
         with self._lock:
@@ -191,6 +200,7 @@ class PoseGraphNode(BaseNode):
     def _keep_up(self) -> None:
         """Decide about closures that waited for odometry, and show what has grown."""
         self._announce(self._durable.update())
+        self._durable.graph.prepare(PREPARE_S)
         self._correct()
         if len(self._durable.graph.trajectory()[0]) != self._drawn:
             self._draw()
@@ -199,6 +209,8 @@ class PoseGraphNode(BaseNode):
         graph = self._durable.graph
         values: dict[str, object] = {**graph.counts, **self._faults, "queue_dropped": self._worker.dropped}
         values["odometry_out_of_line"] = self._durable.feed.dropped
+        values["odometry_held"] = self._durable.feed.held
+        values["queue_waiting"] = self._worker.waiting
         values["executor_stall_max_ms"] = self._heartbeat.longest_ms
         values |= {state.value: count for state, count in graph.verdict_counts().items()}
         trouble = self._worker.dropped or any(name.startswith("optimiser") for name in graph.counts)
@@ -223,13 +235,13 @@ class PoseGraphNode(BaseNode):
         folder = self._results or "pose_graph_results"
         self._worker.drain(10.0)
         with self._lock:
-            self._durable.graph.write_results(folder)
+            self._durable.write_results(Path(folder))
         return f"results written to {folder}"
 
     def _reset(self, _: Any) -> str:
         with self._lock:
             if self._results:
-                self._durable.graph.write_results(_numbered(Path(self._results)))
+                self._durable.write_results(_numbered(Path(self._results)))
             kept = self._durable.end()
         self._map_T_odom, self._drawn = self._durable.graph.map_T_odom(), -1
         return "a new graph begins" + (f"; the old one is kept in {kept}" if kept else "")
@@ -275,7 +287,7 @@ def _broadcaster(node: Node) -> Callable[[TransformStamped], None] | None:
 
 def main() -> None:
     """Entry point of `ros2 run umf_ros pose_graph_node`."""
-    sys.exit(run(PoseGraphNode))
+    leave(run(PoseGraphNode))
 
 
 if __name__ == "__main__":

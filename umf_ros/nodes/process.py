@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
+import logging
+import os
 import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from typing import NoReturn
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -17,6 +22,10 @@ from umf_ros.errors import UmfError
 LONGEST_WAIT_S = 60.0
 """So long a node that was asked to end may wait for those that it hears."""
 
+SWITCH_S = 0.0005
+M_ARENA_MAX = -8
+"""Of glibc's mallopt."""
+
 
 def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> int:
     """Spin one node until Ctrl-C, then let it finish; returns the exit status.
@@ -25,6 +34,9 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     SIGTERM ends the spinning, as soon as the node is ready to close; a second one ends it at once. While the node
     writes its results further ones are ignored.
     """
+    # a thread that comes back from a library waits this long for another that computes in Python: it comes back often
+    sys.setswitchinterval(SWITCH_S)
+    _share_memory()
     asked: list[int] = []
     # our own handlers, before anything else: rclpy's would shut the context down before the node's last words
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -57,11 +69,25 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     return status
 
 
+def leave(status: int) -> NoReturn:
+    """End the process, whose results are written, at once: to take all libraries apart takes Python seconds."""
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
+
+
 def _wait_until_ready(node: Node, executor: SingleThreadedExecutor, asked: list[int]) -> None:
     ready: Callable[[], bool] = getattr(node, "ready_to_close", lambda: True)
     deadline, first = time.monotonic() + LONGEST_WAIT_S, len(asked)
     while not ready() and len(asked) == first and time.monotonic() < deadline and rclpy.ok():
         executor.spin_once(timeout_sec=0.05)
+
+
+def _share_memory() -> None:
+    """Let all threads take memory from two heaps: glibc gives each its own, and what one let go another cannot use."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
 
 
 def complain(error: UmfError) -> None:

@@ -40,6 +40,11 @@ class Worker(Generic[Item]):
             self._queue.append(item)
             self._wake.notify_all()
 
+    @property
+    def waiting(self) -> int:
+        """Items submitted and not yet done."""
+        return len(self._queue) + self._busy
+
     def drain(self, timeout_s: float | None = None) -> bool:
         """Wait until everything submitted is done; False when the time is up first."""
         with self._wake:

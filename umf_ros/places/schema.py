@@ -6,6 +6,7 @@ import json
 import sqlite3
 
 from umf_ros.errors import UmfError
+from umf_ros.sqlite_files import survive_crashes, tables_of
 
 SCHEMA_VERSION = 3
 _TABLES = (
@@ -27,7 +28,7 @@ def check_identity(connection: sqlite3.Connection, name: str, identity: dict[str
     Raises:
         UmfError: the file `name` holds something else, or places of another network or version.
     """
-    tables = _tables(connection)
+    tables = tables_of(connection)
     if not tables:
         return
     if not {"about", "keyframe"} <= tables:
@@ -43,19 +44,13 @@ def check_identity(connection: sqlite3.Connection, name: str, identity: dict[str
 
 def prepare(connection: sqlite3.Connection, identity: dict[str, str]) -> None:
     """Make an empty file a place database, and an older one as good as new; the caller holds its lock."""
-    # WAL without a sync per keyframe: safe against a crash of the process
-    connection.execute("PRAGMA journal_mode = WAL")
-    connection.execute("PRAGMA synchronous = NORMAL")
+    survive_crashes(connection)
     with connection:
         connection.execute("BEGIN IMMEDIATE")
-        if not _tables(connection):
+        if not tables_of(connection):
             for table in _TABLES:
                 connection.execute(table)
             content = json.dumps({"schema": str(SCHEMA_VERSION), **identity})
             connection.execute("INSERT INTO about VALUES (?)", (content,))
         for addition in _ADDED:
             connection.execute(addition)
-
-
-def _tables(connection: sqlite3.Connection) -> set[str]:
-    return {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}

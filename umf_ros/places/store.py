@@ -6,7 +6,7 @@ import os
 import sqlite3
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from uuid import UUID
@@ -22,10 +22,12 @@ from umf_ros.places.columns import Columns
 from umf_ros.places.outbox import Outbox
 from umf_ros.places.packing import pack, unpack
 from umf_ros.places.schema import check_identity, prepare
+from umf_ros.sqlite_files import open_sqlite, take_up
 
 Keys = Columns
 """`id` in the file, `stamp_ns`, `session` and `travelled_m` of every keyframe; metres are NaN without odometry."""
 IDS_AT_ONCE = 1000
+KIND = "place database"
 _KEYS = np.dtype([("id", np.int64), ("stamp_ns", np.int64), ("session", np.int64), ("travelled_m", np.float64)])
 
 
@@ -209,13 +211,7 @@ class KeyframeStore:
             raise UmfError(f"{self._name} is damaged at its keyframe {row}: {error}") from None
 
     def _open(self, identity: dict[str, str]) -> sqlite3.Connection:
-        with writing(self._name, sqlite3.Error):
-            if self.path is not None:
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-            # without a name SQLite keeps a file that no folder lists
-            connection = sqlite3.connect(self.path or "", check_same_thread=False)
-        self._take_up(connection, lambda: self._prepare(connection, identity))
-        return connection
+        return open_sqlite(self.path, KIND, lambda connection: self._prepare(connection, identity))
 
     def _open_to_read(self, identity: dict[str, str]) -> sqlite3.Connection:
         if self.path is None or not self.path.is_file():
@@ -223,20 +219,12 @@ class KeyframeStore:
         # SQLite wants to write files of its own beside what it reads, unless nobody can
         access = "mode=ro" if os.access(self.path.parent, os.W_OK) else "immutable=1"
         connection = sqlite3.connect(f"{self.path.resolve().as_uri()}?{access}", uri=True, check_same_thread=False)
-        self._take_up(connection, lambda: check_identity(connection, self._name, identity))
-        return connection
 
-    def _take_up(self, connection: sqlite3.Connection, check: Callable[[], None]) -> None:
-        """Number the keyframes of a file that passes a check; what does not is closed."""
-        try:
-            check()
-            self._read_keys(connection)
-        except UmfError:
-            connection.close()
-            raise
-        except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
-            connection.close()
-            raise UmfError(f"{self._name} cannot be used as a place database: {error}") from None
+        def check(opened: sqlite3.Connection) -> None:
+            check_identity(opened, self._name, identity)
+            self._read_keys(opened)
+
+        return take_up(connection, self._name, KIND, check)
 
     def _prepare(self, connection: sqlite3.Connection, identity: dict[str, str]) -> None:
         """Look at what is there before anything is changed, and let nobody else write from then on."""
@@ -244,6 +232,7 @@ class KeyframeStore:
         if self.path is not None:
             self._file_lock = FileLock(self.path)
         prepare(connection, identity)
+        self._read_keys(connection)
 
     def _read_keys(self, connection: sqlite3.Connection) -> None:
         # SQLite keeps a NaN as NULL; 9e999 is infinity

@@ -13,6 +13,8 @@ from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, ros_to_gtsam_covariance
 from umf_ros.pose_graph.odometry import OdometryChain, Table
 
+VERDICT_COLUMNS = ("match_stamp_ns", "query_stamp_ns", "verdict", "reason", "mahalanobis", "misfit_m")
+"""Of a table of verdicts, for who writes it and who reads it."""
 _SKEWED = 1e-3
 
 
@@ -70,6 +72,12 @@ class TrackedClosure:
     def accepted(self) -> bool:
         """Whether the closure shapes the map."""
         return self.verdict.state is State.ACCEPTED
+
+    def untried(self) -> TrackedClosure:
+        """The same closure before anything was decided."""
+        return TrackedClosure(
+            self.match, self.query, ClosureVerdict(self.closure, State.UNDECIDED, "new"), self.covariance
+        )
 
     def decide(self, state: State, reason: str, residual: float = np.nan, residual_m: float = np.nan) -> None:
         """Replace the verdict."""

@@ -15,10 +15,9 @@ import numpy as np
 
 from umf_ros.errors import writing
 from umf_ros.geometry import Array, heading, to_quaternion
-from umf_ros.pose_graph.closures import ClosureVerdict
+from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureVerdict
 from umf_ros.pose_graph.condensed import Edge
 
-VERDICT_COLUMNS = ("match_stamp_ns", "query_stamp_ns", "verdict", "reason", "mahalanobis", "misfit_m")
 _ROTATION_LAST = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 
 

@@ -15,6 +15,7 @@ from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array
 from umf_ros.locks import FileLock
 from umf_ros.pose_graph.closures import ClosureVerdict
+from umf_ros.sqlite_files import open_sqlite, survive_crashes, tables_of
 
 _TABLES = (
     "CREATE TABLE event (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, first_ns INTEGER, second_ns INTEGER, data BLOB)",
@@ -22,6 +23,9 @@ _TABLES = (
     "residual_m REAL, PRIMARY KEY (match_ns, query_ns))",
 )
 ODOMETRY, CLOSURE, REVOKED, DECIDED, STARTED = "odometry", "closure", "revoked", "decided", "started"
+UNSETTLED = "unsettled"
+JOURNAL = "pose_graph.sqlite"
+"""Name of the file in a folder of results."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +33,8 @@ class Event:
     """One thing that happened to the graph.
 
     Attributes:
-        kind: an odometry message came, a closure came, a pair of keyframes was revoked, what waited was decided, or
-            the process was started anew.
+        kind: an odometry message came, a closure came, a pair of keyframes was revoked, what waited was decided, the
+            process was started anew, or it ended before the graph was settled.
         first_ns: stamp of the odometry, or of the match.
         second_ns: stamp of the query.
         data: (16,) pose of the odometry; of a closure the pose, the covariance (36,) and the probability.
@@ -84,6 +88,11 @@ class GraphJournal:
         except (sqlite3.Error, ValueError) as error:
             raise UmfError(f"{self.path} is damaged: {error}") from None
 
+    def is_unsettled(self) -> bool:
+        """Whether the last thing that happened was an end without the time to settle the graph."""
+        row = self._connection.execute("SELECT kind FROM event ORDER BY id DESC LIMIT 1").fetchone()
+        return row is not None and row[0] == UNSETTLED
+
     def verdicts(self) -> dict[tuple[int, int], str]:
         """The latest state of every closure, by the stamps of match and query."""
         rows = self._connection.execute("SELECT match_ns, query_ns, state FROM verdict")
@@ -131,24 +140,15 @@ class GraphJournal:
             self._connection.execute("INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)", values)
 
     def _open(self) -> sqlite3.Connection:
-        with writing(self.path, sqlite3.Error):
-            connection = sqlite3.connect(self.path, check_same_thread=False)
-        try:
-            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-            if tables and not {"event", "verdict"} <= tables:
-                raise UmfError(f"{self.path} holds no pose graph, but {', '.join(sorted(tables))}")
-            # WAL without a sync per event: safe against a crash of the process
-            connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute("PRAGMA synchronous = NORMAL")
-            if not tables:
-                with connection:
-                    connection.execute("BEGIN")
-                    for table in _TABLES:
-                        connection.execute(table)
-        except UmfError:
-            connection.close()
-            raise
-        except sqlite3.Error as error:
-            connection.close()
-            raise UmfError(f"{self.path} cannot be used as a pose graph: {error}") from None
-        return connection
+        return open_sqlite(self.path, "pose graph", self._prepare)
+
+    def _prepare(self, connection: sqlite3.Connection) -> None:
+        tables = tables_of(connection)
+        if tables and not {"event", "verdict"} <= tables:
+            raise UmfError(f"{self.path} holds no pose graph, but {', '.join(sorted(tables))}")
+        survive_crashes(connection)
+        if not tables:
+            with connection:
+                connection.execute("BEGIN")
+                for table in _TABLES:
+                    connection.execute(table)

@@ -54,22 +54,22 @@ _OUTVOTED = "revoked: more places contradict it"
 _BY_HAND = "revoked by hand"
 
 
-class MapComparison(NamedTuple):
-    """A closure and the map.
+class MapComparisons(NamedTuple):
+    """N closures and the map.
 
     Attributes:
-        distance: squared Mahalanobis distance.
-        misfit_m: metres.
-        false_alarm: probability that a wrong closure passes for a right one here.
-        ratio: how much likelier a wrong closure misses the map by this than a right one.
-        joined: whether the map says anything about the pair at all.
+        distances: (N,) squared Mahalanobis distances.
+        misfits_m: (N,) metres.
+        false_alarms: (N,) probabilities that a wrong closure passes for a right one here.
+        ratios: (N,) how much likelier a wrong closure misses the map by this than a right one.
+        joined: (N,) whether the map says anything about the pair at all.
     """
 
-    distance: float
-    misfit_m: float
-    false_alarm: float
-    ratio: float
-    joined: bool = True
+    distances: Array
+    misfits_m: Array
+    false_alarms: Array
+    ratios: Array
+    joined: NDArray[np.bool_]
 
 
 class OutlierRejection:
@@ -209,42 +209,47 @@ class OutlierRejection:
 
     def _gate(self, rows: Iterable[int]) -> list[int]:
         """Compare closures with the map; returns those whose consistency with it suffices."""
-        agreed = []
-        for row in rows:
-            if self.closures[row].accepted or row in self._revoked:
-                continue
-            found = self._compare(row)
-            self._too_far.discard(row)
-            (self._unjoined.discard if found.joined else self._unjoined.add)(row)
-            self._ratios[row] = 1.0
-            if self._settings.reject_outliers and found.distance > self._settings.gate_chi2:
-                self._note(row, State.REJECTED, _CONTRADICTS, found.distance, found.misfit_m)
-            elif self._settings.max_correction_m and found.misfit_m > self._settings.max_correction_m:
-                self._too_far.add(row)
-                reason = f"moves the pose by {found.misfit_m:.1f} m"
-                self._note(row, State.REJECTED, reason, found.distance, found.misfit_m)
-            else:
-                self._note(row, State.UNDECIDED, _UNSURE, found.distance, found.misfit_m)
-                self._ratios[row] = found.ratio
-                if found.false_alarm <= self._settings.max_chance or not self._settings.reject_outliers:
-                    agreed.append(row)
-        return agreed
+        open_rows = [row for row in rows if not self.closures[row].accepted and row not in self._revoked]
+        if not open_rows:
+            return []
+        found = self._compare(open_rows)
+        numbers = zip(open_rows, *(column.tolist() for column in found[:4]), strict=True)
+        self._unjoined -= set(open_rows)
+        self._unjoined |= {row for row, joined in zip(open_rows, found.joined, strict=True) if not joined}
+        return [row for row, *rest in numbers if self._agrees(row, *rest)]
 
-    def _compare(self, row: int) -> MapComparison:
-        """Hold a closure against the map."""
-        tracked = self.closures[row]
+    def _agrees(self, row: int, distance: float, misfit_m: float, false_alarm: float, ratio: float) -> bool:
+        """Note what the map says about a closure; returns whether its consistency with it suffices."""
+        self._too_far.discard(row)
+        self._ratios[row] = 1.0
+        if self._settings.reject_outliers and distance > self._settings.gate_chi2:
+            self._note(row, State.REJECTED, _CONTRADICTS, distance, misfit_m)
+            return False
+        if self._settings.max_correction_m and misfit_m > self._settings.max_correction_m:
+            self._too_far.add(row)
+            self._note(row, State.REJECTED, f"moves the pose by {misfit_m:.1f} m", distance, misfit_m)
+            return False
+        self._note(row, State.UNDECIDED, _UNSURE, distance, misfit_m)
+        self._ratios[row] = ratio
+        return false_alarm <= self._settings.max_chance or not self._settings.reject_outliers
+
+    def _compare(self, rows: Sequence[int]) -> MapComparisons:
+        """Hold closures against the map; what it says nothing about agrees with it, and so does anything."""
+        chosen = np.array(rows, np.int64)
         assert self._map is not None
-        predicted = self._map.predict(
-            tracked.match, tracked.closure.match_stamp_ns, tracked.query, tracked.closure.query_stamp_ns
-        )
-        if predicted.covariance is None:
-            return MapComparison(0.0, 0.0, 1.0, 1.0, joined=False)
-        misfit = invert(tracked.closure.match_T_query) @ predicted.pose
-        covariance = (predicted.covariance + self.scale.closures**2 * tracked.covariance)[None]
-        distance = squared_mahalanobis(logmap(misfit[None]), covariance)
-        false_alarm = false_alarm_probability(covariance, self._settings)
-        ratio = likelihood_ratio(false_alarm, distance, self._settings)
-        return MapComparison(distance.item(), float(np.linalg.norm(misfit[:3, 3])), false_alarm.item(), ratio.item())
+        ends = (self._arrays.match, self._arrays.query)
+        predicted = self._map.predict(*((end["session"][chosen], end["stamp"][chosen]) for end in ends))
+        misfits = invert(self._arrays["pose"][chosen]) @ predicted.poses
+        covariances = predicted.covariances + self.scale.closures**2 * self._arrays["covariance"][chosen]
+        known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+        distances, metres = np.zeros(len(chosen)), np.zeros(len(chosen))
+        false_alarms, ratios = np.ones(len(chosen)), np.ones(len(chosen))
+        if known.any():
+            distances[known] = squared_mahalanobis(logmap(misfits[known]), covariances[known])
+            metres[known] = np.linalg.norm(misfits[known, :3, 3], axis=1)
+            false_alarms[known] = false_alarm_probability(covariances[known], self._settings)
+            ratios[known] = likelihood_ratio(false_alarms[known], distances[known], self._settings)
+        return MapComparisons(distances, metres, false_alarms, ratios, known)
 
     def _supported_sets(self, rows: Iterable[int], state: State) -> list[list[int]]:
         """Consistency sets among the closures of one state, each with one of `rows`, that no chance explains."""
@@ -278,7 +283,8 @@ class OutlierRejection:
         if not outvoted:
             return False
         self._solve(without=outvoted)
-        wrong = [row for row in outvoted if self._compare(row).distance > self._settings.gate_chi2]
+        distances = self._compare(outvoted).distances
+        wrong = [row for row, far in zip(outvoted, distances > self._settings.gate_chi2, strict=True) if far]
         for row in wrong:
             self._note(row, State.REJECTED, _OUTVOTED)
         self._solve()

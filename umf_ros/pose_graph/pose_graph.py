@@ -27,6 +27,7 @@ from umf_ros.pose_graph.export import verdict_table, write_g2o, write_vertex_tab
 from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.odometry import OdometryChain, Stamps
 from umf_ros.pose_graph.outlier_rejection import OutlierRejection
+from umf_ros.pose_graph.retrial import Retrial, in_order
 from umf_ros.pose_graph.sessions import Sessions
 from umf_ros.trajectory import Trajectory, write_tum
 
@@ -61,6 +62,7 @@ class PoseGraph:
         self._settings = settings or PoseGraphSettings()
         self._sessions = Sessions(self._settings)
         self._rejection = OutlierRejection(self._settings, self._sessions)
+        self._retrial: Retrial | None = None
         self._waiting: list[_Waiting] = []
         self._seen: set[tuple[int, int, bytes]] = set()
         self._placed: set[tuple[int, int, int, int, bytes]] = set()
@@ -69,7 +71,7 @@ class PoseGraph:
 
     def retune(self, settings: PoseGraphSettings) -> None:
         """Judge by other gates from now on; the model of the odometry's noise stays."""
-        self._settings = settings
+        self._settings, self._retrial = settings, None
         self._rejection.retune(settings)
 
     def begin_session(self) -> None:
@@ -116,19 +118,43 @@ class PoseGraph:
         verdicts, arrived = self._take_waiting()
         return verdicts + self._attempt(lambda: self._rejection.consider(arrived))
 
-    def settle(self) -> list[ClosureVerdict]:
+    def prepare(self, within_s: float) -> None:
+        """Do a part of what `settle` will have to do, for so long at most."""
+        self._refresh()
+        order = in_order(self._rejection.closures)
+        trial = self._trial(order)
+        trial.go_on(trial.ripe(order), self._attempt, within_s)
+
+    def settle(self, within_s: float = float("inf")) -> list[ClosureVerdict] | None:
         """Come to the final decision and the exact optimum, as at the end of a mission.
 
         All closures are decided anew in order of their stamps, so that the time of arrival leaves no trace: a
         live run and a replay end with the same verdicts. Closures that could not be judged are accepted if
         nothing speaks against them.
+
+        Returns:
+            The verdicts that changed; None when the time was up first, and all is as it was.
         """
-        verdicts = self.update() + self._attempt(self._replay)
-        return verdicts + self._attempt(self._rejection.settle)
+        verdicts = self.update()
+        order = in_order(self._rejection.closures)
+        trial, revoked = self._trial(order), self._rejection.revoked
+        if not trial.go_on(order, self._attempt, within_s):
+            return None
+        self._sessions, self._rejection, self._retrial = trial.sessions, trial.rejection, None
+        for closure in revoked:
+            self.revoke(closure.match_stamp_ns, closure.query_stamp_ns)
+        return verdicts + trial.changed() + self._attempt(self._rejection.settle)
+
+    def _trial(self, order: list[TrackedClosure]) -> Retrial:
+        """The trial anew of closures, as far as it has come."""
+        if self._retrial is None or not self._retrial.holds(order, self._sessions):
+            self._retrial = Retrial(self._settings, self._sessions)
+        return self._retrial
 
     def _refresh(self) -> None:
         if self._sessions.update():
             self.counts["odometry out of order"] += 1
+            self._retrial = None
             self._attempt(self._rejection.renew)
 
     def _attempt(self, step: Callable[[], list[ClosureVerdict]]) -> list[ClosureVerdict]:
@@ -216,19 +242,6 @@ class PoseGraph:
         if query is None or match is None:
             return None
         return TrackedClosure(match, query, ClosureVerdict(entry.closure, State.UNDECIDED, "new"), entry.covariance)
-
-    def _replay(self) -> list[ClosureVerdict]:
-        before = {id(c.closure): c.verdict.state for c in self._rejection.closures}
-        order = sorted(self._rejection.closures, key=lambda c: (c.closure.query_stamp_ns, c.closure.match_stamp_ns))
-        revoked = self._rejection.revoked
-        self._sessions.reset()
-        self._rejection = OutlierRejection(self._settings, self._sessions)
-        for tracked in order:
-            tracked.decide(State.UNDECIDED, "new")
-            self._rejection.consider([tracked])
-        for closure in revoked:
-            self.revoke(closure.match_stamp_ns, closure.query_stamp_ns)
-        return [c.verdict for c in self._rejection.closures if before[id(c.closure)] is not c.verdict.state]
 
     def closures(self) -> list[ClosureVerdict]:
         """The latest verdict of every closure, in order of arrival."""
@@ -338,17 +351,21 @@ class PoseGraph:
         if vertex_of is None:
             write_vertex_table(Path(path).with_suffix(".csv"), full.vertices)
 
-    def write_results(self, folder: str | Path) -> None:
+    def write_results(self, folder: str | Path, within_s: float = float("inf")) -> bool:
         """Settle, and write trajectories (TUM), the graph (g2o and id-stamp table) and all verdicts (CSV).
+
+        Returns:
+            Whether there was time to settle; otherwise all is written as it stands.
 
         Raises:
             OutputError: the folder cannot be written.
         """
         folder = Path(folder)
-        self.settle()
+        settled = self.settle(within_s) is not None
         with writing(f"to {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "graph_verdicts.csv").write_text(verdict_table(self.closures()), encoding="utf-8")
         self.write_tum(folder / "trajectory_odometry.tum", optimized=False)
         self.write_tum(folder / "trajectory_optimized.tum")
         self.write_g2o(folder / "graph.g2o")
+        return settled

@@ -119,12 +119,17 @@ class Sessions:
         solved = {session for session, _ in self.solution.vertices}
         return any(path is not None and session not in solved for session, path in enumerate(self.paths))
 
-    def reset(self) -> None:
-        """Go back to the odometry alone."""
-        self._optimizer, self._refined = Optimizer(), {}
-        self.solution = None
-        self.components = list(range(len(self.chains)))
-        self.paths = [self._uncorrected(s) if len(c.stamps) else None for s, c in enumerate(self.chains)]
+    @property
+    def begun(self) -> list[int]:
+        """Sessions with odometry."""
+        return [session for session, chain in enumerate(self.chains) if len(chain.stamps)]
+
+    def anew(self) -> Sessions:
+        """The same odometry, which goes on growing, before any closure moved it."""
+        other = Sessions(self._settings)
+        other.chains, other.components = self.chains, list(range(len(self.chains)))
+        other.paths = [other._uncorrected(s) if len(c.stamps) else None for s, c in enumerate(self.chains)]
+        return other
 
     def find(self, stamp_ns: int, before: int | None = None) -> int | None:
         """The newest session (not newer than `before`) whose odometry covers the stamp, or None."""

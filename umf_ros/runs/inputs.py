@@ -10,15 +10,10 @@ from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import Bag
 from umf_ros.config import Settings
 from umf_ros.sensors.buffers import InputCounter
+from umf_ros.sensors.message_kinds import TYPES
 from umf_ros.sensors.sessions import Input
 
 Severity = Literal["fault", "warning", "note"]
-TYPES = {
-    "left_image": "sensor_msgs/msg/Image",
-    "right_image": "sensor_msgs/msg/Image",
-    "cloud": "sensor_msgs/msg/PointCloud2",
-    "odometry": "nav_msgs/msg/Odometry",
-}
 _ABSENT = {
     "left_image": ("warning", "no images on {topic}: places are told apart by scans alone"),
     "right_image": ("note", "no right images on {topic}: depth of images comes from the scans alone"),
@@ -72,11 +67,11 @@ def _severity(name: str, usual: str, others: list[Advice]) -> Severity:
 
 
 def _remedy(name: str, bag: Bag) -> str:
-    others = sorted(topic for topic, info in bag.topics.items() if info.type == TYPES[name] and info.count)
+    others = sorted(topic for topic, info in bag.topics.items() if info.type in TYPES[name] and info.count)
     if name == "odometry":
         return f"name yours: topics.odometry ({', '.join(others)})" if others else "--odometry FILE.tum supplies it"
     if not others:
-        return f"the recording has no {TYPES[name]} at all"
+        return f"the recording has no {TYPES[name][0]} at all"
     return f"name yours in a --config: topics.{name} ({', '.join(others)})"
 
 

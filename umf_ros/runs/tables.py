@@ -15,7 +15,7 @@ import numpy as np
 from umf_ros.errors import UmfError, writing
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, from_quaternion, to_quaternion
-from umf_ros.pose_graph.export import VERDICT_COLUMNS
+from umf_ros.pose_graph.closures import VERDICT_COLUMNS
 
 if TYPE_CHECKING:
     from umf_ros.verification import Verdict

@@ -33,6 +33,7 @@ class DurableGraph:
         feed: the way of the odometry into it.
         taken_up: number of closures that were found in the journal.
         changed: of these, how many now have another verdict than was written.
+        unsettled: whether the process before had no time to settle the graph at its end.
 
     Raises:
         UmfError: the journal is something else, is damaged, or another process writes it.
@@ -44,6 +45,7 @@ class DurableGraph:
         self._on_fault = on_fault
         self._journal = GraphJournal(path) if path is not None else None
         self.taken_up = self.changed = 0
+        self.unsettled = False
         self._begin()
         if self._journal is not None:
             self._take_up(self._journal)
@@ -75,6 +77,18 @@ class DurableGraph:
             self._write(lambda kept: kept.add(journal.DECIDED))
         return self._noted(verdicts)
 
+    def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
+        """Settle the graph and write what came of it; without the time to settle it, whoever takes it up will know.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        settled = self.graph.write_results(folder, within_s)
+        if not settled:
+            self._write(lambda kept: kept.add(journal.UNSETTLED))
+        self.unsettled = not settled
+        return settled
+
     def end(self) -> Path | None:
         """End this graph and begin another; returns where the journal of the old one is kept."""
         self._begin()
@@ -96,13 +110,14 @@ class DurableGraph:
         self.feed = OdometryFeed(self.graph)
 
     def _take_up(self, kept: GraphJournal) -> None:
-        before = kept.verdicts()
+        before, self.unsettled = kept.verdicts(), kept.is_unsettled()
         apply: dict[str, Callable[[Event], object]] = {
             journal.ODOMETRY: lambda event: self.feed.take(event.first_ns, event.data.reshape(4, 4)),
             journal.CLOSURE: lambda event: self.graph.add_closure(event.closure),
             journal.REVOKED: self._revoke_again,
             journal.DECIDED: lambda _: self.graph.update(),
             journal.STARTED: lambda _: self.feed.interrupted(),
+            journal.UNSETTLED: lambda _: None,
         }
         events = 0
         for event in kept.events():

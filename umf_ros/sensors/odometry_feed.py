@@ -46,6 +46,11 @@ class OdometryFeed:
         self._recent: deque[tuple[int, Array]] = deque(maxlen=50)
         self._interrupted = False
 
+    @property
+    def held(self) -> int:
+        """Messages of which the next will tell whether they are wrong or begin a session."""
+        return self._clock.held
+
     def interrupted(self) -> None:
         """The process was not there for a while: the next message need not go on from the last."""
         self._interrupted = True

@@ -119,6 +119,11 @@ class SessionClock:
             return Ruling(dropped=dropped)
         return self._begin(agreeing, arrival)
 
+    @property
+    def held(self) -> int:
+        """Messages whose fate is open."""
+        return len(self._held)
+
     def give_up(self) -> list[Arrival]:
         """Drop what is still held, at the end of the stream."""
         return self._drop(set(self._held))

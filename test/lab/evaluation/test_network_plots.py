@@ -9,6 +9,8 @@ import torch
 from scipy.spatial.distance import cdist
 from tiny_worlds import TINY
 
+from umf_ros.config import EmbeddingSettings
+from umf_ros.embedding.embedder import Asked
 from umf_ros.embedding.umf_embedder import UmfEmbedder
 from umf_ros.frames import Frame
 from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures, tsne
@@ -54,7 +56,10 @@ def test_descriptors_are_drawn(tmp_path: Path, rng: np.random.Generator) -> None
 def test_attention_and_key_points_are_drawn(tmp_path: Path, rng: np.random.Generator) -> None:
     weights = tmp_path / "tiny.safetensors"
     save_weights(UMF(TINY).eval(), weights, {})
-    embedder, network = UmfEmbedder(weights, runtime="torch", super_features=True), load_weights(weights)
+    embedder, network = (
+        UmfEmbedder(weights, EmbeddingSettings(runtime="torch"), Asked(supers=True)),
+        load_weights(weights),
+    )
     from conftest import CAMERA
 
     def frame(image: np.ndarray | None, count: int) -> Frame:

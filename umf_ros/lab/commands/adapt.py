@@ -35,7 +35,8 @@ def command(
     from rich.console import Console
 
     from umf_ros.lab.training.adaptation import FEWEST, GAINED, Lesson, measure
-    from umf_ros.networks.weights import load_weights, locate_weights
+    from umf_ros.networks.weights import load_weights
+    from umf_ros.networks.weights_files import locate_weights
 
     if out.suffix != ".safetensors":
         raise ConfigError(f"--out {out}: expected a .safetensors file")

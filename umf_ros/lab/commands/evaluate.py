@@ -173,7 +173,8 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     from umf_ros.lab.evaluation.protocol import RULES
     from umf_ros.lab.evaluation.results import EvaluationReport
     from umf_ros.lab.training.validation import answerable, means, table, validate
-    from umf_ros.networks.weights import load_weights, locate_weights
+    from umf_ros.networks.weights import load_weights
+    from umf_ros.networks.weights_files import locate_weights
     from umf_ros.runs.folder import create_run_folder
 
     if rule not in RULES:

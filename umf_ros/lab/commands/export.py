@@ -16,16 +16,16 @@ def command(
     """Export a network to OpenVINO."""
     from rich.console import Console
 
-    from umf_ros.embedding.export import convert, save
-    from umf_ros.embedding.inputs import blank_input
-    from umf_ros.embedding.runtimes import Flat
+    from umf_ros.embedding.embedder import Asked
+    from umf_ros.embedding.export import save
+    from umf_ros.embedding.runtimes import outputs_of
+    from umf_ros.embedding.torch_runtimes import converted
     from umf_ros.errors import ConfigError
-    from umf_ros.networks.weights import load_weights, locate_weights
+    from umf_ros.networks.weights_files import locate_weights
 
     if out.suffix != ".xml":
         raise ConfigError(f"{out}: OpenVINO's files end in .xml")
-    network = load_weights(locate_weights(weights))
-    model = convert(Flat(network, super_features), blank_input(network.config)._asdict())
+    model = converted(locate_weights(weights), outputs_of(Asked(supers=super_features)))
     save(model, out)
     megabytes = out.with_suffix(".bin").stat().st_size / 1e6
     sizes = f"{len(model.inputs)} inputs, {len(model.outputs)} outputs, {megabytes:.1f} MB of weights"

@@ -31,7 +31,8 @@ from umf_ros.lab.evaluation.results import EvaluationReport, TextTable, percent,
 from umf_ros.lab.evaluation.retrieval import METHODS, PlaceCollection, Ranking, rank, rerank_all
 from umf_ros.lab.evaluation.summary import ETNA_RECALL1, measure
 from umf_ros.networks.umf import count_parameters
-from umf_ros.networks.weights import load_weights, locate_weights
+from umf_ros.networks.weights import load_weights
+from umf_ros.networks.weights_files import locate_weights
 from umf_ros.places.codes import CodeTable
 from umf_ros.places.index import DescriptorIndex
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.inputs import prepare_scan, read_frame
+from umf_ros.embedding.torch_runtimes import to_tensors
 from umf_ros.frames import Embedding, Frame, Image, Points
 from umf_ros.geometry import Array, transform
 from umf_ros.lab.evaluation.retrieval import Indices
@@ -64,7 +65,7 @@ def look(network: UMF, embedder: Embedder, frame: Frame) -> Seen:
     """
     points = None if frame.points is None else transform(level(frame.points), frame.points)
     scan = prepare_scan(points, frame.intensity, network.config)
-    batch = read_frame(frame, network.config)
+    batch = to_tensors(read_frame(frame, network.config))
     maps: list[Tensor] = []
     last = network.get_submodule(f"fusion.layers.{network.config.layers - 1}.cloud_cross")
     hook = last.register_forward_hook(lambda module, tokens, found: maps.append(found[1]))

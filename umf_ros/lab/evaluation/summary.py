@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from umf_ros.config import EmbeddingSettings
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.umf_embedder import UmfEmbedder
 from umf_ros.frames import Frame
@@ -19,7 +20,8 @@ from umf_ros.lab.evaluation.results import Figures, TextTable, mean, percent, ro
 from umf_ros.lab.evaluation.retrieval import METHODS, RERANKERS, TOP_K, Indices
 from umf_ros.lab.evaluation.scores import Scores, YawBin
 from umf_ros.networks.umf import count_parameters
-from umf_ros.networks.weights import load_weights, locate_weights
+from umf_ros.networks.weights import load_weights
+from umf_ros.networks.weights_files import locate_weights
 from umf_ros.sensors.calibration import load_calibration
 
 WARM_UP = 3
@@ -187,7 +189,7 @@ def measure(embedder: Embedder, frames: Sequence[Frame], repeats: int) -> float:
 def cost_of_weights(weights: Path, frames: Sequence[Frame], repeats: int) -> Cost:
     """Cost of a weights file, or of shipped weights by name."""
     path = locate_weights(weights)
-    eager = measure(UmfEmbedder(path, runtime="torch"), frames, repeats)
+    eager = measure(UmfEmbedder(path, EmbeddingSettings(runtime="torch")), frames, repeats)
     fast = measure(UmfEmbedder(path), frames, repeats)
     return Cost(path.stem, count_parameters(load_weights(path)), eager, fast)
 

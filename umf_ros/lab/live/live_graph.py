@@ -15,7 +15,10 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from umf_ros.config import load_settings
 from umf_ros.errors import UmfError
+from umf_ros.pose_graph.journal import JOURNAL, GraphJournal
+from umf_ros.sensors.durable_graph import DurableGraph
 
 START_TIMEOUT_S = 180.0
 STOP_TIMEOUT_S = 60.0
@@ -101,6 +104,9 @@ class LiveGraph:
         folder: run folder for results and logs.
         console: where closures are shown as they come.
         config: parameter file of both nodes; None: a recording of the simulator, received whole.
+
+    Attributes:
+        seconds_to_stop: of each node, once they have ended.
     """
 
     def __init__(self, folder: Path, console: Console, config: Path | None = None) -> None:
@@ -108,6 +114,12 @@ class LiveGraph:
         self._config = config
         self._console = console
         self._nodes: list[NodeProcess] = []
+        self.seconds_to_stop: dict[str, float] = {}
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the nodes have not been stopped."""
+        return bool(self._nodes)
 
     def __enter__(self) -> LiveGraph:
         (self._folder / "logs").mkdir(exist_ok=True)
@@ -127,6 +139,7 @@ class LiveGraph:
     ) -> bool:
         with self._console.status("Finishing"):
             self._stop_all()
+            settle_left(self._folder)
         if kind is KeyboardInterrupt:
             self._console.print("[yellow]Interrupted: the report covers what was done so far.")
             return True
@@ -173,9 +186,26 @@ class LiveGraph:
     def _stop_all(self) -> None:
         # the front-end first: its last closures still reach the back-end
         for node in self._nodes:
-            if not node.stop():
+            asked_s = time.monotonic()
+            finished = node.stop()
+            self.seconds_to_stop[node.name] = time.monotonic() - asked_s
+            if not finished:
                 self._console.print(f"[red]{node.name} did not finish and was killed; its results may be incomplete.")
         self._nodes = []
+
+
+def settle_left(folder: Path) -> None:
+    """Settle the graph of a run whose back-end had no time for it at its end."""
+    path = folder / JOURNAL
+    if not path.exists():
+        return
+    kept = GraphJournal(path)
+    unsettled = kept.is_unsettled()
+    kept.close()
+    if unsettled:
+        durable = DurableGraph(load_settings(folder / "config.yaml").pose_graph, path, lambda _: None)
+        durable.write_results(folder)
+        durable.close()
 
 
 def _environment() -> dict[str, str]:

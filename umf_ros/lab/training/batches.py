@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from umf_ros.embedding.inputs import pack
+from umf_ros.embedding.torch_runtimes import to_tensors
 from umf_ros.lab.datasets.correspondences import Matches, cell_points, match_cells, match_voxels
 from umf_ros.lab.datasets.labels import Places
 from umf_ros.lab.datasets.sample import SampleSequence
@@ -61,7 +62,7 @@ class TrainingBatch:
 def stack_views(views: Sequence[View], config: NetworkConfig) -> NetworkInput:
     """The views as one batch."""
     images = [view.image if view.image_present else None for view in views]
-    return pack(images, [view.scan for view in views], config, trim=True)
+    return to_tensors(pack(images, [view.scan for view in views], config, trim=True))
 
 
 def _thin(batch: NetworkInput) -> NetworkInput:

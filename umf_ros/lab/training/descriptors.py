@@ -32,7 +32,8 @@ from umf_ros.lab.training.sampler import PairSampler
 from umf_ros.lab.training.settings import DescriptorSettings, RunSettings
 from umf_ros.networks.place_network import PlaceInput, PlaceNetwork
 from umf_ros.networks.place_networks import load_place_network, make_place_network
-from umf_ros.networks.weights import load_weights, locate_weights
+from umf_ros.networks.weights import load_weights
+from umf_ros.networks.weights_files import locate_weights
 
 RULE = Rule(negative_m=20.0, negative_deg=40.0, between_passes=True)
 """A later pass looks for itself in an earlier one."""

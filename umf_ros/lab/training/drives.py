@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from umf_ros.config import Database, Settings
 from umf_ros.embedding.inputs import read_frame
+from umf_ros.embedding.torch_runtimes import to_tensors
 from umf_ros.errors import UmfError
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array
@@ -191,7 +192,7 @@ class DriveReader:
     def _pool(self, frame: Frame) -> tuple[NDArray, ...]:
         network = self._network
         assert network.scene is not None
-        batch = read_frame(frame, network.config)
+        batch = to_tensors(read_frame(frame, network.config))
         with torch.inference_mode():
             features = network.encode(batch)
             cloud_present = batch.coarse_mask.any(1)
