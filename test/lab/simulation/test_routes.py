@@ -151,7 +151,8 @@ def test_every_preset_drives_within_the_world(drive, name):
     assert route.length_m == pytest.approx(preset.length_m, rel=0.02)
     steps = np.linalg.norm(np.diff(route.path, axis=0), axis=1)
     assert steps.max() < 0.6
-    assert set(route.labels) & {"offset", "opposite"}  # a place to meet again
+    # a place to meet again; those of a session are met by other sessions of its world
+    assert set(route.labels) & {"offset", "opposite"} or name == "session"
     assert np.array_equal(route.path, preset.route(relief, 31).path)
     assert not np.array_equal(route.path, preset.route(relief, 32).path)
 
