@@ -68,7 +68,7 @@ SENSES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class MethodAnswers:
     """One method's answers to one set of queries.
 
     Attributes:
@@ -80,10 +80,10 @@ class Asked:
     hits: Mask
 
 
-def ask(task: RetrievalTask, ranking: Ranking, unanswerable_count: bool = False) -> Asked:
+def ask(task: RetrievalTask, ranking: Ranking, unanswerable_count: bool = False) -> MethodAnswers:
     """Score a ranking and keep what each query found."""
     hits = np.asarray(ranking.hits(task.positive)[task.answerable, :1].any(axis=1))
-    return Asked(score(task, ranking, unanswerable_count), hits)
+    return MethodAnswers(score(task, ranking, unanswerable_count), hits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ class MethodResult:
     """
 
     name: str
-    sets: Mapping[str, Asked]
+    sets: Mapping[str, MethodAnswers]
     cost: MethodCost | None = None
     reranked: Sequence[float] = field(default_factory=tuple)
 

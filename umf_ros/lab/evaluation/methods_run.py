@@ -16,7 +16,7 @@ from umf_ros.embedding.embedder import Embedder
 from umf_ros.errors import ConfigError
 from umf_ros.frames import Frame, Keyframe, LocalFeatures, SuperFeatures
 from umf_ros.lab.evaluation.methods import (
-    Asked,
+    MethodAnswers,
     MethodCost,
     MethodResult,
     ask,
@@ -112,9 +112,9 @@ class MethodsRun:
         self._settings = Verification()
         self._wanted = EmbeddingSettings(weights=str(self._weights))
         self._umf = make_embedder(self._wanted, super_features=True, features=self._settings.features)
-        self._answers: dict[str, dict[str, Asked]] = {}
+        self._answers: dict[str, dict[str, MethodAnswers]] = {}
         self._xfeat: dict[str, list[float]] = {}
-        self._reranked: dict[str, list[Asked]] = {name: [] for name in METHODS}
+        self._reranked: dict[str, list[MethodAnswers]] = {name: [] for name in METHODS}
         self._candidates: dict[str, list[np.ndarray]] = {name: [] for name in RERANKED}
         self._rerank_ms: dict[str, list[float]] = {}
         self._seen: list[Frame] = []
@@ -174,8 +174,8 @@ class MethodsRun:
             if method.split()[0] in again.milliseconds:
                 self._rerank_ms.setdefault(name, []).append(again.milliseconds[method.split()[0]])
 
-    def _keep(self, name: str, place: str, asked: Asked) -> None:
-        self._answers.setdefault(name, {})[place] = asked
+    def _keep(self, name: str, place: str, answers: MethodAnswers) -> None:
+        self._answers.setdefault(name, {})[place] = answers
 
     def results(self, repeats: int) -> list[MethodResult]:
         """What was found, the costs taken now; the thesis's order."""
