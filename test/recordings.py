@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -231,3 +233,22 @@ def small_settings(folder: Path, **overrides: Any) -> Settings:
     path = folder / "calibration.yaml"
     path.write_text(CALIBRATION)
     return load_settings(None, calibration=str(path), **overrides)
+
+
+def part_of(bag: Path, path: Path, first_s: float, last_s: float = math.inf) -> Path:
+    """Some seconds of a recording, with all that comes once at its start."""
+    with bag.open("rb") as source, path.open("wb") as target:
+        writer = McapWriter(target)
+        writer.start("ros2")
+        channels: dict[int, int] = {}
+        start_ns = None
+        for schema, channel, message in make_reader(source).iter_messages():
+            start_ns = message.log_time if start_ns is None else start_ns
+            if schema is None or not first_s <= (message.log_time - start_ns) * 1e-9 < last_s:
+                continue
+            if channel.id not in channels:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return path

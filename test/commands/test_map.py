@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import Ended, only_line, umf
-from mcap.reader import make_reader
-from mcap.writer import Writer
+from recordings import part_of
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
@@ -22,28 +21,9 @@ from umf_ros.sensors.pcd import parse_pcd
 from umf_ros.sensors.ply import parse_ply
 
 
-def without_start(bag: Path, path: Path) -> Path:
-    """The recording, less its first three seconds."""
-    with bag.open("rb") as source, path.open("wb") as target:
-        writer = Writer(target)
-        writer.start("ros2")
-        channels: dict[int, int] = {}
-        first_ns = None
-        for schema, channel, message in make_reader(source).iter_messages():
-            first_ns = message.log_time if first_ns is None else first_ns
-            if message.log_time < first_ns + 3 * 10**9 or schema is None:
-                continue
-            if channel.id not in channels:
-                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-        writer.finish()
-    return path
-
-
 @pytest.fixture(scope="module")
 def again(mini_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return without_start(mini_bag, tmp_path_factory.mktemp("again") / "again.mcap")
+    return part_of(mini_bag, tmp_path_factory.mktemp("again") / "again.mcap", 3.0)
 
 
 @pytest.fixture(scope="module")

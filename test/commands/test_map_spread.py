@@ -12,30 +12,10 @@ from pathlib import Path
 
 import pytest
 from command_line import umf
-from mcap.reader import make_reader
-from mcap.writer import Writer
+from recordings import part_of
 
 from umf_ros import spread as spread_module
 from umf_ros.maps.map_folder import MapFolder
-
-
-def part_of(bag: Path, path: Path, first_s: float, last_s: float) -> Path:
-    """Some seconds of a recording, with all that comes once at its start."""
-    with bag.open("rb") as source, path.open("wb") as target:
-        writer = Writer(target)
-        writer.start("ros2")
-        channels: dict[int, int] = {}
-        start_ns = None
-        for schema, channel, message in make_reader(source).iter_messages():
-            start_ns = message.log_time if start_ns is None else start_ns
-            if schema is None or not first_s <= (message.log_time - start_ns) * 1e-9 < last_s:
-                continue
-            if channel.id not in channels:
-                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-        writer.finish()
-    return path
 
 
 @pytest.fixture(scope="module")
