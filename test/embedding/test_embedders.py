@@ -182,7 +182,7 @@ class Nowhere:
     def embed(self, frame):
         raise NotImplementedError
 
-def make(settings, super_features):
+def make(settings, asked):
     return Nowhere()
 """
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from umf_ros.runs.folder import write_atomically
 from umf_ros.runs.gallery import data_address
+from umf_ros.runs.rendering import render
 
 
 def write_report(folder: Path, summary: dict[str, Any]) -> None:
@@ -17,15 +16,9 @@ def write_report(folder: Path, summary: dict[str, Any]) -> None:
     Raises:
         OutputError: the page cannot be written.
     """
-    environment = Environment(
-        loader=PackageLoader("umf_ros.runs"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     joined, count = summary["joined"], len(summary["sessions"])
-    page = environment.get_template("map.html").render(
+    page = render(
+        "map.html",
         name=folder.resolve().name,
         sentence=sentence(summary),
         mark="good" if joined == count else "warn",

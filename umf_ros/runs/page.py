@@ -8,7 +8,6 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as Grid
@@ -20,6 +19,7 @@ from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.folder import write_atomically
 from umf_ros.runs.honesty import MEDIAN_EXPECTED, in_words
 from umf_ros.runs.inputs import Advice
+from umf_ros.runs.rendering import render
 from umf_ros.runs.truth import JudgedClosure, endpoints
 from umf_ros.runs.verdict import RunVerdict
 
@@ -47,16 +47,8 @@ def write_page(about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advic
         OutputError: the page cannot be written.
     """
     run = about.run
-    # undefined is an error: a report must not say less than it should
-    environment = Environment(
-        loader=PackageLoader("umf_ros.runs"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    page = environment.get_template("report.html").render(
+    page = render(
+        "report.html",
         name=run.folder.resolve().name,
         verdict=verdict,
         findings=findings,
