@@ -19,7 +19,7 @@ MIN_SCAN_POINTS = 200  # by hand: below, consecutive scans are not registered
 CORNERS, CORNER_QUALITY, CORNER_SPACING, CORNER_WINDOW, CORNER_LEVELS = 300, 0.01, 8, (21, 21), 4  # by hand
 MIN_CORNERS = 30  # by hand: inliers that make an essential matrix believed
 MIN_PAIRS = 30  # by hand: of consecutive frames
-LAGS_S = np.arange(-1.0, 1.01, 0.05)  # by hand: a clock further off than this makes no pairs
+LAGS_S = np.arange(-1.5, 1.51, 0.05)  # by hand: a clock further off than this makes no frames
 NOISE_RAD = 0.005  # measured on simulated drives: of the rotation between consecutive scans
 NOISE_DIRECTION = 0.3  # by hand: of the direction of a quarter of a metre of way
 ROUNDS = 5  # of reweighting
@@ -60,6 +60,21 @@ class Disagreement:
     mounting_deg: Array | None
     residual_deg: float
     steps: int
+
+
+def as_measured(frame: Frame) -> tuple[Points, float]:
+    """The scan (N, 3) m with the motion during it put back, and its middle moment, s after the frame's stamp.
+
+    That motion was removed by the very odometry, clock and mounting that are in question: what was removed wrongly
+    would look like motion that agrees with them.
+    """
+    assert frame.points is not None
+    if frame.motion is None:
+        return frame.points, 0.0
+    moments = frame.motion.moments_s
+    turns = Rotation.from_rotvec(-moments[:, None] * frame.motion.rates[3:])
+    measured = turns.apply(frame.points - moments[:, None] * frame.motion.rates[:3])
+    return measured.astype(np.float32), float(np.median(moments)) if len(moments) else 0.0
 
 
 def scan_turn(earlier: Points, later: Points) -> Array | None:
