@@ -140,12 +140,12 @@ refused now adapt "$T/nowhere.mcap" --out "$T/a.safetensors"
 refused later adapt "$T/good.mcap" --out "$T/nowhere/a.safetensors"
 refused later train "$T/nowhere"
 refused later train "$T/folder" --out "$T/train"
-refused now train "$T/folder" --method nonsense
+refused later train "$T/folder" --method nonsense
 refused later train "$T/folder" --preset nonsense --out "$T/train"
 refused later train "$T/folder" --resume --out "$T/train"
 refused later pretrain image "$T/nowhere"
 refused now pretrain sound "$T/folder"
-refused later export "$T/nowhere/model.xml"
+refused later export "$T/notes.txt/model.xml"
 refused later export "$T/model.xml" --weights "$T/notes.txt"
 # evaluating
 printf 'sets: 3\n' > "$T/places.yaml"; printf 'places:\n  - name: a\n    queries: nowhere\n' > "$T/more.yaml"
