@@ -29,7 +29,7 @@ from umf_ros.verification.registration import ScanCache, align_scans, levelled, 
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
 UNTESTED, NO_POSE = "less promising than others", "no pose fits, or others fit better"
-FOUND_BEFORE = "not compared: the expected place had been found"
+FOUND_BEFORE = "not compared: one was found"
 NO_DEPTH = "no depth: neither a scan nor a stereo pair"
 """Why there is nothing to judge about a candidate."""
 
