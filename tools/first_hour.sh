@@ -153,7 +153,7 @@ refused now evaluate
 refused now evaluate "$T/nowhere.yaml"
 refused later evaluate "$T/places.yaml"
 refused later evaluate "$T/more.yaml"
-refused now evaluate --worlds moon
+refused later evaluate --worlds moon
 refused now evaluate --worlds test --count 9
 refused now evaluate --worlds test --methods some
 refused now evaluate "$T/good.mcap" --worlds test

@@ -67,9 +67,15 @@ class RecordingOptions:
 
 
 def choose_worlds(name: str, seed: int | None, quick: bool, count: int) -> list[TestWorld]:
-    """The first worlds of a name, test or validation, or those from a seed on."""
+    """The first worlds of a name, or those from a seed on.
+
+    Raises:
+        ConfigError: there is no such name.
+    """
     from umf_ros.lab.evaluation.worlds import FIRST_SEEDS, FULL, QUICK, test_worlds
 
+    if name not in FIRST_SEEDS:
+        raise ConfigError(f"--worlds: expected {' or '.join(FIRST_SEEDS)}, not {name!r} (etna: with --methods all)")
     return test_worlds(FIRST_SEEDS[name] if seed is None else seed, QUICK if quick else FULL, count)
 
 
