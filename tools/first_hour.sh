@@ -159,7 +159,7 @@ refused now evaluate --worlds test --methods some
 refused now evaluate "$T/good.mcap" --worlds test
 refused later evaluate "$T/good.mcap"
 # and the rest
-refused now why "$T/run" soon
+refused later why "$T/run" soon
 refused later compare --list "$T/nowhere.csv" --out "$T/out.csv"
 refused now compare --list "$T/pairs.csv"
 refused now compare
@@ -177,7 +177,7 @@ refused later simulate "$T/nowhere.png"
 refused later explain "$T/good.mcap" soon 2
 refused later inspect "$T/good.mcap" --write "$T/notes.txt"
 refused now play "$T/good.mcap" --rate 0
-refused now graph
+refused now graph nonsense
 refused later graph optimize "$T/notes.txt"
 
 echo "$count wrong inputs, $wrong not as they should be, $tracebacks tracebacks"
