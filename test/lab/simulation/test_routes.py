@@ -154,7 +154,7 @@ def test_the_drive_for_the_sensors_passes_even_ground_twice_and_rocks_by_night(d
     assert SENSORS.pan is not None and (on_pan < SENSORS.pan.radius_m - 30).all()
     for label in ("flat ground", "rocks by day", NIGHT):
         there = (route.travelled >= legs[label][0] + 1) & (route.travelled <= legs[label][1] - 1)
-        before = route.travelled < legs[label][0] - 15
+        before = route.travelled < legs[label][0] - 1
         assert cKDTree(route.path[before]).query(route.path[there])[0].max() < 1.0
 
 
