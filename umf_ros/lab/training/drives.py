@@ -48,6 +48,7 @@ class Drive:
     """The keyframes of one recording: what the network pools of them, and what the map says.
 
     Attributes:
+        stamps_ns: (N,) int64.
         seen, felt: (N, C) what the heads see of image and scan; cells: (N, D) pooled maps of the scene.
         image_present, cloud_present: (N,) bool.
         map_T_body: (N, 4, 4) by the pose graph.
@@ -56,6 +57,7 @@ class Drive:
         closures: (K, 2) keyframes that accepted closures join.
     """
 
+    stamps_ns: NDArray[np.int64]
     seen: Array
     felt: Array
     cells: Array
@@ -164,7 +166,8 @@ class DriveReader:
         self._graph.settle()
         stamps, poses = self._graph.trajectory()
         order = np.argsort(stamps, kind="stable")
-        map_T_body, known = Trajectory(stamps[order], poses[order]).at(np.array(self._stamps, np.int64))
+        own_stamps = np.array(self._stamps, np.int64)
+        map_T_body, known = Trajectory(stamps[order], poses[order]).at(own_stamps)
         if not known.any():
             raise UmfError("no keyframe has odometry: without it nothing is known of what is one place")
         kept = np.flatnonzero(known)
@@ -172,6 +175,7 @@ class DriveReader:
             np.stack([each[part] for each in self._pooled])[kept] for part in range(5)
         )
         return Drive(
+            own_stamps[kept],
             seen,
             felt,
             cells,
