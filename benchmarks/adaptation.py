@@ -61,7 +61,7 @@ def twice(loop_m: float) -> Preset:
         return Walker(gentle_loop(relief, loop_m, rng), rng).forward(loop_m).forward(loop_m + 10, lateral_m=3)
 
     return Preset(
-        "a loop driven twice", plan, 2 * loop_m + 5, 0, aliasing=1.0, speed_m_s=1.3, swing_deg=8.0, sun_deg=100.0
+        "a loop driven twice", plan, 2 * loop_m + 5, 0, aliasing=1.0, speed_m_s=2.0, swing_deg=8.0, sun_deg=100.0
     )
 
 
@@ -231,7 +231,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("results/adaptation"), help="where recordings are kept")
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
-    preset = twice(45.0 if arguments.quick else 90.0)
+    preset = twice(40.0 if arguments.quick else 60.0)
     rovers = []
     for number, rover in enumerate(ROVERS[: 1 if arguments.quick else None]):
         rovers.append(run_rover(rover, arguments.seed + 2 * number, preset, arguments.work))
