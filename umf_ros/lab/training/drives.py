@@ -153,7 +153,7 @@ class DriveReader:
             self._stamps.append(detection.keyframe.stamp_ns)
             self._sessions.append(detection.keyframe.session)
             self._travelled.append(detection.keyframe.travelled_m)
-            self._pooled.append(self._pool(item))
+            self._pooled.append(pool(self._network, item))
         return detection
 
     def finish(self) -> Drive:
@@ -193,14 +193,15 @@ class DriveReader:
         ends = [(row.get(one.query_stamp_ns), row.get(one.match_stamp_ns)) for one in found]
         return np.array([pair for pair in ends if None not in pair], np.int64).reshape(-1, 2)
 
-    def _pool(self, frame: Frame) -> tuple[NDArray, ...]:
-        network = self._network
-        assert network.scene is not None
-        batch = to_tensors(read_frame(frame, network.config))
-        with torch.inference_mode():
-            features = network.encode(batch)
-            cloud_present = batch.coarse_mask.any(1)
-            tokens = network.stand_in(features, batch.image_present, cloud_present)
-            seen, felt = network.fusion.pool(*tokens)
-            cells = network.scene.pool(batch.image).flatten(1).half()
-        return tuple(each[0].numpy() for each in (seen, felt, cells, batch.image_present, cloud_present))
+
+def pool(network: UMF, frame: Frame) -> tuple[NDArray, ...]:
+    """What the heads see of a frame: the first five fields of a drive after the stamps, of one keyframe."""
+    assert network.scene is not None
+    batch = to_tensors(read_frame(frame, network.config))
+    with torch.inference_mode():
+        features = network.encode(batch)
+        cloud_present = batch.coarse_mask.any(1)
+        tokens = network.stand_in(features, batch.image_present, cloud_present)
+        seen, felt = network.fusion.pool(*tokens)
+        cells = network.scene.pool(batch.image).flatten(1).half()
+    return tuple(each[0].numpy() for each in (seen, felt, cells, batch.image_present, cloud_present))
