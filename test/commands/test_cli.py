@@ -126,12 +126,12 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
 
 
 def test_an_exported_network_can_be_read_by_its_runtime(somewhere_empty: Path) -> None:
-    import openvino
+    from umf_ros.embedding.export import openvino_core
 
     ended = umf("export", "net.xml")
     assert ended.status == 0 and left_behind(somewhere_empty) == ["net.bin", "net.xml"]
     assert ended.out.startswith("net.xml: ") and "MB of weights" in ended.out
-    model = openvino.Core().read_model("net.xml")
+    model = openvino_core().read_model("net.xml")
     assert next(port.get_any_name() for port in model.inputs) == "image"
     assert f"{len(model.inputs)} inputs, {len(model.outputs)} outputs" in ended.out
 

@@ -34,7 +34,9 @@ def command(
             "sets of still images and scans (docs/training.md)."
         ),
     ] = None,
-    worlds: Annotated[str | None, Optional(help="Instead of a recording: test or validation worlds.")] = None,
+    worlds: Annotated[
+        str | None, Optional(help="Instead of a recording: test or validation; with --methods all also etna.")
+    ] = None,
     seed: Annotated[int | None, Optional(min=0, help="First of the worlds' seeds.")] = None,
     count: Annotated[int, Optional(min=1, max=8, help="How many worlds, of different families.")] = 4,
     quick: Annotated[bool, Optional("--quick", help="A smaller sample of every world.")] = False,

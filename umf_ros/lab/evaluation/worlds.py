@@ -104,7 +104,7 @@ class TestWorld:
         ]
         for stamp, sample in enumerate(Survey(world, drives, calibration)):
             if sample.pass_index in wanted:
-                yield _visit(stamp, sample, calibration)
+                yield visit_of(stamp, sample, calibration)
 
 
 def test_worlds(first_seed: int, sampling: Sampling, count: int = WORLDS) -> list[TestWorld]:
@@ -125,11 +125,12 @@ def _drives(seed: int, family: str, sampling: Sampling) -> list[Pass]:
     ]
 
 
-def _visit(stamp: int, sample: SurveyFrame, calibration: Calibration) -> Visit:
+def visit_of(stamp_ns: int, sample: SurveyFrame, calibration: Calibration) -> Visit:
+    """A simulated sample as a frame, its intrinsics those of its resolution."""
     height, width = sample.image.shape
     points = sample.points.astype(np.float32)
     frame = Frame(
-        stamp_ns=stamp,
+        stamp_ns=stamp_ns,
         camera=resized(calibration.camera, width, height),
         body_T_camera=calibration.body_T_camera,
         body_T_lidar=calibration.body_T_lidar,
