@@ -85,7 +85,7 @@ refused later report "$T/folder" "$T/notes.txt"
 refused later report "$T/run" "$T/notes.txt"
 refused now why "$T/nowhere" 3
 refused now why "$T/folder" 3
-refused now why "$T/run" 3
+refused later why "$T/run" 3
 refused now import nonsense "$T" "$T/a.mcap"
 refused now import folder "$T/nowhere" "$T/a.mcap"
 refused now import folder "$T/folder" "$T/a.bag"
