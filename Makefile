@@ -13,15 +13,18 @@ DEMO ?=
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 PYTHON ?= $(shell for p in python3.12 python3.11 python3; do $$p -c 'import sys; sys.exit(not (3,11) <= sys.version_info[:2] <= (3,12))' 2>/dev/null && echo $$p && break; done)
 BIN := $(VENV)/bin
+# files of tests side by side, each worker on one thread
+JOBS ?= $(shell cores=$$(getconf _NPROCESSORS_ONLN); echo $$((cores < 4 ? cores : 4)))
+PYTEST := -m pytest -n $(JOBS) --dist loadfile
 
 demo: install
 	@$(BIN)/umf demo --seed $(SEED) $(DEMO)
 
 test: install
-	@$(BIN)/python -m pytest
+	@OMP_NUM_THREADS=1 $(BIN)/python $(PYTEST)
 
 test-jazzy: .venv-jazzy/.installed
-	@.venv-jazzy/bin/python -m pytest
+	@OMP_NUM_THREADS=1 .venv-jazzy/bin/python $(PYTEST)
 
 .venv-jazzy/.installed: requirements-jazzy.txt requirements-ros.txt requirements-dev.txt setup.py
 	@test -x .venv-jazzy/bin/python || $(PYTHON) -m venv .venv-jazzy

@@ -112,6 +112,11 @@ NO_BAG = "there is no recording nowhere.mcap"
         (["simulate"], "say where to write: OUT.mcap, --shards DIR or --contact-sheet OUT.png"),
         (["simulate", "drive.bag"], "cannot write drive.bag: the name must end in .mcap"),
         (["simulate", "drive.mcap", "--preset", "olympus"], "unknown preset 'olympus'"),
+        (["adapt", "nowhere.mcap", "--out", "mine.safetensors"], NO_BAG),
+        (["sensors", "nowhere.mcap"], NO_BAG),
+        (["places", "delete", "nowhere.sqlite", "--session", "1"], "there is no place database nowhere.sqlite"),
+        (["evaluate", "--worlds", "test", "--methods", "some"], "--methods: expected umf or all, not 'some'"),
+        (["export", "/proc/version/net.xml"], "cannot write to /proc/version"),
         (["export", "net.onnx"], "net.onnx: OpenVINO's files end in .xml"),
         (["export", "net.xml", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
         (["graph", "optimize", "nowhere.g2o"], "nowhere.g2o"),
@@ -126,12 +131,12 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
 
 
 def test_an_exported_network_can_be_read_by_its_runtime(somewhere_empty: Path) -> None:
-    import openvino
+    from umf_ros.embedding.export import openvino_core
 
     ended = umf("export", "net.xml")
     assert ended.status == 0 and left_behind(somewhere_empty) == ["net.bin", "net.xml"]
     assert ended.out.startswith("net.xml: ") and "MB of weights" in ended.out
-    model = openvino.Core().read_model("net.xml")
+    model = openvino_core().read_model("net.xml")
     assert next(port.get_any_name() for port in model.inputs) == "image"
     assert f"{len(model.inputs)} inputs, {len(model.outputs)} outputs" in ended.out
 

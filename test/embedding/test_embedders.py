@@ -43,8 +43,8 @@ def weights(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def shared_cache(converted, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(converted))
 
 
 @pytest.fixture
@@ -106,8 +106,9 @@ def test_positions_belong_to_the_image_given(embedder, shape):
     assert positions[:, 0].max() > shape[1] / 2
 
 
-def test_openvino_agrees_with_torch_and_is_kept(tmp_path):
+def test_openvino_agrees_with_torch_and_is_kept(tmp_path, monkeypatch):
     """With the shipped weights: OpenVINO's CPU plugin hangs on networks as narrow as the tests' own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     plain = UmfEmbedder(None, EmbeddingSettings(runtime="torch", threads=1), Asked(supers=True))
     fast = UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), Asked(supers=True))
     kept = UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), Asked(supers=True))

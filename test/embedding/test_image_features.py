@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -29,9 +31,9 @@ def frame(image: Image | None) -> Frame:
 
 
 @pytest.fixture(scope="module")
-def embedder(tmp_path_factory: pytest.TempPathFactory) -> WithXFeat:
+def embedder(converted: Path) -> WithXFeat:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XDG_CACHE_HOME", str(converted))
         return with_xfeat(ThumbnailEmbedder(), EmbeddingSettings(threads=1))
 
 
@@ -97,8 +99,8 @@ def test_samples_are_bilinear_and_held_at_the_edge() -> None:
     np.testing.assert_allclose(sample(maps, np.array([[1.5, 0.5], [-2, 0], [9, 9]])).ravel(), [3.5, 0, 11])
 
 
-def test_the_name_tells_features_apart(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_the_name_tells_features_apart(converted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(converted))
     plain = EmbeddingSettings(method="thumbnail", threads=1)
     assert make_embedder(plain).name == "thumbnail"
     chosen = make_detector_embedder(Settings(embedding=plain))

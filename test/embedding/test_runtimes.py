@@ -6,7 +6,6 @@ import subprocess
 import sys
 
 import numpy as np
-import openvino
 import pytest
 import torch
 from tiny_worlds import TINY, some_scan
@@ -14,7 +13,7 @@ from torch import Tensor, nn
 
 from umf_ros.config import EmbeddingSettings
 from umf_ros.embedding.embedder import Asked
-from umf_ros.embedding.export import cached, convert, kept_or_made, save
+from umf_ros.embedding.export import cached, convert, kept_or_made, openvino_core, save
 from umf_ros.embedding.inputs import pack, prepare_scan
 from umf_ros.embedding.runtimes import OUTPUTS, SUPERS, make_runtime, outputs_of
 from umf_ros.embedding.torch_runtimes import TorchRuntime, to_tensors
@@ -36,7 +35,7 @@ EXAMPLE = {"values": torch.zeros(1, 3), "offset": torch.zeros(1, 3)}
 
 
 def answer(model: object) -> list[float]:
-    run = openvino.Core().compile_model(model, "CPU", {"INFERENCE_NUM_THREADS": 1})
+    run = openvino_core().compile_model(model, "CPU", {"INFERENCE_NUM_THREADS": 1})
     return run({"values": np.ones((1, 3), np.float32), "offset": np.full((1, 3), 0.5, np.float32)})[0][0].tolist()
 
 
@@ -116,10 +115,10 @@ def test_new_weights_and_other_outputs_are_kept_apart(tmp_path, monkeypatch):
 def test_ctrl_c_after_networks_came_and_went_is_survived() -> None:
     script = """
 import gc, os, signal
-import openvino, torch
-from umf_ros.embedding import runtimes
+import torch
+from umf_ros.embedding import export, runtimes
 for _ in range(2):
-    model = openvino.convert_model(torch.nn.Linear(4, 4), example_input=torch.zeros(1, 4))
+    model = export.import_openvino().convert_model(torch.nn.Linear(4, 4), example_input=torch.zeros(1, 4))
     compiled = runtimes._compiled(model, 1)
     del compiled, model
     gc.collect()
@@ -128,3 +127,14 @@ os.kill(os.getpid(), signal.SIGINT)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "alive\n"), done.stderr
+
+
+def test_nobody_is_told_that_a_network_was_converted() -> None:
+    script = """
+import sys, torch
+from umf_ros.embedding.export import convert
+convert(torch.nn.Linear(4, 4), {"x": torch.zeros(1, 4)})
+print([name for name, module in sys.modules.items() if "openvino_telemetry" in name and module], len(sys.modules) > 9)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "[] True\n"), done.stderr

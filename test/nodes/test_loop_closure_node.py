@@ -203,6 +203,26 @@ def test_services_pause_save_and_end_a_session(rig: Rig, node: Process, tmp_path
     assert rig.until(lambda: rig.count("places") == places)
 
 
+@pytest.mark.parametrize("method", ["dbow2", "netvlad", "solid"])
+def test_one_parameter_changes_how_places_are_embedded(rig: Rig, tmp_path: Path, method: str) -> None:
+    """A vocabulary, a network and a descriptor of points; a replay is driven by all methods in test/embedding."""
+    own = f"results_dir:={tmp_path / 'run'}", f"database.path:={tmp_path / 'map.sqlite'}"
+    node = Process(MODULE, tmp_path / "node.log", *PARAMETERS, f"embedding.method:={method}", *own)
+    try:
+        node.wait_for("ready")
+        assert rig.until(lambda: rig.images.get_subscription_count() > 0 and rig.clouds.get_subscription_count() > 0)
+        for i in range(4):
+            rig.publish_pair(START_NS + i * 213_000_000)
+        assert rig.until(lambda: rig.count("places") >= 3), node.output
+        assert node.interrupt() == 0
+    finally:
+        node.kill()
+    embedder = make_detector_embedder(Settings.model_validate({"embedding": {"method": method}}))
+    kept = PlaceDatabase(Database(path=str(tmp_path / "map.sqlite")), embedder.name, embedder.dimension)
+    assert len(kept) >= 3 and embedder.name.startswith(method)
+    kept.close()
+
+
 def test_a_silent_topic_is_explained(rig: Rig, node: Process) -> None:
     assert rig.until(
         lambda: (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -19,11 +20,17 @@ FORMAT = 2
 """Of what is kept; another number makes all anew."""
 
 
-def convert(flat: nn.Module, example: dict[str, Any]) -> Any:
-    """OpenVINO model of a network with tensors for arguments, at the shapes of the example (by input name)."""
+def import_openvino() -> Any:
+    """OpenVINO without its telemetry, which at every import starts a process that sends a message to its makers."""
+    sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]  # absent: OpenVINO provides for that
     import openvino
 
-    model = openvino.convert_model(flat, example_input=tuple(example.values()))
+    return openvino
+
+
+def convert(flat: nn.Module, example: dict[str, Any]) -> Any:
+    """OpenVINO model of a network with tensors for arguments, at the shapes of the example (by input name)."""
+    model = import_openvino().convert_model(flat, example_input=tuple(example.values()))
     shapes = [tuple(tensor.shape) for tensor in example.values()]
     model.reshape(dict(zip(model.inputs, shapes, strict=True)))
     for port, name in zip(model.inputs, example, strict=True):
@@ -37,12 +44,10 @@ def save(model: Any, path: Path) -> None:
     Raises:
         OutputError: the files cannot be written.
     """
-    import openvino
-
     unfinished = path.with_name(f"{path.stem}.{os.getpid()}.xml")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        openvino.save_model(model, unfinished, compress_to_fp16=False)
+        import_openvino().save_model(model, unfinished, compress_to_fp16=False)
         unfinished.with_suffix(".bin").replace(path.with_suffix(".bin"))
         unfinished.replace(path)
     except (OSError, RuntimeError) as error:
@@ -56,9 +61,7 @@ def openvino_core() -> Any:
     Its CPU plugin gives the thread a stack for signals and takes it back when it is unloaded; whoever gets Ctrl-C
     after a second core came and went dies of it.
     """
-    import openvino
-
-    return openvino.Core()
+    return import_openvino().Core()
 
 
 def kept_or_made(path: Path, make: Callable[[], Any]) -> Any:
@@ -74,9 +77,7 @@ def kept_or_made(path: Path, make: Callable[[], Any]) -> Any:
 
 def cached(weights: Path, outputs: tuple[str, ...] = ()) -> Path:
     """Where the converted model of a weights file is kept: another file for other outputs, weights or OpenVINO."""
-    import openvino
-
     digest = hashlib.sha256(weights.read_bytes())
-    digest.update(f"{openvino.__version__} {' '.join(outputs)} {FORMAT}".encode())
+    digest.update(f"{import_openvino().__version__} {' '.join(outputs)} {FORMAT}".encode())
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(home) / "umf_ros" / f"{digest.hexdigest()[:20]}.xml"

@@ -67,8 +67,13 @@ class NetVlad(PlaceNetwork):
     def whiten(self, vlad: Tensor) -> None:
         """Fit the whitening to descriptors (N, clusters * 112), more of them than it keeps numbers."""
         self.mean.copy_(vlad.mean(0))
-        _, spread, directions = torch.linalg.svd(vlad - self.mean, full_matrices=False)
-        kept = min(self.length, len(spread))
-        variance = spread[:kept].square() / len(vlad)
+        centred = vlad - self.mean
+        energy, weights = torch.linalg.eigh(
+            centred @ centred.T
+        )  # of as many numbers as there are descriptors, not 7168
+        kept = min(self.length, len(energy) - 1)
+        energy, weights = energy[-kept:].flip(0).clamp(min=1e-6 * float(energy[-1])), weights[:, -kept:].flip(1)
+        variance = energy / len(vlad)
         self.directions.zero_()
-        self.directions[:kept] = directions[:kept] / (variance + 0.01 * variance[0]).sqrt()[:, None]
+        self.directions[:kept] = (weights / energy.sqrt()).T @ centred
+        self.directions[:kept] /= (variance + 0.01 * variance[0]).sqrt()[:, None]

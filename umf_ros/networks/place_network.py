@@ -100,7 +100,7 @@ class ImageTrunk(nn.Module):
 
     def late(self, maps: Tensor) -> Tensor:
         """Maps (B, 80, 10, 14) to (B, 112, 10, 14)."""
-        found: Tensor = self.network.stages[-1](maps)
+        found: Tensor = self.network.stages[-1](maps.contiguous(memory_format=torch.channels_last))
         return found
 
 

@@ -12,6 +12,9 @@ from functools import cached_property
 import torch
 from torch import Tensor, nn
 
+MARGIN = 2
+"""Empty voxels around the grid: how far the widest convolution reaches."""
+
 
 @dataclass(frozen=True, eq=False)
 class Level:
@@ -28,17 +31,17 @@ class Level:
     batch: int
 
     def rows(self, cells: Tensor) -> Tensor:
-        """Rows of some cells (..., 4), N for those that are empty or outside."""
-        inside = ((cells[..., 1:] >= 0) & (cells[..., 1:] < self.size)).all(-1)
-        found = self._table[self._flat(torch.where(inside[..., None], cells, torch.zeros_like(cells)))]
-        return torch.where(inside, found, torch.full_like(found, len(self.cells)))
+        """Rows of some cells (M, 4) within the grid, N for those that are empty."""
+        return self._table[self._padded(cells)]
 
     def neighbours(self, kernel: int) -> Tensor:
-        """Rows (N, kernel^3) of the cells around each cell, itself in the middle."""
+        """Rows (N, kernel^3) of the cells around each cell, itself in the middle; N for those that are empty.
+
+        The table is wider than the grid, so that nobody has to ask whether a neighbour is outside.
+        """
         reach = torch.arange(kernel, device=self.cells.device) - kernel // 2
-        around = torch.cartesian_prod(reach, reach, reach)
-        around = torch.cat([torch.zeros_like(around[:, :1]), around], 1)
-        return self.rows(self.cells[:, None] + around)
+        around = torch.cartesian_prod(reach, reach, reach) @ reach.new_tensor([self._wide**2, self._wide, 1])
+        return self._table[self._padded(self.cells)[:, None] + around]
 
     @cached_property
     def half(self) -> Level:
@@ -56,14 +59,22 @@ class Level:
     def _parents(self) -> Tensor:
         return torch.cat([self.cells[:, :1], self.cells[:, 1:] // 2], 1)
 
+    @property
+    def _wide(self) -> int:
+        return self.size + 2 * MARGIN
+
     @cached_property
     def _table(self) -> Tensor:
-        table = self.cells.new_full((self.batch * self.size**3,), len(self.cells))
-        table[self._flat(self.cells)] = torch.arange(len(self.cells), device=table.device)
+        table = self.cells.new_full((self.batch * self._wide**3,), len(self.cells))
+        table[self._padded(self.cells)] = torch.arange(len(self.cells), device=table.device)
         return table
 
-    def _flat(self, cells: Tensor, size: int = 0) -> Tensor:
-        size = size or self.size
+    def _padded(self, cells: Tensor) -> Tensor:
+        """Places of cells (..., 4) in the table."""
+        frame, x, y, z = cells.unbind(-1)
+        return ((frame * self._wide + x + MARGIN) * self._wide + y + MARGIN) * self._wide + z + MARGIN
+
+    def _flat(self, cells: Tensor, size: int) -> Tensor:
         frame, x, y, z = cells.unbind(-1)
         return ((frame * size + x) * size + y) * size + z
 

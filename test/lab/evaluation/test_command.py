@@ -36,6 +36,8 @@ def run(*arguments: str) -> str:
         ([], "either a recording or --worlds"),
         (["a.mcap", "--worlds", "test"], "either a recording or --worlds"),
         (["--worlds", "mars"], "expected test or validation, not 'mars'"),
+        (["--worlds", "etna"], "etna: with --methods all"),
+        (["--worlds", "etna", "--methods", "all", "--count", "2"], "etna has no use for --count"),
         (["--worlds", "test", "--methods", "some"], "expected umf or all"),
         (["nowhere.mcap", "--methods", "all", "--embedder", "umf"], "a recording has no use for --embedder"),
         (["nowhere.mcap", "--trained", "runs"], "--trained names weights of other methods"),

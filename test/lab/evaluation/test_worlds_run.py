@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 from landmarks import CONFUSED, PLACES, LandmarkEmbedder, LineWorld
 from tiny_worlds import TINY
 
@@ -58,15 +59,15 @@ def test_examples_are_true_matches(result: WorldResult) -> None:
 
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
+    torch.manual_seed(0)
     path = tmp_path / "tiny.safetensors"
     save_weights(UMF(TINY), path, {})
     return path
 
 
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return tmp_path / "cache"
+def shared_cache(converted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(converted))
 
 
 def test_tables_figures_and_pictures_of_a_small_network(

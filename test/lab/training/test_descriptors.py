@@ -101,21 +101,6 @@ def test_batches_grow_while_too_few_triplets_are_active(folder: Path) -> None:
     assert objective.batch_size == settings.batch_limit
 
 
-def test_a_remembered_image_is_the_one_that_was_seen(folder: Path) -> None:
-    settings = load_run(None, method="netvlad", train=str(folder), **QUICK)
-    kind = find_objective("netvlad")
-    objective = kind(kind.make_network(settings), settings)
-    make = objective.batch_maker(WorldFolder(folder).refresh(), 0)
-    first, again = make(3), make(3)
-    assert first.keys == again.keys and torch.equal(first.images, again.images)
-    fresh = objective._with_maps(first).maps
-    torch.testing.assert_close(objective._with_maps(again).maps, fresh)
-    trunk = objective.network.trunk
-    assert trunk is not None
-    with torch.no_grad():
-        torch.testing.assert_close(trunk.early(first.images), fresh, rtol=0.01, atol=0.02)
-
-
 def test_a_resumed_run_repeats_an_uninterrupted_one(folder: Path, tmp_path: Path) -> None:
     chosen = QUICK | {"train": str(folder), "method": "pointnet2", "steps": 4}
     whole = train(load_run(None, **chosen), tmp_path / "whole", False, ignore)

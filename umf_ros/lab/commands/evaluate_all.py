@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from umf_ros.lab.evaluation.methods_run import FrameSet
     from umf_ros.lab.evaluation.results import Figures
 
+SPARSE = 3
+"""Every so many-th sample of a sequence is asked in a quick comparison."""
 REPEATS = 3
 """Of every timed frame."""
 
@@ -37,11 +39,22 @@ class EveryMethod:
     out: Path
 
     def worlds(self, name: str, seed: int | None, count: int) -> Figures:
-        """On simulated worlds."""
+        """On simulated worlds, or on those of S3LI's simulated sequences that the thesis tests on."""
         from rich.console import Console
 
-        from umf_ros.lab.evaluation.frame_sets import world_set
+        from umf_ros.lab.evaluation.frame_sets import drive_sets, world_set
+        from umf_ros.lab.evaluation.worlds import WORLDS
+        from umf_ros.lab.simulation.seeds import TEST
 
+        if name == "etna":
+            if count != WORLDS:
+                raise ConfigError("--worlds etna has no use for --count")
+            first, every = TEST.start if seed is None else seed, SPARSE if self.quick else 1
+            note = (
+                f"Simulated S3LI sequences of seed {first}, every {every}. sample: each is asked for its own past, "
+                "20 s and 15 m back; those without a true match can only be wrong. Nothing was trained on the others."
+            )
+            return self._compare(Console(), drive_sets(first, every), note)
         chosen = choose_worlds(name, seed, self.quick, count)
         return self._compare(Console(), map(world_set, chosen), note_on_worlds(chosen, self.quick))
 

@@ -75,7 +75,7 @@ def choose_worlds(name: str, seed: int | None, quick: bool, count: int) -> list[
     from umf_ros.lab.evaluation.worlds import FIRST_SEEDS, FULL, QUICK, test_worlds
 
     if name not in FIRST_SEEDS:
-        raise ConfigError(f"--worlds: expected {' or '.join(FIRST_SEEDS)}, not {name!r}")
+        raise ConfigError(f"--worlds: expected {' or '.join(FIRST_SEEDS)}, not {name!r} (etna: with --methods all)")
     return test_worlds(FIRST_SEEDS[name] if seed is None else seed, QUICK if quick else FULL, count)
 
 

@@ -6,20 +6,27 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from umf_ros.config import Database, Settings
+from umf_ros.config import Database, Loop, Settings
 from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.errors import UmfError
 from umf_ros.frames import Frame, ScanMotion
 from umf_ros.geometry import Array
 from umf_ros.lab.datasets.labels import Rule
+from umf_ros.lab.datasets.s3li import ETNA_TEST
 from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.evaluation.methods_run import FrameSet
 from umf_ros.lab.evaluation.places import PlaceSet, read_set
 from umf_ros.lab.evaluation.protocol import RetrievalTask, loop_closure, place_recognition, revisits
-from umf_ros.lab.evaluation.worlds import FIRST, REVISIT, TestWorld
+from umf_ros.lab.evaluation.worlds import FIRST, REVISIT, TestWorld, visit_of
 from umf_ros.lab.simulation.camera import resized
+from umf_ros.lab.simulation.passes import thinned
+from umf_ros.lab.simulation.sequences import etna_surveys
+from umf_ros.lab.simulation.survey import Survey
 from umf_ros.loop_detector import LoopDetector
 from umf_ros.trajectory import Trajectory
+
+SPEED_M_S = 1.0
+"""Of a simulated sequence, whose samples have no stamps of their own."""
 
 
 def world_set(world: TestWorld) -> FrameSet:
@@ -75,6 +82,25 @@ def recording_set(name: str, frames: Iterable[Frame], truth: Trajectory, setting
         return loop_closure(stamps, truth.at(stamps)[0], travelled, settings.loop, truth.has_orientation)
 
     return FrameSet(name, keyframes(), task, unanswerable_count=True)
+
+
+def drive_sets(seed: int, every: int) -> Iterator[FrameSet]:
+    """Every n-th sample of the simulated sequences that [UMF 5.1.2] tests on, each asked for its own past."""
+    for name, survey in etna_surveys(seed):
+        if f"s3li_{name}" in ETNA_TEST:
+            passes = [thinned(drive, every) for drive in survey.passes]
+            yield _drive_set(f"{name} {seed}", Survey(survey.world, passes, survey.calibration))
+
+
+def _drive_set(name: str, survey: Survey) -> FrameSet:
+    steps = [(number, step) for number, drive in enumerate(survey.passes) for step in range(len(drive.path))]
+    world_T_body = np.stack([survey.pose(*step) for step in steps])
+    moved = np.linalg.norm(np.diff(world_T_body[:, :3, 3], axis=0), axis=1)
+    travelled_m = np.concatenate([[0.0], np.cumsum(moved)])
+    stamps = (travelled_m / SPEED_M_S * 1e9).astype(np.int64)
+    seen = (survey.sample(*step) for step in steps)
+    frames = (visit_of(at, one, survey.calibration).frame for at, one in zip(stamps.tolist(), seen, strict=True))
+    return FrameSet(name, frames, lambda: loop_closure(stamps, world_T_body, travelled_m, Loop()), True)
 
 
 def still_set(places: PlaceSet) -> FrameSet:

@@ -26,6 +26,7 @@ from umf_ros.lab.evaluation.methods import (
     sets_table,
     with_costs,
 )
+from umf_ros.lab.evaluation.pair_inliers import PairInliers
 from umf_ros.lab.evaluation.protocol import RetrievalTask
 from umf_ros.lab.evaluation.results import EvaluationReport, TextTable, percent, plot_precision_recall, plot_recall
 from umf_ros.lab.evaluation.retrieval import METHODS, PlaceCollection, Ranking, rank, rerank_all
@@ -38,7 +39,6 @@ from umf_ros.places.index import DescriptorIndex
 
 RERANKED = {"umf_superfeatures": "superfeatures both", "umf_ransac": "ransac both"}
 """UMF's rerankers that stand beside the other methods."""
-XFEAT = "ransac image"
 PLACES = 858
 """In the database when matching is timed, as in [UMF table 5.9]."""
 TIMED_FRAMES = 6
@@ -137,24 +137,19 @@ class MethodsRun:
             self._report(places.name, 1)
         task = places.task()
         self._keyframe = ours.keyframes[0]
+        queries, references = ([ours.keyframes[row] for row in rows] for rows in (task.queries, task.references))
+        inliers = PairInliers(queries, references, self._settings)
         described = {DEFAULT: ours.descriptors("fused")} | {name: np.stack(rows) for name, rows in theirs.items()}
         for name, found in described.items():
-            self._ask(places, task, name, found, ours.keyframes)
-
-    def _ask(
-        self, places: FrameSet, task: RetrievalTask, name: str, found: np.ndarray, keyframes: list[Keyframe]
-    ) -> None:
-        similarity = found[task.queries] @ found[task.references].T
-        ranking = rank(similarity, task.admissible)
-        self._keep(name, places.name, ask(task, ranking, places.unanswerable_count))
-        queries, references = ([keyframes[row] for row in rows] for rows in (task.queries, task.references))
-        if name == DEFAULT:
-            self._rerank(places, task, ranking, similarity, queries, references)
-        else:
-            ways = {XFEAT: METHODS[XFEAT]}
-            again = rerank_all(queries, references, ranking, similarity, self._settings, ways=ways)
-            self._xfeat.setdefault(name, []).append(ask(task, again.after(XFEAT)).scores.recall1)
-        self._report(f"{places.name}: {name}", 0)
+            similarity = found[task.queries] @ found[task.references].T
+            ranking = rank(similarity, task.admissible)
+            self._keep(name, places.name, ask(task, ranking, places.unanswerable_count))
+            if name == DEFAULT:
+                self._rerank(places, task, ranking, similarity, queries, references)
+            else:
+                again = inliers.reorder(ranking, similarity)
+                self._xfeat.setdefault(name, []).append(ask(task, again).scores.recall1)
+            self._report(f"{places.name}: {name}", 0)
 
     def _rerank(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -157,9 +157,8 @@ def rerank_all(
     similarity: Array,
     settings: Verification,
     report: Callable[[], None] = lambda: None,
-    ways: Mapping[str, tuple[str, str]] = METHODS,
 ) -> Reranking:
-    """Rerank the candidates of every query with the verifier's reranker, in each of some `METHODS`.
+    """Rerank the candidates of every query with the verifier's reranker, in each of the `METHODS`.
 
     Args:
         queries: Q keyframes.
@@ -168,12 +167,11 @@ def rerank_all(
         similarity: (Q, R) of the global descriptors.
         settings: of the reranker.
         report: called after every query.
-        ways: the methods wanted.
     """
     heads = ranking.order[:, :TOP_K]
-    chosen = {name: settings.model_copy(update={"rerank": r, "modalities": m}) for name, (r, m) in ways.items()}
-    scores: dict[str, Array] = {method: np.zeros(heads.shape) for method in ways}
-    took: dict[str, list[float]] = {method: [] for method in ways}
+    chosen = {name: settings.model_copy(update={"rerank": r, "modalities": m}) for name, (r, m) in METHODS.items()}
+    scores: dict[str, Array] = {method: np.zeros(heads.shape) for method in METHODS}
+    took: dict[str, list[float]] = {method: [] for method in METHODS}
     for row, (query, head) in enumerate(zip(queries, heads, strict=True)):
         candidates = [
             (Candidate(column, references[index].stamp_ns, float(similarity[row, index])), references[index])

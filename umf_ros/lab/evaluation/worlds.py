@@ -61,14 +61,21 @@ class Visit:
 
 
 class TestWorld:
-    """One world in the hard setting (offset to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing)."""
+    """One world in the hard setting (offset to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing).
+
+    Args:
+        seed: of the world; its family follows from it.
+        sampling: how densely it is driven.
+        calibration: of the rover; None: the simulated one.
+    """
 
     __test__ = False  # no test of pytest's, whatever the name suggests
 
-    def __init__(self, seed: int, sampling: Sampling) -> None:
+    def __init__(self, seed: int, sampling: Sampling, calibration: Calibration | None = None) -> None:
         self.seed, self.family = seed, FAMILIES[seed % len(FAMILIES)]
         self.name = f"{self.family} {seed}"
         self._sampling = sampling
+        self._calibration = calibration or load_calibration("simulated")
 
     @cached_property
     def passes(self) -> list[Pass]:
@@ -91,13 +98,13 @@ class TestWorld:
         """The same, of some passes alone."""
         path = np.concatenate([drive.path for drive in self.passes])
         world = World(self.seed, self.family, SETTINGS["hard"].aliasing, path)
-        calibration = load_calibration("simulated")
+        calibration = self._calibration
         drives = [
             drive if number in wanted else thinned(drive, len(drive.path)) for number, drive in enumerate(self.passes)
         ]
         for stamp, sample in enumerate(Survey(world, drives, calibration)):
             if sample.pass_index in wanted:
-                yield _visit(stamp, sample, calibration)
+                yield visit_of(stamp, sample, calibration)
 
 
 def test_worlds(first_seed: int, sampling: Sampling, count: int = WORLDS) -> list[TestWorld]:
@@ -118,11 +125,12 @@ def _drives(seed: int, family: str, sampling: Sampling) -> list[Pass]:
     ]
 
 
-def _visit(stamp: int, sample: SurveyFrame, calibration: Calibration) -> Visit:
+def visit_of(stamp_ns: int, sample: SurveyFrame, calibration: Calibration) -> Visit:
+    """A simulated sample as a frame, its intrinsics those of its resolution."""
     height, width = sample.image.shape
     points = sample.points.astype(np.float32)
     frame = Frame(
-        stamp_ns=stamp,
+        stamp_ns=stamp_ns,
         camera=resized(calibration.camera, width, height),
         body_T_camera=calibration.body_T_camera,
         body_T_lidar=calibration.body_T_lidar,

@@ -1,7 +1,7 @@
 """Training of other methods' networks: by UMF's own loss, or by batch-hard triplets [Komorowski 2021].
 
-The early stages of an image trunk are frozen, so their maps are computed once for each variant of an image and
-remembered: what learns is small, and learns in minutes.
+What a network reads is prepared once (`prepared_views`), and an image trunk's frozen stages with it: what is computed
+in a step is what learns, and learns in minutes.
 """
 
 from __future__ import annotations
@@ -15,22 +15,21 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from umf_ros.embedding.place_inputs import stack, stack_images
 from umf_ros.lab.datasets.labels import Rule
 from umf_ros.lab.datasets.listed import open_source
-from umf_ros.lab.datasets.sample import Sample, SampleSequence
+from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.evaluation.protocol import place_recognition
 from umf_ros.lab.evaluation.results import mean
 from umf_ros.lab.evaluation.retrieval import rank
 from umf_ros.lab.evaluation.scores import score
-from umf_ros.lab.training.descriptor_batches import Key, PlaceBatch, PlaceViews
 from umf_ros.lab.training.losses import batch_hard_triplet, neighbourhood_components
 from umf_ros.lab.training.metric_loss import Bank, Relations, relate
 from umf_ros.lab.training.networks import Precision, save_tensors
 from umf_ros.lab.training.objective import Judgement, Objective, generator
+from umf_ros.lab.training.prepared_views import PlaceBatch, PreparedViews
 from umf_ros.lab.training.sampler import PairSampler
 from umf_ros.lab.training.settings import DescriptorSettings, RunSettings
-from umf_ros.networks.place_network import PlaceInput, PlaceNetwork
+from umf_ros.networks.place_network import PlaceNetwork
 from umf_ros.networks.place_networks import load_place_network, make_place_network
 from umf_ros.networks.weights import load_weights
 from umf_ros.networks.weights_files import locate_weights
@@ -58,9 +57,8 @@ class DescriptorObjective(Objective):
         self._validation = open_source(Path(settings.validation)).refresh if settings.validation else list
         self._sequences: Sequence[SampleSequence] = []
         self._sampler: PairSampler | None = None
-        self._maps: dict[Key, Tensor] = {}
-        self._plain: dict[str, tuple[PlaceInput, Tensor]] = {}
-        self._views = PlaceViews(network.reads)
+        kept = Path(settings.views) if settings.views else None
+        self._views = PreparedViews(network.reads, network.trunk, settings.variants, settings.seed, kept)
         self.batch_size, self.best, self.stale = settings.batch, -1.0, 0
         self.untrained: dict[str, float] = {}
 
@@ -99,7 +97,7 @@ class DescriptorObjective(Objective):
             rng = generator(seed, step, rank)
             drawn = sampler.draw(pairs, rng)
             draws = [anchor for anchor, _ in drawn] + [positive for _, positive in drawn]
-            return self._views.batch(sequences, draws, self._settings, rng)
+            return self._views.batch(sequences, draws, rng)
 
         return make
 
@@ -111,7 +109,7 @@ class DescriptorObjective(Objective):
 
     def forward(self, batch: PlaceBatch) -> dict[str, Tensor]:
         """The losses of the descriptor and of the modalities that have one of their own."""
-        found = self.network(self._with_maps(batch))
+        found = self.network(batch.input)
         relations = relate(batch.places, Bank(0, 1).places, RULE, found["descriptor"].device)
         image, cloud = self.network.weight_image, self.network.weight_cloud
         weights = {"descriptor": 1 - image - cloud, "image": image, "cloud": cloud}
@@ -169,41 +167,13 @@ class DescriptorObjective(Objective):
     def describe(self, world: SampleSequence) -> np.ndarray:
         """Unit descriptors (N, D) of all samples of a world, as they are in use."""
         self.network.eval()
-        if world.name not in self._plain:
-            views = [self._views.plain(world.sample(index)) for index in range(len(world))]
-            self._plain[world.name] = stack(views, None), self._see(stack_images(views)).half()
-        whole, maps = self._plain[world.name]
         device = next(self.network.parameters()).device
         parts = []
         for start in range(0, len(world), 32):
-            rows = slice(start, start + 32)
-            batch = PlaceInput(*(part[rows] for part in whole))._replace(maps=maps[rows].float())
+            seen = self._views.plain(world, range(start, min(start + 32, len(world)))).to(device)
             with torch.inference_mode():
-                parts.append(F.normalize(self.network(batch.to(device))["descriptor"].float(), dim=1).cpu())
+                parts.append(F.normalize(self.network(seen)["descriptor"].float(), dim=1).cpu())
         return torch.cat(parts).numpy()
-
-    def early_maps(self, samples: Sequence[Sample]) -> Tensor:
-        """Maps (N, 80, 10, 14) of some samples as they are."""
-        return self._see(stack_images([self._views.plain(sample) for sample in samples]))
-
-    def _with_maps(self, batch: PlaceBatch) -> PlaceInput:
-        if "image" not in self.network.reads:
-            return batch.input
-        new = [row for row, key in enumerate(batch.keys) if key not in self._maps]
-        if new:
-            for row, found in zip(new, self._see(batch.images[new]), strict=True):
-                self._maps[batch.keys[row]] = found.half()
-        maps = torch.stack([self._maps[key] for key in batch.keys]).float()
-        return batch.input._replace(maps=maps.to(batch.input.maps.device))
-
-    def _see(self, images: Tensor) -> Tensor:
-        """Early maps of images, on the CPU."""
-        trunk = self.network.trunk
-        if trunk is None or "image" not in self.network.reads:
-            return torch.zeros(len(images), 0)
-        device = next(trunk.parameters()).device
-        with torch.no_grad():
-            return torch.cat([trunk.early(part.to(device)).cpu() for part in images.split(16)])
 
     def get_extra_state(self) -> dict[str, Any]:
         """For a checkpoint: what is not a weight."""

@@ -9,7 +9,6 @@ import torch
 from pydantic import Field
 from sklearn.cluster import KMeans
 
-from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.training.descriptors import DescriptorObjective
 from umf_ros.lab.training.settings import DescriptorSettings
 from umf_ros.networks.netvlad import NetVlad
@@ -40,7 +39,7 @@ class NetVladObjective(DescriptorObjective):
         if self._settings.start:
             return
         with torch.no_grad():
-            local = self.network.local(self.early_maps(self._some(IMAGES))).flatten(2).transpose(1, 2).flatten(0, 1)
+            local = self.network.local(self._some(IMAGES)).flatten(2).transpose(1, 2).flatten(0, 1)
         count = len(self.network.centres)
         found = KMeans(count, n_init=1, max_iter=50, random_state=self._settings.seed).fit(local.numpy())
         self.network.begin(torch.from_numpy(found.cluster_centers_).float(), local)
@@ -48,18 +47,18 @@ class NetVladObjective(DescriptorObjective):
     def settle(self) -> None:
         """Fit the whitening to training images as they are described now."""
         if self._whitened is None:
-            self._whitened = self.early_maps(self._some(WHITENED)).half()
+            self._whitened = self._some(WHITENED).half()
         self.network.eval()
         device = self.network.mean.device
         with torch.no_grad():
             parts = [self.network.vlad(part.float().to(device)) for part in self._whitened.split(64)]
         self.network.whiten(torch.cat(parts))
 
-    def _some(self, count: int) -> list[Sample]:
+    def _some(self, count: int) -> torch.Tensor:
+        """Early maps (count, 80, 10, 14) of training images as they are."""
         every = [(world, row) for world in self._sequences for row in range(len(world))]
-        rng = np.random.default_rng(self._settings.seed)
-        chosen = rng.permutation(len(every))[:count]
-        return [every[k][0].sample(every[k][1]) for k in chosen]
+        chosen = np.random.default_rng(self._settings.seed).permutation(len(every))[:count]
+        return torch.cat([self._views.plain(every[k][0], [every[k][1]]).maps for k in chosen])
 
 
 OBJECTIVE = NetVladObjective

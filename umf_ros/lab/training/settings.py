@@ -53,8 +53,8 @@ class DescriptorSettings(RunSettings):
     method: str = Field(description="whose network")
     validation: str = Field("", description="as train, for validation; empty: the latest weights are kept")
     warmup_steps: int = Field(20, ge=0, description="linear warm-up")
-    steps: int = Field(600, ge=1, description="optimiser steps in all")
-    epoch_steps: int = Field(25, ge=1, description="steps between validations; new worlds are picked up there")
+    steps: int = Field(1200, ge=1, description="optimiser steps in all")
+    epoch_steps: int = Field(100, ge=1, description="steps between validations; new worlds are picked up there")
     batch: int = Field(48, ge=4, description="frames per step, half of them positives of the others")
     batch_limit: int = Field(96, ge=4, description="largest batch")
     batch_growth: float = Field(1.4, ge=1, description="factor when too few triplets are active")
@@ -65,7 +65,8 @@ class DescriptorSettings(RunSettings):
     )
     margin: float = Field(0.2, gt=0, description="of the triplet loss")
     patience: int = Field(6, ge=0, description="validations without progress before stopping; 0: never")
-    variants: int = Field(2, ge=1, description="augmentations of every image, whose early maps are remembered")
+    variants: int = Field(2, ge=1, description="augmentations of every sample, prepared once; as many of it mirrored")
+    views: str = Field("", description="folder that keeps what was prepared, for other runs; empty: for this run alone")
     half: bool = Field(False, description="bfloat16 mixed precision")
 
     @property
