@@ -22,14 +22,13 @@ OWN_TILT_DEG, MOUNT_TILT_DEG = 12.0, 24.0  # measured: of ground in scans by whi
 MIN_GROUND_POINTS = 50  # by hand: below, nobody knows how high the LiDAR is
 
 
-def level(points: Points) -> Array:
-    """Pose (4, 4) of the body in a frame that is nearly upright, its heading the body's and its z = 0 the ground around.
-
-    A tilt such as a rover has on a slope is left as it is, a bracket's is taken away, and between the two there is no
-    step.
+def level(points: Points, keep_slope: bool = False) -> Array:
+    """Pose (4, 4) of the body in a frame that is upright, its heading the body's and its z = 0 the ground around.
 
     Args:
         points: (N, 3) m, body frame; any N, any that are not finite.
+        keep_slope: leave a tilt such as a rover has on a slope as it is, and take away a mount's alone; between the
+            two there is no step.
     """
     finite = np.isfinite(points)
     known = (points if finite.all() else points[finite.all(axis=1)]).astype(float)
@@ -42,7 +41,7 @@ def level(points: Points) -> Array:
     stands = np.asarray(cloud.points())[:, :3] @ turn.T
     flat = (np.abs(normals @ turn[2]) > GROUND_COS) & (np.hypot(stands[:, 0], stands[:, 1]) < GROUND_M)
     height = float(np.quantile(stands[flat, 2], GROUND_SHARE)) if flat.sum() >= MIN_GROUND_POINTS else 0.0
-    return make_pose(_of_mount(turn), [0.0, 0.0, -height])
+    return make_pose(_of_mount(turn) if keep_slope else turn, [0.0, 0.0, -height])
 
 
 def _of_mount(turn: Array) -> Array:
