@@ -59,7 +59,7 @@ class UmfEmbedder:
     def embed(self, frame: Frame) -> Embedding:
         """Embed one frame; a black image and an empty scan count as missing."""
         image = None if frame.left is None or is_blank(frame.left) else frame.left
-        level_T_body = np.eye(4) if frame.points is None else level(frame.points)
+        level_T_body = np.eye(4) if frame.points is None else level(frame.points, keep_slope=True)
         points = None if frame.points is None else transform(level_T_body, frame.points)
         scan = prepare_scan(points, frame.intensity, self._config)
         found = self._runtime.run(pack([prepare_image(image, self._config)], [scan], self._config))
