@@ -11,8 +11,8 @@ What the network pools of the frames stays in `--work` and is taken up again.
 
 Prints and writes, per rover and as means: recall@1 of the second pass before and after of `fused`, `image` and
 `lidar`, and their `_gain`; `kept`: whether the revisits held out of the drive found that anything was gained (where
-not, `umf adapt` writes nothing and the gain is 0); `labels` and `wrong_labels`: pairs that the first drive called one place, and how many of
-them the truth puts more than 12 m or 30 degrees apart; `minutes`, without simulating.
+not, `umf adapt` writes nothing and the gain is 0); `labels` and `wrong_labels`: pairs that the first drive called one
+place, and how many of them the truth puts more than 12 m or 30 degrees apart; `minutes`, without simulating.
 """
 
 from __future__ import annotations
