@@ -46,17 +46,38 @@ def yard(seed: int = 1) -> np.ndarray:
     return points
 
 
-@pytest.mark.parametrize("tilt", [[0.0, 0.0, 0.0], [0.2, 0.1, 0.0], [-0.25, 0.2, 0.0]])
-def test_a_level_scan_stands_on_its_ground_whatever_the_mount(tilt: list[float]) -> None:
+def mounted(tilt: list[float]) -> np.ndarray:
+    """(4, 4) of a rotation vector, rad."""
     mount = np.eye(4)
     mount[:3, :3] = Rotation.from_rotvec(tilt).as_matrix()
+    return mount
+
+
+@pytest.mark.parametrize("keep_slope", [False, True])
+@pytest.mark.parametrize("tilt", [[0.0, 0.0, 0.0], [0.35, 0.26, 0.0], [-0.4, 0.3, 0.0]])
+def test_a_level_scan_stands_on_its_ground_whatever_the_mount(tilt: list[float], keep_slope: bool) -> None:
+    mount = mounted(tilt)
     points = transform(mount, yard())
-    level_T_body = level(points)
+    level_T_body = level(points, keep_slope)
     stands = transform(level_T_body, points)
     floor = stands[np.abs(yard()[:, 2] + 1.4) < 0.1]
     assert np.abs(floor[np.isfinite(floor).all(axis=1)][:, 2]).max() < 0.4
     assert abs(np.nanmedian(floor[:, 2])) < 0.06
-    assert abs(np.degrees(heading(level_T_body @ mount))) < 3.0
+    assert abs(np.degrees(heading(level_T_body @ mount))) < 4.0
+
+
+@pytest.mark.parametrize("tilt", [[0.1, 0.1, 0.0], [-0.18, 0.0, 0.0]])
+def test_the_tilt_of_a_rover_on_a_slope_stays(tilt: list[float]) -> None:
+    level_T_body = level(transform(mounted(tilt), yard()), keep_slope=True)
+    assert level_T_body[:3, :3] == pytest.approx(np.eye(3), abs=1e-6)
+    assert level_T_body[2, 3] == pytest.approx(1.4, abs=0.1)
+
+
+def test_between_a_slope_and_a_mount_there_is_no_step() -> None:
+    tilts = np.radians(np.arange(10, 28, 1.0))
+    stands = [level(transform(mounted([t, 0, 0]), yard()), keep_slope=True) @ mounted([t, 0, 0]) for t in tilts]
+    kept = [np.degrees(np.arccos(pose[2, 2])) for pose in stands]
+    assert np.abs(np.diff(kept)).max() < 2.5 and kept[0] == pytest.approx(10, abs=1) and kept[-1] < 1.5
 
 
 @pytest.mark.parametrize("count", [0, 20])

@@ -166,7 +166,7 @@ def pairs(detections: list[Detection]) -> set[tuple[int, int]]:
 def test_a_recording_replayed_over_one_store_adds_nothing_and_closes_the_same_loops(
     frames: list[Frame], detections: list[Detection], tmp_path: Path
 ) -> None:
-    for _ in range(3):
+    for _ in range(2):
         found = detector(load_settings(database__path=str(tmp_path / "map.sqlite")))
         again = [found.process(frame) for frame in frames]
         assert len(found.database) == len(frames) and pairs(again) == pairs(detections)
@@ -175,7 +175,7 @@ def test_a_recording_replayed_over_one_store_adds_nothing_and_closes_the_same_lo
 
 def test_a_recording_that_loops_adds_nothing(frames: list[Frame], detections: list[Detection]) -> None:
     found = detector()
-    for lap in range(3):
+    for lap in range(2):
         again = [found.process(replace(frame, session=lap)) for frame in frames]
         assert len(found.database) == len(frames)
         assert {one.keyframe.session for one in again if one.keyframe} == {0}

@@ -23,6 +23,7 @@ COMMANDS = {
     "replay": "umf_ros.commands.replay",
     "map": "umf_ros.commands.map",
     "compare": "umf_ros.commands.compare",
+    "sensors": "umf_ros.lab.commands.sensors",
     "play": "umf_ros.lab.commands.play",
     "report": "umf_ros.lab.commands.report",
     "evaluate": "umf_ros.lab.commands.evaluate",

@@ -1,7 +1,8 @@
 """Which way is up, found in a scan itself, and scans set upright on their ground.
 
 Whoever recognises a place should not care how a LiDAR is mounted: the same rocks are seen from a mast and from a
-tilted bracket, by a rover on a slope and on the level.
+tilted bracket. How a rover stands on a slope is another matter: the network has seen that in training, and two looks at
+rough ground from metres apart find two directions for up, which would turn the same rocks against each other.
 """
 
 from __future__ import annotations
@@ -17,14 +18,17 @@ CONES = np.radians([32.0, 24.0, 16.0, 12.0])  # measured: rights LiDARs tilted b
 MIN_GROUND = 10  # by hand: normals of ground that a direction is worth
 CELL_M, NEIGHBOURS = 0.4, 10  # by hand: coarse normals do, and small_gicp's own default
 GROUND_M, GROUND_COS, GROUND_SHARE = 15.0, 0.9, 0.2  # by hand: how near and how level ground is; how low among that
+OWN_TILT_DEG, MOUNT_TILT_DEG = 12.0, 24.0  # measured: of ground in scans by which networks were trained; of brackets
 MIN_GROUND_POINTS = 50  # by hand: below, nobody knows how high the LiDAR is
 
 
-def level(points: Points) -> Array:
+def level(points: Points, keep_slope: bool = False) -> Array:
     """Pose (4, 4) of the body in a frame that is upright, its heading the body's and its z = 0 the ground around.
 
     Args:
         points: (N, 3) m, body frame; any N, any that are not finite.
+        keep_slope: leave a tilt such as a rover has on a slope as it is, and take away a mount's alone; between the
+            two there is no step.
     """
     finite = np.isfinite(points)
     known = (points if finite.all() else points[finite.all(axis=1)]).astype(float)
@@ -37,7 +41,16 @@ def level(points: Points) -> Array:
     stands = np.asarray(cloud.points())[:, :3] @ turn.T
     flat = (np.abs(normals @ turn[2]) > GROUND_COS) & (np.hypot(stands[:, 0], stands[:, 1]) < GROUND_M)
     height = float(np.quantile(stands[flat, 2], GROUND_SHARE)) if flat.sum() >= MIN_GROUND_POINTS else 0.0
-    return make_pose(turn, [0.0, 0.0, -height])
+    return make_pose(_of_mount(turn) if keep_slope else turn, [0.0, 0.0, -height])
+
+
+def _of_mount(turn: Array) -> Array:
+    """The share of a rotation (3, 3) that the way a LiDAR is mounted must account for."""
+    vector = Rotation.from_matrix(turn).as_rotvec()
+    tilt_deg = np.degrees(np.linalg.norm(vector))
+    share = np.clip((tilt_deg - OWN_TILT_DEG) / (MOUNT_TILT_DEG - OWN_TILT_DEG), 0, 1)
+    found: Array = Rotation.from_rotvec(share * vector).as_matrix()
+    return found
 
 
 def upright(normals: Array) -> Array:

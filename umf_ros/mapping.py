@@ -88,7 +88,7 @@ def find_recordings(paths: list[Path]) -> list[Path]:
     for path in paths:
         if not path.exists():
             raise BagError(f"there is no recording {path}")
-        inside = [path] if _is_recording(path) else sorted(filter(_is_recording, path.iterdir()))
+        inside = [path] if path.is_file() or _is_recording(path) else sorted(filter(_is_recording, path.iterdir()))
         if not inside:
             raise BagError(f"{path} holds no recording ({', '.join(RECORDINGS)}, or a folder with metadata.yaml)")
         found += inside

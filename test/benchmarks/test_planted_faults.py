@@ -38,3 +38,11 @@ def test_what_is_planted_is_in_the_recording(mini_bag: Path, tmp_path: Path) -> 
 def test_the_first_sentence_is_read_from_the_page() -> None:
     page = 'x <p class="verdict bad">A &amp; B are 1.5 m off. 3 closures.</p> y'
     assert planted_faults.first_sentence(page) == "A & B are 1.5 m off"
+
+
+def test_a_clock_that_is_off_is_measured_and_a_good_recording_says_nothing(
+    mini_bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = planted_faults.measured_offset(open_bag(mini_bag), "lidar", 0.5)
+    assert found == pytest.approx(0.5, abs=0.1)
+    assert planted_faults.print_findings(mini_bag), capsys.readouterr().out

@@ -84,6 +84,8 @@ def wrong_calls(tmp_path: Path) -> Iterator[tuple[list[Path], str]]:
     (tmp_path / "empty").mkdir()
     yield [tmp_path / "missing.mcap"], "there is no recording"
     yield [tmp_path / "empty"], "holds no recording"
+    (tmp_path / "notes.txt").write_text("these are notes\n")
+    yield [tmp_path / "notes.txt"], "notes.txt is no recording"
 
 
 def test_what_a_user_gets_wrong_is_one_line(tmp_path: Path) -> None:

@@ -103,7 +103,9 @@ def test_the_sweep_counts_what_a_threshold_would_publish(tmp_path: Path) -> None
         candidate(54, 14, "turned by 90 deg, more than 28", probability=0.99),
     ]
     about = examined(tmp_path, [closure(50, 10)], tested, truth=trajectory())
-    assert scene_in(written(about))["sweep"] == [[0.97, 1, 1], [0.8, 0, 0]]
+    sweep = scene_in(written(about))["sweep"]
+    assert [row for row in sweep if row[0]] == [[0.97, 1, 1], [0.8, 0, 1]]
+    assert sum(revisit for *_, revisit in sweep) == 20  # every keyframe of the second lap, whatever became of it
 
 
 def test_the_terminal_gets_the_same_facts_and_no_line_twice(tmp_path: Path) -> None:

@@ -116,3 +116,15 @@ def _stretched(pose: np.ndarray) -> np.ndarray:
     stretched = pose.copy()
     stretched[:3, 3] *= 1.05
     return stretched
+
+
+def test_a_camera_alone_leaves_no_stops_and_asks_for_none(
+    outing: Drive, database: PlaceDatabase, capfd: pytest.CaptureFixture[str]
+) -> None:
+    finder = SubmapFinder(Verification(), Loop(), database)
+    for keyframe in outing.keyframes[:30]:
+        blind = replace(keyframe, points=np.empty((0, 3), np.float32))
+        assert finder.find(blind, []) == []
+        database.add(blind)
+        finder.remember(blind)
+    assert finder.trail.stops == [] and capfd.readouterr().out == ""

@@ -262,3 +262,26 @@ def test_a_verdict_tells_whether_the_images_agree(verifier: Verifier) -> None:
     assert verifier.verify(query, [candidate(match)])[0].measurement.agreement_image > 5
     blind = verifier.verify(without_image(query), [candidate(match)])[0]
     assert np.isnan(blind.measurement.agreement_image) and blind.closure is not None
+
+
+def on_even_ground(keyframe: Keyframe) -> Keyframe:
+    """The same keyframe, where the LiDAR sees nothing but a bare plane."""
+    x, y = np.meshgrid(np.arange(2.0, 20.0, 0.4), np.arange(-8.0, 8.0, 0.4))
+    height = np.random.default_rng(keyframe.stamp_ns % 2**32).normal(0, 0.003, x.shape)
+    points = np.column_stack([x.ravel(), y.ravel(), height.ravel()]).astype(np.float32)
+    return replace(keyframe, points=points)
+
+
+def test_where_both_scans_show_bare_ground_the_images_tell_the_pose() -> None:
+    """A bare plane lies as well anywhere on another; a scan with something on it is still asked."""
+    asked = Verifier(Verification(min_probability=0.0))
+    query, match = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
+    seen = asked.verify(on_even_ground(query), [candidate(on_even_ground(match))])[0]
+    assert seen.measurement.kind == "image" and gap(seen)[0] < 0.3
+    asked.reset()
+    assert asked.verify(query, [candidate(match)])[0].measurement.kind == "scan"
+    asked.reset()
+    assert asked.verify(on_even_ground(query), [candidate(match)])[0].closure is None
+    blind = [without_image(on_even_ground(one)) for one in (query, match)]
+    asked.reset()
+    assert asked.verify(blind[0], [candidate(blind[1])])[0].closure is None

@@ -47,6 +47,12 @@ def command(
     STAMP is in ns, or in seconds from the recording's start.
     Without --calibration a scan is in the body frame: x forward, y left, z up.
     """
+    images = match_left, match_right, query_left, query_right
+    if pairs is not None and (match is not None or any(images) or as_json or out is None):
+        raise ConfigError("--list PAIRS.csv needs --out VERDICTS.csv, and neither MATCH, QUERY, images nor --json")
+    if pairs is None:
+        _check_named(match or match_left, query or query_left, out)
+
     from rich.console import Console
 
     from umf_ros.commands.progress import WARNING
@@ -56,13 +62,10 @@ def command(
     from umf_ros.config import load_settings
     from umf_ros.loop_detector import make_detector_embedder
 
-    images = match_left, match_right, query_left, query_right
     if pairs is not None:
-        if match is not None or any(images) or as_json or out is None:
-            raise ConfigError("--list PAIRS.csv needs --out VERDICTS.csv, and neither MATCH, QUERY, images nor --json")
         asked = read_pairs(pairs)
     else:
-        asked = [_named_pair(match, query, images, out)]
+        asked = [(_view(match, match_left, match_right), _view(query, query_left, query_right))]
     method = {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}
     settings = load_settings(config, **method)
     errors = Console(stderr=True)
@@ -76,14 +79,13 @@ def command(
         _show(comparer.compare(*asked[0]), as_json)
 
 
-def _named_pair(match: str | None, query: str | None, images: tuple[Path | None, ...], out: Path | None) -> Pair:
+def _check_named(match: str | Path | None, query: str | Path | None, out: Path | None) -> None:
+    """What cannot be is said before anything that takes time to import."""
     if out is not None:
         raise ConfigError("--out VERDICTS.csv goes with --list PAIRS.csv; one pair is printed (--json)")
-    views = _view(match, *images[:2]), _view(query, *images[2:])
-    for name, view in zip(("MATCH", "QUERY"), views, strict=True):
-        if not view.scan and not view.left:
+    for view, name in ((match, "MATCH"), (query, "QUERY")):
+        if not view:
             raise ConfigError(f"say what to compare: {name} is missing (or --list PAIRS.csv --out VERDICTS.csv)")
-    return views
 
 
 def _view(name: str | None, left: Path | None, right: Path | None) -> PlaceView:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from umf_ros.commands.recordings import BagPath, check_files
+from umf_ros.errors import OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,6 +32,8 @@ def command(
     Ends with 3 where a replay could find nothing.
     """
     check_files(bag)
+    if write is not None and write.exists() and not write.is_dir():
+        raise OutputError(f"cannot write to {write}: it is no folder")
 
     from rich.console import Console
 
@@ -77,7 +80,7 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
 
 def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> None:
     from umf_ros.commands import first_settings
-    from umf_ros.errors import OutputError, writing
+    from umf_ros.errors import writing
     from umf_ros.runs.folder import write_atomically
 
     settings, calibration = folder / "my_rover.yaml", folder / "my_calibration.yaml"

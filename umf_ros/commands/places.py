@@ -32,8 +32,9 @@ def delete(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Delete sessions of a store for good, after a confirmation."""
-    from umf_ros.places.upkeep import delete_sessions
+    from umf_ros.places.upkeep import check_sessions, delete_sessions
 
+    check_sessions(store, session)
     if not yes:
         typer.confirm(f"Delete session {', '.join(map(str, session))} of {store} for good?", abort=True)
     typer.echo(f"{delete_sessions(store, session)} keyframes deleted")

@@ -70,7 +70,7 @@ def command(
     Ctrl-C ends the run early and keeps what was found; --resume goes on from there, or after a crash. Ends with 3 where
     the inputs could give nothing.
     """
-    check_files(bag, config, odometry, ground_truth)
+    check_files(bag, config, odometry, ground_truth, map_folder)
     odometry_frame = check_odometry_options(odometry, odometry_frame)
 
     from rich.console import Console

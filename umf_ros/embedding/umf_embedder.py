@@ -21,7 +21,7 @@ from umf_ros.networks.weights_files import locate_weights, read_config
 KEYPOINTS = 400
 # of the fair share of attention; the cap decides in a rich view, this in a poor one
 MIN_SALIENCY = 0.01
-READ_AS = b"scans set upright on their ground"
+READ_AS = b"scans without the tilt of their mount"
 
 
 class UmfEmbedder:
@@ -59,7 +59,7 @@ class UmfEmbedder:
     def embed(self, frame: Frame) -> Embedding:
         """Embed one frame; a black image and an empty scan count as missing."""
         image = None if frame.left is None or is_blank(frame.left) else frame.left
-        level_T_body = np.eye(4) if frame.points is None else level(frame.points)
+        level_T_body = np.eye(4) if frame.points is None else level(frame.points, keep_slope=True)
         points = None if frame.points is None else transform(level_T_body, frame.points)
         scan = prepare_scan(points, frame.intensity, self._config)
         found = self._runtime.run(pack([prepare_image(image, self._config)], [scan], self._config))

@@ -59,15 +59,24 @@ def stored_identity(path: Path) -> tuple[str, int]:
         raise UmfError(f"{path} does not say which network it was made with") from None
 
 
+def check_sessions(path: Path, numbers: Collection[int]) -> None:
+    """See that a store has these sessions.
+
+    Raises:
+        UmfError: the file is no place database, or lacks one of them.
+    """
+    unknown = set(numbers) - {session.number for session in stored_sessions(path)}
+    if unknown:
+        raise UmfError(f"{path} has no session {', '.join(map(str, sorted(unknown)))}")
+
+
 def delete_sessions(path: Path, numbers: Collection[int]) -> int:
     """Delete whole sessions for good; returns how many keyframes that were.
 
     Raises:
         UmfError: the file is no place database, is in use, or lacks one of the sessions.
     """
-    unknown = set(numbers) - {session.number for session in stored_sessions(path)}
-    if unknown:
-        raise UmfError(f"{path} has no session {', '.join(map(str, sorted(unknown)))}")
+    check_sessions(path, numbers)
     lock = FileLock(path)
     try:
         with _told(path), closing(sqlite3.connect(path)) as connection, connection:

@@ -143,18 +143,17 @@ def _similarity(about: ExaminedRun) -> dict[str, Any] | None:
 def _sweep(about: ExaminedRun) -> list[list[float | int]]:
     """Per keyframe with candidates: best probability, 1 or 0 for the same place or not and -1 for unknown, revisit."""
     rows: list[list[float | int]] = []
-    revisits = set(about.judged.missed) | {one.closure.query_stamp_ns for one in about.judged.closures}
     right = {one.closure.query_stamp_ns: one.is_true for one in about.judged.closures}
-    for stamp in map(int, about.places.stamps):
-        best = about.gates.most_probable(stamp)
+    for row, stamp in enumerate(map(int, about.places.stamps)):
+        best, revisit = about.gates.most_probable(stamp), int(len(about.places.same_places(row)) > 0)
         if best is None:
-            if stamp in revisits:
+            if revisit:
                 rows.append([0, 0, 1])
             continue
         same = about.places.is_same_place(stamp, best.match_stamp_ns)
         if best.reason == "accepted" and stamp in right:
             same = right[stamp]
-        rows.append([round(best.probability or 0, 4), -1 if same is None else int(same), int(stamp in revisits)])
+        rows.append([round(best.probability or 0, 4), -1 if same is None else int(same), revisit])
     return rows
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from umf_ros.embedding.depth import disparities
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array
-from umf_ros.runs.sensor_motion import Disagreement, Step, compare_motion, scan_turn, view_turn
+from umf_ros.runs.sensor_motion import Disagreement, Step, as_measured, compare_motion, scan_turn, view_turn
 from umf_ros.trajectory import Trajectory
 
 MIN_STEP_S, MAX_STEP_S = 0.18, 1.0  # between frames whose motion is compared, by hand
@@ -136,10 +136,11 @@ class SensorCheck:
         if len(self._steps["lidar"]) + len(self._steps["camera"]) >= 2 * MAX_STEPS or _stands(earlier, later):
             return
         if earlier.points is not None and later.points is not None:
-            pose = scan_turn(earlier.points, later.points)
+            (before, since), (after, until) = as_measured(earlier), as_measured(later)
+            pose = scan_turn(before, after)
             if pose is not None:
                 turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
-                stamps = self._seconds(earlier.stamp_ns), self._seconds(later.stamp_ns)
+                stamps = self._seconds(earlier.stamp_ns) + since, self._seconds(later.stamp_ns) + until
                 self._steps["lidar"].append(Step(*stamps, turn, pose[:3, 3]))
         if earlier.image_stamp_ns and later.image_stamp_ns:
             view = view_turn(earlier, later)

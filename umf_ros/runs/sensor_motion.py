@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import small_gicp
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from umf_ros.frames import Frame, Image, Points
@@ -19,7 +20,7 @@ MIN_SCAN_POINTS = 200  # by hand: below, consecutive scans are not registered
 CORNERS, CORNER_QUALITY, CORNER_SPACING, CORNER_WINDOW, CORNER_LEVELS = 300, 0.01, 8, (21, 21), 4  # by hand
 MIN_CORNERS = 30  # by hand: inliers that make an essential matrix believed
 MIN_PAIRS = 30  # by hand: of consecutive frames
-LAGS_S = np.arange(-1.0, 1.01, 0.05)  # by hand: a clock further off than this makes no pairs
+LAGS_S = np.arange(-1.5, 1.51, 0.05)  # by hand: a clock further off than this makes no frames
 NOISE_RAD = 0.005  # measured on simulated drives: of the rotation between consecutive scans
 NOISE_DIRECTION = 0.3  # by hand: of the direction of a quarter of a metre of way
 ROUNDS = 5  # of reweighting
@@ -52,7 +53,7 @@ class Disagreement:
         lag_s: to be added to the sensor's stamps.
         mounting_deg: (3,) rotation vector that turns the sensor's motion into the odometry's, body axes; None where
             the motion does not tell.
-        residual_deg: median difference of the turns that remains.
+        residual_deg: difference of the turns that remains: the mean of the axes' medians by their product.
         steps: number of pairs.
     """
 
@@ -60,6 +61,27 @@ class Disagreement:
     mounting_deg: Array | None
     residual_deg: float
     steps: int
+
+
+def as_measured(frame: Frame) -> tuple[Points, float]:
+    """The scan (N, 3) m with the motion during it put back, and its mean moment, s after the frame's stamp.
+
+    That motion was removed by the very odometry, clock and mounting that are in question: what was removed wrongly
+    would look like motion that agrees with them. A point counts by its lever, as it does where scans are aligned.
+    """
+    assert frame.points is not None
+    if frame.motion is None or not len(frame.points):
+        return frame.points, 0.0
+    moments = frame.motion.moments_s
+    turns = Rotation.from_rotvec(-moments[:, None] * frame.motion.rates[3:])
+    measured = turns.apply(frame.points - moments[:, None] * frame.motion.rates[:3])
+    levers: Array = np.square(frame.points[_one_per_cell(frame.points)].astype(float)).sum(axis=1)
+    return measured.astype(np.float32), float(np.average(moments[_one_per_cell(frame.points)], weights=levers + 1e-9))
+
+
+def _one_per_cell(points: Points) -> NDArray[np.intp]:
+    """One of the points (N, 3) in every cell that they are thinned by before they are aligned."""
+    return np.asarray(np.unique(np.floor(points / SCAN_CELL_M).astype(np.int32), axis=0, return_index=True)[1])
 
 
 def scan_turn(earlier: Points, later: Points) -> Array | None:
@@ -132,31 +154,47 @@ def compare_motion(steps: list[Step], odometry: Trajectory, epoch_ns: int) -> Di
         driven = _positions(last, times, odometry) - _positions(first, times, odometry)
         way = _directions(turns(first).inv().apply(driven))
         rotation, residuals, known = _one_rotation(seen[0][inside], stated, seen[1][inside], way)
-        tried.append((float(np.median(residuals)), float(lag), rotation, known))
+        tried.append((_spread(residuals), float(lag), rotation, known))
     if not tried:
         return None
-    residual, lag, rotation, known = min(tried, key=lambda one: one[0])
-    in_step = min(tried, key=lambda one: abs(one[1]))
-    if residual > BETTER * in_step[0]:  # a clock is right until the motion clearly says otherwise
-        residual, lag, rotation, known = in_step
+    in_step = min(range(len(tried)), key=lambda at: abs(tried[at][1]))
+    best = min(range(len(tried)), key=lambda at: tried[at][0])
+    if tried[best][0] > BETTER * tried[in_step][0]:  # a clock is right until the motion clearly says otherwise
+        best = in_step
+    residual, lag, rotation, known = tried[best]
     if residual > CONTRAST * float(np.median([one[0] for one in tried])):
         return None
+    if best != in_step and 0 < best < len(tried) - 1:
+        lag += _lowest([one[0] for one in tried[best - 1 : best + 2]]) * (tried[best + 1][1] - lag)
     mounting = np.degrees(Rotation.from_matrix(rotation).as_rotvec()) if known else None
     return Disagreement(round(lag, 2), mounting, float(np.degrees(residual)), len(steps))
 
 
+def _spread(residuals: Array) -> float:
+    """Size (rad) of residuals (N, 3): the mean of the axes by their product, for one is often far better known."""
+    return float(np.exp(np.log(np.median(np.abs(residuals), axis=0) + 1e-9).mean()))
+
+
+def _lowest(three: list[float]) -> float:
+    """Where a parabola through three values at -1, 0 and 1 is lowest, the middle one being the least of them."""
+    before, middle, after = np.log(three)
+    bend = before - 2 * middle + after
+    return float((before - after) / (2 * bend)) if bend > 0 else 0.0
+
+
 def _one_rotation(turns: Array, stated: Array, ways: Array, stated_ways: Array) -> tuple[Array, Array, bool]:
-    """Rotation (3, 3) that turns (N, 3) into stated (N, 3), robustly; what is left of it; whether it is known."""
+    """Rotation (3, 3) that turns (N, 3) into stated (N, 3), robustly; the (N, 3) that is left; whether it is known."""
     weights = np.ones(len(turns))
-    rotation, residuals, known = np.eye(3), np.zeros(len(turns)), False
+    rotation, residuals, known = np.eye(3), np.zeros_like(turns), False
     for _ in range(ROUNDS):
         weighed = weights[:, None]
         sums = (turns * weighed).T @ stated / NOISE_RAD**2 + (ways * weighed).T @ stated_ways / NOISE_DIRECTION**2
         left, sizes, right = np.linalg.svd(sums)
         sign = np.sign(np.linalg.det(left @ right))
         rotation = (left @ np.diag([1, 1, sign]) @ right).T
-        residuals = np.linalg.norm(turns @ rotation.T - stated, axis=1)
-        weights = 1 / (1 + (residuals / max(float(np.median(residuals)), 1e-9)) ** 2)
+        residuals = turns @ rotation.T - stated
+        size = np.linalg.norm(residuals, axis=1)
+        weights = 1 / (1 + (size / max(float(np.median(size)), 1e-9)) ** 2)
         known = bool(sizes[1] > KNOWN * sizes[0])
     return rotation, residuals, known
 

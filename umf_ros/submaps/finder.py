@@ -136,8 +136,8 @@ class SubmapFinder:
         return Tested(theirs, ours, alignment, measurement)
 
     def remember(self, keyframe: Keyframe) -> None:
-        """Take up a keyframe that was added to the database."""
-        if self.trail.add(keyframe):
+        """Take up a keyframe that was added to the database; one without a scan adds nothing to a submap."""
+        if len(keyframe.points) and self.trail.add(keyframe):
             self._lookalikes.describe()
             if _narrow(keyframe):
                 self._drift.add(keyframe)
@@ -188,4 +188,6 @@ class SubmapFinder:
 
 def _narrow(keyframe: Keyframe) -> bool:
     """Whether the sensor sees so little around it that a turned visit shows it something else."""
+    if not len(keyframe.points):
+        return False
     return FieldOfView(keyframe.points - keyframe.body_T_lidar[:3, 3]).width_deg < const.NARROW_DEG

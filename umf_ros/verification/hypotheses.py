@@ -17,7 +17,7 @@ from umf_ros.geometry import Array, relative, rotation_angle
 from umf_ros.verification import constants as const
 from umf_ros.verification.all_round import Fit, TurnedSurroundings, scout, search
 from umf_ros.verification.ransac import fit_rigid
-from umf_ros.verification.registration import PreparedScan
+from umf_ros.verification.registration import PreparedScan, views_tell
 from umf_ros.verification.rerank import RankedCandidate
 from umf_ros.verification.views import PairedViews
 
@@ -46,7 +46,7 @@ def find_hypotheses(
     match: PreparedScan,
     settings: Verification,
 ) -> list[Hypothesis]:
-    """Distinct poses for one candidate, best first; with scans only those at which the elevation maps fit.
+    """Distinct poses for one candidate, best first; where scans tell places apart, those at which elevation maps fit.
 
     Args:
         query: the query keyframe.
@@ -58,7 +58,7 @@ def find_hypotheses(
     views = None
     if settings.modalities != "cloud":
         views = PairedViews.of(query, ranked.keyframe, const.VIEW_NOISE[settings.features])
-    if turned is None or not match.usable:
+    if turned is None or not match.usable or (views is not None and views_tell(match, turned.scan)):
         seen = views.best_pose() if views else None
         return [Hypothesis(ranked, seen[0], float(seen[1]), views)] if seen else []
     from_points = pose_from_points(query, ranked, settings.ransac_iterations, settings.seed)

@@ -42,6 +42,11 @@ class PreparedScan:
         return len(self.points) >= const.MIN_SCAN_POINTS
 
     @cached_property
+    def bare(self) -> bool:
+        """Whether it shows bare, even ground alone, which could lie anywhere on such ground."""
+        return float(self.elevation.values.std()) < const.BARE_RELIEF_M if len(self.elevation.values) else False
+
+    @cached_property
     def elevation(self) -> ElevationMap:
         """Heights and relief, upright."""
         return ElevationMap(self.upright_points)
@@ -170,6 +175,11 @@ def unlevelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
 def prepare(keyframe: Keyframe) -> PreparedScan:
     """The scan of a keyframe; one whose motion was not removed is blurred."""
     return PreparedScan(keyframe.points, keyframe.body_T_lidar, const.BLUR_M if keyframe.motion is None else 0.0)
+
+
+def views_tell(match: PreparedScan, query: PreparedScan) -> bool:
+    """Whether images have to tell the pose, where there are any: a scan is wanting, or both show bare ground alone."""
+    return not (match.usable and query.usable) or (match.bare and query.bare)
 
 
 def joint_blur(match: PreparedScan, query: PreparedScan) -> float:

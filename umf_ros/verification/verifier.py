@@ -25,11 +25,11 @@ from umf_ros.verification.measurement import (
     measure_candidate,
     uncompared,
 )
-from umf_ros.verification.registration import ScanCache, align_scans, levelled
+from umf_ros.verification.registration import ScanCache, align_scans, levelled, views_tell
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
 UNTESTED, NO_POSE = "less promising than others", "no pose fits, or others fit better"
-FOUND_BEFORE = "not compared: the expected place had been found"
+FOUND_BEFORE = "not compared: one was found"
 NO_DEPTH = "no depth: neither a scan nor a stereo pair"
 """Why there is nothing to judge about a candidate."""
 
@@ -201,7 +201,7 @@ class Verifier:
 
     def _align(self, query: Keyframe, hypothesis: Hypothesis) -> AlignedHypothesis:
         scans = self._scans[hypothesis.ranked.keyframe], self._scans[query]
-        if hypothesis.views is not None and not all(scan.usable for scan in scans):
+        if hypothesis.views is not None and views_tell(*scans):
             return AlignedHypothesis(query, hypothesis, hypothesis.views.align(hypothesis.pose), None)
         return AlignedHypothesis(query, hypothesis, align_scans(*scans, hypothesis.pose), scans)
 

@@ -8,7 +8,7 @@ import pytest
 from umf_ros.errors import ConfigError
 from umf_ros.lab.simulation.families import FAMILIES, draw_traits
 from umf_ros.lab.simulation.noise import detail_texture, spectral_noise
-from umf_ros.lab.simulation.relief import CELL_M, SIZE_M
+from umf_ros.lab.simulation.relief import CELL_M, SIZE_M, Pan
 from umf_ros.lab.simulation.seeds import TEST, TRAINING, VALIDATION, check_seed
 from umf_ros.lab.simulation.world import ground
 
@@ -89,3 +89,14 @@ def test_ranges_of_seeds_do_not_meet():
     assert TRAINING.start == 0 and TEST.stop == 30_000
     with pytest.raises(ConfigError, match="4294967296"):
         check_seed(2**32)
+
+
+def test_a_pan_is_even_and_the_rest_stays_as_it_was():
+    pan = Pan(10.0, -20.0, 30.0)
+    before, after = ground(5, "canyon", 0.4), ground(5, "canyon", 0.4, pan)
+    axis = np.arange(len(after.heights)) * CELL_M - SIZE_M / 2
+    away = np.hypot(*np.meshgrid(axis - pan.x_m, axis - pan.y_m))
+    inside, outside = away < pan.radius_m - 1, away > pan.radius_m + 11
+    assert np.ptp(after.heights[inside]) < 1e-3 and not after.rockiness[inside].any()
+    assert np.abs(after.maps[inside][:, :2]).max() < 1e-3 and after.maps[inside][:, 2].std() > 0.01  # it has a texture
+    assert np.array_equal(before.heights[outside], after.heights[outside])

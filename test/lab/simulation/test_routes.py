@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 from umf_ros.errors import ConfigError
 from umf_ros.geometry import wrap_angle
 from umf_ros.lab.simulation.passes import SETTINGS, plan_passes, resample
-from umf_ros.lab.simulation.presets import DEMO, ETNA, PRESETS, find_preset, gentle_loop
+from umf_ros.lab.simulation.presets import DEMO, ETNA, PRESETS, SENSORS, find_preset, gentle_loop
 from umf_ros.lab.simulation.relief import SIZE_M
-from umf_ros.lab.simulation.route import STEP_M, Walker
+from umf_ros.lab.simulation.route import NIGHT, STEP_M, Walker
 from umf_ros.lab.simulation.sequences import sampled, trail_length
 from umf_ros.lab.simulation.world import ground
 
@@ -138,6 +138,26 @@ def test_the_heading_swings_about_the_path(swing):
     assert abs(off.mean()) < max(0.2 * swing, 1e-6)
 
 
+def test_a_walk_goes_over_to_another_trail_without_a_bend():
+    far = 25 * np.stack([np.cos(ANGLE), np.sin(ANGLE)], 1) + [140.0, 30.0]
+    route = walker().forward(80).over(far).forward(60, label="there").route(0)
+    assert [label for label, _, _ in route.legs()] == ["first", "there"]
+    assert away(route.path[-200:], far).max() < 0.2
+    assert np.degrees(np.abs(wrap_angle(np.diff(route.yaw)))).max() < 6
+
+
+def test_the_drive_for_the_sensors_passes_even_ground_twice_and_rocks_by_night(drive):
+    route = SENSORS.route(drive.world.relief, 31)
+    legs = {label: (start, end) for label, start, end in route.legs()}
+    assert set(legs) == {"first", "flat ground", "rocks by day", NIGHT}
+    on_pan = np.interp(legs["flat ground"], route.travelled, np.hypot(*route.path.T))
+    assert SENSORS.pan is not None and (on_pan < SENSORS.pan.radius_m - 30).all()
+    for label in ("flat ground", "rocks by day", NIGHT):
+        there = (route.travelled >= legs[label][0] + 1) & (route.travelled <= legs[label][1] - 1)
+        before = route.travelled < legs[label][0] - 1
+        assert cKDTree(route.path[before]).query(route.path[there])[0].max() < 1.0
+
+
 def test_a_route_is_cut_where_it_is_told():
     route = walker().forward(100).route(0, length_m=30)
     assert route.length_m == pytest.approx(30, abs=STEP_M + 0.01)
@@ -152,7 +172,7 @@ def test_every_preset_drives_within_the_world(drive, name):
     steps = np.linalg.norm(np.diff(route.path, axis=0), axis=1)
     assert steps.max() < 0.6
     # a place to meet again; those of a session are met by other sessions of its world
-    assert set(route.labels) & {"offset", "opposite"} or name == "session"
+    assert set(route.labels) & {"offset", "opposite"} or name in ("session", "sensors")
     assert np.array_equal(route.path, preset.route(relief, 31).path)
     assert not np.array_equal(route.path, preset.route(relief, 32).path)
 

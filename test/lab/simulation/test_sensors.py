@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from umf_ros.embedding.inputs import is_blank
 from umf_ros.geometry import invert, relative, transform
 from umf_ros.lab.simulation import gnss, imu
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, resized
@@ -189,3 +190,16 @@ def test_raw_colour_cameras_are_bent_and_rectify_to_the_calibrated_pair(drive):
     assert match > np.corrcoef(resized_raw[200:500].ravel(), flat.image[200:500].ravel())[0, 1] + 0.02
     colours = mosaic(np.full((4, 4), 100, np.uint8))
     assert colours[0, 0] > colours[0, 1] > colours[1, 1]
+
+
+def test_after_sunset_a_camera_soon_sees_nothing(drive):
+    camera = Camera(drive.world, resized(drive.calibration.camera, *TRAINING_SIZE))
+    pose = drive.pose(drive.exposures[8].stamp_ns) @ drive.calibration.body_T_camera
+    day = Sun(30.0, 25.0)
+    taken = [
+        camera.take(pose, sun, np.random.default_rng(0)).image
+        for sun in (day, day.set_for(2), day.set_for(3.5), day.set_for(40))
+    ]
+    contrast = [image.std() for image in taken]
+    assert contrast[0] == contrast[1] > contrast[2] > 4 and is_blank(taken[3])  # exposure and gain make up for it first
+    assert day.set_for(40).strength == day.set_for(7).strength < 1e-5 and day.set_for(-1).strength == 1

@@ -29,6 +29,7 @@ def drive_of(x: np.ndarray, y: np.ndarray, closures: list[tuple[int, int]], yaw:
     yaw = np.zeros(count) if yaw is None else yaw
     nothing = np.zeros((count, 1), np.float32)
     return Drive(
+        np.arange(count) * 10**9,
         nothing,
         nothing,
         nothing,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.commands.recordings import ConfigPath, DatasetName, WeightsPath, open_frames, open_recording
+from umf_ros.commands.recordings import ConfigPath, DatasetName, WeightsPath, check_files, open_frames, open_recording
 from umf_ros.errors import ConfigError, UmfError
 
 if TYPE_CHECKING:
@@ -32,14 +32,17 @@ def command(
     revisits of every drive are held out; when they are not found better than before, nothing is written. Drives that
     are read are kept beside OUT: interrupted, the same command goes on with the next one.
     """
+    for bag in bags:
+        check_files(bag, config)
+    if out.suffix != ".safetensors":
+        raise ConfigError(f"--out {out}: expected a .safetensors file")
+
     from rich.console import Console
 
     from umf_ros.lab.training.adaptation import FEWEST, GAINED, Lesson, measure
     from umf_ros.networks.weights import load_weights
     from umf_ros.networks.weights_files import locate_weights
 
-    if out.suffix != ".safetensors":
-        raise ConfigError(f"--out {out}: expected a .safetensors file")
     console = Console()
     path = locate_weights(weights)
     network = load_weights(path)

@@ -15,6 +15,7 @@ from umf_ros.commands.recordings import (
     RunsFolder,
     TruthPath,
     WeightsPath,
+    check_files,
 )
 from umf_ros.embedding import CHOICES
 from umf_ros.errors import ConfigError
@@ -62,16 +63,14 @@ def command(
     a second drive on an offset path under another sun is asked for the first; the default seeds of the
     test worlds are never trained or tuned on.
     """
+    _check(data, worlds, methods, trained)
+    if data is not None:
+        check_files(data, config, odometry, ground_truth)
+
     from umf_ros.lab.commands.evaluate_all import EveryMethod
     from umf_ros.lab.datasets.listed import is_list
     from umf_ros.lab.evaluation.places import lists_place_sets
 
-    if (data is None) == (worlds is None):
-        raise ConfigError("expected either a recording or --worlds test|validation")
-    if methods not in ("umf", "all"):
-        raise ConfigError(f"--methods: expected umf or all, not {methods!r}")
-    if trained is not None and methods == "umf":
-        raise ConfigError("--trained names weights of other methods, and without --methods all there are none")
     of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick, "--count": count != 4}
     of_lists: dict[str, object] = {"--rule": rule != "s3li"}
     of_recordings: dict[str, object] = {"--config": config, "--dataset": dataset != "auto", "--embedder": embedder}
@@ -98,6 +97,16 @@ def command(
         from umf_ros.runs.folder import write_atomically
 
         write_atomically(json_file, json.dumps(figures, indent=2) + "\n")
+
+
+def _check(data: Path | None, worlds: str | None, methods: str, trained: Path | None) -> None:
+    """What cannot be is said before anything that takes time to import."""
+    if (data is None) == (worlds is None):
+        raise ConfigError("expected either a recording or --worlds test|validation")
+    if methods not in ("umf", "all"):
+        raise ConfigError(f"--methods: expected umf or all, not {methods!r}")
+    if trained is not None and methods == "umf":
+        raise ConfigError("--trained names weights of other methods, and without --methods all there are none")
 
 
 def _refuse(data: str, options: Mapping[str, object]) -> None:

@@ -22,9 +22,11 @@ def command(
     from umf_ros.embedding.torch_runtimes import converted
     from umf_ros.errors import ConfigError
     from umf_ros.networks.weights_files import locate_weights
+    from umf_ros.runs.folder import check_writable
 
     if out.suffix != ".xml":
         raise ConfigError(f"{out}: OpenVINO's files end in .xml")
+    check_writable(out.parent)
     model = converted(locate_weights(weights), outputs_of(Asked(supers=super_features)))
     save(model, out)
     megabytes = out.with_suffix(".bin").stat().st_size / 1e6

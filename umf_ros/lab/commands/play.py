@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from umf_ros.commands.recordings import BagPath
+from umf_ros.commands.recordings import BagPath, check_files
 from umf_ros.errors import UmfError
 
 
@@ -19,6 +19,8 @@ def command(
     ] = False,
 ) -> None:
     """Publish a recording on its topics, with /clock, at its own pace."""
+    check_files(bag)
+
     import importlib.util
     import os
     import sys

@@ -21,7 +21,8 @@ def command(
     preset: Annotated[
         str,
         typer.Option(
-            help="demo, vulcano, session, traverse_1, traverse_2, loops,  crater, crater_inout, mapping, landmarks."
+            help="demo, vulcano, session, sensors, traverse_1, traverse_2, loops, crater, crater_inout, mapping or "
+            "landmarks."
         ),
     ] = "demo",
     seed: Annotated[int, typer.Option(help="World, route, light and noise.")] = 1,

@@ -79,7 +79,9 @@ class ViewMaker:
         if rng is not None and self._augmentation is not None:
             view_T_body = _random_motion(rng, self._augmentation) @ view_T_body
             points, intensity = _thin(points, intensity, rng, self._augmentation)
-        view_T_body = level(transform(view_T_body, points)) @ view_T_body  # as the embedder reads scans
+        view_T_body = (
+            level(transform(view_T_body, points), keep_slope=True) @ view_T_body
+        )  # as the embedder reads scans
         scan = prepare_scan(transform(view_T_body, points), intensity, self.config)
         return View(sample, image, present, scan, input_T_pixel, np.linalg.inv(view_T_body))
 

@@ -63,7 +63,7 @@ def look(network: UMF, embedder: Embedder, frame: Frame) -> Seen:
         embedder: the same network as it is used, with super-features.
         frame: with an image and a scan.
     """
-    points = None if frame.points is None else transform(level(frame.points), frame.points)
+    points = None if frame.points is None else transform(level(frame.points, keep_slope=True), frame.points)
     scan = prepare_scan(points, frame.intensity, network.config)
     batch = to_tensors(read_frame(frame, network.config))
     maps: list[Tensor] = []

@@ -61,14 +61,21 @@ class Visit:
 
 
 class TestWorld:
-    """One world in the hard setting (offset to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing)."""
+    """One world in the hard setting (offset to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing).
+
+    Args:
+        seed: of the world; its family follows from it.
+        sampling: how densely it is driven.
+        calibration: of the rover; None: the simulated one.
+    """
 
     __test__ = False  # no test of pytest's, whatever the name suggests
 
-    def __init__(self, seed: int, sampling: Sampling) -> None:
+    def __init__(self, seed: int, sampling: Sampling, calibration: Calibration | None = None) -> None:
         self.seed, self.family = seed, FAMILIES[seed % len(FAMILIES)]
         self.name = f"{self.family} {seed}"
         self._sampling = sampling
+        self._calibration = calibration or load_calibration("simulated")
 
     @cached_property
     def passes(self) -> list[Pass]:
@@ -91,7 +98,7 @@ class TestWorld:
         """The same, of some passes alone."""
         path = np.concatenate([drive.path for drive in self.passes])
         world = World(self.seed, self.family, SETTINGS["hard"].aliasing, path)
-        calibration = load_calibration("simulated")
+        calibration = self._calibration
         drives = [
             drive if number in wanted else thinned(drive, len(drive.path)) for number, drive in enumerate(self.passes)
         ]

@@ -93,6 +93,7 @@ class Camera:
             band = slice(top * columns, (top + BAND_ROWS) * columns)
             shape = (min(BAND_ROWS, rows - top), columns)
             light[top : top + BAND_ROWS] = shader.radiance(hits.part(band), origin, directions[band], shape, pixel_rad)
+        light *= np.float32(sun.strength)
         if smear_px is not None:
             light = _smeared(light, smear_px)
         image = self._develop(light, rng, exposure)

@@ -66,6 +66,10 @@ class Motion:
         """Metres driven along the route at times."""
         return np.asarray(np.interp(times_s, self._times, self._travelled))
 
+    def reached(self, metres: float) -> float:
+        """When so many metres of the route are driven."""
+        return float(np.interp(metres, self._travelled, self._times))
+
     def velocity(self, times_s: ArrayLike) -> Array:
         """(N, 3) velocity of the body, m/s, world frame."""
         return self._position(np.atleast_1d(times_s), 1)

@@ -12,9 +12,9 @@ from umf_ros.errors import ConfigError
 from umf_ros.geometry import Array
 from umf_ros.lab.simulation import rig
 from umf_ros.lab.simulation.odometry import Drift
-from umf_ros.lab.simulation.relief import Relief
+from umf_ros.lab.simulation.relief import Pan, Relief
 from umf_ros.lab.simulation.rig import Layout
-from umf_ros.lab.simulation.route import Route, Walker
+from umf_ros.lab.simulation.route import NIGHT, Route, Walker
 from umf_ros.lab.simulation.seeds import check_seed
 
 SESSION_LOOP_M = 100.0
@@ -40,6 +40,7 @@ class Preset:
         drift: how the odometry goes wrong.
         layout: what the cameras publish.
         shared: whether its world holds all of S3LI Etna's sequences.
+        pan: where the ground is bare and even; None: nowhere.
         ways: lays all that drives of different seeds follow through one world; None: each has its own.
     """
 
@@ -57,6 +58,7 @@ class Preset:
     layout: Layout = rig.ETNA
     shared: bool = False
     ways: Plan | None = None
+    pan: Pan | None = None
 
     def route(self, relief: Relief, seed: int) -> Route:
         """The route on a relief."""
@@ -115,6 +117,28 @@ def _landmarks(relief: Relief, rng: np.random.Generator) -> Walker:
     return (
         Walker(relief.trail, rng).forward(60).cross(100).forward(60, lateral_m=2).cross(130).forward(300, lateral_m=3)
     )
+
+
+PAN = Pan(0.0, 0.0, 45.0)
+RING_M, RING_AWAY_M = 7.2, 68.0
+"""Radius of the rings of `sensors`, and how far the one among rocks is from the one on the pan."""
+
+
+def _sensors(relief: Relief, rng: np.random.Generator) -> Walker:
+    """A ring on the pan, twice; a ring among rocks, twice by day and once more by night."""
+    sides = [_ring(RING_AWAY_M * np.array([np.cos(a), np.sin(a)])) for a in np.linspace(0, 2 * np.pi, 24)[:-1]]
+    rocky = min(sides, key=lambda ring: _steepness(relief, ring))
+    lap, out = 2 * np.pi * RING_M, rocky.mean(axis=0)
+    leave = np.arctan2(out[1], out[0]) - np.pi / 2  # where the ring's direction is that of the other one
+    on_pan = Walker(_ring(np.zeros(2), leave), rng).forward(lap).forward(lap, 0.4, "flat ground")
+    among_rocks = on_pan.over(rocky).forward(lap).forward(0.5 * lap, 0.4, "rocks by day")
+    return among_rocks.forward(0.7 * lap, 0.4, NIGHT)
+
+
+def _ring(middle: Array, start: float = 0.0) -> Array:
+    """(N, 2) closed circle, counter-clockwise."""
+    angle = start + np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    return middle + RING_M * np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
 DEMO = Preset(
@@ -182,7 +206,18 @@ def _steepness(relief: Relief, curve: Array) -> float:
 
 VULCANO = replace(DEMO, summary="the demo's loop with raw colour cameras that distort", layout=rig.VULCANO)
 
-PRESETS: dict[str, Preset] = {"demo": DEMO, "vulcano": VULCANO, "session": SESSION, **ETNA}
+SENSORS = replace(
+    DEMO,
+    summary="a ring where the LiDAR sees nothing, and one where after sunset the camera does",
+    plan=_sensors,
+    length_m=254,
+    speed_m_s=1.8,
+    sun_deg=20,
+    drift=Drift(),
+    pan=PAN,
+)
+
+PRESETS: dict[str, Preset] = {"demo": DEMO, "vulcano": VULCANO, "session": SESSION, "sensors": SENSORS, **ETNA}
 
 
 def find_preset(name: str) -> Preset:

@@ -81,9 +81,15 @@ def write_side_files(simulator: Simulator, bag: Path) -> None:
 
 
 def describe(simulator: Simulator) -> dict[str, str]:
-    """What was simulated, as text; the legs are label, first and last second."""
+    """What was simulated, as text; the legs are labels with first and last metre and stamp."""
     legs = [
-        {"label": label, "from_m": round(start, 1), "to_m": round(end, 1)}
+        {
+            "label": label,
+            "from_m": round(start, 1),
+            "to_m": round(end, 1),
+            "from_ns": stamp_ns(simulator.motion.reached(start)),
+            "to_ns": stamp_ns(simulator.motion.reached(end)),
+        }
         for label, start, end in simulator.route.legs()
     ]
     world = simulator.world

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +16,21 @@ from umf_ros.lab.simulation.noise import Field, smooth_step, spectral_noise
 SIZE_M = 320.0
 CELL_M = 0.2
 CELLS = round(SIZE_M / CELL_M)
+_SHORE_M = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Pan:
+    """A dry lake: ground so even that a LiDAR sees nothing on it, while a camera sees its texture.
+
+    Attributes:
+        x_m, y_m: its middle.
+        radius_m: within it there is neither relief nor rock.
+    """
+
+    x_m: float
+    y_m: float
+    radius_m: float
 
 
 class Relief:
@@ -27,8 +44,8 @@ class Relief:
         rockiness: (CELLS, CELLS) float32, density of rocks relative to the mean.
     """
 
-    def __init__(self, traits: Traits, rng: np.random.Generator, aliasing: float = 0.0) -> None:
-        """Build the ground; `aliasing` from 0 to 1 makes it repeat itself."""
+    def __init__(self, traits: Traits, rng: np.random.Generator, aliasing: float = 0.0, pan: Pan | None = None) -> None:
+        """Build the ground; `aliasing` from 0 to 1 makes it repeat itself, and a pan is levelled into it."""
         self.traits = traits
         axis = (np.arange(CELLS, dtype=np.float32) * CELL_M) - SIZE_M / 2
         self._x, self._y = np.meshgrid(axis, axis)
@@ -41,11 +58,13 @@ class Relief:
         rims = self._craters(heights, rng)
         sand = self._dunes(heights, rng, aliasing)
         self._raise_border(heights, rng)
+        uneven = self._level(heights, pan) if pan else np.float32(1)
         self.heights = heights
-        self.maps = self._maps(rims, sand, rng)
+        self.maps = self._maps(rims, sand * uneven, rng)
         slope = np.hypot(self.maps[..., 0], self.maps[..., 1])
         self.rockiness = np.exp(1.3 * rugged) * (1 - 0.75 * sand) + 2.5 * rims
         self.rockiness *= 1 - smooth_step(slope, 0.6, 0.9)  # on a cliff they would hang in the air
+        self.rockiness *= uneven
         del self._x, self._y
 
     def height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
@@ -135,6 +154,15 @@ class Relief:
         edge = (np.abs(self._x) ** 5 + np.abs(self._y) ** 5) ** 0.2 / (SIZE_M / 2)
         ragged = spectral_noise(CELLS, 3.6, rng, 3, 30)
         heights += ((6 + 1.5 * ragged) * smooth_step(edge + 0.015 * ragged, 0.78, 1.0)).astype(np.float32)
+
+    def _level(self, heights: Field, pan: Pan) -> Field:
+        """Fill a pan to the mean height of its ground; returns 0 inside and 1 outside of it."""
+        away = np.hypot(self._x - np.float32(pan.x_m), self._y - np.float32(pan.y_m))
+        uneven = smooth_step(away, pan.radius_m, pan.radius_m + _SHORE_M).astype(np.float32)
+        level = heights[away < pan.radius_m].mean()
+        heights *= uneven
+        heights += (1 - uneven) * level
+        return uneven
 
     def _maps(self, rims: Field, sand: Field, rng: np.random.Generator) -> Field:
         along, across = np.gradient(self.heights, CELL_M)

@@ -13,6 +13,8 @@ from umf_ros.lab.simulation.noise import smooth_step
 from umf_ros.lab.simulation.passes import direction, metres_along, resample
 
 STEP_M = 0.25
+NIGHT = "night"
+"""Label of a way that is driven after sunset."""
 _EASE_M = 6.0
 
 
@@ -24,7 +26,7 @@ class Route:
         path: (N, 2) places, m.
         yaw: (N,) heading of the rover, rad; near the direction of the path.
         travelled: (N,) metres along the path.
-        labels: (N,) what makes each place a revisit: first, offset, opposite or crossing.
+        labels: (N,) what makes each place a revisit: first, offset, opposite or crossing; or what is special there.
     """
 
     path: Array
@@ -67,8 +69,8 @@ class Walker:
         """Length of the trail."""
         return len(self._points) * STEP_M
 
-    def forward(self, length_m: float, lateral_m: float = 0.0) -> Walker:
-        """Follow the trail, up to `lateral_m` beside it; labels itself by whether the place is new."""
+    def forward(self, length_m: float, lateral_m: float = 0.0, label: str = "") -> Walker:
+        """Follow the trail, up to `lateral_m` beside it; without a label, it is told by whether the place is new."""
         count = round(length_m / STEP_M)
         ease = smooth_step(np.arange(count) * STEP_M, 0, _EASE_M)
         waves = np.arange(count) * STEP_M / 45 * 2 * np.pi
@@ -80,7 +82,7 @@ class Walker:
         self._append(self._points[index] + offset[:, None] * normal)
         fresh = ~self._visited[index]
         fresh &= np.isin(np.arange(count), np.unique(index, return_index=True)[1])  # a move may be longer than a lap
-        self._labels += ["first" if new else again for new in fresh]
+        self._labels += [label or ("first" if new else again) for new in fresh]
         self._visited[index] = True
         self._at, self._offset = int(index[-1] + self._direction) % len(self._points), float(offset[-1])
         return self
@@ -121,6 +123,25 @@ class Walker:
         self._append(points)
         self._labels += ["crossing"] * len(points)
         self._at, self._offset = joining, 0.0
+        return self
+
+    def over(self, trail: Array) -> Walker:
+        """Leave the trail for another one, and join it where that takes the least turning."""
+        place, ahead = self._pose()
+        points, heading = resample(trail, STEP_M)
+        along = np.stack([np.cos(heading), np.sin(heading)], 1)
+        way = points - place
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        joining = int((along * way).sum(axis=1).argmax())
+        corners = np.array([place, place + 4 * ahead, points[joining] - 4 * along[joining], points[joining]])
+        lengths = metres_along(corners)
+        curve = CubicSpline(lengths, corners, bc_type=((1, ahead), (1, along[joining])))
+        between = curve(np.arange(STEP_M, lengths[-1], STEP_M))
+        self._append(between)
+        self._labels += ["first"] * len(between)
+        self._points, self._heading = points, heading
+        self._visited = np.zeros(len(points), bool)
+        self._at, self._direction, self._offset = joining, 1, 0.0
         return self
 
     def route(self, swing_deg: float, length_m: float | None = None) -> Route:

@@ -17,7 +17,7 @@ from umf_ros.lab.simulation.motion import Motion
 from umf_ros.lab.simulation.odometry import drifting
 from umf_ros.lab.simulation.presets import Preset
 from umf_ros.lab.simulation.rig import eyes, mosaic
-from umf_ros.lab.simulation.route import Route
+from umf_ros.lab.simulation.route import NIGHT, Route
 from umf_ros.lab.simulation.world import World, ground
 
 START_NS = 1_625_644_800 * 10**9
@@ -87,7 +87,7 @@ class Simulator:
         family, aliasing = family or preset.family, preset.aliasing if aliasing is None else aliasing
         self.preset, self.seed = preset, seed
         world_seed = seed if world_seed is None else world_seed
-        relief = ground(world_seed, family, aliasing)
+        relief = ground(world_seed, family, aliasing, preset.pan)
         self.route: Route = preset.route(relief, seed)
         self.motion = Motion(relief, self.route, preset.speed_m_s, preset.tilt_deg, seed)
         self.duration_s = self._checked(duration_s)
@@ -95,6 +95,8 @@ class Simulator:
         self.calibration = preset.layout.load()
         self._eyes, self._lidar = eyes(self.world, preset.layout, self.calibration), Lidar(self.world)
         self._sun = self._morning()
+        nights = [start for label, start, _ in self.route.legs() if label == NIGHT]
+        self._sunset_m = min(nights, default=np.inf)
         self.scan_stamps_ns = START_NS + PERIOD_NS * np.arange(int((self.duration_s - 0.3) * 1e9 / PERIOD_NS))
         self.exposures = self._exposures(image_rate_hz)
         self.odometry = drifting(self.motion, preset.drift, np.arange(0, self.duration_s, 1 / ODOMETRY_HZ), seed)
@@ -105,8 +107,9 @@ class Simulator:
 
     def sun(self, stamp_ns: int) -> Sun:
         """Where the sun stands at a time; the hours pass quickly."""
-        way = self.motion.travelled(_seconds(stamp_ns)) / self.route.length_m
-        return self._sun.moved(float(way) * self.preset.sun_deg)
+        driven = float(self.motion.travelled(_seconds(stamp_ns)))
+        sun = self._sun.moved(driven / self.route.length_m * self.preset.sun_deg)
+        return sun.set_for(driven - self._sunset_m) if driven > self._sunset_m else sun
 
     def scan(self, number: int) -> Scan:
         """The numbered scan, taken while the rover moves."""

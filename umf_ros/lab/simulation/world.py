@@ -10,7 +10,7 @@ from umf_ros.errors import ConfigError
 from umf_ros.geometry import Array
 from umf_ros.lab.simulation.families import FAMILIES, Traits, draw_traits
 from umf_ros.lab.simulation.noise import Field, detail_texture, smooth_step, spectral_noise
-from umf_ros.lab.simulation.relief import CELL_M, CELLS, SIZE_M, Relief
+from umf_ros.lab.simulation.relief import CELL_M, CELLS, SIZE_M, Pan, Relief
 from umf_ros.lab.simulation.rocks import Mesh, scatter_rocks, vertex_normals
 from umf_ros.lab.simulation.seeds import check_seed
 
@@ -87,7 +87,7 @@ class World:
         return scene
 
 
-def ground(seed: int, family: str, aliasing: float = 0.0) -> Relief:
+def ground(seed: int, family: str, aliasing: float = 0.0, pan: Pan | None = None) -> Relief:
     """The ground of a world without the rest: enough to plan routes on.
 
     Raises:
@@ -96,7 +96,7 @@ def ground(seed: int, family: str, aliasing: float = 0.0) -> Relief:
     if not 0 <= aliasing <= 1:
         raise ConfigError(f"aliasing {aliasing} is not between 0 and 1")
     traits = draw_traits(family, np.random.default_rng([check_seed(seed), 0]))
-    return Relief(traits, np.random.default_rng([seed, 1, FAMILIES.index(family)]), aliasing)
+    return Relief(traits, np.random.default_rng([seed, 1, FAMILIES.index(family)]), aliasing, pan)
 
 
 def grid_triangles(cells: int) -> NDArray[np.uint32]:

@@ -48,6 +48,7 @@ class Drive:
     """The keyframes of one recording: what the network pools of them, and what the map says.
 
     Attributes:
+        stamps_ns: (N,) int64.
         seen, felt: (N, C) what the heads see of image and scan; cells: (N, D) pooled maps of the scene.
         image_present, cloud_present: (N,) bool.
         map_T_body: (N, 4, 4) by the pose graph.
@@ -56,6 +57,7 @@ class Drive:
         closures: (K, 2) keyframes that accepted closures join.
     """
 
+    stamps_ns: NDArray[np.int64]
     seen: Array
     felt: Array
     cells: Array
@@ -151,7 +153,7 @@ class DriveReader:
             self._stamps.append(detection.keyframe.stamp_ns)
             self._sessions.append(detection.keyframe.session)
             self._travelled.append(detection.keyframe.travelled_m)
-            self._pooled.append(self._pool(item))
+            self._pooled.append(pool(self._network, item))
         return detection
 
     def finish(self) -> Drive:
@@ -164,7 +166,8 @@ class DriveReader:
         self._graph.settle()
         stamps, poses = self._graph.trajectory()
         order = np.argsort(stamps, kind="stable")
-        map_T_body, known = Trajectory(stamps[order], poses[order]).at(np.array(self._stamps, np.int64))
+        own_stamps = np.array(self._stamps, np.int64)
+        map_T_body, known = Trajectory(stamps[order], poses[order]).at(own_stamps)
         if not known.any():
             raise UmfError("no keyframe has odometry: without it nothing is known of what is one place")
         kept = np.flatnonzero(known)
@@ -172,6 +175,7 @@ class DriveReader:
             np.stack([each[part] for each in self._pooled])[kept] for part in range(5)
         )
         return Drive(
+            own_stamps[kept],
             seen,
             felt,
             cells,
@@ -189,14 +193,15 @@ class DriveReader:
         ends = [(row.get(one.query_stamp_ns), row.get(one.match_stamp_ns)) for one in found]
         return np.array([pair for pair in ends if None not in pair], np.int64).reshape(-1, 2)
 
-    def _pool(self, frame: Frame) -> tuple[NDArray, ...]:
-        network = self._network
-        assert network.scene is not None
-        batch = to_tensors(read_frame(frame, network.config))
-        with torch.inference_mode():
-            features = network.encode(batch)
-            cloud_present = batch.coarse_mask.any(1)
-            tokens = network.stand_in(features, batch.image_present, cloud_present)
-            seen, felt = network.fusion.pool(*tokens)
-            cells = network.scene.pool(batch.image).flatten(1).half()
-        return tuple(each[0].numpy() for each in (seen, felt, cells, batch.image_present, cloud_present))
+
+def pool(network: UMF, frame: Frame) -> tuple[NDArray, ...]:
+    """What the heads see of a frame: the first five fields of a drive after the stamps, of one keyframe."""
+    assert network.scene is not None
+    batch = to_tensors(read_frame(frame, network.config))
+    with torch.inference_mode():
+        features = network.encode(batch)
+        cloud_present = batch.coarse_mask.any(1)
+        tokens = network.stand_in(features, batch.image_present, cloud_present)
+        seen, felt = network.fusion.pool(*tokens)
+        cells = network.scene.pool(batch.image).flatten(1).half()
+    return tuple(each[0].numpy() for each in (seen, felt, cells, batch.image_present, cloud_present))

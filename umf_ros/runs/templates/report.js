@@ -11,6 +11,7 @@ const KINDS = {
   missed: { name: "missed revisit", colour: "#8250df", symbol: "circle-open", shown: true },
   tested: { name: "nearly, not published", colour: "#6e7781", symbol: "triangle-up-open", shown: "legendonly" },
 };
+const BUTTONS = [["zoom2d", "pan2d", "resetScale2d", "toImage"]];
 const CURVES = { "ground truth": ["#24292f", "#c9d1d9"], odometry: ["#e07b00", "#f0a04b"], optimised: ["#1f6fb4", "#58a6ff"] };
 let selected = -1;
 
@@ -28,7 +29,7 @@ function layout(extra) {
   return made;
 }
 function draw(id, traces, extra) {
-  return Plotly.react(id, traces, layout(extra), { responsive: true, displaylogo: false, displayModeBar: narrow() ? false : "hover", scrollZoom: id === "trajectory" });
+  return Plotly.react(id, traces, layout(extra), { responsive: true, displaylogo: false, displayModeBar: narrow() || id !== "trajectory" ? false : "hover", modeBarButtons: BUTTONS, scrollZoom: id === "trajectory" });
 }
 function hide(id, when) { byId(id).classList.toggle("hidden", when); }
 function seconds(index) { return scene.keyframes.t[index]; }

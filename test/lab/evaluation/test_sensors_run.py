@@ -1,0 +1,50 @@
+"""What each sensor finds, by stretches of a drive."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from command_line import only_line, umf
+from finished_runs import closure, examined, stamp, trajectory
+
+from umf_ros.errors import UmfError
+from umf_ros.lab.evaluation.sensors_run import Stretch, score, stretches_of, table_of
+
+EARLY, LATE = Stretch("early", stamp(40), stamp(59.5)), Stretch("late", stamp(59.6), stamp(80))
+
+
+def test_revisits_and_closures_are_counted_where_they_were(tmp_path: Path) -> None:
+    about = examined(
+        tmp_path, closures=[closure(50, 10), closure(54, 14), closure(70, 30, error_m=3.0)], truth=trajectory()
+    )
+    found = score(about, [EARLY, LATE, Stretch("all", 0, stamp(1000))])
+    assert (found["early"].true, found["early"].false, found["early"].closed) == (2, 0, 2)
+    assert (found["late"].true, found["late"].false, found["late"].closed) == (0, 1, 0)
+    assert [found[name].revisits for name in ("early", "late", "all")] == [10, 10, 20]
+    head, rows = table_of({"both": found, "LiDAR alone": found})
+    assert len(rows) == 6 and rows[0][:2] == ["early", "both"] and rows[1][0] == "" and len(head) == len(rows[0])
+
+
+def test_without_a_truth_nothing_is_judged(tmp_path: Path) -> None:
+    about = examined(tmp_path, closures=[closure(50, 10)])
+    with pytest.raises(UmfError, match="no ground truth"):
+        score(replace(about, run=replace(about.run, truth=None)), [EARLY])
+
+
+def test_one_recording_is_replayed_with_both_sensors_and_with_each(
+    mini_bag: Path, mini_config: Path, tmp_path: Path
+) -> None:
+    ended = umf("sensors", mini_bag, "--config", mini_config, "--out", tmp_path, "--workers", "1")
+    assert ended.status == 0 and "camera alone" in ended.text
+    figures = json.loads((tmp_path / "latest" / "sensors.json").read_text())
+    assert set(figures) == {"both", "LiDAR alone", "camera alone"}
+    assert all(one["all"]["revisits"] > 5 and one["all"]["false"] == 0 for one in figures.values())
+    assert figures["both"]["all"]["closed"] > 5
+    assert [one.name for one in stretches_of(mini_bag)] == ["all"]
+
+
+def test_a_recording_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    assert "no recording" in only_line(umf("sensors", tmp_path / "nowhere.mcap"))

@@ -1,0 +1,55 @@
+"""`umf sensors`: what LiDAR and camera find together, and what each finds alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from umf_ros.commands.recordings import ConfigPath, RunsFolder, check_files
+
+
+def command(
+    bag: Annotated[
+        Path | None, typer.Argument(help="Recording with ground truth; default: one is simulated.", show_default=False)
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="World and drive, where one is simulated.")] = 1,
+    config: ConfigPath = None,
+    out: RunsFolder = Path("results"),
+    workers: Annotated[int, typer.Option(min=1, max=3, help="Replays at a time.")] = 2,
+    report: Annotated[bool, typer.Option("--report", help="Write a report for each replay, too.")] = False,
+) -> None:
+    """Replay one recording with both sensors, with the LiDAR alone and with the camera alone, in one table.
+
+    Without a recording, a drive is simulated that passes a stretch where the LiDAR sees nothing, even ground, and one
+    where the camera sees nothing, after sunset. Takes some minutes.
+    """
+    if bag is not None:
+        check_files(bag, config)
+
+    import json
+    from dataclasses import asdict
+
+    from rich.console import Console
+
+    from umf_ros.lab.commands import simulate
+    from umf_ros.lab.evaluation.results import print_table
+    from umf_ros.lab.evaluation.sensors_run import replay_all, score, stretches_of, table_of
+    from umf_ros.runs.folder import check_writable, create_run_folder, write_atomically
+
+    console = Console()
+    check_writable(out)
+    if bag is None:
+        bag = Path("data") / f"sensors_seed{seed}.mcap"
+        if not bag.exists():
+            simulate.command(bag, preset="sensors", seed=seed)
+    stretches = stretches_of(bag)
+    folder = create_run_folder(out)
+    with console.status("replaying") as status:
+        runs = replay_all(bag, config, folder, report, workers, lambda done: status.update(f"replayed {done} of 3"))
+    found = {name: score(about, stretches) for name, about in runs.items()}
+    figures = {name: {where: asdict(one) for where, one in scores.items()} for name, scores in found.items()}
+    write_atomically(folder / "sensors.json", json.dumps(figures, indent=2) + "\n")
+    print_table(console, f"{bag}", table_of(found))
+    console.print(f"{folder}", markup=False, soft_wrap=True)

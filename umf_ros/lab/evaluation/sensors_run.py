@@ -1,0 +1,147 @@
+"""What each sensor finds on one recording: LiDAR and camera together, and either alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+from rich.console import Console
+
+from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.presets import settings_for
+from umf_ros.bags.reader import open_bag
+from umf_ros.errors import UmfError
+from umf_ros.lab.evaluation.results import TextTable
+from umf_ros.loop_detector import LoopDetector, make_detector_embedder
+from umf_ros.replay import Replay
+from umf_ros.runs.findings import ExaminedRun
+from umf_ros.runs.finished_run import read_run, remember_recording
+from umf_ros.runs.recorder import count_drops
+from umf_ros.runs.report import finish_run, judge
+from umf_ros.spread import spread
+
+_NOTHING = "/none"
+SENSORS: dict[str, dict[str, Any]] = {
+    "both": {},
+    "LiDAR alone": {"topics__left_image": _NOTHING, "topics__right_image": ""},
+    "camera alone": {"topics__cloud": _NOTHING},
+}
+"""Settings that leave a sensor out, as `load_settings` takes them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """A part of a drive: its name, and the stamps in ns that it lies between."""
+
+    name: str
+    from_ns: int
+    to_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class StretchScore:
+    """What was found on a stretch.
+
+    Attributes:
+        revisits: keyframes that saw a place again, in about the same direction.
+        closed: those of them with a true closure.
+        true, false: closures whose query lies in it.
+    """
+
+    revisits: int
+    closed: int
+    true: int
+    false: int
+
+
+@dataclass(frozen=True, slots=True)
+class SensorTask:
+    """A replay with some of the sensors: which (a name in `SENSORS`), of what, into which folder."""
+
+    name: str
+    bag: Path
+    config: Path | None
+    folder: Path
+    report: bool
+
+
+def stretches_of(bag: Path) -> list[Stretch]:
+    """The stretches of a simulated recording where places are seen again, and all of it at the end."""
+    recording = open_bag(bag)
+    whole = Stretch("all", recording.start_ns - 10**9, recording.end_ns + 10**9)
+    if bag.suffix != ".mcap" or not bag.is_file():
+        return [whole]
+    with bag.open("rb") as stream:
+        notes = [note.metadata for note in make_reader(stream).iter_metadata() if note.name == "simulation"]
+    legs = json.loads(notes[0]["legs"]) if notes else []
+    named = [Stretch(leg["label"], leg["from_ns"], leg["to_ns"]) for leg in legs if leg["label"] != "first"]
+    return [*named, whole] if len(named) > 1 else [whole]
+
+
+def replay_all(
+    bag: Path, config: Path | None, folder: Path, report: bool, workers: int, done: Callable[[int], None]
+) -> dict[str, ExaminedRun]:
+    """Replay a recording with both sensors and with each alone; the runs by name, each judged by the truth.
+
+    Raises:
+        UmfError: the recording cannot be read, or holds no ground truth.
+    """
+    tasks = [SensorTask(name, bag, config, folder / name.replace(" ", "_"), report) for name in SENSORS]
+    spread(replay, tasks, workers, done=done)
+    recording = open_bag(bag)
+    return {task.name: judge(read_run(task.folder, recording), recording) for task in tasks}
+
+
+def replay(task: SensorTask) -> None:
+    """Replay with some of the sensors."""
+    recording = open_bag(task.bag)
+    settings = settings_for(recording, task.config, "auto", **SENSORS[task.name])
+    task.folder.mkdir(parents=True)
+    run = Replay(task.folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
+    reader = FrameReader(recording, settings, None, warn=lambda text: None)
+    for _ in run.run(reader.stream()):
+        pass
+    run.finish(count_drops(reader.counters))
+    remember_recording(task.folder, recording)
+    if task.report:
+        finish_run(task.folder, recording, Console(file=StringIO()))
+
+
+def score(about: ExaminedRun, stretches: Sequence[Stretch]) -> dict[str, StretchScore]:
+    """What a run found on every stretch, by its name.
+
+    Raises:
+        UmfError: there is no ground truth.
+    """
+    if about.run.truth is None:
+        raise UmfError("the recording holds no ground truth to judge by")
+    stamps = about.places.stamps
+    again = np.array([len(about.places.same_places(row)) > 0 for row in range(len(stamps))], bool)
+    queries = np.array([one.closure.query_stamp_ns for one in about.judged.closures], np.int64)
+    right = np.array([one.is_true for one in about.judged.closures], bool)
+    closed = again & np.isin(stamps, queries[right])
+    found = {}
+    for one in stretches:
+        here, there = ((which >= one.from_ns) & (which <= one.to_ns) for which in (stamps, queries))
+        counts = (again & here, closed & here, right & there, ~right & there)
+        found[one.name] = StretchScore(*(int(which.sum()) for which in counts))
+    return found
+
+
+def table_of(found: dict[str, dict[str, StretchScore]]) -> TextTable:
+    """A row for every stretch and choice of sensors, from scores by stretch by sensors."""
+    head = ["stretch", "sensors", "revisits", "closed", "share", "true", "false"]
+    rows = []
+    for stretch in next(iter(found.values())):
+        for number, (name, scores) in enumerate(found.items()):
+            one = scores[stretch]
+            share = f"{one.closed / one.revisits:.0%}" if one.revisits else "-"
+            counts = [str(one.revisits), str(one.closed), share, str(one.true), str(one.false)]
+            rows.append(["" if number else stretch, name, *counts])
+    return head, rows
