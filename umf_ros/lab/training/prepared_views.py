@@ -74,7 +74,7 @@ class PreparedViews:
     ) -> None:
         self._reads, self._variants, self._seed, self._folder = reads, variants, seed, folder
         self._trunk = None if trunk is None else deepcopy(trunk).cpu()
-        self._maker = ViewMaker(CONFIG, Augmentation())
+        self._maker = ViewMaker(CONFIG, Augmentation(), keep_slope=False)
         self._kept: dict[tuple[str, int, Sense], Row] = {}
 
     def plain(self, world: SampleSequence, indices: Sequence[int] | range) -> PlaceInput:
