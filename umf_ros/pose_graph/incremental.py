@@ -1,4 +1,4 @@
-"""The solution of a graph that grows, kept up: what an event does not touch is not solved again [iSAM2, Kaess 2012]."""
+"""The solution of a graph that grows, kept up: what an event does not touch is not solved again [Kaess 2012]."""
 
 from __future__ import annotations
 

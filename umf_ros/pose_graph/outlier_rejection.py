@@ -106,6 +106,7 @@ class OutlierRejection:
         self._changed = set()
         if self._map is None:
             return []
+        self._looks.forget()  # the last word is about the map as it is
         self._decide_all()
         for _ in self.closures:
             if not self._accept(dict.fromkeys(self._unopposed(last_word=True), _UNOPPOSED)):
