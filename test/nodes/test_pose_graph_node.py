@@ -241,7 +241,7 @@ def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Pat
     assert f"taken up: {odometry_before} odometry messages" in again.output and "differ" not in again.output
     rig.until(lambda: rig.values.get("accepted") == before)
     second = Process(MODULE, tmp_path / "three.log", *parameters)
-    wait_until(lambda: second.exit_code is not None, 60.0)
+    wait_until(lambda: second.exit_code is not None, 120.0)
     assert second.exit_code == 1 and "is in use by another process" in second.output
     assert len(second.output.strip().splitlines()) == 1
     for one in (again, second):
