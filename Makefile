@@ -9,6 +9,8 @@ SHELL := /bin/bash
 VENV ?= .venv
 SEED ?= 1
 DEMO ?=
+# where pip finds the CPU builds of torch, if that can be reached: plain "torch" would pull gigabytes of CUDA
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 PYTHON ?= $(shell for p in python3.12 python3.11 python3; do $$p -c 'import sys; sys.exit(not (3,11) <= sys.version_info[:2] <= (3,12))' 2>/dev/null && echo $$p && break; done)
 BIN := $(VENV)/bin
 # files of tests side by side, each worker on one thread
@@ -27,6 +29,7 @@ test-jazzy: .venv-jazzy/.installed
 .venv-jazzy/.installed: requirements-jazzy.txt requirements-ros.txt requirements-dev.txt setup.py
 	@test -x .venv-jazzy/bin/python || $(PYTHON) -m venv .venv-jazzy
 	@grep -hv '^-r' requirements-dev.txt requirements-lab.txt > .venv-jazzy/tools.txt
+	@./tools/install_torch.sh .venv-jazzy/bin/python $(TORCH_INDEX)
 	@.venv-jazzy/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-jazzy.txt \
 		-r requirements-ros.txt -r .venv-jazzy/tools.txt
 	@.venv-jazzy/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
@@ -50,6 +53,7 @@ $(VENV)/.installed: $(wildcard requirements*.txt) package.xml setup.py setup.cfg
 	@test -n "$(PYTHON)" || { echo "make: Python 3.11 or 3.12 is needed (set PYTHON=...)" >&2; exit 1; }
 	@./tools/system_packages.sh
 	@test -x $(BIN)/python || { echo "Making $(VENV) with $$($(PYTHON) --version)"; $(PYTHON) -m venv $(VENV); }
+	@./tools/install_torch.sh $(BIN)/python $(TORCH_INDEX)
 	@echo "Installing the requirements (one to three minutes the first time)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .

@@ -10,13 +10,15 @@ drifts. Then it drives two passes through a world of another seed and family, in
 What the network pools of the frames stays in `--work` and is taken up again.
 
 Prints and writes, per rover and as means: recall@1 of the second pass before and after of `fused`, `image` and
-`lidar`, and their `_gain`; `labels` and `wrong_labels`: pairs that the first drive called one place, and how many of
-them the truth puts more than 12 m or 30 degrees apart; `minutes`, without simulating.
+`lidar`, and their `_gain`; `kept`: whether the revisits held out of the drive found that anything was gained (where
+not, `umf adapt` writes nothing and the gain is 0); `labels` and `wrong_labels`: pairs that the first drive called one
+place, and how many of them the truth puts more than 12 m or 30 degrees apart; `minutes`, without simulating.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 import time
 from dataclasses import dataclass, replace
@@ -47,7 +49,7 @@ from umf_ros.lab.simulation.rig import ETNA
 from umf_ros.lab.simulation.route import Walker
 from umf_ros.lab.simulation.seeds import TEST
 from umf_ros.lab.simulation.simulator import Simulator
-from umf_ros.lab.training.adaptation import PARTS, Adaptation, Lesson, adapt
+from umf_ros.lab.training.adaptation import GAINED, PARTS, Adaptation, Lesson, adapt, measure
 from umf_ros.lab.training.drives import Drive, DriveReader, label_drive, pool
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
@@ -231,12 +233,15 @@ def run_rover(rover: Rover, seed: int, size: Size, work: Path) -> dict[str, Any]
     world = TestWorld(seed + 1, size.sampling, load_calibration(recording.with_suffix(".yaml")))
     passes = read_passes(world, work / f"passes_{seed + 1}.npz", rover, network)
     before, start = recalls(network, passes), time.monotonic()
-    adapt(network, [Lesson(drive)], Adaptation())
-    after = recalls(network, passes)
+    fitted, lessons = copy.deepcopy(network), [Lesson(drive)]
+    adapt(fitted, lessons, Adaptation())
+    kept = measure(fitted, lessons).gain_over(measure(network, lessons)) >= GAINED
+    after = recalls(fitted, passes) if kept else before
     return {
         "seed": seed,
         "minutes": round(minutes + (time.monotonic() - start) / 60, 2),
         "queries": int((passes.session > 0).sum()),
+        "kept": kept,
         "labels": labels,
         "wrong_labels": wrong,
         **{f"{name}_before": value for name, value in before.items()},

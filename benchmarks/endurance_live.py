@@ -6,6 +6,7 @@ import csv
 import sqlite3
 import threading
 from collections import Counter
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from endurance_nodes import BACK_END, FRONT_END, Ears, NodeUnderTest, own_domain, play
 from nav_msgs.msg import Odometry
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -312,7 +313,7 @@ def play_live(folder: Path, bag: Path, config: Path) -> Figures:
         clock.create_subscription(Odometry, "/loop_closures", hear, CLOSURES_QOS)
         executor = SingleThreadedExecutor()
         executor.add_node(clock)
-        threading.Thread(target=executor.spin, daemon=True).start()
+        threading.Thread(target=_spin, args=(executor,), daemon=True).start()
         with LiveGraph(run, Console(stderr=True, quiet=True), config) as graph:
             listening = threading.Thread(target=ears.until, args=(lambda: not graph.is_running, 3600.0), daemon=True)
             listening.start()
@@ -334,6 +335,11 @@ def play_live(folder: Path, bag: Path, config: Path) -> Figures:
         "executor_stall_max_ms": round(max(stalls.values()), 1),
         "shutdown_s": round(max(seconds.values(), default=float("nan")), 2),
     }
+
+
+def _spin(executor: SingleThreadedExecutor) -> None:
+    with suppress(ExternalShutdownException):  # the domain ends first
+        executor.spin()
 
 
 def _median_ms(path: Path) -> float:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 ENVIRONMENT = {
@@ -46,6 +48,16 @@ class Process:
     def wait_for(self, text: str, timeout_s: float = 90.0) -> None:
         wait_until(lambda: text in self.output or self.exit_code is not None, timeout_s)
         assert text in self.output, f"'{text}' not in:\n{self.output}"
+
+    @contextmanager
+    def no_file_longer_than(self, size: int) -> Iterator[None]:
+        """The node as on a disk that is full: where it writes more, it gets an error."""
+        limits = resource.prlimit(self._process.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(self._process.pid, resource.RLIMIT_FSIZE, (size, limits[1]))
+        try:
+            yield
+        finally:
+            resource.prlimit(self._process.pid, resource.RLIMIT_FSIZE, limits)
 
     def interrupt(self, timeout_s: float = 60.0) -> int:
         if self.exit_code is None:

@@ -39,7 +39,8 @@ if [ "$(printf '%s\n' 2.35 "$glibc" | sort -V | head -1)" != 2.35 ]; then
   grep -v '^openvino' "$repository/requirements-jazzy.txt" >"$requirements"
 fi
 echo "Installing the Python packages into $venv (some minutes the first time)"
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check --extra-index-url "$torch_index" -r "$requirements"
+"$repository/tools/install_torch.sh" "$venv/bin/python" "$torch_index"
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -r "$requirements"
 
 cd "$workspace"
 # shellcheck disable=SC1091

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from processes import Process, wait_until
 from rclpy.node import Node
 from recordings import POINT
@@ -46,6 +46,7 @@ class Rig(Node):
         self.clouds = self.create_publisher(PointCloud2, "/bf_lidar/points_raw", 10)
         self.values: dict[str, str] = {}
         self.messages: dict[str, str] = {}
+        self.level = DiagnosticStatus.OK
         self.create_subscription(DiagnosticArray, "/diagnostics", self._listen, 10)
         self._rng = np.random.default_rng(0)
 
@@ -54,6 +55,7 @@ class Rig(Node):
             self.messages[status.name] = status.message
             if status.name == "loop_closure_node: detector":
                 self.values = {pair.key: pair.value for pair in status.values}
+                self.level = status.level
 
     def image(self, stamp_ns: int, **changes: object) -> Image:
         pixels = self._rng.integers(0, 255, 688 * 512, np.uint8)
@@ -148,6 +150,23 @@ def test_results_that_vanish_cost_the_tally_and_nothing_else(rig: Rig, node: Pro
     assert node.interrupt() == 1
     assert "Traceback" not in node.output
     assert node.output.strip().splitlines()[-1].startswith(f"umf: cannot write {tmp_path / 'run' / 'summary.json'}")
+
+
+def test_a_full_disk_shows_at_once_and_ends_nothing(rig: Rig, node: Process) -> None:
+    rig.publish_pair(START_NS)
+    assert rig.until(lambda: rig.count("cloud_received") == 1)
+    with node.no_file_longer_than(100):
+        for i in range(1, 4):
+            rig.publish_pair(START_NS + i * 213_000_000)
+            rig.until(lambda i=i: rig.count("cloud_received") > i)
+        assert rig.until(lambda: "cannot write" in rig.values.get("last_error", "")), node.output
+        assert rig.level == DiagnosticStatus.ERROR
+    stored = rig.count("places")
+    for i in range(4, 9):
+        rig.publish_pair(START_NS + i * 213_000_000)
+        rig.until(lambda i=i: rig.count("cloud_received") > i)
+    assert rig.until(lambda: rig.count("places") > stored), node.output
+    assert node.exit_code is None and "Traceback" not in node.output
 
 
 def test_a_clock_that_jumps_back_starts_a_new_session(rig: Rig, node: Process) -> None:

@@ -242,9 +242,10 @@ def test_another_network_is_named_with_what_was_and_what_is(tmp_path: Path, chan
         KeyframeStore(path, IDENTITY | {change_to: "99"}, 20)
 
 
-def test_a_damaged_keyframe_is_named_and_the_others_are_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("data", [b"\x00\x01", "text where bytes belong"])
+def test_a_damaged_keyframe_is_named_and_the_others_are_read(tmp_path: Path, data: bytes | str) -> None:
     path = filled(tmp_path / "map.sqlite")
-    change(path, "UPDATE keyframe SET data = ? WHERE id = 3", b"\x00\x01")
+    change(path, "UPDATE keyframe SET data = ? WHERE id = 3", data)
     places = database(path)
     with pytest.raises(UmfError, match=r"map\.sqlite is damaged at its keyframe 3") as caught:
         places[2]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from finished_runs import BELOW, START_NS, accepted, candidate, closure, examined, stamp, trajectory
+from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, traverse, write_mcap
 
+from umf_ros.bags.reader import open_bag
 from umf_ros.config import load_settings
 from umf_ros.runs.findings import ExaminedRun, look_first
 from umf_ros.runs.inputs import Advice, useless_inputs
@@ -37,6 +40,16 @@ def test_without_a_truth_what_was_found_is_green_and_not_called_true(tmp_path: P
     mark, status, sentence = verdict(examined(tmp_path, [closure(50, 10)], verdict=accepted()))
     assert (mark, status) == ("good", 0)
     assert sentence.startswith("1 loop closures; there is no ground truth to judge them by")
+
+
+@pytest.mark.parametrize("absent", [(LEFT, RIGHT), (CLOUD,), (ODOMETRY,), ()], ids=str)
+def test_whatever_was_found_a_silent_input_is_not_green(absent: tuple[str, ...], tmp_path: Path) -> None:
+    bag = write_mcap(tmp_path / "bag.mcap", [entry for entry in traverse(0.5) if entry[0] not in absent])
+    found = examined(tmp_path, [closure(50, 10)], verdict=accepted())
+    run = replace(found.run, odometry=None if ODOMETRY in absent else found.run.odometry)
+    mark, status, sentence = verdict(replace(found, bag=open_bag(bag), run=run))
+    assert (mark, status) == ("warn" if absent else "good", 0)
+    assert not absent or sentence.startswith(("No images on", "No scans on", "No odometry on"))
 
 
 def test_revisits_of_which_none_was_closed_are_not_green(tmp_path: Path) -> None:

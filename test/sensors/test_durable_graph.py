@@ -125,6 +125,29 @@ def test_one_process_writes_and_what_is_no_journal_is_refused(tmp_path: Path) ->
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE event SET data = 'text where bytes belong' WHERE id = 3",
+        "UPDATE event SET data = x'00' WHERE id = 3",
+        "UPDATE event SET kind = 'closure' WHERE id = 3",
+        "UPDATE event SET kind = 'anything' WHERE id = 3",
+        "UPDATE event SET first_ns = 'yesterday' WHERE id = 3",
+        "ALTER TABLE verdict DROP COLUMN state",
+    ],
+)
+def test_a_journal_that_holds_nonsense_is_refused_in_one_line(change: str, world: GraphWorld, tmp_path: Path) -> None:
+    path = tmp_path / "pose_graph.sqlite"
+    graph = made(path)
+    drive(graph, world, 0, 5)
+    graph.close()
+    with sqlite3.connect(path) as connection:
+        connection.execute(change)
+    with pytest.raises(UmfError, match="is damaged") as refusal:
+        made(path)
+    assert "\n" not in str(refusal.value)
+
+
 def test_a_journal_that_cannot_be_written_costs_no_closure(world: GraphWorld, tmp_path: Path) -> None:
     faults: list[OutputError] = []
     graph = made(tmp_path / "graph.sqlite", faults)

@@ -68,7 +68,7 @@ def prepare_scan(points: Points | None, intensity: Points | None, config: Networ
 
 
 def read_frame(frame: Frame, config: NetworkConfig) -> InputArrays:
-    """A batch of one frame as the network reads it: a black image is none, a scan stands upright on its ground."""
+    """A batch of one frame as the network reads it: a black image is none, a scan loses its mount's tilt."""
     image = None if frame.left is None or is_blank(frame.left) else prepare_image(frame.left, config)
     points = None if frame.points is None else transform(level(frame.points, keep_slope=True), frame.points)
     return pack([image], [prepare_scan(points, frame.intensity, config)], config)

@@ -21,7 +21,7 @@ from umf_ros.networks.weights_files import locate_weights, read_config
 KEYPOINTS = 400
 # of the fair share of attention; the cap decides in a rich view, this in a poor one
 MIN_SALIENCY = 0.01
-READ_AS = b"scans set upright on their ground"
+READ_AS = b"scans without the tilt of their mount"
 
 
 class UmfEmbedder:

@@ -53,7 +53,7 @@ def voxelise(points: Points, intensity: Points | None, coarse_limit: int, fine_l
     When more cells are occupied than fit, those with most points are kept, ties by index.
 
     Args:
-        points: (N, 3) metres, upright on the ground, x ahead (`levelling.level`); rows that are not finite are ignored.
+        points: (N, 3) metres, on the ground, x ahead (`levelling.level`); rows that are not finite are ignored.
         intensity: (N,) in the sensor's unit, or None.
         coarse_limit: T, cells of the 10^3 grid.
         fine_limit: V, voxels of the 40^3 grid.

@@ -69,7 +69,8 @@ class PoseGraphNode(BaseNode):
         # None: in a map that is there, the rover may be anywhere
         self._map_T_odom: Array | None = None if settings.localizing else np.eye(4)
         self._covariance: Array = np.zeros((6, 6))
-        self._drawn = -1
+        # newest odometry that path and markers show; None: other verdicts than they show
+        self._drawn_ns: int | None = None
         self._make_publishers()
         kept = self._durable if isinstance(self._durable, DurableGraph) else None
         if kept is not None and (kept.taken_up or kept.feed.newest_ns >= 0):
@@ -179,7 +180,7 @@ class PoseGraphNode(BaseNode):
         report = DiagnosticArray(status=[_as_status(verdict) for verdict in verdicts])
         report.header.stamp = self.get_clock().now().to_msg()
         self._verdict_publisher.publish(report)
-        self._draw()
+        self._drawn_ns = None
 
     def _correct(self) -> None:
         self._map_T_odom = self._durable.graph.map_T_odom()
@@ -187,7 +188,6 @@ class PoseGraphNode(BaseNode):
 
     def _draw(self) -> None:
         stamps, poses = self._durable.graph.trajectory()
-        self._drawn = len(stamps)
         self._path_publisher.publish(messages.path(stamps, poses, self._frames))
         verdicts, lines = self._durable.graph.closure_lines()
         newest_ns = max(self._durable.feed.newest_ns, 0)
@@ -202,7 +202,8 @@ class PoseGraphNode(BaseNode):
         self._announce(self._durable.update())
         self._durable.graph.prepare(PREPARE_S)
         self._correct()
-        if len(self._durable.graph.trajectory()[0]) != self._drawn:
+        if self._drawn_ns != self._durable.feed.newest_ns:
+            self._drawn_ns = self._durable.feed.newest_ns
             self._draw()
 
     def _own_status(self) -> DiagnosticStatus:
@@ -243,7 +244,7 @@ class PoseGraphNode(BaseNode):
             if self._results:
                 self._durable.write_results(_numbered(Path(self._results)))
             kept = self._durable.end()
-        self._map_T_odom, self._drawn = self._durable.graph.map_T_odom(), -1
+        self._map_T_odom, self._drawn_ns = self._durable.graph.map_T_odom(), None
         return "a new graph begins" + (f"; the old one is kept in {kept}" if kept else "")
 
 

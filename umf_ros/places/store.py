@@ -207,7 +207,7 @@ class KeyframeStore:
         try:
             (blob,) = self._connection.execute("SELECT data FROM keyframe WHERE id = ?", (row,)).fetchone()
             return unpack(blob)
-        except (sqlite3.Error, SafetensorError) as error:
+        except (sqlite3.Error, SafetensorError, LookupError, ValueError, TypeError, OverflowError) as error:
             raise UmfError(f"{self._name} is damaged at its keyframe {row}: {error}") from None
 
     def _open(self, identity: dict[str, str]) -> sqlite3.Connection:
@@ -246,5 +246,5 @@ class KeyframeStore:
     def _reading(self) -> Iterator[None]:
         try:
             yield
-        except (sqlite3.Error, ValueError, KeyError) as error:
+        except (sqlite3.Error, ValueError, KeyError, TypeError) as error:  # TypeError: text where bytes belong
             raise UmfError(f"{self._name} is damaged: {error}") from None

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from umf_ros.errors import GraphError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, ros_to_gtsam_covariance
-from umf_ros.pose_graph.odometry import OdometryChain, Table
+from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Stamps, Table
 
 VERDICT_COLUMNS = ("match_stamp_ns", "query_stamp_ns", "verdict", "reason", "mahalanobis", "misfit_m")
 """Of a table of verdicts, for who writes it and who reads it."""
@@ -48,9 +50,9 @@ class ClosureVerdict:
     residual_m: float = float("nan")
 
 
-@dataclass
+@dataclass(eq=False)
 class TrackedClosure:
-    """A closure whose endpoints are known, with its latest verdict.
+    """A closure whose endpoints are known, with its latest verdict; no two are equal.
 
     Attributes:
         match: session of the matched keyframe.
@@ -84,6 +86,14 @@ class TrackedClosure:
         self.verdict = ClosureVerdict(self.closure, state, reason, residual, residual_m)
 
 
+class Stops(NamedTuple):
+    """N places: (N,) their sessions and stamps, and the odometry there."""
+
+    sessions: NDArray[np.int64]
+    stamps: Stamps
+    points: PathPoints
+
+
 class Endpoints(Table):
     """One endpoint of N closures: its session and stamp, with the travel, pose and noise of the odometry there."""
 
@@ -104,6 +114,10 @@ class Endpoints(Table):
             stamps = self["stamp"][mine]
             self["travel"][mine] = chain.travel_at(stamps)
             self["pose"][mine], self["noise"][mine] = chain.at(stamps)
+
+    def stops(self, rows: slice | NDArray[np.int64]) -> Stops:
+        """Those at some rows."""
+        return Stops(self["session"][rows], self["stamp"][rows], PathPoints(self["pose"][rows], self["noise"][rows]))
 
     def distances(self, row: int) -> Array:
         """(N,) metres along the path from endpoint `row` to every other; infinite between sessions."""
@@ -129,6 +143,49 @@ class ClosureArrays(Table):
         """Look the odometry up again after its past changed."""
         self.match.renew(chains)
         self.query.renew(chains)
+
+
+@dataclass(frozen=True)
+class ChosenClosures:
+    """N closures as columns.
+
+    Attributes:
+        tracked: the closures.
+        match, query: (N,) sessions of the endpoints.
+        match_ns, query_ns: (N,) their stamps.
+        poses: (N, 4, 4) `match_T_query`.
+        covariances: (N, 6, 6) in GTSAM's order, tangent space of the query.
+    """
+
+    tracked: Sequence[TrackedClosure]
+    match: NDArray[np.int64]
+    query: NDArray[np.int64]
+    match_ns: NDArray[np.int64]
+    query_ns: NDArray[np.int64]
+    poses: Array
+    covariances: Array
+
+
+class ClosureColumns(Table):
+    """Columns of every closure that was ever asked for: each is taken apart once."""
+
+    def __init__(self) -> None:
+        whole = np.empty(0, np.int64)
+        ends = dict.fromkeys(("match", "query", "match_ns", "query_ns"), whole)
+        super().__init__(**ends, pose=np.empty((0, 4, 4)), covariance=np.empty((0, 6, 6)))
+        self._row_of: dict[TrackedClosure, int] = {}
+
+    def choose(self, closures: Sequence[TrackedClosure]) -> ChosenClosures:
+        """Some closures as columns."""
+        for one in closures:
+            if one not in self._row_of:
+                self._row_of[one] = len(self)
+                stamps = {"match_ns": [one.closure.match_stamp_ns], "query_ns": [one.closure.query_stamp_ns]}
+                measured = {"pose": [one.closure.match_T_query], "covariance": [one.covariance]}
+                self.extend(match=[one.match], query=[one.query], **stamps, **measured)
+        rows = np.array([self._row_of[one] for one in closures], np.int64)
+        names = ("match", "query", "match_ns", "query_ns", "pose", "covariance")
+        return ChosenClosures(closures, *(self[name][rows] for name in names))
 
 
 def check_closure(closure: LoopClosure, max_length_m: float) -> Array:

@@ -21,8 +21,8 @@ from umf_ros.pose_graph.odometry import PathPoints
 _ANCHOR = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
 _MAX_STEPS = 30
 # a step this small leaves an error of about the product of both, which the next solution removes
-_SMALL_TURN_RAD = 0.02
-_SMALL_STEP_M = 0.2
+SMALL_TURN_RAD = 0.02
+SMALL_STEP_M = 0.2
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,20 @@ def between(edge: Edge) -> gtsam.BetweenFactorPose3:
     return gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.pose), noise)
 
 
+def prior(vertex: int, pose: Array) -> gtsam.PriorFactorPose3:
+    """The GTSAM factor that holds a vertex where it is."""
+    return gtsam.PriorFactorPose3(vertex, gtsam.Pose3(pose), _ANCHOR)
+
+
+def extracted(values: gtsam.Values) -> Array:
+    """(N, 4, 4) poses of all N values, in the order of their keys."""
+    rows = gtsam.utilities.extractPose3(values)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
+    poses[:, :3, 3] = rows[:, 9:]
+    return poses
+
+
 @dataclass(frozen=True)
 class Graph:
     """A graph of N vertices and M edges.
@@ -112,7 +126,7 @@ class Optimizer:
         self._factors: dict[Hashable, gtsam.BetweenFactorPose3] = {}
         self._numbers: dict[Hashable, int] = {}
         self._values = gtsam.Values()
-        self._poses = np.empty((0, 4, 4))
+        self._poses: Array = np.empty((0, 4, 4))
         self._solved = gtsam.NonlinearFactorGraph()
         self._marginals: dict[Hashable, Array | None] = {}
 
@@ -131,10 +145,7 @@ class Optimizer:
             values = _descend(factors, self._values)
         except (RuntimeError, IndexError, ValueError) as error:
             raise GraphError(f"the pose graph cannot be solved: {_first_line(error)}") from None
-        poses = np.tile(np.eye(4), (len(self._numbers), 1, 1))
-        rows = gtsam.utilities.extractPose3(values)
-        poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
-        poses[:, :3, 3] = rows[:, 9:]
+        poses = extracted(values)
         if not np.isfinite(poses).all():
             raise GraphError("the pose graph cannot be solved: the result is not finite")
         self._values, self._poses, self._solved, self._marginals = values, poses, factors, {}
@@ -165,7 +176,7 @@ class Optimizer:
     def _factor_graph(self, graph: Graph, numbers: NDArray[np.int64]) -> gtsam.NonlinearFactorGraph:
         factors = gtsam.NonlinearFactorGraph()
         for vertex in graph.anchors:
-            factors.add(gtsam.PriorFactorPose3(int(numbers[vertex]), gtsam.Pose3(graph.poses[vertex]), _ANCHOR))
+            factors.add(prior(int(numbers[vertex]), graph.poses[vertex]))
         edges, first, second = graph.edges, numbers[graph.edges.first], numbers[graph.edges.second]
         for row, key in enumerate(graph.keys):
             factor = self._factors.get(key)
@@ -182,7 +193,7 @@ def _descend(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam
     for _ in range(_MAX_STEPS):
         trial, delta = _step(factors, values)
         steps = np.abs(delta).max(axis=0)
-        if max(steps[:3]) < _SMALL_TURN_RAD and max(steps[3:]) < _SMALL_STEP_M:
+        if max(steps[:3]) < SMALL_TURN_RAD and max(steps[3:]) < SMALL_STEP_M:
             return trial
         error = factors.error(values) if error is None else error
         trial_error = factors.error(trial)

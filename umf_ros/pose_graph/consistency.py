@@ -9,31 +9,20 @@ Closures of one place count once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 from scipy.stats import chi2
 
 from umf_ros.config import PoseGraphSettings
-from umf_ros.geometry import Array, adjoint, invert, propagate
+from umf_ros.geometry import Array
 from umf_ros.pose_graph.closures import ClosureArrays
 from umf_ros.pose_graph.noise_scale import LoopResiduals, NoiseScale, loop_residuals
-from umf_ros.pose_graph.sessions import Sessions
 
 _MOST_COMPARED = 40
 _DEGREES = 6
 # nats: where one place is mistaken for another, the next is too more often than by chance
 _MOST_PER_PLACE = 4.0
-# metres at which an angular error counts like a displacement when ways through the graph are compared
-_LEVER_M = 10.0
-# pairs whose ways are looked for together: their trees fill some tens of megabytes
-_AT_ONCE = 256
-
-Stops = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""(N,) sessions and (N,) stamps of places."""
 
 
 def squared_mahalanobis(twists: Array, covariances: Array) -> Array:
@@ -185,138 +174,3 @@ class ConsistencyGraph:
     def _elsewhere(self, rows: list[int], other: int) -> list[int]:
         """Those of other places than one closure."""
         return [row for row, same in zip(rows, self._same_place(rows, other), strict=True) if not same]
-
-
-class Predictions(NamedTuple):
-    """What the map says about N pairs of stamps.
-
-    Attributes:
-        poses: (N, 4, 4) `match_T_query`.
-        covariances: (N, 6, 6) upper bounds in GTSAM's order, tangent space of the query; infinite on the diagonal
-            where no way joins them.
-    """
-
-    poses: Array
-    covariances: Array
-
-
-class RelativePoses:
-    """Relative poses of the map as it was last solved, with a bound on their covariance.
-
-    The covariance of a relative pose is at most that along any single way through odometry and
-    accepted closures; the best such way is found by Dijkstra. Being an upper bound it never rejects a
-    right closure too early, and it needs no marginals of the whole system.
-    """
-
-    def __init__(self, sessions: Sessions, scale: NoiseScale) -> None:
-        self._sessions = sessions
-        self._variance_scale = scale.odometry**2
-        solution = sessions.solution
-        assert solution is not None
-        self._edges, self._poses = solution.edges, solution.poses
-        first, second, size = self._edges.first, self._edges.second, len(self._poses)
-        low, high, lengths = np.minimum(first, second), np.maximum(first, second), _length(self._edges.covariances)
-        # of parallel edges the shortest counts: a sparse matrix would add them up
-        order = np.argsort(lengths, kind="stable")
-        self._keys, best = np.unique((low * size + high)[order], return_index=True)
-        self._rows = order[best]
-        ends = (low[self._rows], high[self._rows])
-        self._ways = csr_matrix((lengths[self._rows], ends), shape=(size, size))
-
-    def predict(self, match: Stops, query: Stops) -> Predictions:
-        """The map's relative poses from N places to N others."""
-        a, b = _Places(self._sessions, *match), _Places(self._sessions, *query)
-        poses = invert(a.poses) @ b.poses
-        bounds = [self._bound(a, b, slice(k, k + _AT_ONCE)) for k in range(0, len(poses), _AT_ONCE)]
-        return Predictions(poses, np.concatenate([np.empty((0, 6, 6)), *bounds]))
-
-    def _bound(self, a: _Places, b: _Places, rows: slice) -> Array:
-        """(M, 6, 6) bounds of some of the pairs."""
-        back = invert(b.poses[rows])
-        leave = self._variance_scale * a.noise_to_vertices(rows, back)
-        enter = self._variance_scale * b.noise_to_vertices(rows, back)
-        direct = self._variance_scale * a.noise_to(b, rows, back)
-        left, entered = a.vertices[rows], b.vertices[rows]
-        sources, of_source = np.unique(left, return_inverse=True)
-        of_source = of_source.reshape(left.shape)
-        lengths, before = dijkstra(self._ways, directed=False, indices=sources, return_predecessors=True)
-        between = lengths[of_source[:, :, None], entered[:, None, :]]
-        totals = (_length(leave)[:, :, None] + between + _length(enter)[:, None, :]).reshape(len(left), -1)
-        best, row = totals.argmin(axis=1), np.arange(len(left))
-        out, into = best // 2, best % 2
-        total = totals[row, best]
-        straight = _length(direct) <= total
-        around = np.flatnonzero(np.isfinite(total) & ~straight)
-        bounds = np.where(straight[:, None, None], direct, np.diag(np.full(6, np.inf)))
-        chosen = leave[around, out[around]] + enter[around, into[around]]
-        trees, ends = before[of_source[around, out[around]]], entered[around, into[around]]
-        bounds[around] = chosen + self._along(trees, ends, back[around])
-        return bounds
-
-    def _along(self, before: NDArray[np.int32], vertices: NDArray[np.int64], back: Array) -> Array:
-        """(M, 6, 6) covariances along the ways that end at vertices, in the tangent spaces `back` leads to.
-
-        Args:
-            before: (M, V) the vertex before each on the ways from one source; negative before the first.
-            vertices: (M,) where the ways end.
-            back: (M, 4, 4) from the map to the tangent space.
-        """
-        sums, running = np.zeros((len(vertices), 6, 6)), np.arange(len(vertices))
-        here = vertices
-        while len(running):  # one step of every way that is not yet at its source
-            there = before[running, here].astype(np.int64)
-            goes_on = there >= 0
-            running, here, there = running[goes_on], here[goes_on], there[goes_on]
-            keys = np.minimum(here, there) * len(self._poses) + np.maximum(here, there)
-            rows = self._rows[np.searchsorted(self._keys, keys)]
-            carry = adjoint(back[running] @ self._poses[self._edges.second[rows]])
-            sums[running] += propagate(carry, self._edges.covariances[rows])
-            here = there
-        return sums
-
-
-class _Places:
-    """N stamps of sessions, each between the two solved vertices beside it.
-
-    Attributes:
-        poses: (N, 4, 4) `map_T_body`.
-        vertices: (N, 2) the solved vertices before and after, twice the same at an end.
-    """
-
-    def __init__(self, sessions: Sessions, of_session: NDArray[np.int64], stamps: NDArray[np.int64]) -> None:
-        count = len(stamps)
-        self._sessions, self._stamps = of_session, stamps
-        self.poses, self._turns, self._noise = np.zeros((count, 4, 4)), np.zeros((count, 4, 4)), np.zeros((count, 6, 6))
-        self.vertices = np.zeros((count, 2), np.int64)
-        self._vertex_noise, self._is_before = np.zeros((count, 2, 6, 6)), np.zeros((count, 2), bool)
-        for session in np.unique(of_session):
-            mine = np.flatnonzero(of_session == session)
-            path, own = sessions.path(int(session)), stamps[mine]
-            points = path.chain.at(own)
-            self._noise[mine], self.poses[mine] = points.noise, path.at(own)
-            self._turns[mine] = self.poses[mine] @ invert(points.poses)
-            after = np.searchsorted(path.stamps, own)
-            beside = np.column_stack([np.maximum(after - 1, 0), np.minimum(after, len(path.stamps) - 1)])
-            self.vertices[mine] = int(sessions.starts[session]) + beside
-            self._vertex_noise[mine] = path.points.noise[beside]
-            self._is_before[mine] = own[:, None] < path.stamps[beside]
-
-    def noise_to_vertices(self, rows: slice, back: Array) -> Array:
-        """(M, 2, 6, 6) noise of the odometry between here and the vertices beside, in the space `back` leads to."""
-        walked = self._vertex_noise[rows] - self._noise[rows, None]
-        forward = np.where(self._is_before[rows, :, None, None], walked, -walked)
-        return propagate(adjoint(back @ self._turns[rows])[:, None], forward)
-
-    def noise_to(self, other: _Places, rows: slice, back: Array) -> Array:
-        """(M, 6, 6) noise of the odometry from here to other places; infinite on the diagonal between sessions."""
-        walked = other._noise[rows] - self._noise[rows]
-        is_before = (self._stamps[rows] <= other._stamps[rows])[:, None, None]
-        noise = propagate(adjoint(back @ other._turns[rows]), np.where(is_before, walked, -walked))
-        same = (self._sessions[rows] == other._sessions[rows])[:, None, None]
-        return np.where(same, noise, np.diag(np.full(6, np.inf)))
-
-
-def _length(covariances: Array) -> Array:
-    """What a way costs, m^2; never zero, which a sparse matrix would read as no edge."""
-    diagonal = np.diagonal(covariances, axis1=-2, axis2=-1)
-    return diagonal[..., 3:].sum(axis=-1) + _LEVER_M**2 * diagonal[..., :3].sum(axis=-1) + 1e-12

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,7 @@ _TABLES = (
 )
 ODOMETRY, CLOSURE, REVOKED, DECIDED, STARTED = "odometry", "closure", "revoked", "decided", "started"
 UNSETTLED = "unsettled"
+_NUMBERS = {ODOMETRY: 16, CLOSURE: 53, REVOKED: 0, DECIDED: 0, STARTED: 0, UNSETTLED: 0}
 JOURNAL = "pose_graph.sqlite"
 """Name of the file in a folder of results."""
 
@@ -81,21 +83,27 @@ class GraphJournal:
         Raises:
             UmfError: the file is damaged.
         """
-        try:
-            rows = self._connection.execute("SELECT kind, first_ns, second_ns, data FROM event ORDER BY id")
-            for kind, first_ns, second_ns, data in rows:
-                yield Event(kind, first_ns, second_ns, np.frombuffer(data, np.float64))
-        except (sqlite3.Error, ValueError) as error:
-            raise UmfError(f"{self.path} is damaged: {error}") from None
+        for row in self._read("SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"):
+            try:
+                yield _event(*row)
+            except (ValueError, TypeError) as error:  # a damaged file holds anything anywhere
+                raise UmfError(f"{self.path} is damaged: {error}") from None
 
     def is_unsettled(self) -> bool:
-        """Whether the last thing that happened was an end without the time to settle the graph."""
-        row = self._connection.execute("SELECT kind FROM event ORDER BY id DESC LIMIT 1").fetchone()
-        return row is not None and row[0] == UNSETTLED
+        """Whether the last thing that happened was an end without the time to settle the graph.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        return any(kind == UNSETTLED for (kind,) in self._read("SELECT kind FROM event ORDER BY id DESC LIMIT 1"))
 
     def verdicts(self) -> dict[tuple[int, int], str]:
-        """The latest state of every closure, by the stamps of match and query."""
-        rows = self._connection.execute("SELECT match_ns, query_ns, state FROM verdict")
+        """The latest state of every closure, by the stamps of match and query.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        rows = self._read("SELECT match_ns, query_ns, state FROM verdict")
         return {(match, query): state for match, query, state in rows}
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
@@ -134,6 +142,12 @@ class GraphJournal:
         self._connection.close()
         self._lock.release()
 
+    def _read(self, query: str) -> Iterator[tuple[Any, ...]]:
+        try:
+            yield from self._connection.execute(query)
+        except sqlite3.Error as error:
+            raise UmfError(f"{self.path} is damaged: {error}") from None
+
     def _add(self, kind: str, first_ns: int, second_ns: int, numbers: Array) -> None:
         values = (kind, first_ns, second_ns, np.ascontiguousarray(numbers, np.float64).tobytes())
         with writing(self.path, sqlite3.Error), self._connection:
@@ -152,3 +166,18 @@ class GraphJournal:
                 connection.execute("BEGIN")
                 for table in _TABLES:
                     connection.execute(table)
+
+
+def _event(kind: Any, first_ns: Any, second_ns: Any, data: Any) -> Event:
+    """A row of the table as an event.
+
+    Raises:
+        ValueError: it is none.
+        TypeError: its numbers are text.
+    """
+    numbers = np.frombuffer(data, np.float64)
+    if len(numbers) != _NUMBERS.get(kind, -1):
+        raise ValueError(f"an event {str(kind)[:40]!r} of {len(numbers)} numbers")
+    if not all(isinstance(stamp, int) for stamp in (first_ns, second_ns)):
+        raise ValueError("a stamp that is no number")
+    return Event(kind, first_ns, second_ns, numbers)

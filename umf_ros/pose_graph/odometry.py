@@ -59,6 +59,10 @@ class PathPoints(NamedTuple):
     poses: Array
     noise: Array
 
+    def of(self, rows: Rows | NDArray[np.bool_]) -> PathPoints:
+        """Those at some rows."""
+        return PathPoints(self.poses[rows], self.noise[rows])
+
 
 class OdometryChain:
     """All messages of one session, and keyframes among them with the noise collected along the way.

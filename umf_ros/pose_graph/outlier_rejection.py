@@ -10,7 +10,6 @@ the map moves, what was rejected is looked at again.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +17,17 @@ from numpy.typing import NDArray
 from umf_ros.config import PoseGraphSettings
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, invert, logmap
-from umf_ros.pose_graph.closures import ClosureArrays, ClosureVerdict, Endpoints, State, TrackedClosure
+from umf_ros.pose_graph.closures import ClosureArrays, ClosureVerdict, Endpoints, State, Stops, TrackedClosure
 from umf_ros.pose_graph.consistency import (
     ConsistencyGraph,
-    RelativePoses,
     false_alarm_probability,
     likelihood_ratio,
     squared_mahalanobis,
 )
+from umf_ros.pose_graph.looks import Looks, MapComparisons
 from umf_ros.pose_graph.noise_scale import NoiseScale, NoiseScaleEstimator
 from umf_ros.pose_graph.odometry import Stamps, Table
+from umf_ros.pose_graph.relative_poses import Bounds, RelativePoses
 from umf_ros.pose_graph.sessions import Sessions
 
 _LOOPS_PER_CLOSURE = 3
@@ -54,24 +54,6 @@ _OUTVOTED = "revoked: more places contradict it"
 _BY_HAND = "revoked by hand"
 
 
-class MapComparisons(NamedTuple):
-    """N closures and the map.
-
-    Attributes:
-        distances: (N,) squared Mahalanobis distances.
-        misfits_m: (N,) metres.
-        false_alarms: (N,) probabilities that a wrong closure passes for a right one here.
-        ratios: (N,) how much likelier a wrong closure misses the map by this than a right one.
-        joined: (N,) whether the map says anything about the pair at all.
-    """
-
-    distances: Array
-    misfits_m: Array
-    false_alarms: Array
-    ratios: Array
-    joined: NDArray[np.bool_]
-
-
 class OutlierRejection:
     """Decides about closures and keeps the map solved accordingly.
 
@@ -87,6 +69,8 @@ class OutlierRejection:
         self._consistency = ConsistencyGraph(self._arrays, settings)
         self._estimator = NoiseScaleEstimator()
         self._map: RelativePoses | None = None
+        self._solved: set[int] = set()
+        self._looks = Looks()
         self._table = Table(state=np.empty(0, "U16"))
         self._changed: set[int] = set()
         self._revoked: set[int] = set()
@@ -101,6 +85,7 @@ class OutlierRejection:
         """Judge by other gates from now on."""
         self._settings = settings
         self._consistency.retune(settings)
+        self._looks.forget()
 
     def consider(self, arrived: list[TrackedClosure]) -> list[ClosureVerdict]:
         """Take closures in; returns the verdicts that are new or changed.
@@ -121,6 +106,7 @@ class OutlierRejection:
         self._changed = set()
         if self._map is None:
             return []
+        self._looks.forget()  # the last word is about the map as it is
         self._decide_all()
         for _ in self.closures:
             if not self._accept(dict.fromkeys(self._unopposed(last_word=True), _UNOPPOSED)):
@@ -135,6 +121,7 @@ class OutlierRejection:
     def renew(self) -> list[ClosureVerdict]:
         """Solve again after the odometry's past changed; no verdict changes by that."""
         self._arrays.renew(self._sessions.chains)
+        self._looks.forget()
         if self._map is not None:
             self._solve()
         return []
@@ -194,6 +181,7 @@ class OutlierRejection:
         self.closures.append(tracked)
         self._table.extend(state=[tracked.verdict.state])
         self._arrays.append(self._sessions.chains, tracked)
+        self._looks.append()
         loops = self._consistency.add(row, self.scale)
         self._estimator.add(loops[-_LOOPS_PER_CLOSURE:], self._consistency.place_of[row])
         return row
@@ -205,6 +193,7 @@ class OutlierRejection:
             return False
         self.scale = scale
         self._consistency.renew(scale)
+        self._looks.forget()
         return True
 
     def _gate(self, rows: Iterable[int]) -> list[int]:
@@ -216,7 +205,9 @@ class OutlierRejection:
         numbers = zip(open_rows, *(column.tolist() for column in found[:4]), strict=True)
         self._unjoined -= set(open_rows)
         self._unjoined |= {row for row, joined in zip(open_rows, found.joined, strict=True) if not joined}
-        return [row for row, *rest in numbers if self._agrees(row, *rest)]
+        agreed = [row for row, *rest in numbers if self._agrees(row, *rest)]
+        self._looks.note(open_rows, found)
+        return agreed
 
     def _agrees(self, row: int, distance: float, misfit_m: float, false_alarm: float, ratio: float) -> bool:
         """Note what the map says about a closure; returns whether its consistency with it suffices."""
@@ -236,12 +227,9 @@ class OutlierRejection:
     def _compare(self, rows: Sequence[int]) -> MapComparisons:
         """Hold closures against the map; what it says nothing about agrees with it, and so does anything."""
         chosen = np.array(rows, np.int64)
-        assert self._map is not None
-        ends = (self._arrays.match, self._arrays.query)
-        predicted = self._map.predict(*((end["session"][chosen], end["stamp"][chosen]) for end in ends))
-        misfits = invert(self._arrays["pose"][chosen]) @ predicted.poses
-        covariances = predicted.covariances + self.scale.closures**2 * self._arrays["covariance"][chosen]
-        known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+        misfits = self._misfits(chosen)
+        covariances, lengths = self._bounds(chosen, self._looks.unbounded(chosen, misfits))
+        known = np.isfinite(lengths)
         distances, metres = np.zeros(len(chosen)), np.zeros(len(chosen))
         false_alarms, ratios = np.ones(len(chosen)), np.ones(len(chosen))
         if known.any():
@@ -249,7 +237,23 @@ class OutlierRejection:
             metres[known] = np.linalg.norm(misfits[known, :3, 3], axis=1)
             false_alarms[known] = false_alarm_probability(covariances[known], self._settings)
             ratios[known] = likelihood_ratio(false_alarms[known], distances[known], self._settings)
-        return MapComparisons(distances, metres, false_alarms, ratios, known)
+        return MapComparisons(distances, metres, false_alarms, ratios, known, misfits, covariances, lengths)
+
+    def _misfits(self, rows: NDArray[np.int64]) -> Array:
+        """(N, 4, 4) the map's poses of the queries of closures, seen from where the closures put them."""
+        ways = invert(self._poses(self._arrays.match, rows)) @ self._poses(self._arrays.query, rows)
+        return invert(self._arrays["pose"][rows]) @ ways
+
+    def _bounds(self, rows: NDArray[np.int64], new: NDArray[np.bool_]) -> Bounds:
+        """Bounds on the covariances of misfits; those that are not new are known."""
+        assert self._map is not None
+        found = Bounds(*(self._looks[name][rows] for name in ("covariance", "length")))
+        if new.any():
+            bounds = self._map.bounds(*self._stops(rows[new]))
+            own = self.scale.closures**2 * self._arrays["covariance"][rows[new]]
+            found.covariances[new] = bounds.covariances + own
+            found.lengths[new] = bounds.lengths
+        return found
 
     def _supported_sets(self, rows: Iterable[int], state: State) -> list[list[int]]:
         """Consistency sets among the closures of one state, each with one of `rows`, that no chance explains."""
@@ -315,7 +319,7 @@ class OutlierRejection:
         companions = ~self._in_state(State.ACCEPTED)
         companions[list(self._revoked)] = False
         places = [[row, *self._consistency.companions(row, companions)] for row in waiting]
-        self._gate(sorted({member for place in places for member in place}))
+        self._gate(self._outdated(np.array(sorted({member for place in places for member in place}), np.int64)))
         against = self._credible()
         best: list[int] = []
         most_odds = _MOST_ODDS_AT_LAST if last_word else _MOST_ODDS
@@ -367,23 +371,42 @@ class OutlierRejection:
         return bool(reasons)
 
     def _solve(self, without: Sequence[int] = ()) -> None:
-        closures = [closure for row, closure in enumerate(self.closures) if closure.accepted and row not in without]
-        self._sessions.solve(closures, self.scale)
+        rows = {row for row, closure in enumerate(self.closures) if closure.accepted} - set(without)
+        self._sessions.solve([self.closures[row] for row in sorted(rows)], self.scale)
         self._map = RelativePoses(self._sessions, self.scale)
+        if rows >= self._solved:
+            self._look_for_shorter_ways(self._map, np.array(sorted(rows - self._solved), np.int64))
+        else:
+            self._looks.forget()
+        self._solved = rows
+
+    def _look_for_shorter_ways(self, solved: RelativePoses, added: NDArray[np.int64]) -> None:
+        """Note for which closures the map knows a better way, through those that were added to it."""
+        rows = np.flatnonzero(~self._in_state(State.ACCEPTED) & ~self._looks["outdated"])
+        self._looks.shorten(rows, solved.lengths_through(*self._stops(rows), *self._stops(added)))
 
     def _worth_another_look(self) -> list[int]:
         """Closures not accepted that the moved map now comes close to."""
-        rows = np.flatnonzero(~self._in_state(State.ACCEPTED))
-        ways = invert(self._poses(self._arrays.match, rows)) @ self._poses(self._arrays.query, rows)
-        misfits = invert(self._arrays["pose"][rows]) @ ways
-        return rows[np.linalg.norm(misfits[:, :3, 3], axis=1) < _CLOSE_M].tolist()
+        return self._outdated(np.flatnonzero(~self._in_state(State.ACCEPTED)), _CLOSE_M)
+
+    def _outdated(self, rows: NDArray[np.int64], within_m: float = np.inf) -> list[int]:
+        """Those closures that the map misses by less, and about which it may say something else than before."""
+        misfits = self._misfits(rows)
+        close = np.linalg.norm(misfits[:, :3, 3], axis=1) < within_m
+        rows = rows[close]
+        return rows[self._looks.outdated(rows, misfits[close])].tolist()
+
+    def _stops(self, rows: NDArray[np.int64]) -> tuple[Stops, Stops]:
+        """Where the matches and the queries of closures are."""
+        return self._arrays.match.stops(rows), self._arrays.query.stops(rows)
 
     def _poses(self, endpoints: Endpoints, rows: slice | NDArray[np.int64]) -> Array:
         """(N, 4, 4) `map_T_body` at one endpoint of closures."""
-        sessions, stamps = endpoints["session"][rows], endpoints["stamp"][rows]
+        sessions, stamps, points = endpoints.stops(rows)
         poses = np.zeros((len(sessions), 4, 4))
         for session in np.unique(sessions):
-            poses[sessions == session] = self._sessions.at(int(session), stamps[sessions == session])
+            mine = sessions == session
+            poses[mine] = self._sessions.at(int(session), stamps[mine], points.of(mine))
         return poses
 
     def _note(
@@ -391,6 +414,7 @@ class OutlierRejection:
     ) -> None:
         before = self.closures[row].verdict.state
         self._table["state"][row] = state
+        self._looks.forget([row])
         self.closures[row].decide(state, reason, float(np.sqrt(squared)), metres)
         if before is not state:
             self._changed.add(row)

@@ -3,64 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.config import PoseGraphSettings
-from umf_ros.geometry import Array, adjoint, expmap, invert, logmap, propagate
-from umf_ros.pose_graph.closures import TrackedClosure
+from umf_ros.geometry import Array, adjoint, invert, propagate
+from umf_ros.pose_graph.closures import ChosenClosures, ClosureColumns, TrackedClosure
 from umf_ros.pose_graph.condensed import Edges, Graph, Optimizer, odometry_edges
+from umf_ros.pose_graph.corrected_path import CorrectedPath
+from umf_ros.pose_graph.incremental import IncrementalOptimizer
 from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Stamps
 
 # where every keyframe is a vertex, one so close to a closure's endpoint adds nothing but rounding errors
 _TOO_CLOSE_NS = 10_000_000
 _REFINEMENTS = 4
-
-
-@dataclass(frozen=True)
-class CorrectedPath:
-    """Where every pose of a session is, given the solved poses of a few.
-
-    Between two solved poses the correction is shared out in proportion to the odometry's noise,
-    which is its least-squares optimum; beyond the last one the path follows the odometry.
-
-    Attributes:
-        chain: the odometry.
-        stamps: (N,) sorted stamps of the solved poses.
-        points: the odometry at `stamps`.
-        poses: (N, 4, 4) solved `map_T_body` at `stamps`.
-    """
-
-    chain: OdometryChain
-    stamps: Stamps
-    points: PathPoints
-    poses: Array
-
-    def at(self, stamps: Stamps) -> Array:
-        """(M, 4, 4) `map_T_body` at stamps the odometry covers."""
-        points = self.chain.at(stamps)
-        after = np.searchsorted(self.stamps, stamps, side="right")
-        lower = np.maximum(after - 1, 0)
-        twists = np.zeros((len(stamps), 6))
-        inside = (after > 0) & (after < len(self.stamps))
-        if inside.any():
-            walked = points.noise[inside] - self.points.noise[lower[inside]]
-            twists[inside] = (walked @ self._multipliers[lower[inside]][..., None])[..., 0]
-        start = self.poses[lower] @ invert(self.points.poses[lower])
-        return start @ expmap(twists) @ points.poses
-
-    @cached_property
-    def _multipliers(self) -> Array:
-        """(N-1, 6) correction between two solved poses per noise: Lagrange multipliers of the solved poses."""
-        steps = invert(self.points.poses[:-1]) @ self.points.poses[1:]
-        misfits = logmap(invert(steps) @ invert(self.poses[:-1]) @ self.poses[1:])
-        twists = adjoint(self.points.poses[1:]) @ misfits[..., None]
-        return np.linalg.solve(np.diff(self.points.noise, axis=0), twists)[..., 0]
 
 
 class Sessions:
@@ -72,7 +32,8 @@ class Sessions:
 
     def __init__(self, settings: PoseGraphSettings) -> None:
         self._settings = settings
-        self._optimizer = Optimizer()
+        self._columns = ClosureColumns()
+        self._optimizer = IncrementalOptimizer()
         self._refiner = Optimizer()
         self._scale = NoiseScale()
         self._refined: dict[int, CorrectedPath | None] = {}
@@ -98,7 +59,7 @@ class Sessions:
             if len(chain.stamps) and (late or self.paths[session] is None):
                 self.paths[session] = self._uncorrected(session)
             if late:
-                self._optimizer, self._refined = Optimizer(), {}
+                self._optimizer, self._refined = IncrementalOptimizer(), {}
         return changed
 
     @property
@@ -163,9 +124,9 @@ class Sessions:
                 way_m[self.components[session]] += chain.travel_at(chain.stamps[-1:]).item()
         return int(np.argmax(way_m))
 
-    def at(self, session: int, stamps: Stamps) -> Array:
-        """(N, 4, 4) `map_T_body` of one session."""
-        return (self._refined.get(session) or self.path(session)).at(stamps)
+    def at(self, session: int, stamps: Stamps, points: PathPoints | None = None) -> Array:
+        """(N, 4, 4) `map_T_body` of one session; `points`: its odometry at the stamps, where it is known."""
+        return (self._refined.get(session) or self.path(session)).at(stamps, points)
 
     def solve(self, closures: Sequence[TrackedClosure], scale: NoiseScale) -> None:
         """Move every path to the optimum of odometry and the given closures, as far as condensed odometry tells.
@@ -174,13 +135,15 @@ class Sessions:
             GraphError: the system cannot be solved; the paths stay as they were.
         """
         if scale != self._scale:
-            self._optimizer, self._scale = Optimizer(), scale
-        stamps = [self._vertex_stamps(session, closures) for session in range(len(self.chains))]
-        components, moves = self._join(closures)
-        starts, graph = self._graph(stamps, closures, scale, components, moves)
+            self._optimizer, self._scale = IncrementalOptimizer(), scale
+        chosen = self._columns.choose(closures)
+        stamps = [self._vertex_stamps(session, chosen) for session in range(len(self.chains))]
+        points = self._points_at(stamps)
+        components, moves = self._join(chosen)
+        starts, graph = self._graph(stamps, points, chosen, scale, components, moves)
         self.solution = replace(graph, poses=self._optimizer.solve(graph))
         self.components, self.starts, self._refined = components, starts, {}
-        self.paths = self._through(stamps, starts, self.solution.poses)
+        self.paths = self._through(stamps, points, starts, self.solution.poses)
 
     def refine(self, closures: Sequence[TrackedClosure], scale: NoiseScale) -> None:
         """Move every path to the exact optimum, of every keyframe, after these closures have been solved for.
@@ -189,17 +152,26 @@ class Sessions:
             GraphError: the system cannot be solved; the paths stay as they were.
         """
         self._refiner, unmoved = Optimizer(), [np.eye(4)] * len(self.chains)
-        stamps = [self._keyframes_and(self._vertex_stamps(s, closures), s) for s in range(len(self.chains))]
+        chosen = self._columns.choose(closures)
+        stamps = [self._keyframes_and(self._vertex_stamps(s, chosen), s) for s in range(len(self.chains))]
+        points = self._points_at(stamps)
         for _ in range(_REFINEMENTS):
-            starts, graph = self._graph(stamps, closures, scale, self.components, unmoved)
-            self._refined = dict(enumerate(self._through(stamps, starts, self._refiner.solve(graph))))
+            starts, graph = self._graph(stamps, points, chosen, scale, self.components, unmoved)
+            self._refined = dict(enumerate(self._through(stamps, points, starts, self._refiner.solve(graph))))
 
-    def _through(self, stamps: list[Stamps], starts: NDArray[np.int64], poses: Array) -> list[CorrectedPath | None]:
+    def _points_at(self, stamps: list[Stamps]) -> list[PathPoints | None]:
+        """The odometry at stamps of every session; None without odometry."""
+        return [None if path is None else path.chain.at(own) for path, own in zip(self.paths, stamps, strict=True)]
+
+    def _through(
+        self, stamps: list[Stamps], points: list[PathPoints | None], starts: NDArray[np.int64], poses: Array
+    ) -> list[CorrectedPath | None]:
         """The paths through solved poses."""
-        return [
-            path and CorrectedPath(path.chain, own, path.chain.at(own), poses[start : start + len(own)])
-            for path, own, start in zip(self.paths, stamps, starts, strict=False)
-        ]
+        paths: list[CorrectedPath | None] = []
+        for path, own, there, start in zip(self.paths, stamps, points, starts, strict=False):
+            solved = poses[start : start + len(own)]
+            paths.append(None if path is None or there is None else CorrectedPath(path.chain, own, there, solved))
+        return paths
 
     @property
     def _active(self) -> list[tuple[int, CorrectedPath]]:
@@ -225,24 +197,27 @@ class Sessions:
     def expand(self, closures: Sequence[TrackedClosure], extra: Sequence[Stamps], scale: NoiseScale) -> Graph:
         """Every keyframe and the `extra` stamps of each session, joined by odometry and by the given closures."""
         stamps = [np.union1d(chain.stamps, more) for chain, more in zip(self.chains, extra, strict=True)]
-        return self._graph(stamps, closures, scale, self.components, [np.eye(4)] * len(stamps))[1]
+        chosen, unmoved = self._columns.choose(closures), [np.eye(4)] * len(stamps)
+        return self._graph(stamps, self._points_at(stamps), chosen, scale, self.components, unmoved)[1]
 
     def _graph(
         self,
         stamps: list[Stamps],
-        closures: Sequence[TrackedClosure],
+        points: list[PathPoints | None],
+        closures: ChosenClosures,
         scale: NoiseScale,
         components: list[int],
         moves: Sequence[Array],
     ) -> tuple[NDArray[np.int64], Graph]:
         """The first vertex of each session, and the graph of moved poses at stamps of each."""
         starts = np.cumsum([0] + [len(own) for own in stamps])
-        edges = [odometry_edges(path.chain.at(stamps[s]), int(starts[s]), scale.odometry) for s, path in self._active]
+        known = ((there, start) for there, start in zip(points, starts, strict=False) if there is not None)
+        edges = [odometry_edges(there, int(start), scale.odometry) for there, start in known]
         edges.append(_closure_edges(closures, stamps, starts, scale.closures))
         vertices = [(session, stamp) for session, own in enumerate(stamps) for stamp in own.tolist()]
         poses = [np.empty((0, 4, 4)), *(moves[s] @ self.at(s, stamps[s]) for s, _ in self._active)]
         anchors = [int(starts[session]) for session, _ in self._active if components[session] == session]
-        keys = _edge_keys(vertices, closures)
+        keys = _edge_keys(vertices, closures.tracked)
         return starts, Graph(vertices, np.concatenate(poses), anchors, keys, Edges.join(edges))
 
     def _uncorrected(self, session: int) -> CorrectedPath:
@@ -250,11 +225,10 @@ class Sessions:
         first = chain.stamps[:1].copy()
         return CorrectedPath(chain, first, chain.at(first), chain.poses_at(first))
 
-    def _vertex_stamps(self, session: int, closures: Sequence[TrackedClosure]) -> Stamps:
+    def _vertex_stamps(self, session: int, closures: ChosenClosures) -> Stamps:
         """The first stamp of a session and those of its closures' endpoints; none without odometry."""
-        endpoints = [c.closure.match_stamp_ns for c in closures if c.match == session]
-        endpoints += [c.closure.query_stamp_ns for c in closures if c.query == session]
-        return np.unique(np.concatenate([self.chains[session].stamps[:1], np.array(endpoints, np.int64)]))
+        own = closures.match_ns[closures.match == session], closures.query_ns[closures.query == session]
+        return np.unique(np.concatenate([self.chains[session].stamps[:1], *own]))
 
     def _keyframes_and(self, stamps: Stamps, session: int) -> Stamps:
         """Stamps of a session with those of all keyframes, except very close ones."""
@@ -263,11 +237,12 @@ class Sessions:
         gaps = [np.abs(keyframes - stamps[np.clip(row, 0, len(stamps) - 1)]) for row in (after - 1, after)]
         return np.union1d(stamps, keyframes[np.min(gaps, axis=0) > _TOO_CLOSE_NS])
 
-    def _join(self, closures: Sequence[TrackedClosure]) -> tuple[list[int], list[Array]]:
+    def _join(self, closures: ChosenClosures) -> tuple[list[int], list[Array]]:
         """The component of each session, and how each moves to its component's gauge, newly joined ones included."""
         components = list(range(len(self.chains)))
         moves: list[Array] = [np.eye(4) for _ in components]
-        for closure in closures:
+        for row in np.flatnonzero(closures.match != closures.query).tolist():
+            closure = closures.tracked[row]
             a, b = components[closure.match], components[closure.query]
             if a == b:
                 continue
@@ -284,21 +259,17 @@ class Sessions:
         return components, moves
 
 
-def _closure_edges(
-    closures: Sequence[TrackedClosure], stamps: list[Stamps], starts: NDArray[np.int64], scale: float
-) -> Edges:
+def _closure_edges(closures: ChosenClosures, stamps: list[Stamps], starts: NDArray[np.int64], scale: float) -> Edges:
     """Edges of closures between the vertices that `starts` and `stamps` of each session number."""
-    first = [starts[c.match] + np.searchsorted(stamps[c.match], c.closure.match_stamp_ns) for c in closures]
-    second = [starts[c.query] + np.searchsorted(stamps[c.query], c.closure.query_stamp_ns) for c in closures]
-    return Edges(
-        np.array(first, np.int64),
-        np.array(second, np.int64),
-        np.array([c.closure.match_T_query for c in closures]).reshape(-1, 4, 4),
-        scale**2 * np.array([c.covariance for c in closures]).reshape(-1, 6, 6),
-    )
+    first, second = np.zeros((2, len(closures.tracked)), np.int64)
+    for session, own in enumerate(stamps):
+        begins, ends = closures.match == session, closures.query == session
+        first[begins] = starts[session] + np.searchsorted(own, closures.match_ns[begins])
+        second[ends] = starts[session] + np.searchsorted(own, closures.query_ns[ends])
+    return Edges(first, second, closures.poses, scale**2 * closures.covariances)
 
 
 def _edge_keys(vertices: list[tuple[int, int]], closures: Sequence[TrackedClosure]) -> list[Hashable]:
     """Lasting keys of the edges along each session, then of the closures."""
     steps: list[Hashable] = [(a, b) for a, b in pairwise(vertices) if a[0] == b[0]]
-    return steps + [id(closure) for closure in closures]
+    return [*steps, *closures]

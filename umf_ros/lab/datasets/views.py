@@ -56,11 +56,19 @@ class View:
 
 
 class ViewMaker:
-    """Turns samples into views for one network."""
+    """Turns samples into views for one network.
 
-    def __init__(self, config: NetworkConfig, augmentation: Augmentation | None = None) -> None:
+    Args:
+        config: of the network.
+        augmentation: how views are varied; None: not at all.
+        keep_slope: whether a rover's own tilt on a slope stays in its scans, as UMF reads them (`levelling.level`).
+    """
+
+    def __init__(
+        self, config: NetworkConfig, augmentation: Augmentation | None = None, keep_slope: bool = True
+    ) -> None:
         self.config = config
-        self._augmentation = augmentation
+        self._augmentation, self._keep_slope = augmentation, keep_slope
 
     def plain(self, sample: Sample) -> View:
         """The view without augmentation."""
@@ -79,9 +87,8 @@ class ViewMaker:
         if rng is not None and self._augmentation is not None:
             view_T_body = _random_motion(rng, self._augmentation) @ view_T_body
             points, intensity = _thin(points, intensity, rng, self._augmentation)
-        view_T_body = (
-            level(transform(view_T_body, points), keep_slope=True) @ view_T_body
-        )  # as the embedder reads scans
+        upright = level(transform(view_T_body, points), self._keep_slope)  # as the embedder reads scans
+        view_T_body = upright @ view_T_body
         scan = prepare_scan(transform(view_T_body, points), intensity, self.config)
         return View(sample, image, present, scan, input_T_pixel, np.linalg.inv(view_T_body))
 

@@ -74,8 +74,8 @@ class PreparedViews:
     ) -> None:
         self._reads, self._variants, self._seed, self._folder = reads, variants, seed, folder
         self._trunk = None if trunk is None else deepcopy(trunk).cpu()
-        self._maker = ViewMaker(CONFIG, Augmentation())
-        self._kept: dict[tuple[str, Sense], Row] = {}
+        self._maker = ViewMaker(CONFIG, Augmentation(), keep_slope=False)
+        self._kept: dict[tuple[str, int, Sense], Row] = {}
 
     def plain(self, world: SampleSequence, indices: Sequence[int] | range) -> PlaceInput:
         """Samples of a world as they are."""
@@ -106,14 +106,13 @@ class PreparedViews:
 
     def _row(self, world: SampleSequence, index: int, variant: int, sense: Sense) -> Row:
         """What is kept of one sense in one view."""
-        rows = self._rows(world, sense)
-        if not rows["made"][index, variant]:
-            found = self._see(self._view(world, index, variant, sense), sense)
-            for name, value in found.items():
-                rows[name][index, variant] = value
-            rows["made"][index, variant] = True  # last: whoever is interrupted begins this row anew
-        found_row: Row = rows[index, variant]
-        return found_row
+        rows = self._rows(world, variant, sense)
+        if not rows["made"][index]:
+            for name, value in self._see(self._view(world, index, variant, sense), sense).items():
+                rows[name][index] = value
+            rows["made"][index] = True  # last: whoever is interrupted begins this row anew
+        found: Row = rows[index]
+        return found
 
     def _view(self, world: SampleSequence, index: int, variant: int, sense: Sense) -> View:
         sample = _only(world.sample(index), sense)
@@ -138,14 +137,13 @@ class PreparedViews:
         points = some_points(upright, np.random.default_rng(self._seed))
         return {} if points is None else {"points": points, "present": True}
 
-    def _rows(self, world: SampleSequence, sense: Sense) -> Row:
-        """(samples, 1 + 2 variants) of a world, on disk."""
-        key = world.name, sense
+    def _rows(self, world: SampleSequence, variant: int, sense: Sense) -> Row:
+        """(samples,) of a world, on disk."""
+        key = world.name, variant, sense
         if key not in self._kept:
             kind = np.dtype([("made", "?"), ("present", "?"), *FIELDS[sense]])
-            shape = len(world), 1 + 2 * self._variants
-            name = f"{world.name.replace('/', '_')}_{shape[0]}x{shape[1]}_{self._seed}.{sense}"
-            self._kept[key] = _on_disk(self._folder, name, kind, shape)
+            name = f"{world.name.replace('/', '_')}_{len(world)}_{self._seed}_{variant}.{sense}"
+            self._kept[key] = _on_disk(self._folder, name, kind, len(world))
         return self._kept[key]
 
 
@@ -155,7 +153,7 @@ def _only(sample: Sample, sense: Sense) -> Sample:
     return replace(sample, image=None)
 
 
-def _on_disk(folder: Path | None, name: str, kind: np.dtype[Any], shape: tuple[int, int]) -> Row:
+def _on_disk(folder: Path | None, name: str, kind: np.dtype[Any], count: int) -> Row:
     """Rows that take space only where they are written, and that processes share; zeros at first.
 
     Raises:
@@ -164,11 +162,11 @@ def _on_disk(folder: Path | None, name: str, kind: np.dtype[Any], shape: tuple[i
     try:
         if folder is None:
             with tempfile.TemporaryFile() as stream:
-                return np.memmap(stream, kind, "w+", shape=shape)
+                return np.memmap(stream, kind, "w+", shape=(count,))
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / name
-        there = path.is_file() and path.stat().st_size == kind.itemsize * shape[0] * shape[1]
-        return np.memmap(path, kind, "r+" if there else "w+", shape=shape)
+        there = path.is_file() and path.stat().st_size == kind.itemsize * count
+        return np.memmap(path, kind, "r+" if there else "w+", shape=(count,))
     except OSError as error:
         raise OutputError(f"cannot keep prepared views in {folder or 'a temporary file'}: {error.strerror}") from None
 

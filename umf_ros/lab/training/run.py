@@ -111,7 +111,7 @@ def _card(settings: RunSettings, name: str, network: nn.Module, data: Source, pr
     """What every card says; of folders and files only the names, in the command too."""
     words = [re.sub(r"[^=]*/", "", word.rstrip("/")) for word in sys.argv[1:]]
     said = settings.model_dump()
-    places = {place: Path(said[place]).name for place in ("train", "validation", "start") if place in said}
+    places = {place: Path(said[place]).name for place in ("train", "validation", "start", "views") if place in said}
     return {
         "name": name,
         "steps": progress.step,

@@ -1,0 +1,25 @@
+"""An input of which nothing arrives: one line that names it, in the command and in the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from command_line import umf
+from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, traverse, write_mcap
+
+SAID = {
+    LEFT: "no images on /stereo/left/image_rect: places are told apart by scans alone",
+    CLOUD: "no scans on /bf_lidar/points_raw: everything rests on the images",
+    ODOMETRY: "no odometry on /odom: closures only, the pose graph is skipped",
+}
+
+
+@pytest.mark.parametrize("absent", [(LEFT, RIGHT), (CLOUD, ODOMETRY)], ids=str)
+def test_every_silent_input_is_one_line(absent: tuple[str, ...], tmp_path: Path) -> None:
+    bag = write_mcap(tmp_path / "bag.mcap", [entry for entry in traverse(1.0) if entry[0] not in absent])
+    ended = umf("replay", bag, "--embedder", "scan_context", "--out", tmp_path / "out")
+    page = (tmp_path / "out" / "latest" / "report.html").read_text()
+    for topic, line in SAID.items():
+        assert ended.text.count(line) == (1 if topic in absent else 0), ended.text
+        assert (line[1:] in page) == (topic in absent)

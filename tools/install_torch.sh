@@ -1,0 +1,20 @@
+#!/usr/bin/env bash
+# Install the CPU build of the torch that is pinned, from where such builds are; without that, say so and leave it to the
+# requirements, whose plain torch may be a CUDA build of some gigabytes.
+#
+#   tools/install_torch.sh PYTHON [INDEX]
+set -euo pipefail
+python=$1
+index=${2:-https://download.pytorch.org/whl/cpu}
+repository=$(cd "$(dirname "$0")/.." && pwd)
+pinned=$(grep -m1 -oE '^torch==[0-9.]+' "$repository/requirements.txt")
+
+if "$python" -c 'import sys, importlib.metadata as m; sys.exit(m.version("torch").split("+")[0] != sys.argv[1])' \
+  "${pinned#torch==}" 2>/dev/null; then
+  exit 0
+fi
+# what torch itself needs is not all there: the usual index has that
+if ! "$python" -m pip install --quiet --disable-pip-version-check --retries 1 --timeout 15 --no-deps \
+  --index-url "$index" "$pinned" 2>/dev/null; then
+  echo "No CPU build of $pinned from $index (set TORCH_INDEX): the usual index decides" >&2
+fi
