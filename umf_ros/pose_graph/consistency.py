@@ -128,10 +128,15 @@ class ConsistencyGraph:
         ]
         return next((one for _, one, other in sorted(pairs) if self._elsewhere([one], other)), found[0])
 
-    def companions(self, row: int, members: NDArray[np.bool_]) -> list[int]:
-        """Closures out of `members` of the same place that are consistent with this one."""
-        consistent = np.array([other for other in self._consistent[row] if members[other]], np.int64)
-        return consistent[self._same_place(consistent, row)].tolist()
+    def companions(self, rows: Sequence[int], members: NDArray[np.bool_]) -> list[list[int]]:
+        """For each closure those out of `members` of the same place that are consistent with it."""
+        pairs = [(row, other) for row in rows for other in self._consistent[row] if members[other]]
+        one, other = np.array(pairs, np.int64).reshape(-1, 2).T
+        found: dict[int, list[int]] = {row: [] for row in rows}
+        for (row, companion), same in zip(pairs, self._same_place(other, one).tolist(), strict=True):
+            if same:
+                found[row].append(companion)
+        return list(found.values())
 
     def opponents(self, row: int, members: NDArray[np.bool_]) -> list[int]:
         """Closures out of `members` that are inconsistent with this one."""
@@ -162,8 +167,8 @@ class ConsistencyGraph:
                 self._inconsistent[row].add(other)
                 self._inconsistent[other].add(row)
 
-    def _same_place(self, rows: Sequence[int] | NDArray[np.int64], other: int) -> NDArray[np.bool_]:
-        """(N,) which closures are of the place of another one."""
+    def _same_place(self, rows: Sequence[int] | NDArray[np.int64], other: int | NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(N,) which closures are of the place of another one, or each of that of its own other one."""
         rows = np.asarray(rows, np.int64)
         same, apart = np.ones(len(rows), bool), np.full(len(rows), np.inf)
         for ends in (self._closures.match, self._closures.query):

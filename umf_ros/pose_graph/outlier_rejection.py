@@ -313,19 +313,20 @@ class OutlierRejection:
         into account how many closures were wrong and what other places say, though it did not suffice.
         """
         patience_m = 0.0 if last_word else self._settings.patience_m
-        waiting = [
-            row for row in np.flatnonzero(self._in_state(State.UNDECIDED)).tolist() if self._waited(row) >= patience_m
-        ]
+        waiting = np.flatnonzero(self._in_state(State.UNDECIDED) & (self._waited() >= patience_m)).tolist()
         companions = ~self._in_state(State.ACCEPTED)
         companions[list(self._revoked)] = False
-        places = [[row, *self._consistency.companions(row, companions)] for row in waiting]
+        others = self._consistency.companions(waiting, companions)
+        places = [[row, *known] for row, known in zip(waiting, others, strict=True)]
         self._gate(self._outdated(np.array(sorted({member for place in places for member in place}), np.int64)))
         against = self._credible()
         best: list[int] = []
-        most_odds = _MOST_ODDS_AT_LAST if last_word else _MOST_ODDS
+        most_odds, waited = _MOST_ODDS_AT_LAST if last_word else _MOST_ODDS, set(waiting)
         for place in places:
             odds = self._odds_against(place, last_word)
-            usual = [row for row, odd in zip(place, odds, strict=True) if row in waiting and odd <= most_odds]
+            if odds.min() > most_odds:
+                continue
+            usual = [row for row, odd in zip(place, odds, strict=True) if row in waited and odd <= most_odds]
             usual = [row for row in usual if not self._consistency.opponents(row, against)]
             if usual and np.median(odds) <= most_odds:
                 best, most_odds = usual, float(np.median(odds))
@@ -355,12 +356,12 @@ class OutlierRejection:
         members[list(self._revoked)] = False
         return members
 
-    def _waited(self, row: int) -> float:
-        """Metres driven since a closure's query; infinite when that was in another session than the newest one's."""
-        travel = self._arrays.query["travel"]
-        if self.closures[row].query != self.closures[-1].query:
-            return float("inf")
-        return float(travel[-1] - travel[row])
+    def _waited(self) -> Array:
+        """(N,) metres driven since each closure's query; infinite where that was in another session than the newest."""
+        travel, session = self._arrays.query["travel"], self._arrays.query["session"]
+        if not len(travel):
+            return np.empty(0)
+        return np.where(session == session[-1], travel[-1] - travel, np.inf)
 
     def _accept(self, reasons: dict[int, str]) -> bool:
         for row, reason in reasons.items():
