@@ -53,7 +53,14 @@ def test_a_lidar_that_is_mounted_otherwise_than_stated_is_found(drive: Drive, ax
     turn = np.radians(10) * np.eye(3)[axis]
     wrong = make_pose(Rotation.from_rotvec(turn).as_matrix(), [0, 0, 0])
     bare = [replace(frame, left=None, right=None, image_stamp_ns=None) for frame in drive[0]]
-    seen = checked((bare, drive[1]), lambda one: replace(one, points=transform(wrong, one.points)))
+
+    def spoil(frame: Frame) -> Frame:
+        assert frame.points is not None and frame.motion is not None
+        # what was removed goes along: before that was removed, it was the scan as measured that was turned
+        rates = np.concatenate([wrong[:3, :3] @ frame.motion.rates[:3], wrong[:3, :3] @ frame.motion.rates[3:]])
+        return replace(frame, points=transform(wrong, frame.points), motion=replace(frame.motion, rates=rates))
+
+    seen = checked((bare, drive[1]), spoil)
     assert seen.lidar is not None and seen.lidar.mounting_deg is not None and seen.camera is None
     np.testing.assert_allclose(seen.lidar.mounting_deg, -np.degrees(turn), atol=4)
 
