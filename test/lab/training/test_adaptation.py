@@ -44,6 +44,7 @@ def drive(seed: int = 0, told: float = 0.7, blind: bool = False) -> Drive:
     count = 2 * PLACES
     along = np.arange(PLACES) * STEP_M
     return Drive(
+        np.arange(count) * 10**9,
         seen.astype(np.float32),
         rng.normal(size=(count, TINY.tokens)).astype(np.float32),
         np.zeros((count, 15 * 112), np.float16),
@@ -93,14 +94,27 @@ def test_a_modality_that_is_absent_has_no_figure_and_no_say() -> None:
     found = measure(network(), [Lesson(drive(blind=True))])
     assert np.isnan(found.lidar) and np.isfinite(found.image)
     assert "LiDAR" not in found.said()
-    better = found._replace(fused=found.fused + 0.1, image=found.image + 0.1)
-    assert better.gain_over(found) == pytest.approx(0.1)
+    better = found._replace(fused=found.fused + 0.1, image=found.image + 0.1, hits=np.ones_like(found.hits))
+    worst = found._replace(hits=np.zeros_like(found.hits))
+    assert better.gain_over(worst) == pytest.approx(0.1)
+
+
+def recall(fused: float, image: float, lidar: float, found: int) -> Recall:
+    """Of a hundred revisits, each asked three times."""
+    return Recall(fused, image, lidar, 100, np.arange(300) < found)
 
 
 def test_a_gain_that_costs_a_modality_is_none() -> None:
-    before = Recall(0.8, 0.5, 0.7, 100)
-    assert Recall(0.8, 0.9, 0.69, 100).gain_over(before) < 0
-    assert Recall(0.8, 0.62, 0.7, 100).gain_over(before) == pytest.approx(0.04)
+    before = recall(0.8, 0.5, 0.7, 200)
+    assert recall(0.8, 0.9, 0.69, 239).gain_over(before) < 0
+    assert recall(0.8, 0.62, 0.7, 212).gain_over(before) == pytest.approx(0.04)
+
+
+def test_a_gain_that_may_be_chance_is_none() -> None:
+    before, after = recall(0.8, 0.5, 0.7, 200), recall(0.81, 0.52, 0.71, 204)
+    assert after.gain_over(before) == pytest.approx(0.0133, abs=1e-3)  # four won, none lost
+    lost = after._replace(hits=np.roll(after.hits, 6))  # ten won, six lost
+    assert lost.gain_over(before) == 0
 
 
 @pytest.fixture

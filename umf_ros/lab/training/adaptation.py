@@ -30,6 +30,8 @@ GAINED = 0.01
 """Mean gain of recall@1 from which the result is kept."""
 LOST = 0.01
 """What no modality may lose."""
+SURE = 1.64
+"""Standard deviations of chance by which what is found now must outweigh what is found no more (a sign test)."""
 PARTS = ("descriptor", "image", "cloud")
 
 
@@ -54,12 +56,19 @@ class Adaptation:
 
 
 class Recall(NamedTuple):
-    """Recall@1 of the revisits held out, by what is asked; NaN where a modality is absent."""
+    """Recall@1 of the revisits held out, by what is asked; NaN where a modality is absent.
+
+    Attributes:
+        fused, image, lidar: shares.
+        revisits: so many.
+        hits: (Q,) bool, of all that was asked, in an order that another network's hits share.
+    """
 
     fused: float
     image: float
     lidar: float
     revisits: int
+    hits: NDArray[np.bool_]
 
     def said(self) -> str:
         """For people."""
@@ -67,10 +76,14 @@ class Recall(NamedTuple):
         return ", ".join(f"{name} {100 * value:.1f} %" for name, value in shown if np.isfinite(value))
 
     def gain_over(self, before: Recall) -> float:
-        """Mean gain; negative where any modality lost."""
+        """Mean gain; negative where any modality lost, 0 at most where it may be chance."""
         gains = np.array(self[:3]) - np.array(before[:3])
         gains = gains[np.isfinite(gains)]
-        return float(gains.mean() if len(gains) and gains.min() >= -LOST else -1.0)
+        if not len(gains) or gains.min() < -LOST:
+            return -1.0
+        won, lost = int((self.hits & ~before.hits).sum()), int((before.hits & ~self.hits).sum())
+        sure = won - lost > SURE * np.sqrt(won + lost)
+        return float(gains.mean() if sure else min(gains.mean(), 0.0))
 
 
 class Lesson:
@@ -126,7 +139,9 @@ def measure(network: UMF, lessons: Sequence[Lesson]) -> Recall:
     """Recall@1 of all revisits that are held out."""
     hits = [lesson.hits(network) for lesson in lessons if len(lesson.held_out)]
     fused, image, lidar = (_share([found[name] for found in hits if name in found]) for name in PARTS)
-    return Recall(fused, image, lidar, sum(len(lesson.held_out) for lesson in lessons))
+    every = [found[name] for found in hits for name in PARTS if name in found]
+    revisits = sum(len(lesson.held_out) for lesson in lessons)
+    return Recall(fused, image, lidar, revisits, np.concatenate(every) if every else np.empty(0, bool))
 
 
 def adapt(
