@@ -121,6 +121,9 @@ def test_a_gain_that_may_be_chance_is_none() -> None:
 def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Weights, and a command whose recordings have been read before."""
     save_weights(network(), tmp_path / "tiny.safetensors", {})
+    monkeypatch.chdir(tmp_path)
+    for name in ("0.alike", *(f"{seed}.mcap" for seed in range(12))):
+        Path(name).touch()
     monkeypatch.setattr(
         command, "_drive", lambda bag, *_: drive(int(bag.stem), 0.0 if bag.suffix == ".alike" else 0.7, blind=True)
     )
