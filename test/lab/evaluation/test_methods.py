@@ -19,10 +19,12 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.errors import UmfError
 from umf_ros.lab.commands import evaluate
-from umf_ros.lab.evaluation import methods_run
+from umf_ros.lab.evaluation import all_methods, methods_run
+from umf_ros.lab.evaluation.all_methods import compare_methods
 from umf_ros.lab.evaluation.frame_sets import drive_sets, recording_set, world_set
 from umf_ros.lab.evaluation.methods import FIGURES, bootstrap
 from umf_ros.lab.evaluation.methods_run import MethodsRun, make_others, search_ms
+from umf_ros.lab.evaluation.worlds import FIRST
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
 
@@ -86,6 +88,30 @@ def test_umf_its_rerankers_and_the_others_stand_in_one_table(
     assert "| ransac both | 100.0 |" in text and "39,385,229" in text
     for picture in methods_run.PICTURES.values():
         assert (tmp_path / picture).stat().st_size > 5000
+
+
+class DrivenOnce(DrivenLine):
+    """The first pass alone."""
+
+    name = "once 0"
+
+    def driven(self, wanted: tuple[int, ...]):  # type: ignore[no-untyped-def]
+        return super().driven((FIRST,))
+
+
+def test_where_no_place_is_seen_twice_nothing_is_asked(
+    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = methods_run.make_embedder
+    monkeypatch.setattr(methods_run, "make_embedder", lambda *a, **k: LandmarkEmbedder() if a else made(*a, **k))
+    monkeypatch.setattr(all_methods, "make_others", lambda trained: ({}, []))
+    once, line = (world_set(world()) for world in (DrivenOnce, DrivenLine))  # type: ignore[arg-type]
+    make = (lambda: tmp_path), 1, lambda what, done: None
+    report, _ = compare_methods([once, line], [], weights, None, *make)
+    assert report.figures["umf.recall1"] == pytest.approx(1 - len(CONFUSED) / PLACES, abs=1e-4)
+    assert "Not asked: once 0, where no place is seen twice" in (tmp_path / "evaluation.md").read_text()
+    with pytest.raises(UmfError, match="no place is seen twice in once 0"):
+        compare_methods([world_set(DrivenOnce())], [], weights, None, *make)  # type: ignore[arg-type]
 
 
 def test_methods_without_weights_are_told_and_left_out(tmp_path: Path) -> None:

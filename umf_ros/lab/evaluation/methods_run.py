@@ -120,8 +120,8 @@ class MethodsRun:
         self._seen: list[Frame] = []
         self._keyframe: Keyframe | None = None
 
-    def add(self, places: FrameSet) -> None:
-        """Ask one set.
+    def add(self, places: FrameSet) -> bool:
+        """Ask one set; returns whether any of its queries has a true match, without which nothing can be said.
 
         Raises:
             UmfError: what its frames raise.
@@ -136,6 +136,8 @@ class MethodsRun:
                 self._seen.append(frame)
             self._report(places.name, 1)
         task = places.task()
+        if not task.positive.any():
+            return False
         self._keyframe = ours.keyframes[0]
         queries, references = ([ours.keyframes[row] for row in rows] for rows in (task.queries, task.references))
         inliers = PairInliers(queries, references, self._settings)
@@ -150,6 +152,7 @@ class MethodsRun:
                 again = inliers.reorder(ranking, similarity)
                 self._xfeat.setdefault(name, []).append(ask(task, again).scores.recall1)
             self._report(f"{places.name}: {name}", 0)
+        return True
 
     def _rerank(
         self,
