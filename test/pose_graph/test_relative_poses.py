@@ -23,7 +23,7 @@ def stop(graph: PoseGraph, *poses: int) -> Stops:
 def test_the_bound_of_a_relative_covariance_is_never_below_the_true_one() -> None:
     world = rover_loops(300, 12)
     solved = drive(world)
-    relative_poses = solved._rejection._map
+    relative_poses = solved._rejection._comparer._map
     assert relative_poses is not None
     full, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     steps = invert(world.odometry[:-1]) @ world.odometry[1:]
@@ -45,7 +45,7 @@ def test_the_bound_of_a_relative_covariance_is_never_below_the_true_one() -> Non
 def test_no_way_through_an_edge_is_shorter_than_it_is_said_to_be(first: int, second: int, straight: bool) -> None:
     closed = [0, 10, 30, 50, 70, 90]
     solved = drive(closing(two_laps(), lap_pairs(*closed)))
-    relative_poses = solved._rejection._map
+    relative_poses = solved._rejection._comparer._map
     assert relative_poses is not None
     ends = stop(solved, first), stop(solved, second)
     known = relative_poses.bounds(*ends).lengths[0]

@@ -16,18 +16,12 @@ from numpy.typing import NDArray
 
 from umf_ros.config import PoseGraphSettings
 from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, invert, logmap
-from umf_ros.pose_graph.closures import ClosureArrays, ClosureVerdict, Endpoints, State, Stops, TrackedClosure
-from umf_ros.pose_graph.consistency import (
-    ConsistencyGraph,
-    false_alarm_probability,
-    likelihood_ratio,
-    squared_mahalanobis,
-)
-from umf_ros.pose_graph.looks import Looks, MapComparisons
+from umf_ros.geometry import Array
+from umf_ros.pose_graph.closures import ClosureArrays, ClosureVerdict, State, TrackedClosure
+from umf_ros.pose_graph.consistency import ConsistencyGraph
+from umf_ros.pose_graph.map_comparer import MapComparer
 from umf_ros.pose_graph.noise_scale import NoiseScale, NoiseScaleEstimator
 from umf_ros.pose_graph.odometry import Stamps, Table
-from umf_ros.pose_graph.relative_poses import Bounds, RelativePoses
 from umf_ros.pose_graph.sessions import Sessions
 
 _LOOPS_PER_CLOSURE = 3
@@ -68,9 +62,8 @@ class OutlierRejection:
         self._arrays = ClosureArrays()
         self._consistency = ConsistencyGraph(self._arrays, settings)
         self._estimator = NoiseScaleEstimator()
-        self._map: RelativePoses | None = None
+        self._comparer = MapComparer(self._arrays, sessions, settings)
         self._solved: set[int] = set()
-        self._looks = Looks()
         self._table = Table(state=np.empty(0, "U16"))
         self._changed: set[int] = set()
         self._revoked: set[int] = set()
@@ -85,7 +78,7 @@ class OutlierRejection:
         """Judge by other gates from now on."""
         self._settings = settings
         self._consistency.retune(settings)
-        self._looks.forget()
+        self._comparer.retune(settings)
 
     def consider(self, arrived: list[TrackedClosure]) -> list[ClosureVerdict]:
         """Take closures in; returns the verdicts that are new or changed.
@@ -94,7 +87,7 @@ class OutlierRejection:
         """
         rows = [self._take(tracked) for tracked in arrived]
         self._changed = set(rows)
-        unsolved = bool(self.closures) and self._map is None  # the solver failed when they came
+        unsolved = bool(self.closures) and not self._comparer.has_map  # the solver failed when they came
         if self._rescale() or unsolved or (rows and self._sessions.outgrown):
             self._solve()
             rows = list(range(len(self.closures)))
@@ -104,9 +97,9 @@ class OutlierRejection:
     def settle(self) -> list[ClosureVerdict]:
         """Decide what can wait no longer and bring the map to its exact optimum; returns changed verdicts."""
         self._changed = set()
-        if self._map is None:
+        if not self._comparer.has_map:
             return []
-        self._looks.forget()  # the last word is about the map as it is
+        self._comparer.forget()  # the last word is about the map as it is
         self._decide_all()
         for _ in self.closures:
             if not self._accept(dict.fromkeys(self._unopposed(last_word=True), _UNOPPOSED)):
@@ -121,8 +114,8 @@ class OutlierRejection:
     def renew(self) -> list[ClosureVerdict]:
         """Solve again after the odometry's past changed; no verdict changes by that."""
         self._arrays.renew(self._sessions.chains)
-        self._looks.forget()
-        if self._map is not None:
+        self._comparer.forget()
+        if self._comparer.has_map:
             self._solve()
         return []
 
@@ -154,7 +147,7 @@ class OutlierRejection:
     def endpoint_positions(self) -> Array:
         """(N, 2, 3) map positions of the match and query endpoints of all closures."""
         both = (self._arrays.match, self._arrays.query)
-        return np.stack([self._poses(endpoints, slice(None))[:, :3, 3] for endpoints in both], axis=1)
+        return np.stack([self._comparer.poses(endpoints, slice(None))[:, :3, 3] for endpoints in both], axis=1)
 
     def _decide_all(self) -> None:
         rows: Iterable[int] = range(len(self.closures))
@@ -181,7 +174,7 @@ class OutlierRejection:
         self.closures.append(tracked)
         self._table.extend(state=[tracked.verdict.state])
         self._arrays.append(self._sessions.chains, tracked)
-        self._looks.append()
+        self._comparer.append()
         loops = self._consistency.add(row, self.scale)
         self._estimator.add(loops[-_LOOPS_PER_CLOSURE:], self._consistency.place_of[row])
         return row
@@ -193,7 +186,7 @@ class OutlierRejection:
             return False
         self.scale = scale
         self._consistency.renew(scale)
-        self._looks.forget()
+        self._comparer.forget()
         return True
 
     def _gate(self, rows: Iterable[int]) -> list[int]:
@@ -201,12 +194,12 @@ class OutlierRejection:
         open_rows = [row for row in rows if not self.closures[row].accepted and row not in self._revoked]
         if not open_rows:
             return []
-        found = self._compare(open_rows)
+        found = self._comparer.compare(open_rows)
         numbers = zip(open_rows, *(column.tolist() for column in found[:4]), strict=True)
         self._unjoined -= set(open_rows)
         self._unjoined |= {row for row, joined in zip(open_rows, found.joined, strict=True) if not joined}
         agreed = [row for row, *rest in numbers if self._agrees(row, *rest)]
-        self._looks.note(open_rows, found)
+        self._comparer.note(open_rows, found)
         return agreed
 
     def _agrees(self, row: int, distance: float, misfit_m: float, false_alarm: float, ratio: float) -> bool:
@@ -223,37 +216,6 @@ class OutlierRejection:
         self._note(row, State.UNDECIDED, _UNSURE, distance, misfit_m)
         self._ratios[row] = ratio
         return false_alarm <= self._settings.max_chance or not self._settings.reject_outliers
-
-    def _compare(self, rows: Sequence[int]) -> MapComparisons:
-        """Hold closures against the map; what it says nothing about agrees with it, and so does anything."""
-        chosen = np.array(rows, np.int64)
-        misfits = self._misfits(chosen)
-        covariances, lengths = self._bounds(chosen, self._looks.unbounded(chosen, misfits))
-        known = np.isfinite(lengths)
-        distances, metres = np.zeros(len(chosen)), np.zeros(len(chosen))
-        false_alarms, ratios = np.ones(len(chosen)), np.ones(len(chosen))
-        if known.any():
-            distances[known] = squared_mahalanobis(logmap(misfits[known]), covariances[known])
-            metres[known] = np.linalg.norm(misfits[known, :3, 3], axis=1)
-            false_alarms[known] = false_alarm_probability(covariances[known], self._settings)
-            ratios[known] = likelihood_ratio(false_alarms[known], distances[known], self._settings)
-        return MapComparisons(distances, metres, false_alarms, ratios, known, misfits, covariances, lengths)
-
-    def _misfits(self, rows: NDArray[np.int64]) -> Array:
-        """(N, 4, 4) the map's poses of the queries of closures, seen from where the closures put them."""
-        ways = invert(self._poses(self._arrays.match, rows)) @ self._poses(self._arrays.query, rows)
-        return invert(self._arrays["pose"][rows]) @ ways
-
-    def _bounds(self, rows: NDArray[np.int64], new: NDArray[np.bool_]) -> Bounds:
-        """Bounds on the covariances of misfits; those that are not new are known."""
-        assert self._map is not None
-        found = Bounds(*(self._looks[name][rows] for name in ("covariance", "length")))
-        if new.any():
-            bounds = self._map.bounds(*self._stops(rows[new]))
-            own = self.scale.closures**2 * self._arrays["covariance"][rows[new]]
-            found.covariances[new] = bounds.covariances + own
-            found.lengths[new] = bounds.lengths
-        return found
 
     def _supported_sets(self, rows: Iterable[int], state: State) -> list[list[int]]:
         """Consistency sets among the closures of one state, each with one of `rows`, that no chance explains."""
@@ -287,7 +249,7 @@ class OutlierRejection:
         if not outvoted:
             return False
         self._solve(without=outvoted)
-        distances = self._compare(outvoted).distances
+        distances = self._comparer.compare(outvoted).distances
         wrong = [row for row, far in zip(outvoted, distances > self._settings.gate_chi2, strict=True) if far]
         for row in wrong:
             self._note(row, State.REJECTED, _OUTVOTED)
@@ -318,7 +280,9 @@ class OutlierRejection:
         companions[list(self._revoked)] = False
         others = self._consistency.companions(waiting, companions)
         places = [[row, *known] for row, known in zip(waiting, others, strict=True)]
-        self._gate(self._outdated(np.array(sorted({member for place in places for member in place}), np.int64)))
+        self._gate(
+            self._comparer.outdated(np.array(sorted({member for place in places for member in place}), np.int64))
+        )
         against = self._credible()
         best: list[int] = []
         most_odds, waited = _MOST_ODDS_AT_LAST if last_word else _MOST_ODDS, set(waiting)
@@ -374,48 +338,20 @@ class OutlierRejection:
     def _solve(self, without: Sequence[int] = ()) -> None:
         rows = {row for row, closure in enumerate(self.closures) if closure.accepted} - set(without)
         self._sessions.solve([self.closures[row] for row in sorted(rows)], self.scale)
-        self._map = RelativePoses(self._sessions, self.scale)
-        if rows >= self._solved:
-            self._look_for_shorter_ways(self._map, np.array(sorted(rows - self._solved), np.int64))
-        else:
-            self._looks.forget()
+        grown = np.array(sorted(rows - self._solved), np.int64) if rows >= self._solved else None
+        self._comparer.take_map(self.scale, grown, np.flatnonzero(~self._in_state(State.ACCEPTED)))
         self._solved = rows
-
-    def _look_for_shorter_ways(self, solved: RelativePoses, added: NDArray[np.int64]) -> None:
-        """Note for which closures the map knows a better way, through those that were added to it."""
-        rows = np.flatnonzero(~self._in_state(State.ACCEPTED) & ~self._looks["outdated"])
-        self._looks.shorten(rows, solved.lengths_through(*self._stops(rows), *self._stops(added)))
 
     def _worth_another_look(self) -> list[int]:
         """Closures not accepted that the moved map now comes close to."""
-        return self._outdated(np.flatnonzero(~self._in_state(State.ACCEPTED)), _CLOSE_M)
-
-    def _outdated(self, rows: NDArray[np.int64], within_m: float = np.inf) -> list[int]:
-        """Those closures that the map misses by less, and about which it may say something else than before."""
-        misfits = self._misfits(rows)
-        close = np.linalg.norm(misfits[:, :3, 3], axis=1) < within_m
-        rows = rows[close]
-        return rows[self._looks.outdated(rows, misfits[close])].tolist()
-
-    def _stops(self, rows: NDArray[np.int64]) -> tuple[Stops, Stops]:
-        """Where the matches and the queries of closures are."""
-        return self._arrays.match.stops(rows), self._arrays.query.stops(rows)
-
-    def _poses(self, endpoints: Endpoints, rows: slice | NDArray[np.int64]) -> Array:
-        """(N, 4, 4) `map_T_body` at one endpoint of closures."""
-        sessions, stamps, points = endpoints.stops(rows)
-        poses = np.zeros((len(sessions), 4, 4))
-        for session in np.unique(sessions):
-            mine = sessions == session
-            poses[mine] = self._sessions.at(int(session), stamps[mine], points.of(mine))
-        return poses
+        return self._comparer.outdated(np.flatnonzero(~self._in_state(State.ACCEPTED)), _CLOSE_M)
 
     def _note(
         self, row: int, state: State, reason: str, squared: float = float("nan"), metres: float = float("nan")
     ) -> None:
         before = self.closures[row].verdict.state
         self._table["state"][row] = state
-        self._looks.forget([row])
+        self._comparer.forget([row])
         self.closures[row].decide(state, reason, float(np.sqrt(squared)), metres)
         if before is not state:
             self._changed.add(row)
