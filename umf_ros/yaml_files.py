@@ -25,6 +25,11 @@ class _OnceLoader(yaml.SafeLoader):
         return dict(super().construct_mapping(node, deep))
 
 
+def is_yaml(path: Path) -> bool:
+    """Whether a path names a YAML file, and not data."""
+    return path.suffix in (".yaml", ".yml")
+
+
 def read_yaml(path: Path) -> Any:
     """What a YAML file holds; None where it is empty.
 

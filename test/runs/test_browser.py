@@ -64,7 +64,7 @@ def test_the_script_runs_to_its_end_and_draws_everything(page: Path, tmp_path: P
         part = dom[dom.index(f'id="{name}"') :]
         assert "main-svg" in part[:3000], name
     assert "false" in text_of(dom, "pair-title") and "FALSE: 0.90 m" in text_of(dom, "pair-facts")
-    assert "2 closures, precision 50.0 %, recall 33.3 % (1 of 3 revisits)" in text_of(dom, "threshold-words")
+    assert "2 closures, precision 50.0 %, recall 5.0 % (1 of 20 revisits)" in text_of(dom, "threshold-words")
 
 
 def test_an_address_leads_to_a_pair_and_its_reasons(page: Path, tmp_path: Path) -> None:

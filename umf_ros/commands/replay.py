@@ -18,6 +18,7 @@ from umf_ros.commands.recordings import (
     TruthPath,
     WeightsPath,
     check_files,
+    check_map,
     check_odometry_options,
     open_frames,
     open_recording,
@@ -70,7 +71,9 @@ def command(
     Ctrl-C ends the run early and keeps what was found; --resume goes on from there, or after a crash. Ends with 3 where
     the inputs could give nothing.
     """
-    check_files(bag, config, odometry, ground_truth, map_folder)
+    check_files(bag, config, odometry, ground_truth)
+    if map_folder is not None:
+        check_map(map_folder)
     odometry_frame = check_odometry_options(odometry, odometry_frame)
 
     from rich.console import Console

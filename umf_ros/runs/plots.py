@@ -14,7 +14,7 @@ from umf_ros.frames import Image
 from umf_ros.geometry import Array
 
 TRUTH, ODOMETRY, OPTIMISED = "#222222", "#e07b00", "#1f6fb4"
-RIGHT, WRONG, UNJUDGED = "#2ca02c", "#d62728", "#6e7781"
+RIGHT, WRONG, UNJUDGED = "#2ca02c", "#d62728", "#64748b"
 MAX_LINES = 60
 
 

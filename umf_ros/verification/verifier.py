@@ -187,8 +187,18 @@ class Verifier:
         for one, measurement in measured:
             others = [(other.pose, found) for other, found in measured if other.match is one.match]
             known = beside(measurement, one.pose, others)
-            judged.append(JudgedHypothesis(one, known, self._acceptance.probability(known)))
+            judged.append(JudgedHypothesis(one, known, self._probability(one, known)))
         return judged
+
+    def _probability(self, aligned: AlignedHypothesis, measurement: Measurement) -> float:
+        """That a hypothesis is right; where scans show bare ground alone, nothing would refute a texture seen twice."""
+        found = self._acceptance.probability(measurement)
+        scans = self._scans[aligned.match], self._scans[aligned.query]
+        if aligned.scans is not None or not all(scan.usable and scan.bare for scan in scans):
+            return found
+        if measurement.spread < const.BARE_SPREAD:
+            return 0.0
+        return found / (found + const.BARE_ODDS * (1.0 - found))
 
     def _aligned(self, query: Keyframe, hypotheses: list[Hypothesis]) -> list[AlignedHypothesis]:
         """Each aligned; of those that end at one pose only the first."""

@@ -39,18 +39,22 @@ def run(*arguments: str) -> str:
         (["--worlds", "etna"], "etna: with --methods all"),
         (["--worlds", "etna", "--methods", "all", "--count", "2"], "etna has no use for --count"),
         (["--worlds", "test", "--methods", "some"], "expected umf or all"),
-        (["nowhere.mcap", "--methods", "all", "--embedder", "umf"], "a recording has no use for --embedder"),
+        (["there.mcap", "--methods", "all", "--embedder", "umf"], "a recording has no use for --embedder"),
         (["nowhere.mcap", "--trained", "runs"], "--trained names weights of other methods"),
         (["nowhere.mcap"], "no recording"),
         (["nowhere.yaml"], "cannot read nowhere.yaml"),
         (["nowhere.yaml", "--odometry", "a.tum"], "a list of sequences has no use for --odometry"),
         (["nowhere.yaml", "--methods", "all", "--seed", "0"], "a list of sequences has no use for --seed"),
         (["--worlds", "test", "--rule", "robotcar", "--config", "a"], "simulated worlds have no use for --rule, --con"),
-        (["nowhere.mcap", "--quick"], "a recording has no use for --quick"),
+        (["there.mcap", "--quick"], "a recording has no use for --quick"),
         (["nowhere.yaml", "--rule", "kitti"], "expected s3li or robotcar, not 'kitti'"),
     ],
 )
-def test_wrong_arguments_are_one_clear_line(arguments: list[str], message: str) -> None:
+def test_wrong_arguments_are_one_clear_line(
+    arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("there.mcap").touch()
     with pytest.raises(UmfError, match=message) as raised:
         run("evaluate", *arguments)
     assert "\n" not in str(raised.value)

@@ -20,6 +20,7 @@ from umf_ros.commands.recordings import (
 from umf_ros.embedding import CHOICES
 from umf_ros.errors import ConfigError
 from umf_ros.lab.commands.evaluation_inputs import RecordingOptions, choose_worlds, note_on_worlds, progress_bar
+from umf_ros.yaml_files import is_yaml
 
 if TYPE_CHECKING:
     from umf_ros.lab.evaluation.results import Figures
@@ -64,11 +65,10 @@ def command(
     test worlds are never trained or tuned on.
     """
     _check(data, worlds, methods, trained)
-    if data is not None:
+    if data is not None and not is_yaml(data):
         check_files(data, config, odometry, ground_truth)
 
     from umf_ros.lab.commands.evaluate_all import EveryMethod
-    from umf_ros.lab.datasets.listed import is_list
     from umf_ros.lab.evaluation.places import lists_place_sets
 
     of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick, "--count": count != 4}
@@ -80,11 +80,11 @@ def command(
         _refuse("simulated worlds", of_lists | of_recordings)
         chosen = str(worlds), seed, count
         figures = every.worlds(*chosen) if every else _on_worlds(*chosen, quick, weights, out)
-    elif is_list(data) and lists_place_sets(data):
+    elif is_yaml(data) and lists_place_sets(data):
         others = {name: value for name, value in of_recordings.items() if name != "--embedder" or every}
         _refuse("a list of place sets", of_worlds | of_lists | others)
         figures = every.places(data) if every else _on_places(data, embedder, weights, out)
-    elif is_list(data):
+    elif is_yaml(data):
         _refuse("a list of sequences", of_worlds | of_recordings)
         figures = every.sequences(data, rule) if every else _on_sequences(data, rule, weights, out)
     else:

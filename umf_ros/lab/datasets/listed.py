@@ -15,7 +15,7 @@ from umf_ros.lab.datasets.robotcar import read_evaluation, read_training
 from umf_ros.lab.datasets.s3li import ETNA_TEST, ETNA_TRAINING, read_bag, read_toolkit
 from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.datasets.simulated import WorldFolder
-from umf_ros.yaml_files import read_yaml
+from umf_ros.yaml_files import is_yaml, read_yaml
 
 
 class ListEntry(Group):
@@ -142,11 +142,6 @@ class SequenceList:
         return self.worlds
 
 
-def is_list(path: Path) -> bool:
-    """Whether a path names a list of sequences, and not data."""
-    return path.suffix in (".yaml", ".yml")
-
-
 def open_source(path: Path) -> Source:
     """A folder of simulated worlds, or a YAML file that lists sequences.
 
@@ -154,7 +149,7 @@ def open_source(path: Path) -> Source:
         ConfigError: the file is no such list.
         UmfError: there is no folder, or a sequence is missing or damaged.
     """
-    return SequenceList(path) if is_list(path) else WorldFolder(path)
+    return SequenceList(path) if is_yaml(path) else WorldFolder(path)
 
 
 def _entries(path: Path) -> list[ListEntry]:
