@@ -52,13 +52,13 @@ def check_files(bag: Path, *others: Path | None) -> None:
             raise ConfigError(f"cannot read {path}: No such file or directory")
 
 
-def check_map(folder: Path) -> None:
-    """Likewise of a map's folder.
+def check_map(folder: Path | None) -> None:
+    """Likewise of a map's folder, if one is asked for.
 
     Raises:
         UmfError: it holds no map.
     """
-    if not (folder / "map.json").is_file():
+    if folder is not None and not (folder / "map.json").is_file():
         raise UmfError(f"{folder} holds no map: map.json is missing (umf map makes one)")
 
 

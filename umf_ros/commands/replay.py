@@ -72,8 +72,7 @@ def command(
     the inputs could give nothing.
     """
     check_files(bag, config, odometry, ground_truth)
-    if map_folder is not None:
-        check_map(map_folder)
+    check_map(map_folder)
     odometry_frame = check_odometry_options(odometry, odometry_frame)
 
     from rich.console import Console
