@@ -75,8 +75,9 @@ def as_measured(frame: Frame) -> tuple[Points, float]:
     moments = frame.motion.moments_s
     turns = Rotation.from_rotvec(-moments[:, None] * frame.motion.rates[3:])
     measured = turns.apply(frame.points - moments[:, None] * frame.motion.rates[:3])
-    levers: Array = np.square(frame.points[_one_per_cell(frame.points)].astype(float)).sum(axis=1)
-    return measured.astype(np.float32), float(np.average(moments[_one_per_cell(frame.points)], weights=levers + 1e-9))
+    thinned = _one_per_cell(frame.points)
+    levers: Array = np.square(frame.points[thinned].astype(float)).sum(axis=1)
+    return measured.astype(np.float32), float(np.average(moments[thinned], weights=levers + 1e-9))
 
 
 def _one_per_cell(points: Points) -> NDArray[np.intp]:
