@@ -81,7 +81,7 @@ class PoseGraphNode(BaseNode):
             self._worker.submit(lambda: self._settle_left())
         topics, transforms = topics_of(settings), StaticTransforms()
         self._odometry_frames = OdometryFrames(settings.frames, transforms, self.get_logger().warning)
-        hear_static_transforms(self, transforms)
+        hear_static_transforms(self, transforms, self._guarded)
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
             self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
