@@ -4,7 +4,7 @@
 #   source install/setup.bash && src/umf_ros/tools/try_ros2.sh [--write docs/ros.md]
 #
 # Needs a sourced Jazzy with umf_ros built by colcon; no sensors. --write puts the table between the markers of a file.
-set -um  # with job control: what runs in the background would ignore Ctrl-C
+set -u
 export ROS_DOMAIN_ID=${ROS_DOMAIN_ID:-77} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 folder=$(mktemp -d)
 table=$folder/table.md

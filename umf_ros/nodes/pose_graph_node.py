@@ -121,7 +121,7 @@ class PoseGraphNode(BaseNode):
             self._durable.graph.retune(settings.pose_graph)
 
     def _on_front_end(self, event: TransitionEvent) -> None:
-        self._front_end_busy = event.goal_state.label in ("deactivating", "inactive", "shuttingdown")
+        self._front_end_busy = event.goal_state.label == "shuttingdown"
 
     def _make_publishers(self) -> None:
         self._path_publisher = self.create_publisher(PathMessage, "~/path", LATCHED_QOS)

@@ -33,16 +33,16 @@ def start(*arguments: str) -> subprocess.Popen[str]:
 
 
 class Listener(Node):
-    """Takes images, scans and the clock."""
+    """Takes images and scans of its namespace, and the clock."""
 
-    def __init__(self) -> None:
-        super().__init__("listener")
+    def __init__(self, namespace: str = "") -> None:
+        super().__init__("listener", namespace=namespace)
         self.images: list[Image] = []
         self.clouds: list[PointCloud2] = []
         self.clock: list[int] = []
         # reliable: what is tested is what the player sends, not what a busy machine loses
-        self.create_subscription(Image, LEFT, self.images.append, 200)
-        self.create_subscription(PointCloud2, CLOUD, self.clouds.append, 200)
+        self.create_subscription(Image, LEFT.removeprefix("/"), self.images.append, 200)
+        self.create_subscription(PointCloud2, CLOUD.removeprefix("/"), self.clouds.append, 200)
         self.create_subscription(Clock, "/clock", self._on_clock, 10)
 
     def _on_clock(self, message: Clock) -> None:
@@ -62,11 +62,12 @@ def spin(node: Node, player: subprocess.Popen[str], patience_s: float = 60.0) ->
     node.destroy_node()
 
 
-def test_plays_every_message_unchanged_with_clock(ros_context: None, tmp_path: Path) -> None:
+def test_plays_every_message_unchanged_with_clock_in_its_namespace(ros_context: None, tmp_path: Path) -> None:
     entries = traverse(2.0)
     bag = write_mcap(tmp_path / "a.mcap", entries)
-    player = start(str(bag), "--rate", "2", "--wait-for-subscribers", "--quiet")
-    heard = Listener()
+    options = "--rate 2 --wait-for-subscribers --quiet --ros-args -r __ns:=/red"
+    player = start(str(bag), *options.split())
+    heard = Listener("/red")
     spin(heard, player)
     assert player.returncode == 0, player.stderr.read() if player.stderr else ""
     sent_images = [message for topic, _, message in entries if topic == LEFT]
