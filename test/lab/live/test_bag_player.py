@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -21,15 +22,17 @@ from sensor_msgs.msg import Image, PointCloud2
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import open_bag
+from umf_ros.lab.live.bag_player_node import TRANSPORT
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.intake import Intake, wanted_inputs
 from umf_ros.sensors.messages import decode_cloud, decode_image, stamp_ns
 from umf_ros.sensors.synchronizer import Synchronizer
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
+def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "umf_ros.lab.live.bag_player_node", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    environment = {**os.environ, **environment}
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 
 class Listener(Node):
@@ -104,6 +107,29 @@ def test_ctrl_c_ends_a_loop_cleanly_after_more_than_one_turn(ros_context: None, 
     assert "Traceback" not in player.stderr.read()
     assert node.clock != sorted(node.clock)  # it jumped back
     node.destroy_node()
+
+
+def segments(player: subprocess.Popen[str]) -> list[int]:
+    """Sizes of the pieces of memory through which a process of Fast DDS sends."""
+    mapped = Path(f"/proc/{player.pid}/maps").read_text().splitlines()
+    names = {line.split()[-1] for line in mapped if "/dev/shm/fastrtps_" in line and "_el" not in line}
+    return [Path(name).stat().st_size for name in names if Path(name).exists()]
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_dozens_of_images_find_room_unless_the_user_says_otherwise(
+    own: bool, ros_context: None, tmp_path: Path
+) -> None:
+    bag = write_mcap(tmp_path / "a.mcap", traverse(0.5))
+    profile = tmp_path / "own.xml"
+    profile.write_text('<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"></dds>')
+    player = start(str(bag), "--loop", "--quiet", **({TRANSPORT: str(profile)} if own else {}))
+    deadline = time.monotonic() + 30
+    while not (found := segments(player)) and player.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    player.send_signal(signal.SIGINT)
+    assert player.wait(20) == 0
+    assert found and (max(found) > 32 * 2**20) is not own
 
 
 @pytest.mark.parametrize(

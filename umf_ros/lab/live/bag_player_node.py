@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import signal
 import sys
 import time
@@ -24,8 +25,11 @@ from rosgraph_msgs.msg import Clock
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.errors import BagError, UmfError
 from umf_ros.nodes.process import complain, init
+from umf_ros.resources import find
 
 CLOCK_PERIOD_NS = 10_000_000
+TRANSPORT, TRANSPORT_FILE = "FASTRTPS_DEFAULT_PROFILES_FILE", "config/dds/large_messages.xml"
+"""Where Fast DDS reads how a process sends, and what it takes to send images at full rate."""
 SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
 SUBSCRIBER_TIMEOUT_S = 180.0
 SETTLING_S = 2.0
@@ -189,6 +193,7 @@ def main() -> None:
         signal.signal(number, _interrupt)
     status = 0
     try:
+        os.environ.setdefault(TRANSPORT, str(find(TRANSPORT_FILE)))
         init()
         _play(options)
     except KeyboardInterrupt:
