@@ -55,13 +55,15 @@ def start_nodes(context, *_):
         raise RuntimeError(f"bag: there is no {value['bag']}")
 
     def node(executable, **options):
+        # its own logger alone: at "debug" those of rcl say hundreds of lines
+        logger = full_name(value["namespace"], executable).strip("/").replace("/", ".")
         return Node(
             package="umf_ros",
             executable=executable,
             name=executable,
             namespace=value["namespace"],
             output="screen",
-            ros_arguments=["--log-level", value["log_level"]],
+            ros_arguments=["--log-level", f"{logger}:={value['log_level']}"],
             sigterm_timeout=LONGEST_S,
             sigkill_timeout=LONGEST_S,
             **options,
