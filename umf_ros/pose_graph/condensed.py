@@ -18,7 +18,7 @@ from umf_ros.errors import GraphError
 from umf_ros.geometry import Array, adjoint, invert, propagate
 from umf_ros.pose_graph.odometry import PathPoints
 
-_ANCHOR = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+ANCHOR = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
 _MAX_STEPS = 30
 # a step this small leaves an error of about the product of both, which the next solution removes
 SMALL_TURN_RAD = 0.02
@@ -84,7 +84,7 @@ def between(edge: Edge) -> gtsam.BetweenFactorPose3:
 
 def prior(vertex: int, pose: Array) -> gtsam.PriorFactorPose3:
     """The GTSAM factor that holds a vertex where it is."""
-    return gtsam.PriorFactorPose3(vertex, gtsam.Pose3(pose), _ANCHOR)
+    return gtsam.PriorFactorPose3(vertex, gtsam.Pose3(pose), ANCHOR)
 
 
 def extracted(values: gtsam.Values) -> Array:
