@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
-from itertools import pairwise
+from collections.abc import Hashable
 
 import gtsam
 import numpy as np
@@ -11,13 +10,13 @@ from numpy.typing import NDArray
 
 from umf_ros.geometry import Array
 from umf_ros.pose_graph.condensed import (
-    ANCHOR,
     SMALL_STEP_M,
     SMALL_TURN_RAD,
     Edge,
     Graph,
     Optimizer,
     between,
+    dissection,
     extracted,
     prior,
 )
@@ -32,7 +31,7 @@ _MOVED = 1e-6
 # factorised anew in a better order once it has so many times the entries per vertex that it began with; what is this
 # small is quick in any order (both *by hand*, on 20,000 poses with 1,900 closures: 40 ms instead of 160 per event)
 _TANGLED = 1.1
-_SMALL_ENTRIES, _FEW_VERTICES = 300_000, 300
+_SMALL_ENTRIES = 300_000
 
 
 class IncrementalOptimizer:
@@ -154,9 +153,9 @@ class _Tree:
     def _build(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, graph: Graph) -> None:
         """Factorise all at once, the last vertex last, so that its covariance is at hand."""
         parameters = gtsam.ISAM2UpdateParams()
-        if len(self._rows) > _FEW_VERTICES:
-            anchors = [_key(self._asked[vertex]) for vertex in graph.anchors]
-            parameters.constrainedKeys = _dissected(factors, anchors, _key(self._asked[-1]))
+        ordering = dissection(factors, [_key(self._asked[vertex]) for vertex in graph.anchors], len(self._rows))
+        if ordering is not None:
+            parameters.constrainedKeys = _with_last(ordering, _key(self._asked[-1]))
         self._solver.update(factors, values, parameters)
         self._density = self._solver.treeNnz() / len(self._rows)
 
@@ -212,16 +211,12 @@ def _solver() -> gtsam.ISAM2:
     return gtsam.ISAM2(parameters)
 
 
-def _dissected(factors: gtsam.NonlinearFactorGraph, anchors: Sequence[int], last: int) -> gtsam.KeyGroupMap:
-    """The place of every vertex in a nested dissection, one of them at the end.
+def _with_last(ordering: gtsam.Ordering, last: int) -> gtsam.KeyGroupMap:
+    """The place of every vertex in an order of elimination, one of them moved to the end.
 
     Every place is taken: GTSAM 4.3.0 writes outside of its memory where a number is left out.
     """
-    joined = factors.clone()
-    for one, other in pairwise(anchors):  # of parts: METIS may look for ever for what parts a graph that is in parts
-        joined.add(gtsam.BetweenFactorPose3(one, other, gtsam.Pose3(), ANCHOR))
-    ordering, places = gtsam.Ordering.MetisNonlinearFactorGraph(joined), gtsam.KeyGroupMap()
-    keys = [ordering.at(place) for place in range(ordering.size())]
+    places, keys = gtsam.KeyGroupMap(), [ordering.at(place) for place in range(ordering.size())]
     for place, key in enumerate([*(key for key in keys if key != last), last]):
         places.insert2(key, place)
     return places
