@@ -26,9 +26,12 @@ test: install
 test-jazzy: .venv-jazzy/.installed
 	@OMP_NUM_THREADS=1 .venv-jazzy/bin/python $(PYTEST)
 
-.venv-jazzy/.installed: requirements-jazzy.txt requirements-ros.txt requirements-dev.txt setup.py
+# all that tests import but the Rerun viewer, which asks for NumPy 2
+.venv-jazzy/.installed: $(wildcard requirements*.txt) package.xml setup.py setup.cfg pyproject.toml
+	@test -n "$(PYTHON)" || { echo "make: Python 3.11 or 3.12 is needed (set PYTHON=...)" >&2; exit 1; }
+	@./tools/system_packages.sh
 	@test -x .venv-jazzy/bin/python || $(PYTHON) -m venv .venv-jazzy
-	@grep -hv '^-r' requirements-dev.txt requirements-lab.txt > .venv-jazzy/tools.txt
+	@grep -hv '^-r' requirements-dev.txt requirements-lab.txt requirements-fleet.txt > .venv-jazzy/tools.txt
 	@./tools/install_torch.sh .venv-jazzy/bin/python $(TORCH_INDEX)
 	@.venv-jazzy/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-jazzy.txt \
 		-r requirements-ros.txt -r .venv-jazzy/tools.txt

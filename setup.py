@@ -54,9 +54,9 @@ setup(
     entry_points={
         "console_scripts": [
             "umf = umf_ros.cli:main",
-            "loop_closure_node = umf_ros.nodes.loop_closure_node:main",
-            "pose_graph_node = umf_ros.nodes.pose_graph_node:main",
-            "bag_player_node = umf_ros.lab.live.bag_player_node:main",
+            "loop_closure_node = umf_ros.nodes.start:loop_closure_node",
+            "pose_graph_node = umf_ros.nodes.start:pose_graph_node",
+            "bag_player_node = umf_ros.lab.live.start:bag_player_node",
         ],
     },
 )

@@ -16,6 +16,11 @@ def keyframe_stamp(frame: str) -> int:
     return int(frame.removeprefix("keyframe/"))
 
 
+def is_own(message: Any) -> bool:
+    """Whether a closure lies between keyframes of this robot: between rovers of a fleet the frames name theirs."""
+    return all(frame.count("/") == 1 for frame in (message.header.frame_id, message.child_frame_id))
+
+
 def to_pose_graph(message: Any, robot: int, types: Any) -> Any:
     """The graph of one edge that a message of loop_closures says; `types` has the message classes by name."""
     edge = types.PoseGraphEdge(
@@ -46,7 +51,8 @@ def main() -> None:
     publisher = node.create_publisher(msg.PoseGraph, "pose_graph_incremental", 100)
 
     def forward(message: Odometry) -> None:
-        publisher.publish(to_pose_graph(message, robot, msg))
+        if is_own(message):
+            publisher.publish(to_pose_graph(message, robot, msg))
 
     node.create_subscription(Odometry, "loop_closures", forward, latched)
     with suppress(KeyboardInterrupt, ExternalShutdownException):

@@ -2,6 +2,9 @@
 
 python examples/rtabmap_bridge.py      (with ROS 2 Jazzy and rtabmap_msgs; no package of umf_ros needed)
 
+Names are those of `ros2 launch rtabmap_launch rtabmap.launch.py`; where RTAB-Map runs without that namespace, add
+`--ros-args -r rtabmap/info:=info -r rtabmap/rtabmap/add_link:=rtabmap/add_link`.
+
 RTAB-Map numbers its nodes, and says the stamp of each on `info`; its nodes are not taken at our keyframes' stamps. So
 a closure is carried by odometry from both keyframes to the nodes nearest in time.
 """
@@ -41,6 +44,11 @@ def quaternion(rotation: Array) -> Array:
     symmetric = np.array([*rows, [c + g, f + h, i - a - e, d - b], [h - f, c - g, d - b, a + e + i]])
     found: Array = np.linalg.eigh(symmetric)[1][:, -1]
     return found if found[3] >= 0 else -found
+
+
+def is_own(message: Any) -> bool:
+    """Whether a closure lies between keyframes of this robot: between rovers of a fleet the frames name theirs."""
+    return all(frame.count("/") == 1 for frame in (message.header.frame_id, message.child_frame_id))
 
 
 class Links:
@@ -109,7 +117,7 @@ def main() -> None:
     types = SimpleNamespace(Link=Link, Transform=Transform, Vector3=Vector3, Quaternion=Quaternion)
     links = Links()
     waiting: list[Any] = []
-    service = node.create_client(AddLink, "rtabmap/add_link")
+    service = node.create_client(AddLink, "rtabmap/rtabmap/add_link")
 
     def stamp_ns(message: Any) -> int:
         return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
@@ -120,7 +128,14 @@ def main() -> None:
     def add_node(message: Any) -> None:
         links.add_node(stamp_ns(message), int(message.ref_id))
 
+    def add_closure(message: Any) -> None:
+        if is_own(message):
+            waiting.append(message)
+
     def retry() -> None:
+        if waiting and not service.service_is_ready():
+            node.get_logger().warning(f"{len(waiting)} closures wait for {service.srv_name}", throttle_duration_sec=30)
+            return
         for message in list(waiting):
             link = links.link(message, types)
             if link is not None:
@@ -128,7 +143,7 @@ def main() -> None:
                 service.call_async(AddLink.Request(link=link))
 
     latched = QoSProfile(depth=5000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(Odometry, "loop_closures", waiting.append, latched)
+    node.create_subscription(Odometry, "loop_closures", add_closure, latched)
     node.create_subscription(Odometry, "odom", add_odometry, 200)
     node.create_subscription(Info, "rtabmap/info", add_node, 100)
     node.create_timer(1.0, retry)

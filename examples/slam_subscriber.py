@@ -27,6 +27,8 @@ class SlamSubscriber(Node):
 
     def add_closure(self, message: Odometry) -> None:
         """x_query = x_match * match_T_query; frames are called keyframe/<stamp in ns>."""
+        if message.child_frame_id.count("/") > 1:
+            return  # keyframe/<rover>/<stamp in ns>: of another rover's graph
         match, query = (int(frame.split("/")[1]) for frame in (message.header.frame_id, message.child_frame_id))
         p, q = message.pose.pose.position, message.pose.pose.orientation
         match_T_query = gtsam.Pose3(gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), np.array([p.x, p.y, p.z]))

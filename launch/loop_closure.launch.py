@@ -5,6 +5,7 @@ ros2 launch umf_ros loop_closure.launch.py params_file:=/path/to/params.yaml bag
 
 from pathlib import Path
 
+from ament_index_python.packages import PackageNotFoundError
 from launch.actions import DeclareLaunchArgument, EmitEvent, OpaqueFunction, RegisterEventHandler
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
@@ -13,6 +14,8 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
+from umf_ros.errors import ConfigError
+from umf_ros.nodes.launching import check_parameter_file, full_name, is_true
 
 ARGUMENTS = [
     ("params_file", "", "parameter file; empty: the shipped config/loop_closure.yaml"),
@@ -25,62 +28,86 @@ ARGUMENTS = [
     ("results_dir", "", "folder for closures, trajectories and the pose graph; empty: none"),
     ("autostart", "true", "false: the nodes wait for the services of their life cycle"),
 ]
+CHOICES = {"log_level": ["debug", "info", "warn", "error", "fatal"]}
 LONGEST_S = "60"
 """So long the nodes may take to write their results before launch insists."""
 
 
+NODES = ("loop_closure_node", "pose_graph_node")
+
+
 def start_nodes(context, *_):
-    """Turn the arguments into nodes.
+    """Turn the arguments into nodes; what is wrong with them is found before anything is started.
 
     Raises:
-        RuntimeError: a file is missing: nothing is started on other settings than those that were asked for.
+        RuntimeError: an argument is wrong, a file or a package is missing, or a file is for other nodes.
     """
     value = {name: LaunchConfiguration(name).perform(context) for name, *_ in ARGUMENTS}
     share = FindPackageShare("umf_ros").perform(context)
     config = value["params_file"] or value["config"] or f"{share}/config/loop_closure.yaml"
-    for name, path in (("params_file", config), ("bag", value["bag"])):
-        if path and not Path(path).exists():
-            raise RuntimeError(f"{name}: there is no {path}")
-    own = {
-        "use_sim_time": _is_true(value["use_sim_time"] or str(bool(value["bag"]))),
-        "results_dir": value["results_dir"],
-        "autostart": _is_true(value["autostart"]),
-    }
+    try:
+        own = _own_parameters(value)
+        rviz = is_true("rviz", value["rviz"])
+        check_parameter_file(Path(config), [full_name(value["namespace"], name) for name in NODES])
+    except ConfigError as error:
+        raise RuntimeError(str(error)) from None
+    if value["bag"] and not Path(value["bag"]).exists():
+        raise RuntimeError(f"bag: there is no {value['bag']}")
 
     def node(executable, **options):
+        # its own logger alone: at "debug" those of rcl say hundreds of lines
+        logger = full_name(value["namespace"], executable).strip("/").replace("/", ".")
         return Node(
             package="umf_ros",
             executable=executable,
             name=executable,
             namespace=value["namespace"],
             output="screen",
-            ros_arguments=["--log-level", value["log_level"]],
+            ros_arguments=["--log-level", f"{logger}:={value['log_level']}"],
             sigterm_timeout=LONGEST_S,
             sigkill_timeout=LONGEST_S,
             **options,
         )
 
-    nodes = [node(name, parameters=[config, own]) for name in ("loop_closure_node", "pose_graph_node")]
+    viewer = [_viewer(context, share, value["namespace"])] if rviz else []
+    nodes = [node(name, parameters=[config, own]) for name in NODES]
     # one alone finds or judges nothing: when one cannot start, the other is not left behind
     ends = [
         RegisterEventHandler(OnProcessExit(target_action=one, on_exit=[EmitEvent(event=Shutdown())])) for one in nodes
     ]
     if value["bag"]:
-        nodes.append(node("bag_player_node", arguments=[value["bag"], "--wait-for-subscribers"]))
-    if _is_true(value["rviz"]):
-        rviz = ["-d", f"{share}/config/loop_closure.rviz"]
-        options = {"namespace": value["namespace"], "arguments": rviz}
-        nodes.append(Node(package="rviz2", executable="rviz2", name="rviz2", **options))
-    return [*nodes, *ends]
+        player = node("bag_player_node", arguments=[value["bag"], "--wait-for-subscribers"])
+        ends.append(RegisterEventHandler(OnProcessExit(target_action=player, on_exit=_end_if_it_failed)))
+        nodes.append(player)
+    return [*viewer, *ends, *nodes]
 
 
-def _is_true(text):
-    return text.strip().lower() in ("true", "1", "yes", "on")
+def _own_parameters(value):
+    return {
+        "use_sim_time": is_true("use_sim_time", value["use_sim_time"] or str(bool(value["bag"]))),
+        "results_dir": value["results_dir"],
+        "autostart": is_true("autostart", value["autostart"]),
+    }
+
+
+def _viewer(context, share, namespace):
+    try:
+        FindPackageShare("rviz2").perform(context)
+    except PackageNotFoundError:
+        raise RuntimeError("rviz: rviz2 is not installed (sudo apt install ros-jazzy-rviz2)") from None
+    arguments = ["-d", f"{share}/config/loop_closure.rviz"]
+    return Node(package="rviz2", executable="rviz2", name="rviz2", namespace=namespace, arguments=arguments)
+
+
+def _end_if_it_failed(event, _):
+    """At the end of a recording the nodes go on; without one they would wait for ever."""
+    return [EmitEvent(event=Shutdown(reason="the recording cannot be played"))] if event.returncode else []
 
 
 def generate_launch_description():
     """Entry point of `ros2 launch`."""
     declared = [
-        DeclareLaunchArgument(name, default_value=default, description=text) for name, default, text in ARGUMENTS
+        DeclareLaunchArgument(name, default_value=default, description=text, choices=CHOICES.get(name))
+        for name, default, text in ARGUMENTS
     ]
     return LaunchDescription([*declared, OpaqueFunction(function=start_nodes)])

@@ -140,6 +140,14 @@ def test_what_is_imported_is_required(wing: str, lists: list[str]) -> None:
         )
 
 
+def test_an_installed_jazzy_gets_everything_that_a_rover_needs() -> None:
+    """`tools/install_jazzy.sh` installs that list alone, pinned, with the NumPy of Ubuntu 24.04."""
+    assert required("requirements-jazzy.txt") == required("requirements.txt")
+    lines = [line for line in (ROOT / "requirements-jazzy.txt").read_text().splitlines() if line[:1] != "#"]
+    assert all("==" in line for line in lines)
+    assert "numpy==1.26.4" in lines
+
+
 @pytest.mark.parametrize(
     ("module", "advice"),
     [

@@ -18,7 +18,7 @@ command -v colcon >/dev/null || fail "colcon is missing: sudo apt install python
 
 missing=()
 for package in python3-venv ros-jazzy-common-interfaces ros-jazzy-lifecycle-msgs ros-jazzy-tf2-ros-py ros-jazzy-launch-ros; do
-  dpkg -s "$package" >/dev/null 2>&1 || missing+=("$package")
+  [ "$(dpkg-query -W -f='${db:Status-Status}' "$package" 2>/dev/null)" = installed ] || missing+=("$package")
 done
 if [ ${#missing[@]} -gt 0 ]; then
   sudo=(); [ "$(id -u)" -eq 0 ] || sudo=(sudo)
@@ -31,7 +31,7 @@ venv=$workspace/venv
 [ -x "$venv/bin/python" ] || python3 -m venv --system-site-packages "$venv"
 touch "$venv/COLCON_IGNORE"
 requirements=$repository/requirements-jazzy.txt
-glibc=$(ldd --version | head -1 | grep -oE '[0-9]+\.[0-9]+$')
+glibc=$(getconf GNU_LIBC_VERSION | cut -d' ' -f2)
 if [ "$(printf '%s\n' 2.35 "$glibc" | sort -V | head -1)" != 2.35 ]; then
   echo "glibc $glibc is older than 2.35: without openvino, torch runs the network"
   requirements=$(mktemp)

@@ -16,5 +16,5 @@ fi
 # what torch itself needs is not all there: the usual index has that
 if ! "$python" -m pip install --quiet --disable-pip-version-check --retries 1 --timeout 15 --no-deps \
   --index-url "$index" "$pinned" 2>/dev/null; then
-  echo "No CPU build of $pinned from $index (set TORCH_INDEX): the usual index decides" >&2
+  echo "No CPU build of $pinned from $index (set TORCH_INDEX): the usual index decides, whose build may be one of 5 GB" >&2
 fi

@@ -32,7 +32,7 @@ def is_past(age_ns: NDArray[np.int64], way_m: Array, rules: Loop, same_session: 
 
 
 class KeyframeSelector:
-    """Chooses frames by distance, angle and time, and counts the metres driven.
+    """Chooses frames by distance, angle and time, and counts the metres driven, of each session by itself.
 
     With odometry a frame is kept after enough motion; one that is merely late (`max_period_s`) is
     kept only if the rover moved at all, so that a parked rover does not fill the database. Without
@@ -54,7 +54,9 @@ class KeyframeSelector:
         return self._travelled_m if frame.odom_T_body is not None else math.nan
 
     def select(self, frame: Frame) -> bool:
-        """Whether `frame` becomes a keyframe; call once per frame, in order of stamps."""
+        """Whether `frame` becomes a keyframe; call once per frame, in order of stamps within a session."""
+        if self._last is not None and frame.session != self._last.session:
+            self.reset()
         self._count_metres(frame)
         if self._last is not None and not self._is_due(self._last, frame):
             return False

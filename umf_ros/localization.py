@@ -12,6 +12,7 @@ import numpy as np
 from umf_ros.config import Settings
 from umf_ros.frames import Frame
 from umf_ros.geometry import to_quaternion
+from umf_ros.lookahead import one_ahead
 from umf_ros.loop_detector import Detection, LoopDetector
 from umf_ros.maps.localizer import Localization, Localizer
 from umf_ros.maps.outputs import read_poses
@@ -65,6 +66,7 @@ class LocalizingReplay:
         self._detector = detector
         self._localizer = Localizer(read_poses(Path(settings.map)), settings.pose_graph)
         self._feed = OdometryFeed(self._localizer)
+        self._policy = settings.keyframe
         self._recorder = RunRecorder(folder, settings, detector.embedder_name)
         self._table = CsvTable(folder / TABLE, COLUMNS)
         self._found: list[Localization] = []
@@ -76,7 +78,7 @@ class LocalizingReplay:
         Raises:
             OutputError: the disk is full.
         """
-        for item in stream:
+        for item in one_ahead(stream, self._policy, self._detector.foresee):
             if isinstance(item, OdometrySample):
                 self._feed.take(item.stamp_ns, item.odom_T_body)
                 continue
@@ -103,7 +105,7 @@ class LocalizingReplay:
         self._recorder.write_summary(drops)
         self._recorder.close()
         self._table.close()
-        self._detector.database.close()
+        self._detector.close()
         known: dict[str, Any] = {"localization": asdict(self.counts)}
         write_summary(self._folder, read_summary(self._folder) | known)
         if self._found:

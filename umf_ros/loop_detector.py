@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,6 +68,7 @@ class LoopDetector:
     Attributes:
         database: the rover's places.
         encounters: with other rovers of a fleet; None of a rover on its own.
+        embed_ms: milliseconds that the last embedding took, whether or not it was foreseen.
 
     Raises:
         UmfError: the place database of the settings belongs to another embedder.
@@ -84,6 +87,9 @@ class LoopDetector:
         self._stored_session = self.database.next_session
         self._ahead_m = 0.0
         self._depth_told = False
+        self.embed_ms = 0.0
+        self._network = ThreadPoolExecutor(1, "embedding")
+        self._foreseen: deque[tuple[Frame, Future[tuple[Keyframe, float]]]] = deque()
 
     def retune(self, settings: Settings) -> None:
         """Search and verify by other settings from the next frame on."""
@@ -101,8 +107,8 @@ class LoopDetector:
         if not self.select(frame):
             return Detection(frame.stamp_ns)
         latency = Stopwatch()
-        with latency.measure("embed"):
-            keyframe = self.embed(frame)
+        keyframe = self.embed(frame)
+        latency.add("embed", self.embed_ms)
         known = self.database.recognise(keyframe) if self._map is None else None
         if known is not None:
             keyframe = self._go_on_from(frame, known)
@@ -126,10 +132,24 @@ class LoopDetector:
             self._start_session(frame)
         return self._selector.select(frame)
 
+    def foresee(self, frame: Frame) -> None:
+        """Begin to embed a frame that is to come, in a thread of its own; frames that come are embedded in order."""
+        self._foreseen.append((frame, self._network.submit(self._perceive, frame)))
+
     def embed(self, frame: Frame) -> Keyframe:
-        """The keyframe that the frame selected last becomes."""
+        """The keyframe that the frame selected last becomes, foreseen or not."""
+        while self._foreseen and self._foreseen[0][0] is not frame:
+            self._foreseen.popleft()
+        if not self._foreseen:
+            self.foresee(frame)
+        keyframe, self.embed_ms = self._foreseen.popleft()[1].result()
         travelled_m = self._selector.travelled_m(frame) + self._ahead_m
-        return make_keyframe(frame, self._embedder, travelled_m, self._stored_session)
+        return replace(keyframe, travelled_m=travelled_m, session=self._stored_session)
+
+    def _perceive(self, frame: Frame) -> tuple[Keyframe, float]:
+        start = time.perf_counter()
+        keyframe = make_keyframe(frame, self._embedder)
+        return keyframe, 1e3 * (time.perf_counter() - start)
 
     def query(self, keyframe: Keyframe) -> list[Candidate]:
         """Remembered places that look like a keyframe, best first."""
@@ -182,6 +202,7 @@ class LoopDetector:
 
     def close(self) -> None:
         """Leave the fleet's server, and release the database."""
+        self._network.shutdown(cancel_futures=True)
         if self.encounters is not None:
             self.encounters.close()
         self.database.close()
@@ -286,6 +307,9 @@ class Stopwatch:
         """Time the block."""
         start = time.perf_counter()
         yield
-        elapsed = 1e3 * (time.perf_counter() - start)
-        self.milliseconds[name] = elapsed
-        self.milliseconds["total"] += elapsed
+        self.add(name, 1e3 * (time.perf_counter() - start))
+
+    def add(self, name: str, elapsed_ms: float) -> None:
+        """What was timed elsewhere."""
+        self.milliseconds[name] = elapsed_ms
+        self.milliseconds["total"] += elapsed_ms

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from umf_ros.config import Settings
 from umf_ros.frames import Frame, LoopClosure
+from umf_ros.lookahead import one_ahead
 from umf_ros.loop_detector import Detection, LoopDetector
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.runs.recorder import RunRecorder
@@ -38,6 +39,7 @@ class Replay:
         self._graph = PoseGraph(settings.pose_graph)
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometryFeed(self._graph)
+        self._policy = settings.keyframe
         self._has_odometry = False
         self._done = len(self._recorder.recorded) if resume else 0
         self._earlier: dict[int, list[LoopClosure]] = defaultdict(list)
@@ -50,7 +52,7 @@ class Replay:
         Raises:
             OutputError: the disk is full.
         """
-        for item in stream:
+        for item in one_ahead(stream, self._policy, self._foresee):
             if isinstance(item, OdometrySample):
                 self._has_odometry = True
                 self._feed.take(item.stamp_ns, item.odom_T_body)
@@ -69,6 +71,10 @@ class Replay:
             yield detection
             if detection.fault is not None:
                 raise detection.fault
+
+    def _foresee(self, frame: Frame) -> None:
+        if self._done <= WARM_UP:
+            self._detector.foresee(frame)
 
     def graph_counts(self) -> dict[str, int]:
         """How many closures the graph has in which state so far; none without odometry."""

@@ -83,3 +83,11 @@ def test_a_link_for_rtabmap_is_carried_to_its_nodes(store: Any) -> None:
     np.testing.assert_allclose(found, truth[:3, :3], atol=1e-9)
     np.testing.assert_allclose(np.linalg.eigvalsh(link.information.reshape(6, 6))[[0, -1]], [1 / 9, 10], atol=1e-9)
     assert store.serialize_cdr(link, "rtabmap_msgs/msg/Link")
+
+
+@pytest.mark.parametrize("bridge", ["kimera_bridge", "rtabmap_bridge"])
+def test_closures_between_rovers_are_left_to_those_who_know_both(bridge: str) -> None:
+    message = closure(START_NS, START_NS + 60 * 10**9, pose_at(1.5))
+    assert example(bridge).is_own(message)
+    message.header.frame_id = f"keyframe/red/{START_NS}"
+    assert not example(bridge).is_own(message)

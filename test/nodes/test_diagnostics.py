@@ -168,8 +168,9 @@ def test_another_type_on_the_topic_is_named(node: Node, clock: Clock) -> None:
 
 
 def test_a_sensor_under_another_name_is_named(node: Node, clock: Clock) -> None:
-    node.create_publisher(Image, "/elsewhere/image", 1)
-    assert wait_until(lambda: node.count_publishers("/elsewhere/image") == 1)
+    for name in ("/elsewhere/image", "/blue/loop_closures"):
+        node.create_publisher(Image, name, 1)
+        assert wait_until(lambda name=name: node.count_publishers(name) == 1)
     message = InputWatch(node, "left_image", TOPIC, Image).status().message
     assert message == f"nothing received: no publisher on {TOPIC}; /elsewhere/image is of that type"
 

@@ -53,6 +53,21 @@ def test_results_that_cannot_be_written_are_one_line_and_status_1() -> None:
     assert ended.stderr == "umf: cannot write results: No space left on device\n"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--log-level", "loud"], "Couldn't parse log level: '--log-level loud'. Error: Argument does not use a valid"),
+        (["--params-file", "/no.yaml"], "Couldn't parse params file: '--params-file /no.yaml'. Error: Error opening"),
+        (["--nonsense"], "['--nonsense']"),
+    ],
+)
+def test_arguments_that_ros_cannot_read_are_one_line_and_status_1(arguments: list[str], told: str) -> None:
+    ended = start("plain", "--ros-args", *arguments)
+    (line,) = ended.stderr.splitlines()
+    assert ended.returncode == 1 and line.startswith("umf: ROS cannot read its arguments: ") and told in line
+    assert ".c:" not in line
+
+
 def test_arguments_reach_the_node() -> None:
     ended = start("interrupt", "--ros-args", "-p", "depth:=7")
     assert ended.stdout.splitlines()[0] == "depth 7", ended.stderr

@@ -102,6 +102,23 @@ def test_odometry_of_another_part_is_carried_to_the_body() -> None:
     assert frames.odom == "vio" and told == []
 
 
+def test_odometry_of_another_part_waits_for_transforms_that_come_late() -> None:
+    """Both nodes begin with the same pose, whichever of them hears the latched transforms first."""
+    told: list[str] = []
+    transforms = StaticTransforms()
+    frames = OdometryFrames(Frames(), transforms, told.append, patience_s=2.0)
+    messages = [odometry(START_NS + second * 10**9, np.eye(4)) for second in range(4)]
+    for message in messages:
+        message.child_frame_id = "imu"
+    assert frames.to_body(messages[0], at(3)) is None and frames.to_body(messages[1], at(3)) is None
+    transforms.add(SimpleNamespace(transforms=[stamped("base_link", "imu", at(0.5))]))
+    np.testing.assert_allclose(frames.to_body(messages[1], at(3)), at(2.5), atol=1e-12)
+    patient = OdometryFrames(Frames(), StaticTransforms(), told.append, patience_s=2.0)
+    assert patient.to_body(messages[0], at(3)) is None and told == []
+    np.testing.assert_array_equal(patient.to_body(messages[3], at(3)), at(3))
+    assert len(told) == 1
+
+
 def test_unknown_parts_are_told_and_two_sources_on_a_topic_refused() -> None:
     told: list[str] = []
     frames = OdometryFrames(Frames(), StaticTransforms(), told.append)

@@ -49,10 +49,12 @@ class BaseNode(LifecycleNode, ABC):
         self._settings, own = declare(self, results_dir=results)
         self._results = own["results_dir"]
         self._watches: list[InputWatch] = []
+        self._own: list[Any] = []
         self._faults: Counter[str] = Counter()
         self._last_fault = ""
         self._throttle = Throttle()
-        self._active = self._opened = False
+        self._active = self._opened = self._leaving = False
+        self._unwritten: Exception | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._use_parameters)
@@ -74,11 +76,15 @@ class BaseNode(LifecycleNode, ABC):
                 self._configure()
             except UmfError as error:
                 self.get_logger().error(str(error))
+                self._let_go()
                 return TransitionCallbackReturn.FAILURE
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take messages."""
+        if not self._opened:
+            self.get_logger().error("its results could not be written: clean it up again, then configure it")
+            return TransitionCallbackReturn.FAILURE
         self._active = True
         return super().on_activate(state)
 
@@ -101,9 +107,13 @@ class BaseNode(LifecycleNode, ABC):
         Raises:
             OutputError: they cannot be written.
         """
-        if self._active and rclpy.ok(context=self.context):
-            self.trigger_deactivate()  # who waits for our last words hears that they are being written
+        self._leaving = True
+        if self._opened and rclpy.ok(context=self.context):
+            self.trigger_shutdown()  # who waits for our last words hears when they begin and when all are said
         self._close()
+        error, self._unwritten = self._unwritten, None
+        if error is not None:
+            raise error
 
     def _close(self) -> None:
         self._active = False
@@ -134,19 +144,33 @@ class BaseNode(LifecycleNode, ABC):
     def _configure(self) -> None:
         if self._results:
             check_writable(Path(self._results))
-        self._open()
-        self._opened = True
+        before, self._unwritten = self._entities(), None
+        try:
+            self._open()
+            self._opened = True
+        finally:
+            self._own = [item for item in self._entities() if item not in before]
+
+    def _entities(self) -> list[Any]:
+        return [*self.publishers, *self.subscriptions, *self.services]
 
     def _end(self, result: TransitionCallbackReturn) -> TransitionCallbackReturn:
         try:
             self._close()
-        except UmfError as error:
-            self.get_logger().error(str(error))
+        except Exception as error:  # rclpy would drop it without a word
+            self._unwritten = error
+            if not self._leaving:
+                self.get_logger().error(f"{type(error).__name__}: {error}")
             return TransitionCallbackReturn.FAILURE
-        for entity in [*self.subscriptions]:
-            self.destroy_subscription(entity)
-        self._watches.clear()
+        self._let_go()
         return result
+
+    def _let_go(self) -> None:
+        """Take off the graph what `_open` made, and nothing else: `/clock` is heard in every state."""
+        for entity in self._own:
+            self.destroy_publisher(entity) or self.destroy_subscription(entity) or self.destroy_service(entity)
+        self._own.clear()
+        self._watches.clear()
 
     def _watch(self) -> None:
         if not self._opened:

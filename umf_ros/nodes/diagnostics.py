@@ -151,8 +151,9 @@ class InputWatch:
     def _others(self) -> list[str]:
         """Topics of the same type that somebody publishes: the sensor may be there under another name."""
         names = [name for name, types in self._node.get_topic_names_and_types() if self._type in types]
-        ours = self.topic, self._node.resolve_topic_name("loop_closures")
-        return [name for name in names if name not in ours and self._node.count_publishers(name)][:5]
+        # odometry between keyframes, of this robot or of another, is nobody's odometry
+        fit = [name for name in names if name != self.topic and name.rpartition("/")[2] != "loop_closures"]
+        return [name for name in fit if self._node.count_publishers(name)][:5]
 
     def _now_s(self) -> float:
         # the machine's clock, not the bag's: silence is silence even when /clock stands still

@@ -27,7 +27,7 @@ from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.nodes.worker import Worker
 from umf_ros.runs.recorder import RunRecorder, count_drops
 from umf_ros.sensors.intake import Intake, wanted_inputs
-from umf_ros.sensors.static_transforms import Mounting, OdometryFrames, StaticTransforms
+from umf_ros.sensors.static_transforms import PATIENCE_S, Mounting, OdometryFrames, StaticTransforms
 from umf_ros.sensors.synchronizer import Synchronizer
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class LoopClosureNode(BaseNode):
         self._detector = LoopDetector(settings, embedder)
         self._synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(topics), warn)
         transforms = StaticTransforms()
-        self._odometry_frames = OdometryFrames(settings.frames, transforms, warn)
+        self._odometry_frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
         mounting = Mounting(calibration, transforms, settings.frames.base, warn) if uses_transforms(settings) else None
         frames = self._odometry_frames
         self._intake = Intake(self._synchronizer, topics, warn, mounting=mounting, odometry_frames=frames)

@@ -37,7 +37,7 @@ from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.journal import JOURNAL
 from umf_ros.sensors.durable_graph import DurableGraph
 from umf_ros.sensors.messages import OdometrySample, decode_odometry
-from umf_ros.sensors.static_transforms import OdometryFrames, StaticTransforms
+from umf_ros.sensors.static_transforms import PATIENCE_S, OdometryFrames, StaticTransforms
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works
@@ -83,7 +83,8 @@ class PoseGraphNode(BaseNode):
         if self._durable.unsettled:
             self._worker.submit(lambda: self._settle_left())
         topics, transforms = topics_of(settings), StaticTransforms()
-        self._odometry_frames = OdometryFrames(settings.frames, transforms, self.get_logger().warning)
+        warn = self.get_logger().warning
+        self._odometry_frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
         hear_static_transforms(self, transforms)
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
@@ -142,7 +143,7 @@ class PoseGraphNode(BaseNode):
         self.create_service(Trigger, name, answer)
 
     def _on_front_end(self, event: TransitionEvent) -> None:
-        self._front_end_busy = event.goal_state.label in ("deactivating", "inactive", "shuttingdown")
+        self._front_end_busy = event.goal_state.label == "shuttingdown"
 
     def _make_publishers(self) -> None:
         self._path_publisher = self.create_publisher(PathMessage, "~/path", LATCHED_QOS)
@@ -154,7 +155,10 @@ class PoseGraphNode(BaseNode):
 
     def _on_odometry(self, message: Odometry) -> None:
         sample = decode_odometry(message)
-        sample = OdometrySample(sample.stamp_ns, self._odometry_frames.to_body(message, sample.odom_T_body))
+        odom_T_body = self._odometry_frames.to_body(message, sample.odom_T_body)
+        if odom_T_body is None:
+            return
+        sample = OdometrySample(sample.stamp_ns, odom_T_body)
         if self._odometry_frames.odom != self._frames.odom:
             self._frames = self._frames.model_copy(update={"odom": self._odometry_frames.odom})
         self._worker.submit(lambda: self._add_odometry(sample))

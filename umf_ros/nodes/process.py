@@ -17,7 +17,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from umf_ros.errors import UmfError
+from umf_ros.errors import ConfigError, UmfError
 
 LONGEST_WAIT_S = 60.0
 """So long a node that was asked to end may wait for those that it hears."""
@@ -41,8 +41,8 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     # our own handlers, before anything else: rclpy's would shut the context down before the node's last words
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: asked.append(number))
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     try:
+        init(arguments)
         node = make_node()
     except UmfError as error:
         complain(error)
@@ -67,6 +67,20 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
         node.destroy_node()
         rclpy.try_shutdown()
     return status
+
+
+def init(arguments: list[str] | None = None) -> None:
+    """`rclpy.init` without its signal handlers.
+
+    Raises:
+        ConfigError: ROS cannot read the arguments, or a parameter file that they name.
+    """
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        # its text ends with places in the source of rcl
+        text = " ".join(str(error).partition(", at /")[0].split())
+        raise ConfigError(f"ROS cannot read its arguments: {text}") from None
 
 
 def leave(status: int) -> NoReturn:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from umf_ros.embedding.depth import disparities
 from umf_ros.frames import Frame
 from umf_ros.geometry import Array
-from umf_ros.runs.sensor_motion import Disagreement, Step, as_measured, compare_motion, scan_turn, view_turn
+from umf_ros.runs.sensor_motion import Disagreement, MeasuredScan, Step, compare_motion, scan_turn, view_turn
 from umf_ros.trajectory import Trajectory
 
 MIN_STEP_S, MAX_STEP_S = 0.18, 1.0  # between frames whose motion is compared, by hand
@@ -69,6 +69,7 @@ class SensorCheck:
         self._last: Frame | None = None
         self._epoch_ns = 0
         self._steps: dict[str, list[Step]] = {"lidar": [], "camera": []}
+        self._ready: tuple[Frame, MeasuredScan] | None = None
 
     def take(self, frame: Frame) -> None:
         """Look at one frame, in the order of their stamps."""
@@ -136,17 +137,26 @@ class SensorCheck:
         if len(self._steps["lidar"]) + len(self._steps["camera"]) >= 2 * MAX_STEPS or _stands(earlier, later):
             return
         if earlier.points is not None and later.points is not None:
-            (before, since), (after, until) = as_measured(earlier), as_measured(later)
+            before, after = self._scan(earlier), self._scan(later)
             pose = scan_turn(before, after)
             if pose is not None:
                 turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
-                stamps = self._seconds(earlier.stamp_ns) + since, self._seconds(later.stamp_ns) + until
+                stamps = (
+                    self._seconds(earlier.stamp_ns) + before.moment_s,
+                    self._seconds(later.stamp_ns) + after.moment_s,
+                )
                 self._steps["lidar"].append(Step(*stamps, turn, pose[:3, 3]))
         if earlier.image_stamp_ns and later.image_stamp_ns:
             view = view_turn(earlier, later)
             if view is not None:
                 stamps = self._seconds(earlier.image_stamp_ns), self._seconds(later.image_stamp_ns)
                 self._steps["camera"].append(Step(*stamps, Rotation.from_matrix(view[0]).as_rotvec(), view[1]))
+
+    def _scan(self, frame: Frame) -> MeasuredScan:
+        """Made ready once, though it is aligned with the one before and the one after."""
+        if self._ready is None or self._ready[0] is not frame:
+            self._ready = frame, MeasuredScan.of(frame)
+        return self._ready[1]
 
     def _seconds(self, stamp_ns: int) -> float:
         return (stamp_ns - self._epoch_ns) * 1e-9

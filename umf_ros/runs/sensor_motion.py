@@ -16,6 +16,7 @@ from umf_ros.geometry import Array
 from umf_ros.trajectory import Trajectory
 
 SCAN_CELL_M, SCAN_REACH_M, SCAN_NEIGHBOURS = 0.4, 1.0, 10  # by hand: consecutive scans, a quarter of a metre apart
+CELL_MASK = 2**21 - 1  # three coordinates in one number: a scan is far narrower than two million cells
 MIN_SCAN_POINTS = 200  # by hand: below, consecutive scans are not registered
 CORNERS, CORNER_QUALITY, CORNER_SPACING, CORNER_WINDOW, CORNER_LEVELS = 300, 0.01, 8, (21, 21), 4  # by hand
 MIN_CORNERS = 30  # by hand: inliers that make an essential matrix believed
@@ -63,6 +64,30 @@ class Disagreement:
     steps: int
 
 
+@dataclass(frozen=True, slots=True)
+class MeasuredScan:
+    """A scan as it was measured, ready to be aligned.
+
+    Attributes:
+        cloud: its points, thinned, with covariances; None where there are too few.
+        tree: their neighbours.
+        moment_s: their mean moment, after the frame's stamp.
+    """
+
+    cloud: small_gicp.PointCloud | None
+    tree: small_gicp.KdTree | None
+    moment_s: float
+
+    @classmethod
+    def of(cls, frame: Frame) -> MeasuredScan:
+        """The scan of a frame that has one."""
+        points, moment_s = as_measured(frame)
+        if len(points) < MIN_SCAN_POINTS:
+            return cls(None, None, moment_s)
+        cloud, tree = small_gicp.preprocess_points(points.astype(float), SCAN_CELL_M, SCAN_NEIGHBOURS, 1)
+        return cls(cloud, tree, moment_s)
+
+
 def as_measured(frame: Frame) -> tuple[Points, float]:
     """The scan (N, 3) m with the motion during it put back, and its mean moment, s after the frame's stamp.
 
@@ -82,17 +107,22 @@ def as_measured(frame: Frame) -> tuple[Points, float]:
 
 def _one_per_cell(points: Points) -> NDArray[np.intp]:
     """One of the points (N, 3) in every cell that they are thinned by before they are aligned."""
-    return np.asarray(np.unique(np.floor(points / SCAN_CELL_M).astype(np.int32), axis=0, return_index=True)[1])
+    cell = np.floor(points / SCAN_CELL_M).astype(np.int64) & CELL_MASK
+    return np.asarray(np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)[1])
 
 
-def scan_turn(earlier: Points, later: Points) -> Array | None:
-    """Pose (4, 4) of the later body in the earlier one from their scans (N, 3), m; None where they do not align."""
-    if min(len(earlier), len(later)) < MIN_SCAN_POINTS:
+def scan_turn(earlier: MeasuredScan, later: MeasuredScan) -> Array | None:
+    """Pose (4, 4) of the later body in the earlier one from their scans; None where they do not align."""
+    if earlier.cloud is None or later.cloud is None:
         return None
-    target, tree = small_gicp.preprocess_points(earlier.astype(float), SCAN_CELL_M, SCAN_NEIGHBOURS, 1)
-    source, _ = small_gicp.preprocess_points(later.astype(float), SCAN_CELL_M, SCAN_NEIGHBOURS, 1)
     found = small_gicp.align(
-        target, source, tree, np.eye(4), "GICP", max_correspondence_distance=SCAN_REACH_M, num_threads=1
+        earlier.cloud,
+        later.cloud,
+        earlier.tree,
+        np.eye(4),
+        "GICP",
+        max_correspondence_distance=SCAN_REACH_M,
+        num_threads=1,
     )
     pose: Array = found.T_target_source
     return pose if found.converged else None

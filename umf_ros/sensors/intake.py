@@ -79,7 +79,9 @@ class Intake:
         entry = self._entries[topic]
         try:
             if entry == ODOMETRY:
-                self.take_odometry(self._of_body(message, decode_odometry(message)))
+                sample = self._of_body(message, decode_odometry(message))
+                if sample is not None:
+                    self.take_odometry(sample)
             elif entry in ("left_info", "right_info"):
                 self._use_info(entry, message)
             else:
@@ -104,10 +106,11 @@ class Intake:
             self._warned.add((topic, error.kind))
             self._warn(f"{topic}: {error}; such messages are skipped")
 
-    def _of_body(self, message: Any, sample: OdometrySample) -> OdometrySample:
+    def _of_body(self, message: Any, sample: OdometrySample) -> OdometrySample | None:
         if self._odometry_frames is None:
             return sample
-        return OdometrySample(sample.stamp_ns, self._odometry_frames.to_body(message, sample.odom_T_body))
+        odom_T_body = self._odometry_frames.to_body(message, sample.odom_T_body)
+        return None if odom_T_body is None else OdometrySample(sample.stamp_ns, odom_T_body)
 
     def _mount(self, entry: str, message: Any) -> None:
         if self._mounting is None or entry == "right_image":

@@ -11,9 +11,12 @@ from umf_ros.config import Frames
 from umf_ros.errors import MessageError
 from umf_ros.geometry import Array, from_quaternion, invert
 from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.messages import stamp_ns
 
 TOPIC = "/tf_static"
 _UP = 0.9
+PATIENCE_S = 3.0
+"""What is latched comes this soon after a node has started, as a rule much sooner."""
 
 
 class StaticTransforms:
@@ -120,21 +123,26 @@ class OdometryFrames:
         frames: names of the frames.
         transforms: tell where the body is, if the odometry is of another part of the robot.
         warn: told in one line when they do not.
+        patience_s: so long the odometry of another part waits for them, by its stamps.
 
     Attributes:
         odom: name of the odometry's frame: that of the messages, where they name one.
     """
 
-    def __init__(self, frames: Frames, transforms: StaticTransforms, warn: Callable[[str], None]) -> None:
+    def __init__(
+        self, frames: Frames, transforms: StaticTransforms, warn: Callable[[str], None], patience_s: float = 0.0
+    ) -> None:
+        self._patience_ns = int(patience_s * 1e9)
         self._base = frames.base
         self._transforms = transforms
         self._warn = warn
         self._names: tuple[str, str] | None = None
         self._part_T_body: Array | None = None
+        self._first_ns = 0
         self.odom = frames.odom
 
-    def to_body(self, message: Any, odom_T_part: Array) -> Array:
-        """(4, 4) `odom_T_body` of a nav_msgs/Odometry whose pose is `odom_T_part`.
+    def to_body(self, message: Any, odom_T_part: Array) -> Array | None:
+        """(4, 4) `odom_T_body` of a nav_msgs/Odometry whose pose is `odom_T_part`; None while the transforms may come.
 
         Raises:
             MessageError: of kind "frame" when its frames are not those of the first message.
@@ -143,16 +151,21 @@ class OdometryFrames:
         if self._names is None:
             self._names = names
             self.odom = names[0] or self.odom
-            self._look_up(names[1])
+            self._first_ns = stamp_ns(message)
         if names != self._names:
             before, now = (" to ".join(map(repr, pair)) for pair in (self._names, names))
             raise MessageError("frame", f"odometry from {now}, after that from {before}: two sources on one topic?")
-        return odom_T_part if self._part_T_body is None else odom_T_part @ self._part_T_body
-
-    def _look_up(self, part: str) -> None:
-        if not part or part == self._base:
-            return
-        self._part_T_body = self._transforms.find(part, self._base)
         if self._part_T_body is None:
+            self._part_T_body = self._look_up(names[1], stamp_ns(message) - self._first_ns)
+        return None if self._part_T_body is None else odom_T_part @ self._part_T_body
+
+    def _look_up(self, part: str, waited_ns: int) -> Array | None:
+        """Where the body is on `part`; None while it is worth waiting."""
+        if not part or part == self._base:
+            return np.eye(4)
+        part_T_body = self._transforms.find(part, self._base)
+        if part_T_body is None and not 0 <= waited_ns < self._patience_ns:
             text = f"and {TOPIC} does not say where {self._base} is on it: taken as the body's"
             self._warn(f"the odometry is that of {part}, {text} (parameter frames.base)")
+            return np.eye(4)
+        return part_T_body

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from umf_ros.verification.registration import CovarianceModel
 
 SHIPPED = "config/verification/calibration.json"
 KINDS = (SCAN, IMAGE)
+NO_RIVAL = 10.0  # logarithm of how much worse the fit is elsewhere: beyond the best that any criterion asks for
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +160,10 @@ class AcceptanceModel:
     def probability(self, measurement: Measurement) -> float:
         """Probability that the closure with this measurement is right."""
         return self.models[measurement.kind].probability(scores(measurement))
+
+    def at_best(self, measurement: Measurement) -> float:
+        """The same if no other pose fitted the scans: what it cannot exceed before it is held against its rivals."""
+        return self.probability(replace(measurement, rival_near=NO_RIVAL, rival_far=NO_RIVAL))
 
     def unlike(self, measurement: Measurement) -> str:
         """What no right pose that the decision was fitted on ever measured, or nothing: name and value of a number."""

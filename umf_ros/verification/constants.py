@@ -82,6 +82,7 @@ NORMAL_NEIGHBOURS = 10  # small_gicp's own default
 NOISE_NEIGHBOURS = 5  # by hand: the point itself and four around it
 SAMPLE = 1500  # measured: points of the query that are aligned; a third of the scan is as good in half the time
 COARSE_REACH_M, COARSE_STEPS = 1.0, 10  # geometry: two cells of the elevation maps
+COARSE_EVERY = 3  # of the sample; measured: all of it ends within a millimetre of the same poses
 FINE_REACH_M, FINE_STEPS = 0.4, 8  # by hand: the spacing of far returns is wider than the noise
 MIN_SCAN_POINTS = 100  # by hand: below, there is nothing to align
 BARE_RELIEF_M = 0.01  # measured on simulated drives: of bare, even ground .002, of the plainest of other places .03
@@ -112,6 +113,7 @@ RIVAL_FAR_M = np.concatenate([np.arange(-6.0, -0.9, 0.5), np.arange(1.0, 6.1, 0.
 RIVAL_EVERY = 10  # of the sample: bounds the time
 RIVAL_MISFIT = 3.0  # by hand: how bad a misfit can be, in counterparts' reach
 
+HOPELESS = 0.5  # by definition: what is wrong more likely than right, whatever its rivals, is held against none
 RUNNER_UP_ROOM = 0.02  # by hand: shares nearer to nothing than this are alike
 MAX_MISFIT = 2.5  # measured: of 2,400 right poses one in 100 has more than 1.5, of wrong ones half have more than this
 MIN_RUNNER_UP = 0.1  # measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 86

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from umf_ros.frames import Candidate, Keyframe, LocalFeatures, Points
+from umf_ros.frames import Candidate, Keyframe, Points
 from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
@@ -69,7 +70,8 @@ class Measurement:
         counterparts: share of these that have a counterpart, as near as both scans' points let one expect.
         upright_counterparts: the same of walls, trunks and rocks alone; NaN where next to nothing stands.
         unexplained: share of what stands and should be seen that is far from everything, the larger of both.
-        rival_near: logarithm of how much worse the fit is half a metre on, along the way that is known least.
+        rival_near: logarithm of how much worse the fit is half a metre on, along the way that is known least; NaN
+            where a hypothesis could not have become probable any more.
         rival_far: the same of the best fit 1 to 6 m on: 0 when another place fits as well.
         pose_inliers: feature pairs that agree with the pose.
         spread: of those pairs across the image: smaller deviation of column and row, of its width and height.
@@ -205,7 +207,7 @@ def uncompared(candidate: Candidate) -> Measurement:
 
 
 def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) -> Measurement:
-    """Every test of one hypothesis.
+    """Every test of one hypothesis but those of `against_rivals`.
 
     Args:
         aligned: the hypothesis.
@@ -230,6 +232,14 @@ def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) ->
     )
 
 
+def against_rivals(measurement: Measurement, aligned: AlignedHypothesis) -> Measurement:
+    """The same, knowing how much worse the scans fit at poses beside this one: what takes longest to find out."""
+    if aligned.scans is None or isinstance(aligned.alignment, ViewAlignment):
+        return measurement
+    near_by, far = rivalry(*aligned.scans, aligned.pose, aligned.alignment.information)
+    return replace(measurement, rival_near=near_by, rival_far=far)
+
+
 def beside(measurement: Measurement, pose: Array, others: Sequence[tuple[Array, Measurement]]) -> Measurement:
     """The same, knowing the other hypotheses about the pair: poses `match_T_query` and what was measured there."""
     distinct = [other.missing for there, other in others if not near(pose, there, const.DISTINCT_M, const.DISTINCT_RAD)]
@@ -251,10 +261,13 @@ def image_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
     ours, theirs = strongest(ours, const.AGREEMENT_COMPARED), strongest(theirs, const.AGREEMENT_COMPARED)
     camera = match.camera
     pixels, depth = camera.project(transform(pose, ours.points.astype(float)), match.body_T_camera)
-    across, down = (pixels[:, None] - theirs.positions[None].astype(float)).transpose(2, 0, 1)
-    distance = np.sqrt(across**2 + down**2)
-    peers = (np.abs(down) < const.AGREEMENT_ROWS * camera.height) & (depth > 0)[:, None]
-    return _rank_agreement(ours, theirs, distance, const.AGREEMENT_PIXELS * camera.width, peers)
+    ahead = depth > 0  # False for what has no depth
+    offset = pixels[ahead, None].astype(np.float32) - theirs.positions[None]
+    squared = np.einsum("ijk,ijk->ij", offset, offset)
+    peers = np.abs(offset[..., 1]) < const.AGREEMENT_ROWS * camera.height
+    return _rank_agreement(
+        ours.descriptors[ahead], theirs.descriptors, squared, const.AGREEMENT_PIXELS * camera.width, peers
+    )
 
 
 def cloud_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
@@ -264,11 +277,12 @@ def cloud_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:
         return float("nan")
     ours, theirs = strongest(ours, const.AGREEMENT_COMPARED), strongest(theirs, const.AGREEMENT_COMPARED)
     moved = transform(pose, ours.positions.astype(float))
-    distance = np.linalg.norm(moved[:, None] - theirs.positions[None], axis=2)
+    offset = moved[:, None].astype(np.float32) - theirs.positions[None]
+    squared = np.einsum("ijk,ijk->ij", offset, offset)
     range_ours = np.linalg.norm(moved, axis=1)[:, None]
     range_theirs = np.linalg.norm(theirs.positions, axis=1)[None]
     peers = np.abs(range_ours - range_theirs) < const.AGREEMENT_RANGE * range_theirs + const.AGREEMENT_RANGE_M
-    return _rank_agreement(ours, theirs, distance, const.AGREEMENT_M, peers)
+    return _rank_agreement(ours.descriptors, theirs.descriptors, squared, const.AGREEMENT_M, peers)
 
 
 def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan, query: PreparedScan) -> Measurement:
@@ -277,7 +291,6 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
     level = levelled(match, query, pose)
     fit = evaluate(match.elevation, query.elevation, level)
     ours, theirs = meet(match, query, pose)
-    close, far = rivalry(match, query, pose, alignment.information)
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     return replace(
         known,
@@ -295,8 +308,6 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
         counterparts=min(ours.counterparts, theirs.counterparts),
         upright_counterparts=float(np.fmin(ours.upright_counterparts, theirs.upright_counterparts)),
         unexplained=float(np.fmax(ours.unexplained, theirs.unexplained)),
-        rival_near=close,
-        rival_far=far,
     )
 
 
@@ -314,18 +325,27 @@ def _measure_views(known: Measurement, alignment: ViewAlignment) -> Measurement:
     )
 
 
-def _rank_agreement(ours: LocalFeatures, theirs: LocalFeatures, distance: Array, reach: float, peers: Array) -> float:
-    """Mean rank of the similarity of the nearest counterpart among its peers, as a z-score."""
-    if 0 in distance.shape:
+def _rank_agreement(
+    ours: NDArray[Any], theirs: NDArray[Any], squared: NDArray[Any], reach: float, peers: NDArray[np.bool_]
+) -> float:
+    """Mean rank of the similarity of the nearest counterpart among its peers, as a z-score.
+
+    Args:
+        ours: (N, D) descriptors.
+        theirs: (M, D) descriptors.
+        squared: (N, M) distances.
+        reach: how far away a counterpart may be, in the unit of the distances before they were squared.
+        peers: (N, M) which of theirs each of ours is compared with.
+    """
+    if 0 in squared.shape:
         return float("nan")
-    distance = np.where(np.isfinite(distance), distance, np.inf)
-    nearest = distance.argmin(axis=1)
-    rows = np.arange(len(distance))
-    usable = (distance[rows, nearest] < reach) & (peers.sum(axis=1) >= const.AGREEMENT_PEERS)
-    if not usable.any():
+    nearest = squared.argmin(axis=1)
+    rows = np.arange(len(squared))
+    usable = np.flatnonzero((squared[rows, nearest] < reach**2) & (peers.sum(axis=1) >= const.AGREEMENT_PEERS))
+    if not len(usable):
         return float("nan")
-    similarity = similarities(ours.descriptors[rows[usable]], theirs.descriptors)
-    own = similarity[np.arange(len(similarity)), nearest[usable]]
-    below = ((similarity < own[:, None]) & peers[usable]).sum(axis=1)
-    rank = below / np.maximum(peers[usable].sum(axis=1) - 1, 1)
-    return float((np.minimum(rank, 1).mean() - 0.5) * np.sqrt(12 * len(similarity)))
+    similarity, among = similarities(ours[usable], theirs), peers[usable]
+    own = similarity[np.arange(len(usable)), nearest[usable]]
+    below = ((similarity < own[:, None]) & among).sum(axis=1)
+    rank = below / np.maximum(among.sum(axis=1) - 1, 1)
+    return float((np.minimum(rank, 1).mean() - 0.5) * np.sqrt(12 * len(usable)))

@@ -127,6 +127,11 @@ class PreparedScan:
         return _cloud_of(self.sample)
 
     @cached_property
+    def coarse_cloud(self) -> small_gicp.PointCloud:
+        """A third of the sample, likewise: enough for where there is far to go."""
+        return _cloud_of(self.sample[:: const.COARSE_EVERY])
+
+    @cached_property
     def tree(self) -> small_gicp.KdTree:
         """Nearest neighbours among the points."""
         return small_gicp.KdTree(self.points)
@@ -288,9 +293,8 @@ class Alignment:
 
 def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Alignment:
     """Generalised ICP (Segal, RSS 2009) from the pose `guess`, first far-sighted, then near-sighted."""
-    pose = guess
-    for reach, steps in ((const.COARSE_REACH_M, const.COARSE_STEPS), (const.FINE_REACH_M, const.FINE_STEPS)):
-        pose = draw(match, query.sample_cloud, pose, reach, steps)
+    pose = draw(match, query.coarse_cloud, guess, const.COARSE_REACH_M, const.COARSE_STEPS)
+    pose = draw(match, query.sample_cloud, pose, const.FINE_REACH_M, const.FINE_STEPS)
     return inspect(match, query, pose)
 
 

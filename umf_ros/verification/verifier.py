@@ -19,6 +19,7 @@ from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, find_hyp
 from umf_ros.verification.measurement import (
     AlignedHypothesis,
     Measurement,
+    against_rivals,
     beside,
     image_agreement,
     measure,
@@ -141,7 +142,7 @@ class Verifier:
     def examine(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[JudgedHypothesis]:
         """Every hypothesis about every candidate, without a decision: what the decision is fitted on."""
         hypotheses = self._hypotheses(query, rerank(query, candidates, self._settings), self._turned(query))
-        examined = self._judge(query, hypotheses)
+        examined = self._judge(query, hypotheses, 0.0)
         first = {one.match_stamp_ns: one.aligned for one in reversed(examined)}
         self._memory.remember(query, [(one.match, one.pose, False) for one in first.values()])
         return examined
@@ -155,7 +156,8 @@ class Verifier:
     ) -> list[JudgedHypothesis]:
         """The best hypotheses about some candidates, judged."""
         with self._timed("refine"):
-            return self._judge(query, self._hypotheses(query, ranked, turned)[: const.MAX_REFINED])
+            hypotheses = self._hypotheses(query, ranked, turned)[: const.MAX_REFINED]
+            return self._judge(query, hypotheses, min(const.HOPELESS, self._threshold))
 
     def _wanting(self, judged: list[JudgedHypothesis]) -> bool:
         """Whether more closures are asked for than were found."""
@@ -180,13 +182,18 @@ class Verifier:
             found += find_hypotheses(query, item, turned, self._scans[item.keyframe], self._settings)
         return sorted(found, key=lambda one: -one.score)
 
-    def _judge(self, query: Keyframe, hypotheses: list[Hypothesis]) -> list[JudgedHypothesis]:
-        """Align and measure hypotheses, and judge each knowing the others about its candidate."""
+    def _judge(self, query: Keyframe, hypotheses: list[Hypothesis], hopeless: float) -> list[JudgedHypothesis]:
+        """Align and measure hypotheses, and judge each knowing the others about its candidate.
+
+        What stays below the probability `hopeless` even without rivals is not held against any.
+        """
         measured = [(one, self._measure(one)) for one in self._aligned(query, hypotheses)]
         judged = []
         for one, measurement in measured:
             others = [(other.pose, found) for other, found in measured if other.match is one.match]
             known = beside(measurement, one.pose, others)
+            if self._acceptance.at_best(known) >= hopeless:
+                known = against_rivals(known, one)
             judged.append(JudgedHypothesis(one, known, self._probability(one, known)))
         return judged
 
@@ -201,12 +208,15 @@ class Verifier:
         return found / (found + const.BARE_ODDS * (1.0 - found))
 
     def _aligned(self, query: Keyframe, hypotheses: list[Hypothesis]) -> list[AlignedHypothesis]:
-        """Each aligned; of those that end at one pose only the first."""
+        """Each aligned; of those that begin or end where another of the same candidate ended, only the first."""
         kept: list[AlignedHypothesis] = []
-        for one in (self._align(query, hypothesis) for hypothesis in hypotheses):
-            others = (other.pose for other in kept if other.match is one.match)
-            if not any(near(one.pose, pose, const.SAME_M, const.SAME_RAD) for pose in others):
-                kept.append(one)
+        for hypothesis in hypotheses:
+            ends = [one.pose for one in kept if one.match is hypothesis.ranked.keyframe]
+            if any(near(hypothesis.pose, end, const.DISTINCT_M, const.DISTINCT_RAD) for end in ends):
+                continue
+            aligned = self._align(query, hypothesis)
+            if not any(near(aligned.pose, end, const.SAME_M, const.SAME_RAD) for end in ends):
+                kept.append(aligned)
         return kept
 
     def _align(self, query: Keyframe, hypothesis: Hypothesis) -> AlignedHypothesis:

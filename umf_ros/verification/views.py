@@ -240,10 +240,16 @@ class PairedViews:
 
     def _compare(self, pose: Array) -> _Fit:
         """Residuals of all pairs at a pose: from the query's depth where it is known, else from the match's."""
-        forth = _carry(self.query, self.match, pose, transform(pose, self.query.points) - pose[:3, 3])
-        back = _carry(self.match, self.query, invert(pose), self.match.points - pose[:3, 3], inverse=True)
         first = self.query.lifted
-        return _Fit(*(np.where(first.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(forth, back, strict=True)))
+        arms = np.where(first[:, None], transform(pose, self.query.points), self.match.points) - pose[:3, 3]
+        forth = _carry(self.query, self.match, pose, arms, first)
+        back = _carry(self.match, self.query, invert(pose), arms, ~first, inverse=True)
+        together = []
+        for one, other in zip(forth, back, strict=True):
+            both = np.empty((len(first), *one.shape[1:]), one.dtype)
+            both[first], both[~first] = one, other
+            together.append(both)
+        return _Fit(*together)
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,27 +272,28 @@ class _Fit:
 
 
 def _carry(
-    source: CameraView, target: CameraView, pose: Array, arms: Array, inverse: bool = False
+    source: CameraView, target: CameraView, pose: Array, arms: Array, rows: Mask, inverse: bool = False
 ) -> tuple[Array, Array, Mask]:
-    """Residuals of the source's points in the target's measurements, `pose` being `target_T_source`.
+    """Residuals of some of the source's points in the target's measurements, `pose` being `target_T_source`.
 
     Args:
         source: view whose points are carried over.
         target: view they are compared with.
         pose: of the source's body in the target's.
         arms: (N, 3) from the query's origin to the points, match axes.
+        rows: (N,) which points.
         inverse: whether the target is the query.
     """
-    predicted, derivative, front = target.predict(transform(pose, source.points))
-    usable = front & source.lifted
-    scatter = derivative @ pose[:3, :3] @ source.scatter
+    predicted, derivative, front = target.predict(transform(pose, source.points[rows]))
+    usable = front & source.lifted[rows]
+    scatter = derivative @ pose[:3, :3] @ source.scatter[rows]
     covariance = scatter @ scatter.transpose(0, 2, 1) + np.diag(target.noise**2)
-    residual = predicted - target.measured
+    residual = predicted - target.measured[rows]
     unmeasured = ~np.isfinite(residual[:, 2])
     residual[unmeasured, 2] = 0.0
     covariance[unmeasured, 2, 2] += const.UNMEASURED
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-    arms = np.where(usable[:, None], arms, 0.0)
+    arms = np.where(usable[:, None], arms[rows], 0.0)
     motion = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], axis=2)
     if inverse:
         motion = -pose[:3, :3] @ motion

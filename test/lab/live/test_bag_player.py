@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -21,28 +22,30 @@ from sensor_msgs.msg import Image, PointCloud2
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import open_bag
+from umf_ros.lab.live.bag_player_node import TRANSPORT
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.intake import Intake, wanted_inputs
 from umf_ros.sensors.messages import decode_cloud, decode_image, stamp_ns
 from umf_ros.sensors.synchronizer import Synchronizer
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
+def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "umf_ros.lab.live.bag_player_node", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    environment = {**os.environ, **environment}
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 
 class Listener(Node):
-    """Takes images, scans and the clock."""
+    """Takes images and scans of its namespace, and the clock."""
 
-    def __init__(self) -> None:
-        super().__init__("listener")
+    def __init__(self, namespace: str = "") -> None:
+        super().__init__("listener", namespace=namespace)
         self.images: list[Image] = []
         self.clouds: list[PointCloud2] = []
         self.clock: list[int] = []
         # reliable: what is tested is what the player sends, not what a busy machine loses
-        self.create_subscription(Image, LEFT, self.images.append, 200)
-        self.create_subscription(PointCloud2, CLOUD, self.clouds.append, 200)
+        self.create_subscription(Image, LEFT.removeprefix("/"), self.images.append, 200)
+        self.create_subscription(PointCloud2, CLOUD.removeprefix("/"), self.clouds.append, 200)
         self.create_subscription(Clock, "/clock", self._on_clock, 10)
 
     def _on_clock(self, message: Clock) -> None:
@@ -62,11 +65,12 @@ def spin(node: Node, player: subprocess.Popen[str], patience_s: float = 60.0) ->
     node.destroy_node()
 
 
-def test_plays_every_message_unchanged_with_clock(ros_context: None, tmp_path: Path) -> None:
+def test_plays_every_message_unchanged_with_clock_in_its_namespace(ros_context: None, tmp_path: Path) -> None:
     entries = traverse(2.0)
     bag = write_mcap(tmp_path / "a.mcap", entries)
-    player = start(str(bag), "--rate", "2", "--wait-for-subscribers", "--quiet")
-    heard = Listener()
+    options = "--rate 2 --wait-for-subscribers --quiet --ros-args -r __ns:=/red"
+    player = start(str(bag), *options.split())
+    heard = Listener("/red")
     spin(heard, player)
     assert player.returncode == 0, player.stderr.read() if player.stderr else ""
     sent_images = [message for topic, _, message in entries if topic == LEFT]
@@ -103,6 +107,29 @@ def test_ctrl_c_ends_a_loop_cleanly_after_more_than_one_turn(ros_context: None, 
     assert "Traceback" not in player.stderr.read()
     assert node.clock != sorted(node.clock)  # it jumped back
     node.destroy_node()
+
+
+def segments(player: subprocess.Popen[str]) -> list[int]:
+    """Sizes of the pieces of memory through which a process of Fast DDS sends."""
+    mapped = Path(f"/proc/{player.pid}/maps").read_text().splitlines()
+    names = {line.split()[-1] for line in mapped if "/dev/shm/fastrtps_" in line and "_el" not in line}
+    return [Path(name).stat().st_size for name in names if Path(name).exists()]
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_dozens_of_images_find_room_unless_the_user_says_otherwise(
+    own: bool, ros_context: None, tmp_path: Path
+) -> None:
+    bag = write_mcap(tmp_path / "a.mcap", traverse(0.5))
+    profile = tmp_path / "own.xml"
+    profile.write_text('<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"></dds>')
+    player = start(str(bag), "--loop", "--quiet", **({TRANSPORT: str(profile)} if own else {}))
+    deadline = time.monotonic() + 30
+    while not (found := segments(player)) and player.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    player.send_signal(signal.SIGINT)
+    assert player.wait(20) == 0
+    assert found and (max(found) > 32 * 2**20) is not own
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import signal
 import sys
 import time
@@ -16,7 +17,6 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -24,9 +24,12 @@ from rosgraph_msgs.msg import Clock
 
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.errors import BagError, UmfError
-from umf_ros.nodes.process import complain
+from umf_ros.nodes.process import complain, init
+from umf_ros.resources import find
 
 CLOCK_PERIOD_NS = 10_000_000
+TRANSPORT, TRANSPORT_FILE = "FASTRTPS_DEFAULT_PROFILES_FILE", "config/dds/large_messages.xml"
+"""Where Fast DDS reads how a process sends, and what it takes to send images at full rate."""
 SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
 SUBSCRIBER_TIMEOUT_S = 180.0
 SETTLING_S = 2.0
@@ -66,7 +69,7 @@ class BagPlayer(Node):
             elif settled_since is None:
                 settled_since = time.monotonic()
             if time.monotonic() > deadline:
-                names = " and ".join(" or ".join(topics) for topics in sensors if topics)
+                names = " and ".join(" or ".join(self._names(topics)) for topics in sensors if topics)
                 raise UmfError(f"nobody subscribed to {names} within {SUBSCRIBER_TIMEOUT_S:.0f} s")
             time.sleep(0.02)
 
@@ -92,18 +95,23 @@ class BagPlayer(Node):
             if message_type is None:
                 self.get_logger().warning(f"{topic} is left out: {info.type} is not installed")
             elif topic != "/clock" and info.count:
-                publishers[topic] = self.create_publisher(message_type, topic, _qos(topic))
+                # in a namespace its topics move along; the trees of transforms are one for all
+                name = topic if topic in ("/tf", "/tf_static") else topic.removeprefix("/")
+                publishers[topic] = self.create_publisher(message_type, name, _qos(topic))
         if not publishers:
             raise BagError(f"{self._bag.path} holds no topic whose message type is installed")
         return publishers
+
+    def _names(self, topics: list[str]) -> list[str]:
+        return [self._topic_publishers[topic].topic_name for topic in topics]
 
     def _is_taken(self, topics: list[str]) -> bool:
         return any(self._topic_publishers[topic].get_subscription_count() for topic in topics)
 
     def _all_connected(self) -> bool:
         return all(
-            publisher.get_subscription_count() >= self.count_subscribers(topic)
-            for topic, publisher in self._topic_publishers.items()
+            publisher.get_subscription_count() >= self.count_subscribers(publisher.topic_name)
+            for publisher in self._topic_publishers.values()
         )
 
     def _wait_until(self, log_ns: int, started: float) -> None:
@@ -181,10 +189,12 @@ def _interrupt(*_: object) -> None:
 def main() -> None:
     """Entry point of `ros2 run umf_ros bag_player_node`; 0 at the end and after Ctrl-C."""
     options = _parse(remove_ros_args(sys.argv)[1:])
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, _interrupt)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
     status = 0
     try:
+        os.environ.setdefault(TRANSPORT, str(find(TRANSPORT_FILE)))
+        init()
         _play(options)
     except KeyboardInterrupt:
         pass

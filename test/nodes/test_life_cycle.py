@@ -1,0 +1,104 @@
+"""Managed nodes: what a transition makes, the opposite one takes off the graph again."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+import pytest
+from lifecycle_msgs.msg import TransitionEvent
+from processes import wait_until
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from umf_ros.errors import OutputError
+from umf_ros.nodes.pose_graph_node import PoseGraphNode
+
+
+class Back(PoseGraphNode):
+    """With last words that may fail."""
+
+    fault: Exception | None = None
+
+    def _finish(self) -> None:
+        super()._finish()
+        if self.fault is not None:
+            raise self.fault
+
+
+@pytest.fixture
+def node(ros_context: None) -> Iterator[Back]:
+    node = Back()
+    yield node
+    node.fault = None
+    node.close()
+    node.destroy_node()
+
+
+def entities(node: Node) -> Counter[str]:
+    topics = [f"to {item.topic_name}" for item in node.publishers] + [
+        f"from {i.topic_name}" for i in node.subscriptions
+    ]
+    return Counter([*topics, *(service.srv_name for service in node.services)])
+
+
+def test_a_node_that_is_made_anew_is_there_once(node: Back) -> None:
+    node.set_parameters([Parameter("use_sim_time", value=True)])
+    made = entities(node)
+    assert {"from /clock", "from /odom", "to /pose_graph_node/path"} <= set(made)
+    for _ in range(2):
+        node.trigger_deactivate()
+        node.trigger_cleanup()
+        left = entities(node)
+        assert "from /odom" not in left and "to /pose_graph_node/path" not in left
+        # it goes on to know the time, and to say how it is
+        assert {"from /clock", "to /diagnostics"} <= set(left)
+        node.trigger_configure()
+        node.trigger_activate()
+        assert entities(node) == made
+
+
+def heard_at_the_end(node: Back) -> list[str]:
+    events: list[str] = []
+    listener = Node("listener")
+    topic = "/pose_graph_node/transition_event"
+    listener.create_subscription(TransitionEvent, topic, lambda event: events.append(event.goal_state.label), 10)
+    executor = SingleThreadedExecutor()
+    executor.add_node(listener)
+
+    def spin() -> None:
+        executor.spin_once(timeout_sec=0.02)
+
+    wait_until(lambda: listener.count_publishers(topic) > 0, 10.0, spin)
+    wait_until(lambda: False, 0.3, spin)
+    try:
+        node.close()
+    finally:
+        wait_until(lambda: "finalized" in events, 10.0, spin)
+        executor.shutdown()
+        listener.destroy_node()
+    return events
+
+
+def test_who_waits_for_its_last_words_hears_when_they_begin_and_end(node: Back) -> None:
+    assert heard_at_the_end(node) == ["shuttingdown", "finalized"]
+
+
+def test_results_that_cannot_be_written_at_the_end_are_told_to_who_closes_it(node: Back) -> None:
+    node.fault = OutputError("cannot write graph.g2o: No space left on device")
+    with pytest.raises(OutputError, match="No space left"):
+        node.close()
+
+
+def test_a_fault_in_a_transition_is_told_and_can_be_mended(node: Back, capfd: pytest.CaptureFixture[str]) -> None:
+    node.fault = ZeroDivisionError("a fault in the program")
+    node.trigger_deactivate()
+    assert node.trigger_cleanup() is TransitionCallbackReturn.FAILURE
+    captured = capfd.readouterr()
+    assert "ZeroDivisionError: a fault in the program" in captured.out + captured.err
+    assert node.trigger_activate() is TransitionCallbackReturn.FAILURE
+    node.fault = None
+    for step in (node.trigger_cleanup, node.trigger_configure, node.trigger_activate):
+        assert step() is TransitionCallbackReturn.SUCCESS
