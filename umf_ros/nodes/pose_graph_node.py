@@ -14,6 +14,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from lifecycle_msgs.msg import TransitionEvent
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import String
@@ -140,7 +141,8 @@ class PoseGraphNode(BaseNode):
             response.success, response.message = await answered
             return response
 
-        self.create_service(Trigger, name, answer)
+        # a group of its own: those in one group wait for each other, the timers too
+        self.create_service(Trigger, name, answer, callback_group=ReentrantCallbackGroup())
 
     def _on_front_end(self, event: TransitionEvent) -> None:
         self._front_end_busy = event.goal_state.label == "shuttingdown"
