@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import sqlite3
+import tempfile
 import threading
 from collections import Counter
 from contextlib import suppress
@@ -300,8 +301,7 @@ def two_robots(folder: Path, bag: Path, config: Path) -> Figures:
 
 def play_live(folder: Path, bag: Path, config: Path) -> Figures:
     """Milliseconds from the stamp of a scan to its closure, by the recording's clock, at its own pace."""
-    run = folder / "live"
-    run.mkdir(exist_ok=True)
+    run = Path(tempfile.mkdtemp(prefix="live_", dir=folder))  # a folder that is used again is gone on with
     delays_ms: list[float] = []
     with own_domain():
         ears = Ears()

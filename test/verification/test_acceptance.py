@@ -134,3 +134,21 @@ def test_larger_errors_never_make_a_closure_more_probable(shipped: AcceptanceMod
     value = GOOD.numbers[name]
     odds = [shipped.probability(replace(GOOD, **{name: value * factor})) for factor in (0.5, 1, 2, 5, 20)]
     assert odds == sorted(odds, reverse=True)
+
+
+@pytest.mark.parametrize("measurement", [GOOD, BAD], ids=["good", "bad"])
+@pytest.mark.parametrize("rival", [-1.0, 0.0, 0.2, 3.0])
+def test_no_rival_makes_a_closure_more_probable_than_none(
+    shipped: AcceptanceModel, measurement: Measurement, rival: float
+) -> None:
+    alone = replace(measurement, rival_near=float("nan"), rival_far=float("nan"))
+    beside = replace(measurement, rival_near=rival, rival_far=rival)
+    assert shipped.at_best(alone) >= shipped.probability(beside) >= shipped.probability(alone)
+
+
+def test_what_was_never_measured_is_not_what_a_closure_was_lost_by(shipped: AcceptanceModel) -> None:
+    assert shipped.lost(BAD)["no_rival"] == pytest.approx(shipped.models["scan"].weights["no_rival"])
+    hopeless = replace(BAD, rival_near=float("nan"), rival_far=float("nan"))
+    lost = shipped.lost(hopeless)
+    assert "no_rival" not in lost and "heading_known" in lost
+    assert all(odds > 0 for odds in lost.values())

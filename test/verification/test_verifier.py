@@ -16,6 +16,7 @@ from umf_ros.geometry import Array, make_pose, relative, rotation_angle
 from umf_ros.verification import NO_DEPTH, Verdict, Verifier
 from umf_ros.verification.constants import SAME_M, SAME_RAD
 from umf_ros.verification.hypotheses import near
+from umf_ros.verification.measurement import SCAN
 from umf_ros.verification.verifier import FOUND_BEFORE
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
@@ -255,6 +256,28 @@ def test_hypotheses_that_end_at_one_pose_are_judged_once(verifier: Verifier) -> 
     assert poses
     for number, pose in enumerate(poses):
         assert not any(near(pose, other, SAME_M, SAME_RAD) for other in poses[:number])
+
+
+def rivals_known(verdicts: list[Verdict]) -> list[bool]:
+    return [bool(np.isfinite(one.measurement.rival_far)) for one in verdicts if one.measurement.kind == SCAN]
+
+
+def test_what_is_hopeless_is_held_against_no_rivals_and_all_else_is() -> None:
+    query, match = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
+    found = Verifier(Verification()).verify(query, [candidate(match)])
+    assert found[0].closure is not None and rivals_known(found)[0]
+    wrong = Verifier(Verification()).verify(query, others(4))
+    assert wrong and not any(verdict.closure for verdict in wrong)
+    assert not all(rivals_known(wrong))
+    # who asks for improbable ones, or fits the decision, gets every number
+    everything = Verifier(Verification(min_probability=0.0)).verify(query, others(4))
+    assert rivals_known(everything) and all(rivals_known(everything))
+    examined = Verifier(Verification()).examine(query, others(4))
+    assert all(np.isfinite(one.measurement.rival_far) for one in examined if one.measurement.kind == SCAN)
+    # what was left out would have changed no verdict
+    by_stamp = {verdict.candidate.stamp_ns: verdict for verdict in everything}
+    for verdict in wrong:
+        assert (by_stamp[verdict.candidate.stamp_ns].probability or 0.0) < 0.5
 
 
 def test_a_verdict_tells_whether_the_images_agree(verifier: Verifier) -> None:

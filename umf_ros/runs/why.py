@@ -84,12 +84,10 @@ class GateKeeper:
 
     def missing(self, candidate: TestedCandidate) -> dict[str, float]:
         """Log-odds that each criterion could have added and did not, the most first."""
-        measurement, given = measurement_of(candidate.numbers), self.contributions(candidate)
-        if measurement is None or not given:
+        measurement = measurement_of(candidate.numbers)
+        if measurement is None or measurement.kind == SUBMAP:
             return {}
-        weights = self._acceptance.models[measurement.kind].weights
-        lost = {name: weight - given.get(name, 0.0) for name, weight in weights.items() if weight > 0}
-        return dict(sorted(((name, one) for name, one in lost.items() if one > 0), key=lambda one: -one[1]))
+        return dict(sorted(self._acceptance.lost(measurement).items(), key=lambda one: -one[1]))
 
     def at_threshold(self, threshold: float) -> tuple[int, int]:
         """Closures that would be published from this probability on, and how many of them join no same place."""

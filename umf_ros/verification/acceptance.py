@@ -173,6 +173,15 @@ class AcceptanceModel:
                 return f"{name} {value:.3g}"
         return ""
 
+    def lost(self, measurement: Measurement) -> dict[str, float]:
+        """Log-odds that each criterion could have added and did not; without those whose value is unknown."""
+        weights, scored = self.models[measurement.kind].weights, scores(measurement)
+        criteria = criteria_of(measurement.kind)
+        known = [name for name in weights if math.isfinite(criteria[name].read(measurement))]
+        return {
+            name: weights[name] * (1.0 - scored[name]) for name in known if weights[name] * (1.0 - scored[name]) > 0
+        }
+
     def contributions(self, measurement: Measurement) -> dict[str, float]:
         """Log-odds of each criterion by name; "bias" is what has to be overcome."""
         model = self.models[measurement.kind]
