@@ -40,8 +40,8 @@ def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> Array:
 
 
 def to_quaternion(pose: ArrayLike) -> Array:
-    """Quaternion (x, y, z, w) with w >= 0 of a (4, 4) pose's or (3, 3) matrix's rotation."""
-    return Rotation.from_matrix(np.asarray(pose)[:3, :3]).as_quat(canonical=True)
+    """Quaternion (x, y, z, w) with w >= 0 of the rotation of a pose (..., 4, 4) or of a matrix (..., 3, 3)."""
+    return Rotation.from_matrix(np.asarray(pose)[..., :3, :3]).as_quat(canonical=True)
 
 
 def invert(a_T_b: Array) -> Array:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from umf_ros.geometry import Array, adjoint, expmap, invert, logmap
-from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Stamps
+from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Rows, Stamps
 
 
 @dataclass(frozen=True)
@@ -48,14 +47,15 @@ class CorrectedPath:
         inside = (after > 0) & (after < len(self.stamps))
         if inside.any():
             walked = points.noise[inside] - self.points.noise[lower[inside]]
-            twists[inside] = (walked @ self._multipliers[lower[inside]][..., None])[..., 0]
+            steps, of_step = np.unique(lower[inside], return_inverse=True)
+            twists[inside] = (walked @ self._multipliers(steps)[of_step][..., None])[..., 0]
         start = self.poses[lower] @ invert(self.points.poses[lower])
         return start @ expmap(twists) @ points.poses
 
-    @cached_property
-    def _multipliers(self) -> Array:
-        """(N-1, 6) correction between two solved poses per noise: Lagrange multipliers of the solved poses."""
-        steps = invert(self.points.poses[:-1]) @ self.points.poses[1:]
-        misfits = logmap(invert(steps) @ invert(self.poses[:-1]) @ self.poses[1:])
-        twists = adjoint(self.points.poses[1:]) @ misfits[..., None]
-        return np.linalg.solve(np.diff(self.points.noise, axis=0), twists)[..., 0]
+    def _multipliers(self, steps: Rows) -> Array:
+        """(M, 6) correction from some solved poses to the next per noise: Lagrange multipliers of the solved poses."""
+        here, there = self.points.of(steps), self.points.of(steps + 1)
+        walked = invert(here.poses) @ there.poses
+        misfits = logmap(invert(walked) @ invert(self.poses[steps]) @ self.poses[steps + 1])
+        twists = adjoint(there.poses) @ misfits[..., None]
+        return np.linalg.solve(there.noise - here.noise, twists)[..., 0]
