@@ -26,7 +26,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from endurance_fuzz import some_keyframe
+from endurance_files import some_keyframe
 from endurance_graph import live_graph, long_graph, timed
 from endurance_live import fuzz_back_end, fuzz_front_end, kill_back_end, kill_front_end, play_live, two_robots
 from rich.console import Console

@@ -28,9 +28,11 @@ def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> Array:
     """Pose from a (3,) translation and a quaternion (x, y, z, w).
 
     Raises:
-        ValueError: the quaternion is not finite or its norm is further than 1 % from one.
+        ValueError: a number is not finite, or the norm of the quaternion is further than 1 % from one.
     """
     quaternion = np.asarray(xyzw, dtype=float)
+    if not np.isfinite(np.asarray(translation, dtype=float)).all():
+        raise ValueError("a translation that is not finite")
     norm = float(np.linalg.norm(quaternion))
     if not np.isfinite(norm) or abs(norm - 1.0) > 0.01:
         raise ValueError(f"not a unit quaternion (norm {norm:.4g})")

@@ -179,6 +179,23 @@ def test_what_was_not_settled_in_time_is_known_to_be_and_settled_later(tmp_path:
     again.close()
 
 
+def test_ending_a_graph_keeps_a_journal_that_somebody_reads(world: GraphWorld, tmp_path: Path) -> None:
+    graph = made(tmp_path / JOURNAL)
+    drive(graph, world, 0, 230)
+    before = states(graph)
+    reader = sqlite3.connect(tmp_path / JOURNAL)
+    reader.execute("BEGIN")
+    reader.execute("SELECT count(*) FROM event").fetchone()  # its log cannot be written back now
+    graph.take_odometry(231 * PERIOD_NS, world.odometry[230])
+    kept = graph.end()
+    graph.close()
+    reader.close()
+    assert kept is not None
+    assert made(tmp_path / JOURNAL).taken_up == 0
+    again = made(kept)
+    assert states(again) == before and again.graph.counts["odometry"] == 231
+
+
 def test_a_long_graph_is_taken_up_by_its_verdicts(
     world: GraphWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,12 +16,10 @@ from visualization_msgs.msg import Marker
 from umf_ros.errors import MessageError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, to_quaternion
-from umf_ros.sensors.messages import decode_pose
+from umf_ros.sensors.messages import LAST_STAMP_NS, decode_pose
 
 GREEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.5)
-LAST_STAMP_NS = 2**31 * 10**9
-"""What a stamp with seconds of 32 bits stays below."""
 BETWEEN_FRAME = re.compile(r"keyframe/[^/]{1,63}/[0-9]{1,19}")
 KEYFRAME_FRAME = re.compile(r"keyframe/([0-9]{1,19})")
 

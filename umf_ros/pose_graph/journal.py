@@ -150,11 +150,17 @@ class GraphJournal:
 
     def set_aside(self) -> Path:
         """Keep what there is under another name, and begin anew; returns that name."""
-        self._connection.close()
         old = next(name for i in count(1) if not (name := self.path.with_suffix(f".{i}.sqlite")).exists())
-        with writing(self.path):
-            self.path.rename(old)
-        self._connection = self._open()
+        self._connection.close()
+        try:
+            with writing(self.path):
+                # while somebody reads it, its newest part lies in a log that belongs to its name
+                for end in ("-wal", ""):
+                    part = self.path.with_name(self.path.name + end)
+                    if part.exists():
+                        part.rename(old.with_name(old.name + end))
+        finally:
+            self._connection = self._open()
         return old
 
     def close(self) -> None:
