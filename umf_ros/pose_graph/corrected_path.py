@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from umf_ros.geometry import Array, adjoint, expmap, invert, logmap
 from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Rows, Stamps
@@ -52,10 +54,20 @@ class CorrectedPath:
         start = self.poses[lower] @ invert(self.points.poses[lower])
         return start @ expmap(twists) @ points.poses
 
+    @cached_property
+    def _found(self) -> tuple[Array, NDArray[np.bool_]]:
+        """(N-1, 6) multipliers of the steps between solved poses, and (N-1,) which of them are known yet."""
+        return np.zeros((len(self.stamps) - 1, 6)), np.zeros(len(self.stamps) - 1, bool)
+
     def _multipliers(self, steps: Rows) -> Array:
         """(M, 6) correction from some solved poses to the next per noise: Lagrange multipliers of the solved poses."""
-        here, there = self.points.of(steps), self.points.of(steps + 1)
-        walked = invert(here.poses) @ there.poses
-        misfits = logmap(invert(walked) @ invert(self.poses[steps]) @ self.poses[steps + 1])
-        twists = adjoint(there.poses) @ misfits[..., None]
-        return np.linalg.solve(there.noise - here.noise, twists)[..., 0]
+        multipliers, known = self._found
+        new = steps[~known[steps]]
+        if len(new):
+            here, there = self.points.of(new), self.points.of(new + 1)
+            walked = invert(here.poses) @ there.poses
+            misfits = logmap(invert(walked) @ invert(self.poses[new]) @ self.poses[new + 1])
+            twists = adjoint(there.poses) @ misfits[..., None]
+            multipliers[new] = np.linalg.solve(there.noise - here.noise, twists)[..., 0]
+            known[new] = True
+        return multipliers[steps]
