@@ -61,3 +61,10 @@ def test_the_right_submap_is_found_among_others_and_only_if_admissible() -> None
     everything[7] = False
     assert all(guess.row != 7 for guess in index.search(query, everything))
     assert not index.search(query, np.zeros(12, bool))
+
+
+def test_submaps_of_ground_on_which_nothing_stands_out_are_like_none() -> None:
+    index = KeypointIndex()
+    index.add(find_keypoints(np.zeros((const.ROWS, const.COLUMNS), np.float32)))
+    assert len(index) == 1
+    assert index.search(find_keypoints(relief(1)), np.array([True])) == []

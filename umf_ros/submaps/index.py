@@ -73,6 +73,8 @@ class KeypointIndex:
     def _votes(self, query: Keypoints, admissible: NDArray[np.bool_]) -> Array:
         """(N,) for every submap: by how much its keypoints are more like the query's than most others'."""
         mine = np.flatnonzero(admissible[self._owner])
+        if not len(mine):  # ground on which nothing stands out
+            return np.zeros(len(self._submaps))
         similarity = query.descriptors @ self._table[mine].T
         kept = min(const.KEYPOINT_VOTES, similarity.shape[1] - 1)
         best = np.argpartition(-similarity, kept, axis=1)[:, : kept + 1]
