@@ -145,6 +145,11 @@ def test_no_packing_hides_how_large_a_chunk_is(broken: bool, tmp_path: Path, mon
         if broken:
             path.write_bytes(path.read_bytes()[:-100])
         assert len(list(open_bag(path).raw_messages())) == 200
+    with monkeypatch.context() as limited:
+        limited.setattr("umf_ros.bags.mcap_storage.LARGEST_CHUNK", 2500)
+        for packing in CompressionType:  # what they claim is looked at before
+            with pytest.raises(BagError, match="holds no message"):
+                open_bag(tmp_path / f"{packing}.mcap")
     monkeypatch.setattr("umf_ros.bags.unpacking.LARGEST_CHUNK", 2500)
     path = tmp_path / f"{CompressionType.LZ4}.mcap"
     with pytest.raises(BagError, match="holds no message" if broken else "holds more than"):

@@ -36,7 +36,10 @@ def test_the_message_names_its_ends_as_documented(rng: np.random.Generator) -> N
     assert message.twist.covariance[0] == -1.0
 
 
-@pytest.mark.parametrize("frame", ["", "odom", "keyframe/", "keyframe/12a", "xkeyframe/12"])
+NO_STAMPS = ["keyframe/" + "9" * 5000, "keyframe/" + "9" * 19, "keyframe/\u0661\u0662", "keyframe/-1"]
+
+
+@pytest.mark.parametrize("frame", ["", "odom", "keyframe/", "keyframe/12a", "xkeyframe/12", *NO_STAMPS])
 def test_foreign_frames_are_refused(rng: np.random.Generator, frame: str) -> None:
     message = closure_to_message(random_closure(rng))
     message.child_frame_id = frame
@@ -53,3 +56,10 @@ def test_a_pose_that_is_none_is_refused(rng: np.random.Generator) -> None:
     message.pose.pose.orientation.w = 4.0
     with pytest.raises(MessageError, match="not a unit quaternion"):
         closure_from_message(message)
+
+
+@pytest.mark.parametrize("frame", NO_STAMPS)
+def test_a_pair_to_reject_has_stamps_that_a_message_can_carry(frame: str) -> None:
+    assert conversions.parse_pair("keyframe/1 keyframe/2") == (1, 2)
+    with pytest.raises(MessageError, match="expected 'keyframe/<match ns> keyframe/<query ns>'"):
+        conversions.parse_pair(f"{frame} keyframe/2")

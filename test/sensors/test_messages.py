@@ -177,6 +177,11 @@ def test_bad_cloud_is_refused_by_kind(dtype: Any, changes: dict[str, Any], kind:
     assert kind_of(decode_cloud, cloud(0, np.ones(3, dtype), **changes)) == kind
 
 
+def test_a_point_of_many_bytes_is_refused() -> None:
+    wide = np.dtype({"names": ["x", "y", "z"], "formats": ["<f4"] * 3, "offsets": [0, 4, 8], "itemsize": 5000})
+    assert kind_of(decode_cloud, cloud(START_NS, np.zeros(2, wide))) == "step"
+
+
 def test_unknown_data_type_is_refused() -> None:
     message = cloud(0, scan(POINTS))
     message.fields[2].datatype = 99

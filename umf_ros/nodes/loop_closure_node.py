@@ -71,6 +71,7 @@ class LoopClosureNode(BaseNode):
         self._announcer = Announcer(self, settings.frames)
         self._lock = threading.Lock()
         self._paused = False
+        self._wanted: Settings | None = None
         self._closures = 0
         self._between = 0
         self._last: Detection | None = None
@@ -103,8 +104,7 @@ class LoopClosureNode(BaseNode):
             self._detector.close()
 
     def _retune(self, settings: Settings) -> None:
-        with self._lock:
-            self._detector.retune(settings)
+        self._wanted = settings  # the executor does not wait for the keyframe in hand
 
     def _enqueue(self, topic: str, message: Any) -> None:
         if not self._paused:
@@ -117,6 +117,9 @@ class LoopClosureNode(BaseNode):
 
     def _detect(self, frame: Frame) -> None:
         with self._lock:
+            wanted, self._wanted = self._wanted, None
+            if wanted is not None:
+                self._detector.retune(wanted)
             detection = self._detector.process(frame)
             # before anybody forgets them
             matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
