@@ -250,3 +250,17 @@ def test_an_empty_graph_answers_everything(tmp_path: Path) -> None:
 def test_outlier_free_optimum_is_what_the_drive_ends_with(driven: PoseGraph) -> None:
     assert accepted(driven) == right(WORLD)
     assert rms(driven.trajectory()[1], batch_optimum(WORLD)) < 1e-3
+
+
+def test_what_is_settled_is_not_settled_again_until_something_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = rover_loops(300, 12)
+    graph = drive(world)
+    settled = graph.trajectory()[1]
+    tried: list[int] = []
+    monkeypatch.setattr(PoseGraph, "_trial", lambda *_: tried.append(1))
+    assert graph.settle() == [] and not tried
+    np.testing.assert_array_equal(graph.trajectory()[1], settled)
+    graph.add_odometry(10**15, world.odometry[-1])
+    with pytest.raises(AttributeError):
+        graph.settle()
+    assert tried

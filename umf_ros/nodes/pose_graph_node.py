@@ -75,6 +75,7 @@ class PoseGraphNode(BaseNode):
         # newest odometry that path and markers show; None: other verdicts than they show
         self._drawn_ns: int | None = None
         self._draws_again_s = 0.0
+        self._keeps_up = False
         self._make_publishers()
         kept = self._durable if isinstance(self._durable, DurableGraph) else None
         if kept is not None and (kept.taken_up or kept.feed.newest_ns >= 0):
@@ -226,11 +227,14 @@ class PoseGraphNode(BaseNode):
         self._marker_publisher.publish(messages.markers(verdicts, lines, newest_ns, self._frames))
 
     def _tick(self) -> None:
-        self._worker.submit(self._keep_up)
+        if not self._keeps_up:  # once is enough, however long the worker is at something else
+            self._keeps_up = True
+            self._worker.submit(self._keep_up)
         self._diagnose(self._judge(self._own_status()))
 
     def _keep_up(self) -> None:
         """Decide about closures that waited for odometry, and show what has grown."""
+        self._keeps_up = False
         self._announce(self._durable.update())
         self._durable.graph.prepare(PREPARE_S)
         self._correct()

@@ -66,6 +66,7 @@ class PoseGraph:
         self._retrial: Retrial | None = None
         self._waiting: list[_Waiting] = []
         self._held: list[TrackedClosure] = []
+        self._settled = False
         self._seen: set[tuple[int, int, bytes]] = set()
         self._placed: set[tuple[int, int, int, int, bytes]] = set()
         self._refused: list[ClosureVerdict] = []
@@ -73,7 +74,7 @@ class PoseGraph:
 
     def retune(self, settings: PoseGraphSettings) -> None:
         """Judge by other gates from now on; the model of the odometry's noise stays."""
-        self._settings, self._retrial = settings, None
+        self._settings, self._retrial, self._settled = settings, None, False
         self._rejection.retune(settings)
 
     def begin_session(self) -> None:
@@ -101,6 +102,7 @@ class PoseGraph:
             self.counts[f"odometry refused: {error}"] += 1
             return False
         self.counts["odometry"] += 1
+        self._settled = False
         self._sessions.chains[-1].add(int(stamp_ns), np.asarray(odom_T_body, float), covariance)
         return True
 
@@ -171,6 +173,8 @@ class PoseGraph:
             The verdicts that changed; None when the time was up first, and all is as it was.
         """
         verdicts = self.update()
+        if self._settled:  # nothing has come since
+            return verdicts
         order = in_order(self._rejection.closures)
         trial, revoked = self._trial(order), self._rejection.revoked
         if not trial.go_on(order, self._attempt, within_s):
@@ -178,7 +182,9 @@ class PoseGraph:
         self._sessions, self._rejection, self._retrial = trial.sessions, trial.rejection, None
         for closure in revoked:
             self.revoke(closure.match_stamp_ns, closure.query_stamp_ns)
-        return verdicts + trial.changed() + self._attempt(self._rejection.settle)
+        verdicts += trial.changed() + self._attempt(self._rejection.settle)
+        self._settled = True
+        return verdicts
 
     def _trial(self, order: list[TrackedClosure]) -> Retrial:
         """The trial anew of closures, as far as it has come."""
@@ -210,6 +216,7 @@ class PoseGraph:
         endpoints = (match_stamp_ns, query_stamp_ns)
         closures = enumerate(tracked.closure for tracked in self._rejection.closures)
         rows = [row for row, closure in closures if (closure.match_stamp_ns, closure.query_stamp_ns) == endpoints]
+        self._settled = False
         if not rows:
             raise GraphError(f"no closure between keyframes {match_stamp_ns} and {query_stamp_ns}")
         return [verdict for row in rows for verdict in self._rejection.revoke(row)]
@@ -225,6 +232,7 @@ class PoseGraph:
             self.counts["closure twice"] += 1
             return None
         self._seen.add(message)
+        self._settled = False
         self._waiting.append(_Waiting(closure, covariance, self._sessions.newest_ns))
         return None
 
