@@ -2,7 +2,7 @@
 FROM ros:jazzy-ros-base-noble
 SHELL ["/bin/bash", "-c"]
 RUN apt-get update -qq && apt-get install -y -qq --no-install-recommends python3-venv python3-colcon-common-extensions \
-    ros-jazzy-common-interfaces ros-jazzy-lifecycle-msgs ros-jazzy-tf2-ros-py ros-jazzy-launch-ros && rm -rf /var/lib/apt/lists/*
+    ros-jazzy-common-interfaces ros-jazzy-lifecycle-msgs ros-jazzy-tf2-ros-py ros-jazzy-ros2launch && rm -rf /var/lib/apt/lists/*
 COPY . /workspace/src/umf_ros
 RUN source /opt/ros/jazzy/setup.bash && /workspace/src/umf_ros/tools/install_jazzy.sh /workspace
 RUN printf '%s\n' '#!/bin/bash' 'set -e' 'source /opt/ros/jazzy/setup.bash' 'source /workspace/venv/bin/activate' \

@@ -21,22 +21,20 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-from endurance_fuzz import some_keyframe
+from endurance_files import some_keyframe
+from endurance_graph import live_graph, long_graph, timed
 from endurance_live import fuzz_back_end, fuzz_front_end, kill_back_end, kill_front_end, play_live, two_robots
 from rich.console import Console
 from rich.table import Table
 
-from umf_ros.config import Database, Loop, load_settings
+from umf_ros.config import Database, Loop
 from umf_ros.frames import Embedding
-from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.pose_graph.pose_graph import PoseGraph
 
 Figures = dict[str, Any]
 KEYS = "kills lost_keyframes duplicate_closures backend_kills lost_verdicts fuzz_messages fuzz_bags fuzz_files"
@@ -149,13 +147,6 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def timed(step: Callable[[], object]) -> tuple[float, float]:
-    """Milliseconds of a step by the clock on the wall, and of CPU: on a busy machine only those say how long it is."""
-    wall_s, cpu_s = time.perf_counter(), time.process_time()
-    step()
-    return 1e3 * (time.perf_counter() - wall_s), 1e3 * (time.process_time() - cpu_s)
-
-
 def many_places(rng: np.random.Generator, count: int = 100_000) -> Figures:
     """Memory per place, and the time of a query among them."""
     places = PlaceDatabase(Database(), "noise", 256)
@@ -174,22 +165,6 @@ def many_places(rng: np.random.Generator, count: int = 100_000) -> Figures:
     return {"rss_bytes_per_keyframe": round(used / count), "query_ms_100k": wall, "query_cpu_ms_100k": cpu}
 
 
-def long_graph(poses: int = 20_000) -> Figures:
-    """Milliseconds, p50, of a closure that comes to a graph of so many poses; in the order of a drive at its end."""
-    world = rover_loops(poses, 10005)
-    graph = PoseGraph(load_settings().pose_graph.model_copy(update={"max_gap_s": 3.0}))
-    for k, pose in enumerate(world.odometry):
-        graph.add_odometry(k * PERIOD_NS, pose)
-    closures = [world.message(row) for row in range(len(world.closures))]
-    graph.add_closures(closures[:-40])
-    for _ in range(20):  # what the moved map comes close to is looked at with the next call
-        if not graph.update():
-            break
-    times = [timed(partial(graph.add_closure, closure)) for closure in closures[-40:]]
-    wall, cpu = np.median(times[20:], axis=0).round(1).tolist()
-    return {"event_ms_20k": wall, "event_cpu_ms_20k": cpu}
-
-
 PARTS = {
     "replay": Part(kill_replays, 4, 200, 8),
     "front_end": Part(lambda task, n, rng: kill_front_end(task.folder, n, task.bag, task.light, rng), 2, 40, 4),
@@ -202,6 +177,7 @@ PARTS = {
     "files": Part(lambda task, n, rng: fuzz("files", task, n, rng), 48, 300, 60),
     "places": Part(lambda _, __, rng: many_places(rng), 1, 1, 1),
     "graph": Part(lambda _, __, ___: long_graph(), 1, 1, 1),
+    "graph_live": Part(lambda task, _, __: live_graph(task.folder), 1, 1, 1),
     "live": Part(lambda task, _, __: play_live(task.folder, task.live_bag, task.whole), 1, 1, 1),
 }
 

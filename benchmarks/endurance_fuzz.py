@@ -7,18 +7,24 @@ Each part runs in a process of its own with 2 GB of memory, which prints what be
 from __future__ import annotations
 
 import json
-import pickle
 import resource
+import shutil
 import sys
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
+from itertools import count as count_up
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from endurance_attacks import attacked
+from endurance_files import damage, lie_in_sqlite, mutated, with_other_words, write_files
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
@@ -27,16 +33,13 @@ from rosbags.typesys import Stores, get_typestore
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import calibration_of, topics_of
 from umf_ros.bags.reader import Bag, decode, open_bag
-from umf_ros.config import Database, Settings, load_settings
+from umf_ros.config import Settings, load_settings
 from umf_ros.errors import UmfError
-from umf_ros.frames import Embedding, Keyframe, StereoCamera
-from umf_ros.lab.datasets.g2o import read_g2o
-from umf_ros.lab.datasets.pickles import load_pickle
-from umf_ros.networks.weights import load_weights
-from umf_ros.places.database import PlaceDatabase
-from umf_ros.resources import find
-from umf_ros.sensors.durable_graph import DurableGraph
+from umf_ros.loop_detector import LoopDetector, make_detector_embedder
+from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.sensors.intake import Intake, wanted_inputs
+from umf_ros.sensors.messages import OdometrySample
+from umf_ros.sensors.odometry_feed import OdometryFeed
 from umf_ros.sensors.synchronizer import Synchronizer
 
 MEMORY = 2 * 2**30
@@ -44,17 +47,6 @@ SLOW_S = 10.0
 VALUES: list[Any] = [0, -1, 1, 2**31, 2**32 - 1, 2**63, 1e-300, 1e308, float("nan"), float("inf"), "", "\0", "x" * 9999]
 VALUES += [None, [], b"", np.zeros(3), np.zeros(0, np.uint8), "keyframe/" + "9" * 5000, "mono16", "yuv422"]
 Outcome = Counter[str]
-
-
-def mutated(whole: bytes, rng: np.random.Generator) -> bytes:
-    """A copy with a few bytes changed close together, or cut off, or both."""
-    copy = bytearray(whole)
-    first = int(rng.integers(0, len(copy)))
-    for place in first + rng.integers(0, 64, rng.integers(1, 16)):
-        copy[min(int(place), len(copy) - 1)] = int(rng.integers(0, 256))
-    if rng.random() < 0.2:
-        del copy[int(rng.integers(1, len(copy))) :]
-    return bytes(copy)
 
 
 def attempt(outcome: Outcome, step: Callable[..., object], *arguments: object) -> None:
@@ -67,34 +59,64 @@ def attempt(outcome: Outcome, step: Callable[..., object], *arguments: object) -
         outcome["crashes" if "\n" in str(error) else "refused"] += 1
     except Exception as error:
         outcome["crashes"] += 1
-        sys.stderr.write(f"{type(error).__name__}: {error}\n")
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        sys.stderr.write(
+            f"{arguments[:1]}: {type(error).__name__}: {error} ({where.filename}, {where.lineno})\n"[-600:]
+        )
     outcome["hangs"] += time.monotonic() - start > SLOW_S
 
 
+class Rover:
+    """The way of messages through the front-end and the odometry's way into the graph, as of a replay."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.topics = topics_of(settings)
+        calibration = calibration_of(settings)
+        self.synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(self.topics), lambda _: None)
+        self._samples: list[OdometrySample] = []
+        self.intake = Intake(self.synchronizer, self.topics, lambda _: None, self._samples.append)
+        self._detector = LoopDetector(settings, make_detector_embedder(settings))
+        self._graph = PoseGraph(settings.pose_graph)
+        self._feed = OdometryFeed(self._graph)
+
+    def take(self, topic: str, message: Any) -> None:
+        """One message, and whatever follows from it."""
+        self.intake.take(topic, message)
+        for sample in self._samples:
+            self._feed.take(sample.stamp_ns, sample.odom_T_body)
+        self._samples.clear()
+        for frame in self.synchronizer.pop():
+            self._graph.add_closures(self._detector.process(frame).closures)
+
+    def counted(self) -> int:
+        """Messages of images, scans and odometry, all of which have found their fate."""
+        self.synchronizer.flush()
+        return sum(counter.received for counter in self.synchronizer.counters.values())
+
+
 def fuzz_messages(count: int, rng: np.random.Generator, settings: Settings, bag: Bag) -> Outcome:
-    """Messages of a recording with fields that nobody sends, through the intake of the front-end."""
+    """A recording in which many messages mean harm, or have fields that nobody sends, through the whole front-end."""
     outcome: Outcome = Counter()
-    topics = topics_of(settings)
-    synchronizer = Synchronizer(settings.sync, calibration_of(settings), wanted_inputs(topics), lambda _: None)
-    intake = Intake(synchronizer, topics, lambda _: None)
-    messages = [(raw.topic, decode(raw)) for raw in islice(bag.raw_messages(intake.topics), 60)]
-    infos = {topics.left_info, topics.right_info}
+    rover = Rover(settings)
+    infos = {rover.topics.left_info, rover.topics.right_info}
     sent = 0
-    for number in range(count):
-        topic, message = messages[number % len(messages)]
-        names = [name for name in message.__dataclass_fields__ if name != "header"]
-        changes = {names[rng.integers(len(names))]: VALUES[rng.integers(len(VALUES))] for _ in range(2)}
-        sent += topic not in infos
-        attempt(outcome, intake.take, topic, replace(message, **changes))
-        synchronizer.pop()
-    synchronizer.flush()
-    counted = sum(counter.received for counter in synchronizer.counters.values())
-    outcome["uncounted"] = max(0, sent - counted)
+    for raw in islice(chain.from_iterable(bag.raw_messages(rover.intake.topics) for _ in count_up()), count):
+        message = decode(raw)
+        kind = rng.random()
+        if kind < 0.3:
+            message = attacked(message, rng)
+        elif kind < 0.5:
+            names = [name for name in message.__dataclass_fields__ if name != "header"]
+            changes = {names[rng.integers(len(names))]: VALUES[rng.integers(len(VALUES))] for _ in range(2)}
+            message = replace(message, **changes)
+        sent += raw.topic not in infos
+        attempt(outcome, rover.take, raw.topic, message)
+    outcome["uncounted"] = abs(sent - rover.counted())
     return outcome
 
 
 def write_kinds(bag: Bag, folder: Path, settings: Settings) -> list[Path]:
-    """The start of a recording as mcap, db3, folder of ROS 2 and bag of ROS 1."""
+    """The start of a recording as mcap, packed and not, as db3, folder of ROS 2 and bag of ROS 1."""
     wanted = set(topics_of(settings).model_dump().values())
     raws = list(islice(bag.raw_messages(bag.topics.keys() & wanted), 40))
     jazzy, noetic = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
@@ -107,6 +129,19 @@ def write_kinds(bag: Bag, folder: Path, settings: Settings) -> list[Path]:
                     known[raw.topic] = writer.add_connection(raw.topic, raw.type, typestore=jazzy)
                 writer.write(known[raw.topic], raw.log_ns, raw.data)
         paths += [path for path in sorted((folder / plugin.name).iterdir()) if path.suffix in (".mcap", ".db3")]
+    paths.append(folder / StoragePlugin.SQLITE3.name)
+    for packing in (CompressionType.LZ4, CompressionType.ZSTD):
+        paths.append(folder / f"{packing.name}.mcap")
+        with paths[-1].open("wb") as file:
+            packed = McapWriter(file, chunk_size=2**20, compression=packing)
+            packed.start("ros2")
+            channels: dict[str, int] = {}
+            for raw in raws:
+                if raw.topic not in channels:
+                    schema = packed.register_schema(raw.type, "ros2msg", b"")
+                    channels[raw.topic] = packed.register_channel(raw.topic, "cdr", schema)
+                packed.add_message(channels[raw.topic], raw.log_ns, raw.data, raw.log_ns)
+            packed.finish()
     with Ros1Writer(folder / "one.bag") as old:
         links: dict[str, Any] = {}
         for raw in raws:
@@ -119,7 +154,7 @@ def write_kinds(bag: Bag, folder: Path, settings: Settings) -> list[Path]:
 
 
 def fuzz_bags(count: int, rng: np.random.Generator, settings: Settings, bag: Bag, folder: Path) -> Outcome:
-    """Recordings of all kinds with damaged bytes."""
+    """Recordings of all kinds with damaged bytes, or that lie."""
     outcome: Outcome = Counter()
     paths = write_kinds(bag, folder, settings)
 
@@ -132,61 +167,29 @@ def fuzz_bags(count: int, rng: np.random.Generator, settings: Settings, bag: Bag
     for number in range(count):
         source = paths[number % len(paths)]
         path = folder / f"mutated{source.suffix}"
-        path.write_bytes(mutated(source.read_bytes(), rng))
+        if source.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+            shutil.copytree(source, path)
+            about = path / "metadata.yaml"
+            about.write_bytes(with_other_words(about.read_bytes(), rng))
+        else:
+            path.write_bytes(source.read_bytes())
+            if source.suffix == ".db3" and rng.random() < 0.5:
+                lie_in_sqlite(path, rng)
+            else:
+                path.write_bytes(mutated(path.read_bytes(), rng))
         attempt(outcome, read, path)
     return outcome
 
 
-def some_keyframe(stamp_ns: int, rng: np.random.Generator) -> Keyframe:
-    """A keyframe of noise."""
-    descriptor = rng.standard_normal(16).astype(np.float32)
-    camera = StereoCamera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.2)
-    points = rng.standard_normal((20, 3)).astype(np.float32)
-    return Keyframe(stamp_ns, Embedding(descriptor / np.linalg.norm(descriptor)), camera, np.eye(4), points)
-
-
-def write_files(folder: Path, rng: np.random.Generator) -> dict[str, tuple[bytes, Callable[[Path], object]]]:
-    """A file of every kind that is read, and how it is read."""
-    places = PlaceDatabase(Database(path=str(folder / "places.sqlite")), "noise", 16)
-    for number in range(20):
-        places.add(some_keyframe(number * 10**9, rng))
-    places.close()
-    graph = DurableGraph(load_settings().pose_graph, folder / "graph.sqlite", lambda _: None)
-    for number in range(200):
-        graph.take_odometry(number * 10**8 + 1, np.eye(4))
-    graph.graph.write_g2o(folder / "graph.g2o")
-    graph.close()
-
-    def read_places(path: Path) -> None:
-        opened = PlaceDatabase(Database(path=str(path)), "noise", 16)
-        try:
-            for row in range(len(opened)):
-                opened[row]
-        finally:
-            opened.close()
-
-    def read_graph(path: Path) -> None:
-        DurableGraph(load_settings().pose_graph, path, lambda _: None).close()
-
-    return {
-        "places.sqlite": ((folder / "places.sqlite").read_bytes(), read_places),
-        "graph.sqlite": ((folder / "graph.sqlite").read_bytes(), read_graph),
-        "settings.yaml": (find("config/loop_closure.yaml").read_bytes(), load_settings),
-        "graph.g2o": ((folder / "graph.g2o").read_bytes(), read_g2o),
-        "weights.safetensors": (find("models/umf_light.safetensors").read_bytes(), load_weights),
-        "table.pickle": (pickle.dumps({"a": [np.arange(9.0), "b"], "c": np.array([None], object)}), load_pickle),
-    }
-
-
 def fuzz_files(count: int, rng: np.random.Generator, folder: Path) -> Outcome:
-    """Files of every kind with damaged bytes; of weights their head, where names and shapes are."""
+    """Files of every kind, damaged or lying."""
     outcome: Outcome = Counter()
     files = list(write_files(folder, rng).items())
     for number in range(count):
         name, (whole, read) = files[number % len(files)]
         path = folder / f"mutated_{number}_{name}"
-        head = 4096 if name.startswith("weights") else len(whole)
-        path.write_bytes(mutated(whole[:head], rng) + whole[head:])
+        damage(path, whole, rng)
         attempt(outcome, read, path)
         for left in folder.glob(f"{path.name}*"):
             left.unlink()
@@ -206,7 +209,8 @@ def main() -> None:
     elif part == "bags":
         outcome = fuzz_bags(count, rng, settings, open_bag(sys.argv[5]), folder)
     else:
-        outcome = fuzz_messages(count, rng, settings, open_bag(sys.argv[5]))
+        often = load_settings(None, loop__min_time_gap_s=3.0, loop__min_travel_m=1.0, keyframe__min_translation_m=0.2)
+        outcome = fuzz_messages(count, rng, often, open_bag(sys.argv[5]))
     print(json.dumps(outcome))
 
 

@@ -153,7 +153,7 @@ def fuzz_back_end(folder: Path, count: int, rng: np.random.Generator) -> Figures
             ears.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS),
             ears.create_publisher(String, f"/{BACK_END}/reject_edge", MANY),
         ]
-        node = NodeUnderTest(BACK_END, folder / f"fuzz_{BACK_END}", {})
+        node = NodeUnderTest(BACK_END, folder / f"fuzz_{BACK_END}_{int(rng.integers(10**9))}", {})
         crashes = 0 if ears.anew(BACK_END) else 1
         ears.until(lambda: all(publisher.get_subscription_count() for publisher in publishers), 10.0)
         sent: Counter[str] = Counter()
@@ -196,7 +196,7 @@ def fuzz_front_end(folder: Path, count: int, config: Path, rng: np.random.Genera
     with own_domain():
         ears = Ears()
         publishers = {name: ears.create_publisher(kind, getattr(topics, name), MANY) for name, kind in kinds.items()}
-        node = NodeUnderTest(FRONT_END, folder / f"fuzz_{FRONT_END}", {}, config=config)
+        node = NodeUnderTest(FRONT_END, folder / f"fuzz_{FRONT_END}_{int(rng.integers(10**9))}", {}, config=config)
         crashes = 0 if ears.anew(FRONT_END) else 1
         ears.until(lambda: all(publisher.get_subscription_count() for publisher in publishers.values()), 10.0)
         sent: Counter[str] = Counter()

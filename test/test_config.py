@@ -97,6 +97,12 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("a: " + "b" * 2**23, "larger than 4 MB"),
         ("? {a: b}\n: c", "not valid YAML"),
         ("loop: !!python/object/apply:os.system [true]", "not valid YAML"),
+        ("a: !!int ''", "not valid YAML"),
+        ("a: !!bool maybe", "not valid YAML: 'maybe'"),
+        ("a: !!timestamp x", "not valid YAML"),
+        ("loop: {min_time_gap_s: .inf}", "loop.min_time_gap_s: .*finite"),
+        ("loop: {min_travel_m: .nan}", "loop.min_travel_m"),
+        ("loop: {min_time_gap_s: 1.0e+300}", "loop.min_time_gap_s"),
     ],
 )
 def test_a_hostile_file_is_one_short_line(tmp_path: Path, text: str, message: str) -> None:
@@ -111,3 +117,10 @@ def test_localization_needs_a_map() -> None:
         load_settings(None, mode="localization")
     settings = load_settings(None, mode="localization", map="somewhere")
     assert settings.localizing and not Settings().localizing
+
+
+def test_a_file_without_end_or_with_a_name_without_end_is_one_short_line(tmp_path: Path) -> None:
+    for path in (Path("/dev/zero"), tmp_path / ("x" * 5000), tmp_path):
+        with pytest.raises(ConfigError) as caught:
+            load_settings(path)
+        assert "\n" not in str(caught.value) and len(str(caught.value)) < 500

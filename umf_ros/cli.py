@@ -12,7 +12,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from umf_ros import __version__
-from umf_ros.errors import UmfError
+from umf_ros.errors import UmfError, one_line, shortened
 from umf_ros.resources import FLEET_PACKAGES, LAB_PACKAGES
 
 COMMANDS = {
@@ -100,9 +100,16 @@ def main() -> NoReturn:
     except ModuleNotFoundError as error:
         typer.echo(f"umf: {error.name} is not installed; {_what_helps(str(error.name).split('.')[0])}", err=True)
         sys.exit(1)
+    except MemoryError:
+        typer.echo("umf: out of memory", err=True)
+        sys.exit(1)
     except BrokenPipeError:
         # the reader of our output went away, as with `umf ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:  # a name that is too long, a folder that may not be looked into, a disk that is full
+        where = shortened(error.filename) if error.filename else "a file cannot be used"
+        typer.echo(f"umf: {where}: {error.strerror or one_line(error)}", err=True)
         sys.exit(1)
 
 

@@ -20,7 +20,7 @@ from umf_ros.yaml_files import read_values
 class Group(BaseModel):
     """A group of settings: unknown names are refused, whole numbers pass for floats."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
 
 
 def _known(name: str) -> str:
@@ -113,7 +113,7 @@ class EmbeddingSettings(Group):
 class Loop(Group):
     """Which keyframes may be candidates for a loop closure."""
 
-    min_time_gap_s: float = Field(20.0, ge=0, description="a match is at least this much older, s")
+    min_time_gap_s: float = Field(20.0, ge=0, le=1e9, description="a match is at least this much older, s")
     min_travel_m: float = Field(15.0, ge=0, description="and lies at least this far back along the path, m")
     top_k: int = Field(20, ge=1, le=200, description="candidates handed to verification")
     min_similarity: float = Field(0.0, ge=-1, le=1, description="candidates below this cosine similarity are dropped")

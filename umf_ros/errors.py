@@ -5,6 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+LONGEST = 300
+"""Letters of an error's text or of a name in it: both may be what somebody sent."""
+
+
+def shortened(text: object) -> str:
+    """A text of anybody's on one line that a person can read, its middle left out where it is long."""
+    line = " ".join(str(text).split())
+    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 3 :]}"
+
+
+def one_line(error: BaseException) -> str:
+    """What an exception says; its kind where it says nothing."""
+    return shortened(error) or type(error).__name__
+
 
 class UmfError(Exception):
     """Base of every error the package raises on purpose; its text is one line for a person."""
@@ -14,7 +28,7 @@ class MessageError(UmfError):
     """A sensor message that cannot be used; `kind` groups equal causes for counting."""
 
     def __init__(self, kind: str, text: str) -> None:
-        super().__init__(text)
+        super().__init__(shortened(text))
         self.kind = kind
 
 

@@ -28,9 +28,11 @@ def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> Array:
     """Pose from a (3,) translation and a quaternion (x, y, z, w).
 
     Raises:
-        ValueError: the quaternion is not finite or its norm is further than 1 % from one.
+        ValueError: a number is not finite, or the norm of the quaternion is further than 1 % from one.
     """
     quaternion = np.asarray(xyzw, dtype=float)
+    if not np.isfinite(np.asarray(translation, dtype=float)).all():
+        raise ValueError("a translation that is not finite")
     norm = float(np.linalg.norm(quaternion))
     if not np.isfinite(norm) or abs(norm - 1.0) > 0.01:
         raise ValueError(f"not a unit quaternion (norm {norm:.4g})")
@@ -38,8 +40,8 @@ def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> Array:
 
 
 def to_quaternion(pose: ArrayLike) -> Array:
-    """Quaternion (x, y, z, w) with w >= 0 of a (4, 4) pose's or (3, 3) matrix's rotation."""
-    return Rotation.from_matrix(np.asarray(pose)[:3, :3]).as_quat(canonical=True)
+    """Quaternion (x, y, z, w) with w >= 0 of the rotation of a pose (..., 4, 4) or of a matrix (..., 3, 3)."""
+    return Rotation.from_matrix(np.asarray(pose)[..., :3, :3]).as_quat(canonical=True)
 
 
 def invert(a_T_b: Array) -> Array:

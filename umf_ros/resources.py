@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from umf_ros.errors import UmfError
@@ -39,3 +40,13 @@ def dataset_names() -> list[str]:
     """Data sets that have a file in `config/datasets`, the default first."""
     names = {path.stem for folder in share_folders() for path in (folder / "config" / "datasets").glob("*.yaml")}
     return sorted(names, key=lambda name: (name != DEFAULT_DATASET, name))
+
+
+def check_packages() -> None:
+    """See to it that this Python is one that the package was installed for.
+
+    Raises:
+        UmfError: nothing that it needs is there, as in a workspace whose venv is not activated.
+    """
+    if not any(find_spec(name) for name in ("rosbags", "pydantic_core")):
+        raise UmfError(f"{sys.executable} has none of the packages that are needed: source venv/bin/activate first")

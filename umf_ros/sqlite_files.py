@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
-from umf_ros.errors import UmfError, writing
+from umf_ros.errors import UmfError, one_line, shortened, writing
 
 Step = Callable[[sqlite3.Connection], None]
 
@@ -39,14 +40,48 @@ def take_up(connection: sqlite3.Connection, name: str, kind: str, step: Step) ->
         UmfError: the step's own, or the file is damaged.
     """
     try:
+        _check_plain(connection)
         step(connection)
-    except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
+    except Exception as error:  # damaged bytes provoke anything
         connection.close()
-        raise UmfError(f"{name} cannot be used as a {kind}: {error}") from None
-    except BaseException:
-        connection.close()
-        raise
+        if isinstance(error, UmfError):
+            raise
+        raise UmfError(f"{name} cannot be used as a {kind}: {one_line(error)}") from None
     return connection
+
+
+@contextmanager
+def looked_at(path: Path, kind: str) -> Iterator[sqlite3.Connection]:
+    """A file of ours for a few statements, also one that another process writes.
+
+    Raises:
+        UmfError: it is missing, something else, or damaged.
+    """
+    if not path.is_file():
+        raise UmfError(f"there is no {kind} {shortened(path)}")
+    try:
+        with closing(sqlite3.connect(path)) as connection:
+            _check_plain(connection)
+            yield connection
+    except UmfError:
+        raise
+    except Exception as error:  # damaged bytes provoke anything
+        raise UmfError(f"{path} cannot be used as a {kind}: {one_line(error)}") from None
+
+
+def _check_plain(connection: sqlite3.Connection) -> None:
+    """See that there is nothing but tables and indices: a view, a trigger or a computed column runs what it likes.
+
+    Raises:
+        ValueError: there is.
+    """
+    connection.execute("PRAGMA trusted_schema = OFF")
+    for kind, name in connection.execute("SELECT type, name FROM sqlite_master"):
+        if kind not in ("table", "index"):
+            raise ValueError(f"it holds a {kind}")
+        columns = connection.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)) if kind == "table" else ()
+        if any(hidden for (hidden,) in columns):
+            raise ValueError("it holds a table with computed columns")
 
 
 def survive_crashes(connection: sqlite3.Connection) -> None:

@@ -64,9 +64,10 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    lines = []
-    for stamp, pose in zip(trajectory.stamps_ns, trajectory.poses, strict=True):
-        numbers = " ".join(f"{value:.9f}" for value in (*pose[:3, 3], *to_quaternion(pose)))
-        lines.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers}\n")
+    poses = trajectory.poses
+    numbers = np.concatenate([poses[:, :3, 3], to_quaternion(poses)], axis=1).tolist() if len(poses) else []
+    stamps = [divmod(stamp, 10**9) for stamp in trajectory.stamps_ns.tolist()]
+    form = "%d.%09d" + " %.9f" * 7 + "\n"
+    lines = [form % (*stamp, *row) for stamp, row in zip(stamps, numbers, strict=True)]
     with writing(path):
         Path(path).write_text("".join(lines), encoding="ascii")

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from umf_ros.errors import ConfigError
+from umf_ros.errors import ConfigError, one_line, shortened
 
 LARGEST_YAML = 2**22
 MOST_NODES = 100_000
@@ -37,15 +37,18 @@ def read_yaml(path: Path) -> Any:
         ConfigError: the file cannot be read.
     """
     try:
-        if path.stat().st_size > LARGEST_YAML:
+        with path.open(encoding="utf-8") as file:  # also a pipe, whose size nobody knows
+            text = file.read(LARGEST_YAML + 1)
+        if len(text) > LARGEST_YAML:
             raise ConfigError(f"{path} is not valid YAML: larger than {LARGEST_YAML >> 20} MB")
-        text = path.read_text(encoding="utf-8")
         _count_nodes(yaml.compose(text, yaml.SafeLoader), {})
         return yaml.load(text, _OnceLoader)
+    except ConfigError:
+        raise
     except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
-    except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:
-        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+        raise ConfigError(f"cannot read {shortened(path)}: {error.strerror}") from None
+    except Exception as error:  # the library raises anything on a tag that its value does not fit
+        raise ConfigError(f"{shortened(path)} is not valid YAML: {one_line(error)}") from None
 
 
 def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:

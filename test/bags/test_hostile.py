@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import bz2
+import os
 import resource
 import shutil
+import sqlite3
 import struct
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from recordings import small_settings, traverse, write_db3, write_mcap, write_ros1
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.records import LARGEST_CHUNK
-from umf_ros.bags.rosbags_storage import _unpack_bz2
+from umf_ros.bags.unpacking import unpack_bz2, unpack_lz4
 from umf_ros.errors import BagError
 
 ENTRIES = traverse(0.4)
@@ -87,11 +92,101 @@ def test_a_chunk_that_claims_gigabytes_is_not_unpacked(tmp_path: Path) -> None:
 
 
 def test_a_bzip2_chunk_is_unpacked_to_a_limit_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert _unpack_bz2(bz2.compress(b"abc" * 1000)) == b"abc" * 1000
-    monkeypatch.setattr("umf_ros.bags.rosbags_storage.LARGEST_CHUNK", 2**16)
-    with pytest.raises(AssertionError, match="more than"):
-        _unpack_bz2(bz2.compress(bytes(2**20)))
-    assert LARGEST_CHUNK == 2**29
+    assert unpack_bz2(bz2.compress(b"abc" * 1000)) == b"abc" * 1000
+    monkeypatch.setattr("umf_ros.bags.unpacking.LARGEST_CHUNK", 2**16)
+    with pytest.raises(ValueError, match="more than"):
+        unpack_bz2(bz2.compress(bytes(2**20)))
+
+
+def zeros_in_lz4(count: int) -> bytes:
+    packer = lz4.frame.LZ4FrameCompressor()
+    block = bytes(2**24)
+    return packer.begin() + b"".join(packer.compress(block) for _ in range(count >> 24)) + packer.flush()
+
+
+def test_an_lz4_chunk_is_unpacked_to_a_limit_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert unpack_lz4(lz4.frame.compress(b"abc" * 1000)) == b"abc" * 1000
+    monkeypatch.setattr("umf_ros.bags.unpacking.LARGEST_CHUNK", 2**16)
+    with pytest.raises(ValueError, match="more than"):
+        unpack_lz4(zeros_in_lz4(2**25))
+
+
+def overlapping(path: Path, packing: CompressionType = CompressionType.NONE) -> Path:
+    """Chunks whose times lie across each other."""
+    rng = np.random.default_rng(1)
+    with path.open("wb") as file:
+        writer = McapWriter(file, chunk_size=3000, compression=packing)
+        writer.start("ros2")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channels = [writer.register_channel(f"/{name}", "cdr", schema) for name in "abc"]
+        for number in range(200):
+            log_ns = 1000 + 10 * number + int(rng.integers(-300, 300))
+            writer.add_message(channels[number % 3], log_ns, bytes([number]) * 400, log_ns)
+        writer.finish()
+    return path
+
+
+def test_chunks_across_each_other_come_in_order_as_far_as_there_is_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = open_bag(overlapping(tmp_path / "a.mcap"))
+    with (tmp_path / "a.mcap").open("rb") as file:
+        expected = [(message.log_time, message.data) for _, _, message in make_reader(file).iter_messages(["/a", "/c"])]
+    assert [(raw.log_ns, raw.data) for raw in bag.raw_messages(["/a", "/c"])] == expected
+    monkeypatch.setattr("umf_ros.bags.mcap_storage.MOST_WAITING", 2000)
+    held = [(raw.log_ns, raw.data) for raw in bag.raw_messages(["/a", "/c"])]
+    assert sorted(held) == sorted(expected) and held != expected
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_no_packing_hides_how_large_a_chunk_is(broken: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for packing in CompressionType:
+        path = overlapping(tmp_path / f"{packing}.mcap", packing)
+        if broken:
+            path.write_bytes(path.read_bytes()[:-100])
+        assert len(list(open_bag(path).raw_messages())) == 200
+    monkeypatch.setattr("umf_ros.bags.unpacking.LARGEST_CHUNK", 2500)
+    path = tmp_path / f"{CompressionType.LZ4}.mcap"
+    with pytest.raises(BagError, match="holds no message" if broken else "holds more than"):
+        list(open_bag(path).raw_messages())
+
+
+def test_a_chunk_of_ros_1_in_lz4_is_unpacked_to_a_limit_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.bag"
+    whole = Ros1Writer(path)
+    whole.set_compression(Ros1Writer.CompressionFormat.LZ4)
+    with whole as writer:
+        topic, _, message = next(entry for entry in NOETIC if entry[2].__msgtype__ == "nav_msgs/msg/Odometry")
+        store = get_typestore(Stores.ROS1_NOETIC)
+        connection = writer.add_connection(topic, message.__msgtype__, typestore=store)
+        for log_ns in range(1, 50):
+            writer.write(connection, log_ns, store.serialize_ros1(message, message.__msgtype__))
+    assert len(list(open_bag(path).raw_messages())) == 49
+    monkeypatch.setattr("umf_ros.bags.unpacking.LARGEST_CHUNK", 2**12)
+    with pytest.raises(BagError, match="holds more than"):
+        list(open_bag(path).raw_messages())
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mcap")
+    (tmp_path / "endless").symlink_to("/dev/zero")
+    for path in (tmp_path / "pipe.mcap", tmp_path / "endless", tmp_path, tmp_path / ("x" * 5000)):
+        with pytest.raises(BagError) as caught:
+            open_bag(path)
+        assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+def test_messages_that_a_killed_recorder_left_in_a_log_are_told(tmp_path: Path) -> None:
+    folder = write_db3(tmp_path / "b", ENTRIES)
+    assert open_bag(folder).warning == ""
+    (path,) = folder.glob("*.db3")
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA journal_mode = WAL")
+        with connection:
+            connection.execute("UPDATE messages SET timestamp = timestamp + 1")
+        shutil.copytree(folder, tmp_path / "killed")
+    for killed in (tmp_path / "killed", tmp_path / "killed" / path.name):
+        assert f"{path.name}-wal holds messages that are not read" in open_bag(killed).warning
 
 
 def test_metadata_of_another_kind_is_one_line(tmp_path: Path) -> None:

@@ -48,6 +48,9 @@ def test_tum_keeps_every_nanosecond_and_the_pose(tmp_path: Path) -> None:
         ("1.0 nan 0 0 0 0 0 1", "not finite"),
         ("0.5 0 0 0 0 0 0 1", "not later than the one before"),
         ("nan 0 0 0 0 0 0 1", "expected numbers"),
+        ("inf 0 0 0 0 0 0 1", "expected numbers"),
+        ("1e30 0 0 0 0 0 0 1", "expected numbers"),
+        ("9223372037.0 0 0 0 0 0 0 1", "expected numbers"),
     ],
 )
 def test_wrong_line_of_a_tum_file_is_named(line: str, text: str, tmp_path: Path) -> None:
@@ -156,6 +159,8 @@ def test_rtklib_week_and_seconds_are_the_same_time(tmp_path: Path) -> None:
     [
         ("2021/07/07 10:00:18.000 37.75 15.0 2600.0", "line 1"),
         ("2021/07/07 noon 37.75 15.0 2600.0 1", "line 1"),
+        ("99999999999 5 37.75 15.0 2600.0 1", "line 1"),
+        ("2165 1e30 37.75 15.0 2600.0 1", "line 1"),
         ("2021/07/07 10:00:18.000 95.0 15.0 2600.0 1", "line 1"),
         ("2021/07/07 10:00:18.000 37.75 15.0 2600.0 5", "no position of quality 2"),
     ],

@@ -121,6 +121,9 @@ NO_BAG = "there is no recording nowhere.mcap"
         (["export", "net.xml", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
         (["graph", "optimize", "nowhere.g2o"], "nowhere.g2o"),
         (["graph", "plot", "nowhere.g2o"], "nowhere.g2o"),
+        (["replay", "x" * 5000], "xxx: File name too long"),
+        (["graph", "optimize", "x" * 5000], "File name too long"),
+        (["places", "list", "x" * 5000], "File name too long"),
     ],
 )
 def test_what_cannot_be_done_is_one_line_and_leaves_nothing(

@@ -52,6 +52,19 @@ def test_a_missing_package_is_a_problem() -> None:
     assert "pip install 'no-such-package>=1'" in finding.advice
 
 
+@pytest.mark.parametrize(("package", "told"), [("openvino", "torch runs the network"), ("open3d", "umf_ros[lab]")])
+def test_a_rover_may_do_without_some(package: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    check, real = dict(checks.checks())[package], importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else real(name))
+    finding = check()
+    assert finding.fine and finding.found.startswith("not installed; ") and told in finding.found
+
+
+def test_what_a_rover_may_do_without_has_to_work_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = broken_package(tmp_path, monkeypatch, "raise OSError('libusb-1.0.so.0: cannot open shared object file')")
+    assert not checks.check_optional(name, name, "1", "").fine
+
+
 def test_dds_really_exchanges_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "77")
     finding = checks.check_dds()
@@ -156,12 +169,3 @@ def test_a_program_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.Mo
     name = broken_package(tmp_path, monkeypatch, "import time; time.sleep(60)")
     finding = checks.check_package(name, name, "1")
     assert not finding.fine and finding.found == "no answer within 0.5 s"
-
-
-def test_a_rover_does_without_the_lab_but_a_broken_lab_is_a_problem(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    missing = checks.check_lab_package("no_such_package", "no-such-package", "1")
-    assert missing.fine and "umf_ros[lab]" in missing.found
-    name = broken_package(tmp_path, monkeypatch, "raise OSError('libusb-1.0.so.0: cannot open shared object file')")
-    assert not checks.check_lab_package(name, name, "1").fine

@@ -125,8 +125,25 @@ def test_a_garbled_word_about_the_architecture(weights, word):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"backbone": "vgg16"}, {"heads": 0}, {"tokens": "many"}, {"image_size": [100, 128]}, {"local": 18}],
-    ids=lambda changes: next(iter(changes)),
+    [
+        {"backbone": "vgg16"},
+        {"backbone": []},
+        {"heads": 0},
+        {"heads": -4},
+        {"tokens": "many"},
+        {"tokens": 2**40},
+        {"image_size": [100, 128]},
+        {"image_size": [32]},
+        {"local": 18},
+        {"width": True},
+        {"pyramid": 1.5},
+        {"layers": 10**7},
+        {"voxel_channels": [8, 8, 8, 8]},
+        {"coarse_voxels": 10**9},
+        {"image_supers": [8000, 8000]},
+        {"scene": 8000},
+    ],
+    ids=str,
 )
 def test_an_architecture_that_cannot_be_built(weights, changes):
     rewrite(weights, architecture=TINY.as_dict() | changes)
@@ -154,3 +171,15 @@ def test_loaded_weights_are_ready_to_use(weights):
     found = load_weights(weights)
     assert not found.training
     assert {value.dtype for value in found.parameters()} == {torch.float32}
+
+
+def test_scales_that_do_not_fit_are_one_line(tmp_path):
+    path = tmp_path / "int8.safetensors"
+    save_weights(UMF(replace(TINY, width=32, tokens=64)), path, {}, "int8")
+    tensors = load_file(path)
+    for name in [name for name in tensors if name.endswith(".scale")]:
+        tensors[name] = torch.ones(3, 5, 7, dtype=torch.float16)
+    rewrite(path, tensors)
+    with pytest.raises(WeightsError) as raised:
+        load_weights(path)
+    assert "\n" not in str(raised.value)

@@ -84,6 +84,20 @@ def test_the_rate_is_that_since_the_last_look(node: Node, clock: Clock) -> None:
     assert rates == ["5", "0", "20"]
 
 
+def test_an_input_of_which_everything_is_refused_is_a_warning_while_it_is_so(node: Node, clock: Clock) -> None:
+    """As when a driver was started again with other frames: the rate alone looks healthy."""
+    watch = InputWatch(node, "odometry", TOPIC)
+    levels = []
+    for refused in (0, 3, 4):
+        clock.now_s += 1
+        for _ in range(4):
+            watch.saw(1)
+        watch.refused += refused
+        levels.append((watch.status().level, watch.warning))
+    assert levels[:2] == [(DiagnosticStatus.OK, "")] * 2
+    assert levels[2] == (DiagnosticStatus.WARN, f"odometry: 4.0 Hz on {TOPIC}, and all are refused")
+
+
 def test_without_a_publisher_the_topic_is_named(node: Node, clock: Clock) -> None:
     watch = InputWatch(node, "cloud", TOPIC)
     clock.now_s += 1

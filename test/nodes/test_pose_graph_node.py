@@ -155,7 +155,7 @@ def test_a_drive_ends_on_its_true_path_and_wrong_closures_stay_out(rig: Rig, pro
     assert error_m < 0.5 * drift_m
     assert np.linalg.eigvalsh(np.reshape(pose.pose.covariance, (6, 6))).min() > 0
     assert rig.heard["map_to_odom"][-1].child_frame_id == "odom"
-    assert len(rig.heard["path"][-1].poses) >= len(rig.world.truth) - 5
+    rig.until(lambda: len(rig.heard["path"][-1].poses) >= len(rig.world.truth) - 5)
     rig.until(lambda: sum(len(m.points) for m in rig.heard["markers"][-1].markers) == 2 * len(rig.world.closures))
     green, red = rig.heard["markers"][-1].markers
     assert (green.ns, red.ns) == ("accepted", "rejected")

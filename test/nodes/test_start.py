@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -9,14 +10,16 @@ from pathlib import Path
 
 import pytest
 from processes import ENVIRONMENT
+from sources import ROOT
+
+START = "from umf_ros.nodes.start import start; start"
+COMMANDS = [["-c", f"{START}('umf_ros.nodes.pose_graph_node')"], [str(ROOT / "tools" / "umf")]]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_it_ends_the_process_without_a_word(number: signal.Signals, tmp_path: Path) -> None:
     (tmp_path / "slow_node.py").write_text("print('loading', flush=True)\nimport time\ntime.sleep(60)\n")
-    code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\nfrom umf_ros.nodes.start import start\nstart('slow_node')"
-    )
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {START}('slow_node')"
     process = subprocess.Popen(
         [sys.executable, "-c", code], env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -28,8 +31,23 @@ def test_it_ends_the_process_without_a_word(number: signal.Signals, tmp_path: Pa
 
 def test_a_node_that_is_loaded_runs(tmp_path: Path) -> None:
     (tmp_path / "quick_node.py").write_text("def main():\n    print('runs')\n")
-    code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\nfrom umf_ros.nodes.start import start\nstart('quick_node')"
-    )
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {START}('quick_node')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30)
     assert done.stdout == "runs\n"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_without_its_venv_a_workspace_says_so_in_one_line(command: list[str]) -> None:
+    """What most forget in a new terminal; -S leaves the packages of this Python out."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-S", *command], env=environment, capture_output=True, text=True, check=False, timeout=30
+    )
+    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
+    assert done.stderr.startswith("umf: ") and "source venv/bin/activate" in done.stderr
+
+
+def test_a_package_that_is_missing_is_named_in_one_line() -> None:
+    code = f"import sys; sys.modules['gtsam'] = None; {START}('umf_ros.nodes.pose_graph_node')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (1, "umf: gtsam is not installed; umf doctor says what helps\n")

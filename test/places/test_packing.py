@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import make_keyframe, unit
 from safetensors import SafetensorError
+from safetensors.numpy import load, save
 
 from umf_ros.frames import Embedding, Keyframe, LocalFeatures, ScanMotion
 from umf_ros.places.packing import pack, unpack
@@ -80,6 +81,25 @@ def test_the_descriptor_is_the_one_that_was_packed() -> None:
     found = unpack(pack(make_keyframe(0, descriptor=descriptor))).embedding.descriptor
     np.testing.assert_array_equal(found, descriptor)
     assert found.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        {"points": np.zeros((5, 2), np.float32)},
+        {"points": np.full((5, 3), np.nan, np.float32)},
+        {"points": np.float32(3)},
+        {"body_T_camera": np.zeros((3, 3))},
+        {"body_T_lidar": np.full((4, 4), np.inf)},
+        {"odom_T_body": np.zeros(3)},
+        {"camera": np.full(7, np.nan)},
+    ],
+    ids=lambda lie: next(iter(lie)),
+)
+def test_arrays_that_are_something_else_are_refused(lie: dict[str, np.ndarray]) -> None:
+    blob = save(load(pack(make_keyframe(0))) | {name: np.ascontiguousarray(value) for name, value in lie.items()})
+    with pytest.raises(ValueError):
+        unpack(blob)
 
 
 @pytest.mark.parametrize("part", [0.0, 0.3, 0.99])

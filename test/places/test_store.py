@@ -273,6 +273,22 @@ def test_a_file_whose_end_is_missing_is_one_clear_line(tmp_path: Path) -> None:
         database(path)
 
 
+@pytest.mark.parametrize(("column", "value"), [("session", 2**63 - 1), ("id", 2**63 - 1), ("id", -5)])
+def test_numbers_after_which_none_comes_are_refused(tmp_path: Path, column: str, value: int) -> None:
+    path = filled(tmp_path / "map.sqlite")
+    change(path, f"UPDATE keyframe SET {column} = ? WHERE id = 4", value)
+    with pytest.raises(UmfError, match=f"whose {column} is no number of ours"):
+        database(path)
+
+
+def test_a_copy_that_was_killed_is_in_nobody_s_way(tmp_path: Path) -> None:
+    (tmp_path / "copy.sqlite.part").write_bytes(b"half a file" * 1000)
+    opened = database(filled(tmp_path / "map.sqlite"))
+    opened.save(tmp_path / "copy.sqlite")
+    opened.close()
+    assert len(database(tmp_path / "copy.sqlite")) == 5 and not list(tmp_path.glob("*.part"))
+
+
 def test_a_folder_is_no_file(tmp_path: Path) -> None:
     with pytest.raises(UmfError, match="cannot write"):
         database(tmp_path)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import sqlite3
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ from umf_ros.commands.places import app
 from umf_ros.config import Database
 from umf_ros.errors import UmfError
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.places.upkeep import StoredSession, delete_sessions, stored_sessions
+from umf_ros.places.upkeep import StoredSession, delete_sessions, stored_identity, stored_sessions
 
 
 def database(path: Path) -> PlaceDatabase:
@@ -60,3 +62,40 @@ def test_what_is_no_store_is_told_in_one_line(tmp_path: Path) -> None:
         with pytest.raises(UmfError) as caught:
             stored_sessions(tmp_path / name)
         assert "\n" not in str(caught.value)
+
+
+LIES = ["[]", "null", "5", "[" * 100_000, "9" * 5000, '{"schema": "3", "embedder": [1], "dimension": "16"}']
+
+
+@pytest.mark.parametrize("lie", LIES, ids=lambda lie: lie[:10])
+def test_a_store_that_lies_about_itself_is_told_in_one_line(path: Path, lie: str) -> None:
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE about SET content = ?", (lie,))
+    for use in (stored_identity, database):
+        with pytest.raises(UmfError, match="cannot be used as a place database") as caught:
+            use(path)
+        assert "\n" not in str(caught.value)
+
+
+ENDLESS = "WITH RECURSIVE r(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM r) SELECT"
+TRAPS = {
+    "view": ["DROP TABLE keyframe", f"CREATE VIEW keyframe AS {ENDLESS} i id, i stamp_ns, 0 session FROM r"],
+    "trigger": [f"CREATE TRIGGER t AFTER INSERT ON keyframe BEGIN INSERT INTO about {ENDLESS} i FROM r; END"],
+    "computed": ["ALTER TABLE keyframe ADD COLUMN large AS (zeroblob(900000000))"],
+}
+
+
+@pytest.mark.parametrize("trap", TRAPS)
+def test_a_store_that_would_run_something_is_not_used(path: Path, trap: str) -> None:
+    with sqlite3.connect(path) as connection:
+        for statement in TRAPS[trap]:
+            connection.execute(statement)
+    delete = partial(delete_sessions, numbers=[0])
+    for use in (
+        stored_sessions,
+        stored_identity,
+        delete,
+        database,
+    ):
+        with pytest.raises(UmfError, match=f"it holds a.*{trap}"):
+            use(path)

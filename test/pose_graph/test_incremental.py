@@ -134,3 +134,46 @@ def test_a_long_straight_chain_is_solved(monkeypatch: pytest.MonkeyPatch) -> Non
     np.testing.assert_allclose(IncrementalOptimizer().solve(chain), poses, atol=1e-3)
     monkeypatch.setattr(incremental, "_MOST_STEPS", 0)
     np.testing.assert_allclose(IncrementalOptimizer().solve(chain), poses, atol=1e-3)
+
+
+def test_what_has_become_slow_is_built_anew_and_means_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(incremental, "_SMALL_ENTRIES", 0)
+    monkeypatch.setattr(incremental, "_TANGLED", 0.0)  # with every event
+    built: list[int] = []
+    build = incremental._Tree._build
+    monkeypatch.setattr(incremental._Tree, "_build", lambda *told: (built.append(1), build(*told))[1])
+    optimizer = IncrementalOptimizer()
+    found = drive(optimizer, range(300, 401, 10))
+    assert len(built) >= 10 and apart_m(found, exact(400)) < 0.02
+    without = tuple(range(0, len(WORLD.closures), 2))  # edges are still found by their keys
+    for _ in range(2):
+        found = optimizer.solve(grown(WORLD, 400, found, without))
+    assert apart_m(found, exact(400, without)) < 0.02
+
+
+def test_in_a_large_graph_the_covariance_is_that_of_when_the_last_pose_was_seen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(incremental, "_SMALL_ENTRIES", 0)
+    optimizer, whole = IncrementalOptimizer(), Optimizer()
+    poses = drive(optimizer, range(360, 401, 10))
+    whole.solve(grown(WORLD, 400, poses))
+    found, expected = optimizer.marginal(399), whole.marginal(399)
+    assert found is not None and expected is not None
+    np.testing.assert_allclose(np.trace(found[3:, 3:]), np.trace(expected[3:, 3:]), rtol=0.05)
+    monkeypatch.setattr(incremental._Tree, "marginal", None)  # is not asked again
+    optimizer.solve(grown(WORLD, 400, poses))
+    np.testing.assert_array_equal(optimizer._tree._kept[399], found)  # type: ignore[union-attr]
+
+
+def test_a_graph_in_parts_is_put_in_order() -> None:
+    """Two long drives that nothing joins, and a session of one pose."""
+    one = grown(WORLD, 400, exact(400))
+    edges = Edges(*(np.concatenate([column, column]) for column in vars(one.edges).values()))
+    edges.first[len(one.keys) :] += 400
+    edges.second[len(one.keys) :] += 400
+    poses = np.concatenate([one.poses, one.poses, np.eye(4)[None]])
+    keys = [*one.keys, *(("second", key) for key in one.keys)]
+    both = Graph(range(801), poses, [0, 400, 800], keys, edges)
+    for optimizer in (IncrementalOptimizer(), Optimizer()):
+        assert apart_m(optimizer.solve(both), poses) < 0.02

@@ -59,6 +59,16 @@ def test_etna_lidar_points_land_where_the_data_set_projects_them() -> None:
     assert calibration.lidar_time_offset_s == pytest.approx(0.1)
 
 
+RAW = {"width": 64, "height": 48, "fx": 1e-300, "fy": 1e300, "cx": 1e300, "cy": 0.0, "distortion": [1e300] * 8}
+NO_PAIR = {
+    "left": RAW,
+    "right": RAW,
+    "left_T_right": {"translation": [0.0, 0.0, 0.0], "quaternion": [0.0, 0.0, 0.0, 1.0]},
+    "width": 64,
+    "height": 48,
+}
+
+
 def test_camera_info_replaces_intrinsics_and_keeps_a_known_baseline() -> None:
     calibration = load_calibration("s3li-etna")
     left, right = camera_info(0, 500.0, (688, 512)), camera_info(0, 500.0, (688, 512), baseline=0.3)
@@ -79,6 +89,10 @@ def test_camera_info_replaces_intrinsics_and_keeps_a_known_baseline() -> None:
         ({"camera": {"width": 0}}, "camera.width"),
         ({"camera": None}, "either camera"),
         ({"lidar_time_offset_s": "soon"}, "lidar_time_offset_s"),
+        ({"lidar_time_offset_s": 1e300}, "lidar_time_offset_s"),
+        ({"camera": {"width": 10**9}}, "camera.width"),
+        ({"body_T_lidar": {"translation": [0, float("nan"), 0], "quaternion": [0, 0, 0, 1]}}, "body_T_lidar"),
+        ({"camera": None, "raw_camera": NO_PAIR}, "no calibration of real sensors"),
     ],
 )
 def test_faults_are_named_by_key_on_one_line(change: dict[str, object], text: str, tmp_path: Path) -> None:

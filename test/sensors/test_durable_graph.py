@@ -177,3 +177,56 @@ def test_what_was_not_settled_in_time_is_known_to_be_and_settled_later(tmp_path:
     again = made(tmp_path / JOURNAL)
     assert not again.unsettled
     again.close()
+
+
+def test_ending_a_graph_keeps_a_journal_that_somebody_reads(world: GraphWorld, tmp_path: Path) -> None:
+    graph = made(tmp_path / JOURNAL)
+    drive(graph, world, 0, 230)
+    before = states(graph)
+    reader = sqlite3.connect(tmp_path / JOURNAL)
+    reader.execute("BEGIN")
+    reader.execute("SELECT count(*) FROM event").fetchone()  # its log cannot be written back now
+    graph.take_odometry(231 * PERIOD_NS, world.odometry[230])
+    kept = graph.end()
+    graph.close()
+    reader.close()
+    assert kept is not None
+    assert made(tmp_path / JOURNAL).taken_up == 0
+    again = made(kept)
+    assert states(again) == before and again.graph.counts["odometry"] == 231
+
+
+def test_a_long_graph_is_taken_up_by_its_verdicts(
+    world: GraphWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("umf_ros.sensors.durable_graph.MANY", 1)
+    whole, path = made(None), tmp_path / "pose_graph.sqlite"
+    drive(whole, world, 0, len(world.truth))
+    graph = made(path)
+    drive(graph, world, 0, 270)
+    revoked = next((match, query) for match, query, state in states(graph) if state == "accepted")
+    before = graph.graph.verdict_counts()
+    graph.close()
+    monkeypatch.setattr(DurableGraph, "_replay", None)  # fails if it is tried
+    again = made(path)
+    assert again.changed == 0 and again.graph.verdict_counts() == before and again.taken_up == sum(before.values())
+    drive(again, world, 270, len(world.truth))
+    assert states(again) == states(whole)
+    np.testing.assert_allclose(again.graph.trajectory()[1], whole.graph.trajectory()[1], atol=0.05)
+    again.revoke(*revoked)
+    again.close()
+    last_one = made(path)
+    assert (*revoked, "rejected") in states(last_one)
+    last_one.graph.settle()
+    assert (*revoked, "rejected") in states(last_one)
+
+
+def test_other_settings_decide_all_again(world: GraphWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("umf_ros.sensors.durable_graph.MANY", 1)
+    graph = made(tmp_path / JOURNAL)
+    drive(graph, world, 0, len(world.truth))
+    counts = graph.graph.verdict_counts()
+    graph.close()
+    believing = SETTINGS.model_copy(update={"reject_outliers": False})
+    again = DurableGraph(believing, tmp_path / JOURNAL, [].append)
+    assert again.graph.verdict_counts() != counts and again.changed

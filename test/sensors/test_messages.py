@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,13 @@ def kind_of(decode: Any, *messages: Any) -> str:
 
 def test_stamp_keeps_every_nanosecond() -> None:
     assert stamp_ns(image(START_NS + 123_456_789, np.zeros((2, 2), np.uint8))) == START_NS + 123_456_789
+
+
+@pytest.mark.parametrize(("sec", "nanosec"), [(2**31 - 1, 2**32 - 1), (2**31 - 1, 10**9), (-1, 0), (0, 0)])
+def test_a_stamp_that_cannot_be_sent_on_is_refused(sec: int, nanosec: int) -> None:
+    with pytest.raises(MessageError) as caught:
+        stamp_ns(SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec))))
+    assert caught.value.kind == "stamp"
 
 
 def test_message_without_a_stamp_is_refused() -> None:
@@ -109,6 +117,11 @@ def test_pulses_without_a_return_and_points_that_are_not_finite_are_left_out() -
     assert np.allclose(decoded.points, POINTS)
     assert decoded.time_offset_ns is not None and decoded.time_offset_ns.tolist() == [200, 201, 202]
     assert len(decode_cloud(cloud(0, nowhere)).points) == 0
+
+
+def test_returns_from_beyond_all_lidars_are_left_out() -> None:
+    points = np.array([[5, 0, 0], [9000, 0, 0], [2e4, 0, 0], [0, 1e18, 0], [0, 0, 3e38]], np.float32)
+    assert decode_cloud(cloud(START_NS, scan(points))).points[:, 0].tolist() == [5, 9000]
 
 
 def test_a_real_return_one_metre_away_stays() -> None:

@@ -129,6 +129,8 @@ PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float
         ("a.pcd", b"FIELDS x y\nDATA ascii\n1 2\n", "no field z"),
         ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 three\n", "not numbers"),
         ("a.pcd", b"FIELDS x y z\nDATA binary\n", "holds no return"),
+        ("a.pcd", b"FIELDS x y z\nCOUNT 1 0 1\nDATA ascii\n", "a.pcd"),
+        ("a.pcd", b"FIELDS x y z\nDATA ascii\n", "a.pcd is damaged"),
         ("a.pcd", b"FIELDS x y z\nDATA zipped\n", "'zipped'"),
         ("a.pcd", b"FIELDS x y z\nDATA binary_compressed\n\x05\0\0\0\x0c\0\0\0\xe0", "break off"),
         ("a.pcd", b"FIELDS x y z\nDATA binary_compressed\n\x02\0\0\0\x0c\0\0\0\x40\x10", "damaged"),

@@ -56,8 +56,10 @@ def test_circles_and_broken_transforms_do_no_harm() -> None:
     transforms = tree(("a", "b", at(1)), ("b", "a", at(1)), ("a", "a", at(1)))
     broken = stamped("a", "c", at(1))
     broken.transform.rotation.w = float("nan")
-    transforms.add(SimpleNamespace(transforms=[broken]))
-    assert transforms.find("a", "x") is None and transforms.find("a", "c") is None
+    nowhere = stamped("a", "d", at(1))
+    nowhere.transform.translation.x = float("nan")
+    transforms.add(SimpleNamespace(transforms=[broken, nowhere]))
+    assert transforms.find("a", "x") is None and transforms.find("a", "d") is None and transforms.find("a", "c") is None
 
 
 def test_extrinsics_come_from_the_transforms_and_else_from_the_file(calibration: Calibration) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import heapq
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
@@ -16,7 +18,8 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from zstandard import ZstdError, frame_content_size
 
 from umf_ros.bags.records import LARGEST_CHUNK, RawMessage, TopicInfo
-from umf_ros.errors import BagError
+from umf_ros.bags.unpacking import unpack_lz4
+from umf_ros.errors import BagError, one_line
 
 # what the mcap library and the decompressors raise on damaged data
 _DAMAGE = (McapError, struct.error, ZstdError, ValueError, RuntimeError, EOFError, LookupError, TypeError, MemoryError)
@@ -26,6 +29,8 @@ _CHUNK_HEAD = 64
 
 SORTING_WINDOW_NS = 1_000_000_000
 """Without an index, messages are put in order as far as they lie this close together."""
+MOST_WAITING = 2**28
+"""Bytes of messages that wait for earlier ones; those of a recorder's second are some dozens of megabytes."""
 
 
 class McapStorage:
@@ -72,7 +77,13 @@ class _IndexedFile:
             encodings = ", ".join(sorted({channel.message_encoding for channel in summary.channels.values()}))
             raise BagError(f"{path} holds messages encoded as {encodings}; only those of ROS 2 (cdr) can be read")
         _check_chunks(path, summary.chunk_indexes)
-        self.types = {channel.topic: summary.schemas[channel.schema_id].name for channel in channels.values()}
+        self._channels = {
+            key: (channel.topic, summary.schemas[channel.schema_id].name) for key, channel in channels.items()
+        }
+        self._chunks = sorted(
+            summary.chunk_indexes, key=lambda index: (index.message_start_time, index.chunk_start_offset)
+        )
+        self.types = dict(self._channels.values())
         self.counts: Counter[str] = Counter()
         for key, count in summary.statistics.channel_message_counts.items():
             if key in channels:
@@ -81,14 +92,23 @@ class _IndexedFile:
         self.end_ns = summary.statistics.message_end_time
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        wanted = self.types.keys() & set(topics)
+        wanted = {key: channel for key, channel in self._channels.items() if channel[0] in topics}
+        row = _Row()
         with self._path.open("rb") as stream:
             try:
-                for schema, channel, message in make_reader(stream).iter_messages(wanted):
-                    if schema is not None:
-                        yield RawMessage(channel.topic, message.log_time, schema.name, message.data)
+                for index in self._chunks:
+                    if index.message_index_offsets and not wanted.keys() & index.message_index_offsets.keys():
+                        continue
+                    yield from row.until(index.message_start_time)
+                    stream.seek(index.chunk_start_offset + 9)
+                    for number, record in enumerate(_unpacked(Chunk.read(ReadDataStream(stream)))):
+                        if isinstance(record, Message) and record.channel_id in wanted:
+                            topic, kind = wanted[record.channel_id]
+                            message = RawMessage(topic, record.log_time, kind, record.data)
+                            yield from row.take(message, (index.chunk_start_offset, number))
             except _DAMAGE as error:
-                raise BagError(f"{self._path} is damaged: {error or type(error).__name__}") from None
+                raise BagError(f"{self._path} is damaged: {one_line(error)}") from None
+        yield from row.rest()
 
 
 class _BrokenFile:
@@ -111,15 +131,12 @@ class _BrokenFile:
             self.warning = f"{path} breaks off; its first {seconds:.1f} s ({self.counts.total()} messages) are readable"
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        waiting: list[tuple[int, int, RawMessage]] = []
+        row = _Row()
         for number, message in enumerate(self._stream()):
-            if message.topic not in topics:
-                continue
-            heapq.heappush(waiting, (message.log_ns, number, message))
-            while waiting[0][0] < message.log_ns - SORTING_WINDOW_NS:
-                yield heapq.heappop(waiting)[2]
-        while waiting:
-            yield heapq.heappop(waiting)[2]
+            if message.topic in topics:
+                yield from row.take(message, (0, number))
+                yield from row.until(message.log_ns - SORTING_WINDOW_NS)
+        yield from row.rest()
 
     def _stream(self) -> Iterator[RawMessage]:
         """Messages as they lie in the file."""
@@ -142,14 +159,55 @@ class _BrokenFile:
                 self._fault = str(error) or type(error).__name__
 
 
+class _Row:
+    """Messages that wait for earlier ones, as many as there is memory for: what is set to burst it comes as it lies."""
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[int, tuple[int, int], RawMessage]] = []
+        self._held = 0
+
+    def take(self, message: RawMessage, place: tuple[int, int]) -> Iterator[RawMessage]:
+        """Take one in, whose place in the file decides between equal times; yields those that there is no room for."""
+        heapq.heappush(self._waiting, (message.log_ns, place, message))
+        self._held += len(message.data)
+        while self._held > MOST_WAITING:
+            yield self._first()
+
+    def until(self, log_ns: int) -> Iterator[RawMessage]:
+        """Those before a time."""
+        while self._waiting and self._waiting[0][0] < log_ns:
+            yield self._first()
+
+    def rest(self) -> Iterator[RawMessage]:
+        """Those that are left."""
+        while self._waiting:
+            yield self._first()
+
+    def _first(self) -> RawMessage:
+        message = heapq.heappop(self._waiting)[2]
+        self._held -= len(message.data)
+        return message
+
+
 def _records(reader: StreamReader) -> Iterator[McapRecord]:
     """Records as they lie in the file, those in chunks of a size that can be unpacked among them."""
     for record in reader.records:
         if isinstance(record, Chunk):
-            _check_chunk(record.uncompressed_size, record.compression, record.data[:18])
-            yield from breakup_chunk(record)
+            yield from _unpacked(record)
         else:
             yield record
+
+
+def _unpacked(chunk: Chunk) -> Iterable[McapRecord]:
+    """The records of a chunk of a size that can be unpacked.
+
+    Raises:
+        ValueError: it is larger.
+    """
+    _check_chunk(chunk.uncompressed_size, chunk.compression, chunk.data[:18])
+    if chunk.compression == "lz4":
+        chunk = replace(chunk, compression="", data=unpack_lz4(chunk.data))
+    return breakup_chunk(chunk)
 
 
 def _check_chunks(path: Path, indexes: Collection[ChunkIndex]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from umf_ros.bags.records import RawMessage, Storage, message_types
 from umf_ros.bags.storages import open_storage
-from umf_ros.errors import BagError, MessageError
+from umf_ros.errors import BagError, MessageError, one_line, shortened
 
 
 class Bag:
@@ -66,7 +66,7 @@ def decode(raw: RawMessage) -> Any:
     try:
         return message_types().deserialize_cdr(raw.data, raw.type)
     except Exception as error:  # damaged bytes provoke anything
-        cause = " ".join(str(error).split())[:200] or type(error).__name__
+        cause = one_line(error)
         raise MessageError("undecodable", f"message is not what its type {raw.type} says ({cause})") from None
 
 
@@ -78,9 +78,9 @@ def _one_line(path: Path) -> Iterator[None]:
     except BagError:
         raise
     except OSError as error:
-        raise BagError(f"cannot read {path}: {error.strerror or error}") from None
+        raise BagError(f"cannot read {shortened(path)}: {error.strerror or error}") from None
     except Exception as error:  # damaged bytes provoke anything
-        raise BagError(f"{path} is damaged: {' '.join(str(error).split())[:200] or type(error).__name__}") from None
+        raise BagError(f"{shortened(path)} is damaged: {one_line(error)}") from None
 
 
 def open_bag(path: str | Path) -> Bag:
@@ -92,9 +92,9 @@ def open_bag(path: str | Path) -> Bag:
         BagError: there is no such recording, it is none, or it holds no message.
     """
     path = Path(path)
-    if not path.exists():
-        raise BagError(f"there is no recording {path}")
     with _one_line(path):
+        if not path.exists():
+            raise BagError(f"there is no recording {path}")
         storage = open_storage(path)
     if not any(topic.count for topic in storage.topics.values()):
         raise BagError(f"{path} holds no message" + (f" ({storage.warning})" if storage.warning else ""))

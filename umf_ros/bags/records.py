@@ -12,7 +12,7 @@ from rosbags.typesys.store import Typestore
 
 from umf_ros.sensors.message_kinds import LIVOX, LIVOX_DEFINITION
 
-LARGEST_CHUNK = 2**29
+LARGEST_CHUNK = 2**28
 """Bytes of a chunk after unpacking, and of any record; recorders write some megabytes."""
 
 

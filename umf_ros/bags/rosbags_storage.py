@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import apsw
+import lz4.frame
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import ReaderError as Error1
@@ -16,8 +17,12 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as Error2
 from rosbags.serde import SerdeError
 
-from umf_ros.bags.records import LARGEST_CHUNK, RawMessage, TopicInfo, message_types
+from umf_ros.bags.records import RawMessage, TopicInfo, message_types
+from umf_ros.bags.unpacking import unpack_bz2, unpack_lz4
 from umf_ros.errors import BagError
+
+_LIMITED: dict[Any, Any] = {bz2.decompress: unpack_bz2, lz4.frame.decompress: unpack_lz4}
+"""What unpacks a chunk, and what does so with a limit."""
 
 
 def _summary(connections: list[Connection]) -> dict[str, TopicInfo]:
@@ -26,6 +31,15 @@ def _summary(connections: list[Connection]) -> dict[str, TopicInfo]:
         count = topics[connection.topic].count if connection.topic in topics else 0
         topics[connection.topic] = TopicInfo(connection.msgtype, count + connection.msgcount)
     return topics
+
+
+def _left_behind(paths: list[Path]) -> str:
+    """What to say of messages that a killed recorder left in a log of SQLite, which is not read."""
+    files = [one for path in paths for one in (sorted(path.glob("*.db3")) if path.is_dir() else [path])]
+    logs = [log for one in files if (log := one.with_name(one.name + "-wal")).is_file() and log.stat().st_size]
+    if not logs:
+        return ""
+    return f"{logs[0]} holds messages that are not read: sqlite3 {logs[0].name[:-4]} 'PRAGMA wal_checkpoint' adds them"
 
 
 @contextmanager
@@ -43,10 +57,9 @@ class RosbagsStorage:
     The messages of ROS 1 come out as those of ROS 2; types that ROS 2 does not know are left out.
     """
 
-    warning = ""
-
     def __init__(self, paths: list[Path], ros1: bool = False) -> None:
         self._paths = paths
+        self.warning = _left_behind(paths)
         self._reader: Any = Reader1 if ros1 else Reader2
         self._to_cdr = message_types().ros1_to_cdr if ros1 else None
         connections: list[Connection] = []
@@ -70,24 +83,13 @@ class RosbagsStorage:
                     yield RawMessage(connection.topic, log_ns, connection.msgtype, cdr)
 
     def _limited(self, reader: Any) -> Any:
-        """The reader, with chunks that unpack to a limit only (ROS 1; bzip2 packs a thousandfold and more)."""
+        """The reader, with chunks that unpack to a limit only (ROS 1)."""
         for place, chunk in getattr(reader, "chunks", {}).items():
-            if chunk.decompressor is bz2.decompress:
-                reader.chunks[place] = chunk._replace(decompressor=_unpack_bz2)
+            limited = _LIMITED.get(chunk.decompressor)
+            if limited is not None:
+                reader.chunks[place] = chunk._replace(decompressor=limited)
         return reader
 
     def _readable(self, reader: Any) -> list[Connection]:
         known = message_types().fielddefs
         return [one for one in reader.connections if self._to_cdr is None or one.msgtype in known]
-
-
-def _unpack_bz2(data: bytes) -> bytes:
-    """Contents of a chunk.
-
-    Raises:
-        AssertionError: there are more than any recorder writes.
-    """
-    unpacked = bz2.BZ2Decompressor().decompress(data, LARGEST_CHUNK + 1)
-    if len(unpacked) > LARGEST_CHUNK:
-        raise AssertionError(f"a chunk holds more than {LARGEST_CHUNK} bytes")
-    return unpacked

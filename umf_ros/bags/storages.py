@@ -22,6 +22,8 @@ def open_storage(path: Path) -> Storage:
     """
     if path.is_dir():
         return _open_folder(path)
+    if not path.is_file():  # a pipe says nothing until somebody writes
+        raise BagError(f"{path} is no recording: neither a file nor a folder")
     with path.open("rb") as file:
         start = file.read(16)
     if not start:
@@ -36,7 +38,7 @@ def open_storage(path: Path) -> Storage:
 
 
 def _open_folder(path: Path) -> Storage:
-    mcap, db3 = _in_number_order(path.glob("*.mcap")), _in_number_order(path.glob("*.db3"))
+    mcap, db3 = (_in_number_order(one for one in path.glob(f"*.{kind}") if one.is_file()) for kind in ("mcap", "db3"))
     if mcap:
         return McapStorage(mcap)
     if (path / "metadata.yaml").is_file():

@@ -13,7 +13,7 @@ from umf_ros.bags.reader import Bag
 from umf_ros.config import Settings
 from umf_ros.errors import BagError, MessageError
 from umf_ros.geometry import Array, make_pose
-from umf_ros.sensors.messages import decode_pose, stamp_ns
+from umf_ros.sensors.messages import LAST_STAMP_NS, decode_pose, stamp_ns
 from umf_ros.trajectory import Trajectory
 
 GPS_EPOCH_S = 315_964_800
@@ -41,7 +41,7 @@ def read_tum(path: str | Path) -> Trajectory:
             continue
         try:
             stamp, row = _to_ns(fields[0]), [float(field) for field in fields[1:]]
-        except ValueError:
+        except (ValueError, OverflowError):
             raise BagError(f"{path}, line {number}: expected numbers, found {line.strip()[:60]!r}") from None
         if len(row) != 7:
             raise BagError(f"{path}, line {number}: expected 8 numbers (stamp x y z qx qy qz qw), found {len(fields)}")
@@ -114,9 +114,20 @@ def _recorded_truth(bag: Bag) -> Trajectory | None:
 def _to_ns(seconds: str) -> int:
     """Nanoseconds of decimal seconds, without the rounding of a float."""
     if not seconds.replace(".", "", 1).isdigit():  # as 1.6e9, or negative
-        return round(float(seconds) * 1e9)
+        return _a_stamp(round(float(seconds) * 1e9))
     whole, _, fraction = seconds.partition(".")
-    return int(whole or 0) * 10**9 + int(fraction[:9].ljust(9, "0"))
+    return _a_stamp(int(whole or 0) * 10**9 + int(fraction[:9].ljust(9, "0")))
+
+
+def _a_stamp(nanoseconds: int) -> int:
+    """The same.
+
+    Raises:
+        OverflowError: there is no such time.
+    """
+    if abs(nanoseconds) >= LAST_STAMP_NS:
+        raise OverflowError("beyond the last stamp")
+    return nanoseconds
 
 
 def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> tuple[NDArray[np.int64], Array]:
@@ -135,7 +146,7 @@ def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> tuple[N
             continue
         try:
             stamp, latitude, longitude, height, quality = _parse(line.split())
-        except (ValueError, IndexError):
+        except (ValueError, IndexError, OverflowError):
             expected = "expected date time lat lon height Q"
             raise BagError(f"{path}, line {number}: {expected}, found {line.strip()[:60]!r}") from None
         if quality <= worst_quality and (not stamps or stamp > stamps[-1]):
@@ -159,7 +170,7 @@ def _date_ns(date: str, time: str) -> int:
 
 
 def _week_ns(week: str, seconds: str) -> int:
-    return (GPS_EPOCH_S + int(week) * 604_800) * 10**9 + round(float(seconds) * 1e9)
+    return _a_stamp((GPS_EPOCH_S + int(week) * 604_800) * 10**9 + round(float(seconds) * 1e9))
 
 
 def east_north_up(geodetic: Array) -> Array:

@@ -25,7 +25,6 @@ _PACKAGES = (
     ("cv2", "opencv-python-headless", "4.10"),
     ("torch", "torch", "2.4"),
     ("safetensors", "safetensors", "0.4"),
-    ("openvino", "openvino", "2025"),
     ("small_gicp", "small_gicp", "1"),
     ("gtsam", "gtsam", "4.3"),
     ("mcap", "mcap", "1.2"),
@@ -35,6 +34,8 @@ _PACKAGES = (
     ("jinja2", "Jinja2", "3.1"),
     ("plotly", "plotly", "6"),
 )
+_WITHOUT_OPENVINO = "torch runs the network instead (OpenVINO asks for glibc 2.35)"
+_WITHOUT_LAB = "only the lab needs it: pip install 'umf_ros[lab]'"
 _MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "visualization_msgs", "std_srvs")
 
 
@@ -60,8 +61,9 @@ def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
     yield "Python", check_python
     for module, distribution, minimum in _PACKAGES:
         yield distribution, partial(check_package, module, distribution, minimum)
+    yield "openvino", partial(check_optional, "openvino", "openvino", "2025", _WITHOUT_OPENVINO)
     for module, (distribution, minimum) in LAB_PACKAGES.items():
-        yield distribution, partial(check_lab_package, module, distribution, minimum)
+        yield distribution, partial(check_optional, module, distribution, minimum, _WITHOUT_LAB)
     yield "ROS 2 Python", check_rclpy
     yield "ROS 2 messages", check_messages
     yield "DDS", check_dds
@@ -90,10 +92,10 @@ def check_package(module: str, distribution: str, minimum: str) -> Finding:
     return Finding(distribution, _at_least(found, minimum), found, f"{minimum} or newer is needed: {advice}")
 
 
-def check_lab_package(module: str, distribution: str, minimum: str) -> Finding:
-    """A rover does without the lab's packages; one that is there has to work."""
+def check_optional(module: str, distribution: str, minimum: str, without: str) -> Finding:
+    """A package that a rover can do without, as `without` says; one that is there has to work."""
     if importlib.util.find_spec(module) is None:
-        return Finding(distribution, True, "not installed; only the lab needs it: pip install 'umf_ros[lab]'")
+        return Finding(distribution, True, f"not installed; {without}")
     return check_package(module, distribution, minimum)
 
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
-from umf_ros.errors import WeightsError
+from umf_ros.errors import WeightsError, one_line
 
 XFEAT_CELL = 8
 """Pixels along a side of the cell that one descriptor of XFeat stands for."""
 XFEAT_STRIDE = 32
 """Of its deepest layer: images are cut to multiples of this many pixels."""
+LARGEST = 8192
+"""No size of a network is larger."""
+_MOST = {"voxel_blocks": 64, "layers": 64, "super_iterations": 64, "width": 1024}
+_MAY_BE_NONE = ("voxel_blocks", "scene")
 Backbone = Literal["resnet18", "resnet34", "resnet50", "efficientnet_lite0"]
 
 
@@ -58,12 +62,26 @@ class NetworkConfig:
     scene: int = 0
 
     def __post_init__(self) -> None:
+        self._check_sizes()
         if self.backbone not in get_args(Backbone):
             raise ValueError(f"backbone must be one of {', '.join(get_args(Backbone))}, not {self.backbone}")
         if any(side % 32 or side <= 0 for side in self.image_size):
             raise ValueError(f"image_size must be multiples of 32, not {self.image_size}")
         if self.tokens % self.heads or self.local % 4:
             raise ValueError("the width of a transformer must be a multiple of its heads")
+
+    def _check_sizes(self) -> None:
+        """See that each is a whole number, or as many, that a network can have: a weights file may say anything."""
+        for field in fields(self):
+            value, usual = getattr(self, field.name), field.default
+            if isinstance(usual, str):
+                continue
+            numbers = value if isinstance(usual, tuple) else (value,)
+            if not isinstance(numbers, tuple) or len(numbers) != (len(usual) if isinstance(usual, tuple) else 1):
+                raise ValueError(f"{field.name} must be {usual!r} or alike, not {value!r}")
+            least, most = 0 if field.name in _MAY_BE_NONE else 1, _MOST.get(field.name, LARGEST)
+            if not all(type(number) is int and least <= number <= most for number in numbers):
+                raise ValueError(f"{field.name} must be whole and from {least} to {most}, not {value!r}")
 
     @property
     def length(self) -> int:
@@ -85,4 +103,4 @@ class NetworkConfig:
             fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
             return cls(**fields)
         except (TypeError, ValueError, ArithmeticError) as error:
-            raise WeightsError(f"weights of another architecture: {error}") from None
+            raise WeightsError(f"weights of another architecture: {one_line(error)}") from None

@@ -24,7 +24,10 @@ def load_weights(path: Path) -> UMF:
         WeightsError: missing, truncated or foreign file, not finite, or of another architecture.
     """
     architecture, tensors = read_weights(path)
-    network = UMF(NetworkConfig.from_dict(architecture))
+    config = NetworkConfig.from_dict(architecture)
+    with torch.device("meta"):  # takes no memory: the file itself says how much there may be
+        _check(UMF(config).state_dict(), tensors, path)
+    network = UMF(config)
     fill(network, tensors, path)
     channels_last(network)
     return network.eval()
@@ -37,16 +40,20 @@ def fill(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
         WeightsError: a tensor is missing, surplus, of another shape or not finite.
     """
     wanted = network.state_dict()
+    _check(wanted, tensors, path)
+    bad = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
+    if bad:
+        raise WeightsError(f"{path} is damaged: {bad[0]} holds values that are not finite")
+    network.load_state_dict({name: value.to(wanted[name].dtype) for name, value in tensors.items()})
+
+
+def _check(wanted: dict[str, Tensor], tensors: dict[str, Tensor], path: Path) -> None:
     differing = sorted(wanted.keys() ^ tensors.keys())
     differing += [name for name in wanted.keys() & tensors.keys() if wanted[name].shape != tensors[name].shape]
     if differing:
         raise WeightsError(
             f"{path} holds weights of another architecture: {differing[0]} and {len(differing) - 1} more"
         )
-    bad = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
-    if bad:
-        raise WeightsError(f"{path} is damaged: {bad[0]} holds values that are not finite")
-    network.load_state_dict({name: value.to(wanted[name].dtype) for name, value in tensors.items()})
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

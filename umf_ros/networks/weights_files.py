@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 
-from umf_ros.errors import WeightsError
+from umf_ros.errors import WeightsError, one_line, shortened
 from umf_ros.networks.config import NetworkConfig
 from umf_ros.resources import find
 
@@ -37,13 +37,15 @@ def read_config(path: Path) -> NetworkConfig:
 @contextmanager
 def open_weights(path: Path, framework: str) -> Iterator[Any]:
     """An open weights file; whatever goes wrong while it is read is a `WeightsError`."""
-    if not path.is_file():
-        raise WeightsError(f"weights {path} do not exist")
     try:
+        if not path.is_file():
+            raise WeightsError(f"weights {shortened(path)} do not exist")
         with safe_open(path, framework=framework) as stream:
             yield stream
-    except (SafetensorError, OSError, ValueError) as error:
-        raise WeightsError(f"{path} is truncated or not a safetensors file: {' '.join(str(error).split())}") from None
+    except WeightsError:
+        raise
+    except Exception as error:  # shapes that do not fit, sizes that nobody has memory for
+        raise WeightsError(f"{shortened(path)} is truncated or not a safetensors file: {one_line(error)}") from None
 
 
 def parse_architecture(path: Path, stream: Any) -> dict[str, Any]:
@@ -57,5 +59,5 @@ def parse_architecture(path: Path, stream: Any) -> dict[str, Any]:
         raise WeightsError(f"{path} holds weights of another architecture: it does not say which")
     try:
         return dict(json.loads(metadata["architecture"]))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RecursionError):
         raise WeightsError(f"{path} holds weights of another architecture: it does not say which clearly") from None

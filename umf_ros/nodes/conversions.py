@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -16,12 +16,10 @@ from visualization_msgs.msg import Marker
 from umf_ros.errors import MessageError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, to_quaternion
-from umf_ros.sensors.messages import decode_pose
+from umf_ros.sensors.messages import LAST_STAMP_NS, decode_pose
 
 GREEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.5)
-LAST_STAMP_NS = 2**31 * 10**9
-"""What a stamp with seconds of 32 bits stays below."""
 BETWEEN_FRAME = re.compile(r"keyframe/[^/]{1,63}/[0-9]{1,19}")
 KEYFRAME_FRAME = re.compile(r"keyframe/([0-9]{1,19})")
 
@@ -44,8 +42,15 @@ def to_point(position: Array) -> Point:
 
 def to_pose(pose: Array) -> Pose:
     """(4, 4) pose as a message."""
-    x, y, z, w = (float(number) for number in to_quaternion(pose))
-    return Pose(position=to_point(pose[:3, 3]), orientation=Quaternion(x=x, y=y, z=z, w=w))
+    return to_poses(pose[None])[0]
+
+
+def to_poses(poses: Array) -> list[Pose]:
+    """(N, 4, 4) poses as messages."""
+    both = zip(poses[:, :3, 3], to_quaternion(poses).tolist(), strict=True)
+    return [
+        Pose(position=to_point(position), orientation=Quaternion(x=x, y=y, z=z, w=w)) for position, (x, y, z, w) in both
+    ]
 
 
 def to_header(stamp_ns: int, frame: str) -> Header:
@@ -56,6 +61,12 @@ def to_header(stamp_ns: int, frame: str) -> Header:
 def to_pose_stamped(stamp_ns: int, frame: str, pose: Array) -> PoseStamped:
     """Pose in `frame` with its stamp."""
     return PoseStamped(header=to_header(stamp_ns, frame), pose=to_pose(pose))
+
+
+def to_poses_stamped(stamps_ns: Sequence[int], frame: str, poses: Array) -> list[PoseStamped]:
+    """(N, 4, 4) poses in `frame` with their stamps."""
+    both = zip(stamps_ns, to_poses(poses), strict=True)
+    return [PoseStamped(header=to_header(stamp_ns, frame), pose=pose) for stamp_ns, pose in both]
 
 
 def to_lines(name: str, lines: Iterable[Iterable[Point]], header: Header) -> Marker:

@@ -97,7 +97,7 @@ class InputWatch:
         self.last_stamp_ns: int | None = None
         self._last_seen_s: float | None = None
         self._born_s = self._now_s()
-        self._window: tuple[float, int] = (self._born_s, 0)
+        self._window: tuple[float, int, int] = (self._born_s, 0, 0)
 
     def saw(self, stamp_ns: int) -> None:
         """Count one message."""
@@ -108,9 +108,10 @@ class InputWatch:
     def status(self) -> DiagnosticStatus:
         """Rate since the last call, and the reason when the topic is silent."""
         now_s = self._now_s()
-        since_s, count = self._window
+        since_s, count, refused = self._window
         rate = (self.received - count) / max(now_s - since_s, 1e-9)
-        self._window = (now_s, self.received)
+        all_refused = self.received > count and self.refused - refused == self.received - count
+        self._window = (now_s, self.received, self.refused)
         values = {
             "topic": self.topic,
             "rate_hz": round(rate, 2),
@@ -121,6 +122,9 @@ class InputWatch:
         }
         silent_s = None if self._last_seen_s is None else now_s - self._last_seen_s
         self.warning = ""
+        if all_refused:
+            self.warning = f"{self.name}: {rate:.1f} Hz on {self.topic}, and all are refused"
+            return status(WARN, f"input {self.name}", f"{rate:.1f} Hz, all refused", values)
         if silent_s is not None and silent_s < self._silent_after_s:
             return status(OK, f"input {self.name}", f"{rate:.1f} Hz", values)
         publishers = self._node.get_publishers_info_by_topic(self.topic)

@@ -24,7 +24,7 @@ def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: Frames) -> Pat
     if not len(stamps_ns):
         return Path(header=Header(frame_id=frames.map))
     rows = np.unique(np.linspace(0, len(stamps_ns) - 1, MAX_POSES).astype(int))
-    poses = [conversions.to_pose_stamped(int(stamps_ns[row]), frames.map, map_T_body[row]) for row in rows]
+    poses = conversions.to_poses_stamped(stamps_ns[rows].tolist(), frames.map, map_T_body[rows])
     return Path(header=conversions.to_header(int(stamps_ns[-1]), frames.map), poses=poses)
 
 

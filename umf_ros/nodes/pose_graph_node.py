@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from itertools import count
@@ -15,7 +14,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from lifecycle_msgs.msg import TransitionEvent
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
+from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -46,6 +47,9 @@ FRONT_END = "loop_closure_node"
 SETTLE_S, PREPARE_S = 1.0, 0.2
 """Longest time to settle the graph at the end, and to work ahead for that once per second."""
 UNSETTLED = "no time to settle the graph: results as they stand; they are settled when this folder is used next"
+DRAWING = 20.0
+"""So many times as long as path and markers took to publish they are not published again: on a long way they are
+large."""
 GRACE_S = 0.5
 """A front-end that was asked to end together with us says so within this."""
 
@@ -61,7 +65,6 @@ class PoseGraphNode(BaseNode):
     def _open(self) -> None:
         settings = self._settings
         self._frames = settings.frames
-        self._lock = threading.Lock()
         journal = Path(self._results) / JOURNAL if self._results else None
         self._durable: DurableGraph | MapFollower = (
             MapFollower(settings) if settings.localizing else DurableGraph(settings.pose_graph, journal, self._complain)
@@ -71,18 +74,19 @@ class PoseGraphNode(BaseNode):
         self._covariance: Array = np.zeros((6, 6))
         # newest odometry that path and markers show; None: other verdicts than they show
         self._drawn_ns: int | None = None
+        self._draws_again_s = 0.0
         self._make_publishers()
         kept = self._durable if isinstance(self._durable, DurableGraph) else None
         if kept is not None and (kept.taken_up or kept.feed.newest_ns >= 0):
             self.get_logger().info(_taken_up(kept))
             self._announce(kept.graph.closures())
-        self._worker: Worker[Callable[[], None]] = Worker(self._run, self._complain, QUEUE)
+        self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._complain, QUEUE)
         if self._durable.unsettled:
             self._worker.submit(lambda: self._settle_left())
         topics, transforms = topics_of(settings), StaticTransforms()
         warn = self.get_logger().warning
         self._odometry_frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
-        hear_static_transforms(self, transforms)
+        hear_static_transforms(self, transforms, self._guarded)
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
             self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
@@ -90,9 +94,9 @@ class PoseGraphNode(BaseNode):
         self.create_subscription(String, "~/reject_edge", self._guarded("reject_edge", self._on_reject), 10)
         hear = self._guarded("front-end", self._on_front_end)
         self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", hear, 10)
-        self._offer(Trigger, "~/reject_last", self._reject_last)
-        self._offer(Trigger, "~/save", self._save)
-        self._offer(Trigger, "~/reset", self._reset)
+        self._offer_in_turn("~/reject_last", self._reject_last)
+        self._offer_in_turn("~/save", self._save)
+        self._offer_in_turn("~/reset", self._reset)
 
     def _finish(self) -> None:
         """Take in what is queued, settle the graph and write the results."""
@@ -118,8 +122,27 @@ class PoseGraphNode(BaseNode):
         self._announce(self._durable.graph.closures())
 
     def _retune(self, settings: Settings) -> None:
-        with self._lock:
-            self._durable.graph.retune(settings.pose_graph)
+        self._worker.submit(lambda: self._durable.graph.retune(settings.pose_graph))
+
+    def _offer_in_turn(self, name: str, action: Callable[[], str]) -> None:
+        """Offer a service whose action the worker does when it is its turn: poses go out meanwhile."""
+
+        def act(answered: Future) -> None:
+            try:
+                answered.set_result((True, action()))
+            except Exception as error:
+                if not isinstance(error, UmfError):
+                    self._complain(error, name)
+                answered.set_result((False, str(error)))
+
+        async def answer(_: Any, response: Any) -> Any:
+            answered = Future()
+            self._worker.submit(lambda: act(answered))
+            response.success, response.message = await answered
+            return response
+
+        # a group of its own: those in one group wait for each other, the timers too
+        self.create_service(Trigger, name, answer, callback_group=ReentrantCallbackGroup())
 
     def _on_front_end(self, event: TransitionEvent) -> None:
         self._front_end_busy = event.goal_state.label == "shuttingdown"
@@ -162,10 +185,6 @@ class PoseGraphNode(BaseNode):
         match, query = parse_pair(message.data)
         self._worker.submit(lambda: self._announce(self._durable.revoke(match, query)))
 
-    def _run(self, step: Callable[[], None]) -> None:
-        with self._lock:
-            step()
-
     def _add_odometry(self, sample: OdometrySample) -> None:
         reset = self._durable.take_odometry(sample.stamp_ns, sample.odom_T_body)
         if reset is not None:
@@ -190,6 +209,15 @@ class PoseGraphNode(BaseNode):
         self._map_T_odom = self._durable.graph.map_T_odom()
         self._covariance = self._durable.graph.covariance()
 
+    def _show(self) -> None:
+        """Publish path and markers where they have changed and someone listens; who comes later hears the last ones."""
+        listeners = self._path_publisher.get_subscription_count() + self._marker_publisher.get_subscription_count()
+        newest_ns = self._durable.feed.newest_ns
+        if listeners and self._drawn_ns != newest_ns and time.monotonic() >= self._draws_again_s:
+            started_s, self._drawn_ns = time.thread_time(), newest_ns
+            self._draw()
+            self._draws_again_s = time.monotonic() + DRAWING * (time.thread_time() - started_s)
+
     def _draw(self) -> None:
         stamps, poses = self._durable.graph.trajectory()
         self._path_publisher.publish(messages.path(stamps, poses, self._frames))
@@ -206,9 +234,7 @@ class PoseGraphNode(BaseNode):
         self._announce(self._durable.update())
         self._durable.graph.prepare(PREPARE_S)
         self._correct()
-        if self._drawn_ns != self._durable.feed.newest_ns:
-            self._drawn_ns = self._durable.feed.newest_ns
-            self._draw()
+        self._show()
 
     def _own_status(self) -> DiagnosticStatus:
         graph = self._durable.graph
@@ -228,26 +254,22 @@ class PoseGraphNode(BaseNode):
         level = ERROR if self._cannot_write else WARN if trouble or self._faults else OK
         return status(level, "pose graph", text, values)
 
-    def _reject_last(self, _: Any) -> str:
-        with self._lock:
-            accepted = [v.closure for v in self._durable.graph.closures() if v.state is State.ACCEPTED]
-            if not accepted:
-                raise UmfError("no closure is accepted")
-            self._announce(self._durable.revoke(accepted[-1].match_stamp_ns, accepted[-1].query_stamp_ns))
+    def _reject_last(self) -> str:
+        accepted = [v.closure for v in self._durable.graph.closures() if v.state is State.ACCEPTED]
+        if not accepted:
+            raise UmfError("no closure is accepted")
+        self._announce(self._durable.revoke(accepted[-1].match_stamp_ns, accepted[-1].query_stamp_ns))
         return f"closure {_name(accepted[-1])} revoked"
 
-    def _save(self, _: Any) -> str:
+    def _save(self) -> str:
         folder = self._results or "pose_graph_results"
-        self._worker.drain(10.0)
-        with self._lock:
-            self._durable.write_results(Path(folder))
+        self._durable.write_results(Path(folder))
         return f"results written to {folder}"
 
-    def _reset(self, _: Any) -> str:
-        with self._lock:
-            if self._results:
-                self._durable.write_results(_numbered(Path(self._results)))
-            kept = self._durable.end()
+    def _reset(self) -> str:
+        if self._results:
+            self._durable.write_results(_numbered(Path(self._results)))
+        kept = self._durable.end()
         self._map_T_odom, self._drawn_ns = self._durable.graph.map_T_odom(), None
         return "a new graph begins" + (f"; the old one is kept in {kept}" if kept else "")
 

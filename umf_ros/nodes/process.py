@@ -17,7 +17,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from umf_ros.errors import ConfigError, UmfError
+from umf_ros.errors import ConfigError, UmfError, one_line
 
 LONGEST_WAIT_S = 60.0
 """So long a node that was asked to end may wait for those that it hears."""
@@ -53,7 +53,7 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     status = 0
     try:
         while not asked and rclpy.ok():
-            executor.spin_once(timeout_sec=0.2)
+            _spin_once(node, executor, 0.2)
         _wait_until_ready(node, executor, asked)
     except ExternalShutdownException:
         pass
@@ -95,7 +95,17 @@ def _wait_until_ready(node: Node, executor: SingleThreadedExecutor, asked: list[
     ready: Callable[[], bool] = getattr(node, "ready_to_close", lambda: True)
     deadline, first = time.monotonic() + LONGEST_WAIT_S, len(asked)
     while not ready() and len(asked) == first and time.monotonic() < deadline and rclpy.ok():
-        executor.spin_once(timeout_sec=0.05)
+        _spin_once(node, executor, 0.05)
+
+
+def _spin_once(node: Node, executor: SingleThreadedExecutor, timeout_s: float) -> None:
+    """Let the executor work; whatever leaves a callback, ours or one of the library's own, does not end the node."""
+    try:
+        executor.spin_once(timeout_sec=timeout_s)
+    except ExternalShutdownException:
+        raise
+    except Exception as error:
+        node.get_logger().error(f"{type(error).__name__}: {one_line(error)}; the node goes on")
 
 
 def _share_memory() -> None:

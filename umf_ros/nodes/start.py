@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from importlib import import_module
 
 
 def start(module: str) -> None:
     """Load the module of a node and run its `main`; a signal that comes before it can be heard ends the process, as 0.
 
+    What is not installed is one line on stderr and status 1.
+
     Args:
         module: its name.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))  # nothing is made yet that could be lost
-    import_module(module).main()
+    from umf_ros.errors import UmfError
+    from umf_ros.resources import check_packages
+
+    try:
+        check_packages()
+        main = import_module(module).main
+    except UmfError as error:
+        sys.exit(f"umf: {error}")
+    except ModuleNotFoundError as error:
+        sys.exit(f"umf: {error.name} is not installed; umf doctor says what helps")
+    main()
 
 
 def loop_closure_node() -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
@@ -11,11 +14,16 @@ from umf_ros.sensors.static_transforms import TOPIC, StaticTransforms
 QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def hear_static_transforms(node: Node, transforms: StaticTransforms) -> None:
-    """Fill `transforms` from `/tf_static`; without tf2_msgs, which Jazzy from PyPI lacks, they stay empty."""
+def hear_static_transforms(
+    node: Node, transforms: StaticTransforms, guarded: Callable[[str, Callable[..., Any]], Callable[..., Any]]
+) -> None:
+    """Fill `transforms` from `/tf_static`; without tf2_msgs, which Jazzy from PyPI lacks, they stay empty.
+
+    `guarded` keeps the faults of a callback in, as that of `BaseNode`.
+    """
     try:
         from tf2_msgs.msg import TFMessage
     except ImportError:
         node.get_logger().info("tf2_msgs is not installed: the calibration file alone says where the sensors are")
         return
-    node.create_subscription(TFMessage, TOPIC, transforms.add, QOS)
+    node.create_subscription(TFMessage, TOPIC, guarded("transforms", transforms.add), QOS)

@@ -19,6 +19,10 @@ FEATURES: dict[str, type[LocalFeatures] | type[SuperFeatures]] = {
 }
 
 
+_SHAPES = {"points": (3,), "body_T_camera": (4, 4), "body_T_lidar": (4, 4), "odom_T_body": (4, 4)}
+"""Ends of the shapes of what geometry is done with."""
+
+
 def pack(keyframe: Keyframe) -> bytes:
     """All of a keyframe in one safetensors blob."""
     embedding = keyframe.embedding
@@ -41,8 +45,16 @@ def pack(keyframe: Keyframe) -> bytes:
 
 
 def unpack(blob: bytes) -> Keyframe:
-    """The keyframe that `pack` was given."""
+    """The keyframe that `pack` was given.
+
+    Raises:
+        SafetensorError, ValueError, LookupError, TypeError: they are other bytes.
+    """
     arrays = load(blob)
+    for name, shape in _SHAPES.items():
+        found = arrays.get(name)
+        if found is not None and (found.shape[-len(shape) :] != shape or not np.isfinite(found).all()):
+            raise ValueError(f"{name} is not what it should be")
     stamp_ns, session = (int(number) for number in arrays["stamp_session"])
     width, height, *rest = (float(number) for number in arrays["camera"])
     features = {group: _group(arrays, group, kind) for group, kind in FEATURES.items()}

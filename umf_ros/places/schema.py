@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from typing import Any
 
 from umf_ros.errors import UmfError
 from umf_ros.sqlite_files import survive_crashes, tables_of
 
+KIND = "place database"
 SCHEMA_VERSION = 3
 _TABLES = (
     "CREATE TABLE about (content TEXT NOT NULL)",
@@ -22,6 +24,19 @@ _ADDED = (
 """What later versions have added, in order; a file of an older one gets it when it is opened."""
 
 
+def read_identity(connection: sqlite3.Connection) -> dict[str, Any]:
+    """What a file says of itself: `schema`, `embedder` and `dimension`, as text.
+
+    Raises:
+        ValueError: it says nothing that can be read.
+    """
+    about = connection.execute("SELECT content FROM about").fetchone()
+    stored = json.loads(about[0]) if about else {}
+    if not isinstance(stored, dict) or not all(isinstance(value, str) for value in stored.values()):
+        raise ValueError("it does not say what it is")
+    return stored
+
+
 def check_identity(connection: sqlite3.Connection, name: str, identity: dict[str, str]) -> None:
     """Look, and change nothing.
 
@@ -33,8 +48,7 @@ def check_identity(connection: sqlite3.Connection, name: str, identity: dict[str
         return
     if not {"about", "keyframe"} <= tables:
         raise UmfError(f"{name} is no place database, but another one with {', '.join(sorted(tables))}")
-    about = connection.execute("SELECT content FROM about").fetchone()
-    stored = json.loads(about[0]) if about else {}
+    stored = read_identity(connection)
     if stored.get("schema") != str(SCHEMA_VERSION):
         raise UmfError(f"{name} was written by another version of umf_ros; name a new file (database.path)")
     wrong = [f"{key} {stored.get(key)}, not {value}" for key, value in identity.items() if stored.get(key) != value]

@@ -21,13 +21,13 @@ from umf_ros.locks import FileLock
 from umf_ros.places.columns import Columns
 from umf_ros.places.outbox import Outbox
 from umf_ros.places.packing import pack, unpack
-from umf_ros.places.schema import check_identity, prepare
+from umf_ros.places.schema import KIND, check_identity, prepare
 from umf_ros.sqlite_files import open_sqlite, take_up
 
 Keys = Columns
 """`id` in the file, `stamp_ns`, `session` and `travelled_m` of every keyframe; metres are NaN without odometry."""
 IDS_AT_ONCE = 1000
-KIND = "place database"
+LARGEST_NUMBER = 2**53
 _KEYS = np.dtype([("id", np.int64), ("stamp_ns", np.int64), ("session", np.int64), ("travelled_m", np.float64)])
 
 
@@ -180,6 +180,7 @@ class KeyframeStore:
         part = path.with_name(path.name + ".part")
         with writing(path, sqlite3.Error), self._lock:
             path.parent.mkdir(parents=True, exist_ok=True)
+            part.unlink(missing_ok=True)  # of one that was killed
             try:
                 with closing(sqlite3.connect(part)) as target:
                     self._connection.backup(target)
@@ -239,6 +240,9 @@ class KeyframeStore:
         columns = "SELECT id, stamp_ns, session, ifnull(travelled_m, 9e999) FROM keyframe"
         keys = np.fromiter(connection.execute(columns), _KEYS)
         keys = keys[np.argsort(keys["id"])]
+        for name in ("id", "session"):  # the next one has to be a number too
+            if keys[name].min(initial=0) < 0 or keys[name].max(initial=0) > LARGEST_NUMBER:
+                raise ValueError(f"it holds a keyframe whose {name} is no number of ours")
         keys["travelled_m"][np.isinf(keys["travelled_m"])] = np.nan
         self.keys.extend(**{name: keys[name] for name in _KEYS.names or ()})
 

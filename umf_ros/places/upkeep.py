@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import sqlite3
-from collections.abc import Collection, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 from umf_ros.errors import UmfError
 from umf_ros.locks import FileLock
+from umf_ros.places.schema import KIND, read_identity
+from umf_ros.sqlite_files import looked_at
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +34,7 @@ def stored_sessions(path: Path) -> list[StoredSession]:
     Raises:
         UmfError: the file is missing or no place database.
     """
-    if not path.is_file():
-        raise UmfError(f"there is no place database {path}")
-    with _told(path), closing(sqlite3.connect(path)) as connection:
+    with looked_at(path, KIND) as connection:
         columns = "SELECT session, count(*), min(stamp_ns), max(stamp_ns) FROM keyframe GROUP BY session"
         return [StoredSession(*row) for row in connection.execute(columns)]
 
@@ -48,11 +45,8 @@ def stored_identity(path: Path) -> tuple[str, int]:
     Raises:
         UmfError: the file is missing or no place database.
     """
-    if not path.is_file():
-        raise UmfError(f"there is no place database {path}")
-    with _told(path), closing(sqlite3.connect(path)) as connection:
-        about = connection.execute("SELECT content FROM about").fetchone()
-    stored = json.loads(about[0]) if about else {}
+    with looked_at(path, KIND) as connection:
+        stored = read_identity(connection)
     try:
         return stored["embedder"], int(stored["dimension"])
     except (KeyError, ValueError):
@@ -79,16 +73,8 @@ def delete_sessions(path: Path, numbers: Collection[int]) -> int:
     check_sessions(path, numbers)
     lock = FileLock(path)
     try:
-        with _told(path), closing(sqlite3.connect(path)) as connection, connection:
+        with looked_at(path, KIND) as connection, connection:
             statement = "DELETE FROM keyframe WHERE session = ?"
             return sum(connection.execute(statement, (number,)).rowcount for number in set(numbers))
     finally:
         lock.release()
-
-
-@contextmanager
-def _told(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except sqlite3.Error as error:
-        raise UmfError(f"{path} cannot be used as a place database: {error}") from None

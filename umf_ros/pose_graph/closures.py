@@ -30,6 +30,10 @@ class State(StrEnum):
     REFUSED = "refused"
 
 
+Decision = tuple[State, str, float, float]
+"""State, reason, residual and residual_m of a `ClosureVerdict`."""
+
+
 @dataclass(frozen=True)
 class ClosureVerdict:
     """The decision about one closure at one moment.

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from umf_ros.geometry import Array, adjoint, expmap, invert, logmap
-from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Stamps
+from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Rows, Stamps
 
 
 @dataclass(frozen=True)
@@ -48,14 +49,25 @@ class CorrectedPath:
         inside = (after > 0) & (after < len(self.stamps))
         if inside.any():
             walked = points.noise[inside] - self.points.noise[lower[inside]]
-            twists[inside] = (walked @ self._multipliers[lower[inside]][..., None])[..., 0]
+            steps, of_step = np.unique(lower[inside], return_inverse=True)
+            twists[inside] = (walked @ self._multipliers(steps)[of_step][..., None])[..., 0]
         start = self.poses[lower] @ invert(self.points.poses[lower])
         return start @ expmap(twists) @ points.poses
 
     @cached_property
-    def _multipliers(self) -> Array:
-        """(N-1, 6) correction between two solved poses per noise: Lagrange multipliers of the solved poses."""
-        steps = invert(self.points.poses[:-1]) @ self.points.poses[1:]
-        misfits = logmap(invert(steps) @ invert(self.poses[:-1]) @ self.poses[1:])
-        twists = adjoint(self.points.poses[1:]) @ misfits[..., None]
-        return np.linalg.solve(np.diff(self.points.noise, axis=0), twists)[..., 0]
+    def _found(self) -> tuple[Array, NDArray[np.bool_]]:
+        """(N-1, 6) multipliers of the steps between solved poses, and (N-1,) which of them are known yet."""
+        return np.zeros((len(self.stamps) - 1, 6)), np.zeros(len(self.stamps) - 1, bool)
+
+    def _multipliers(self, steps: Rows) -> Array:
+        """(M, 6) correction from some solved poses to the next per noise: Lagrange multipliers of the solved poses."""
+        multipliers, known = self._found
+        new = steps[~known[steps]]
+        if len(new):
+            here, there = self.points.of(new), self.points.of(new + 1)
+            walked = invert(here.poses) @ there.poses
+            misfits = logmap(invert(walked) @ invert(self.poses[new]) @ self.poses[new + 1])
+            twists = adjoint(there.poses) @ misfits[..., None]
+            multipliers[new] = np.linalg.solve(there.noise - here.noise, twists)[..., 0]
+            known[new] = True
+        return multipliers[steps]

@@ -18,7 +18,7 @@ from umf_ros.geometry import Array, heading, to_quaternion
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureVerdict
 from umf_ros.pose_graph.condensed import Edge
 
-_ROTATION_LAST = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
+_ROTATION_LAST, _IN_PLANE = np.array([3, 4, 5, 0, 1, 2]), np.array([3, 4, 2])
 
 
 def verdict_table(verdicts: list[ClosureVerdict], vertex_of: Callable[[int], int] | None = None) -> str:
@@ -58,11 +58,21 @@ def write_g2o(
     Raises:
         OutputError: the file cannot be written.
     """
-    poses = list(poses)
-    names = range(len(poses)) if ids is None else ids
-    vertex, edge = (_planar_vertex, _planar_edge) if planar else (_spatial_vertex, _spatial_edge)
-    lines = [vertex(pose, name) for pose, name in zip(poses, names, strict=True)]
-    _write(path, lines + [edge(item, names[item.first], names[item.second]) for item in edges])
+    places = np.array(list(poses), float).reshape(-1, 4, 4)
+    names = range(len(places)) if ids is None else ids
+    pairs = [(names[edge.first], names[edge.second]) for edge in edges]
+    measured = np.array([edge.pose for edge in edges], float).reshape(-1, 4, 4)
+    covariances = np.array([edge.covariance for edge in edges], float).reshape(-1, 6, 6)
+    kept = _IN_PLANE if planar else np.arange(6)
+    upper = np.triu_indices(len(kept))
+    information = np.linalg.inv(covariances[:, kept[:, None], kept])
+    if not planar:
+        information = information[:, _ROTATION_LAST[:, None], _ROTATION_LAST]
+    numbers = _planar if planar else _spatial
+    edge_numbers = np.concatenate([numbers(measured), information[:, upper[0], upper[1]]], axis=1)
+    kind = "SE2" if planar else "SE3:QUAT"
+    lines = _lines(f"VERTEX_{kind}", [(name,) for name in names], numbers(places))
+    _write(path, lines + _lines(f"EDGE_{kind}", pairs, edge_numbers))
 
 
 def write_vertex_table(path: str | Path, vertices: Iterable[tuple[int, int]]) -> None:
@@ -84,25 +94,17 @@ def _write(path: str | Path, lines: Iterable[str]) -> None:
         Path(path).write_text("".join(line + "\n" for line in lines), encoding="ascii")
 
 
-def _spatial_vertex(pose: Array, name: int) -> str:
-    return f"VERTEX_SE3:QUAT {name} {_numbers([*pose[:3, 3], *to_quaternion(pose)])}"
+def _spatial(poses: Array) -> Array:
+    """(N, 7) position and quaternion of (N, 4, 4) poses."""
+    return np.concatenate([poses[:, :3, 3], to_quaternion(poses) if len(poses) else np.empty((0, 4))], axis=1)
 
 
-def _spatial_edge(edge: Edge, first: int, second: int) -> str:
-    information = np.linalg.inv(edge.covariance)[_ROTATION_LAST][np.triu_indices(6)]
-    measured = [*edge.pose[:3, 3], *to_quaternion(edge.pose)]
-    return f"EDGE_SE3:QUAT {first} {second} {_numbers(measured)} {_numbers(information)}"
+def _planar(poses: Array) -> Array:
+    """(N, 3) position in the plane and heading of (N, 4, 4) poses."""
+    return np.column_stack([poses[:, :2, 3], heading(poses)])
 
 
-def _planar_vertex(pose: Array, name: int) -> str:
-    return f"VERTEX_SE2 {name} {_numbers([*pose[:2, 3], heading(pose)])}"
-
-
-def _planar_edge(edge: Edge, first: int, second: int) -> str:
-    plane = np.linalg.inv(edge.covariance[np.ix_([3, 4, 2], [3, 4, 2])])[np.triu_indices(3)]
-    measured = [*edge.pose[:2, 3], heading(edge.pose)]
-    return f"EDGE_SE2 {first} {second} {_numbers(measured)} {_numbers(plane)}"
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return " ".join(f"{value:.12g}" for value in values)
+def _lines(word: str, names: Sequence[tuple[int, ...]], numbers: Array) -> list[str]:
+    """Lines of a word, the names of vertices and (N, M) numbers."""
+    form = word + " %d" * len(names[0]) + " %.12g" * numbers.shape[1] if len(names) else ""
+    return [form % (*name, *row) for name, row in zip(names, numbers.tolist(), strict=True)]

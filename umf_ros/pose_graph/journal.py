@@ -15,7 +15,7 @@ from umf_ros.errors import UmfError, writing
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array
 from umf_ros.locks import FileLock
-from umf_ros.pose_graph.closures import ClosureVerdict
+from umf_ros.pose_graph.closures import ClosureVerdict, Decision, State
 from umf_ros.sqlite_files import open_sqlite, survive_crashes, tables_of
 
 _TABLES = (
@@ -97,14 +97,34 @@ class GraphJournal:
         """
         return any(kind == UNSETTLED for (kind,) in self._read("SELECT kind FROM event ORDER BY id DESC LIMIT 1"))
 
-    def verdicts(self) -> dict[tuple[int, int], str]:
-        """The latest state of every closure, by the stamps of match and query.
+    def verdicts(self) -> dict[tuple[int, int], Decision]:
+        """The latest decision about every closure, by the stamps of match and query.
 
         Raises:
             UmfError: the file is damaged.
         """
-        rows = self._read("SELECT match_ns, query_ns, state FROM verdict")
-        return {(match, query): state for match, query, state in rows}
+        rows = self._read("SELECT match_ns, query_ns, state, reason, residual, residual_m FROM verdict")
+        try:
+            return {
+                (match, query): (State(state), str(reason), _number(residual), _number(residual_m))
+                for match, query, state, reason, residual, residual_m in rows
+            }
+        except (ValueError, TypeError) as error:
+            raise UmfError(f"{self.path} is damaged: {error}") from None
+
+    @property
+    def settings_mark(self) -> int:
+        """Of the settings that the verdicts were decided by, 0 where nobody left one.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        return int(next(self._read("PRAGMA user_version"))[0])
+
+    def mark_settings(self, mark: int) -> None:
+        """Leave a mark of 31 bits of the settings that verdicts are decided by."""
+        with writing(self.path, sqlite3.Error):
+            self._connection.execute(f"PRAGMA user_version = {int(mark)}")
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
         """Write down a message of the odometry."""
@@ -130,11 +150,17 @@ class GraphJournal:
 
     def set_aside(self) -> Path:
         """Keep what there is under another name, and begin anew; returns that name."""
-        self._connection.close()
         old = next(name for i in count(1) if not (name := self.path.with_suffix(f".{i}.sqlite")).exists())
-        with writing(self.path):
-            self.path.rename(old)
-        self._connection = self._open()
+        self._connection.close()
+        try:
+            with writing(self.path):
+                # while somebody reads it, its newest part lies in a log that belongs to its name
+                for end in ("-wal", ""):
+                    part = self.path.with_name(self.path.name + end)
+                    if part.exists():
+                        part.rename(old.with_name(old.name + end))
+        finally:
+            self._connection = self._open()
         return old
 
     def close(self) -> None:
@@ -166,6 +192,10 @@ class GraphJournal:
                 connection.execute("BEGIN")
                 for table in _TABLES:
                     connection.execute(table)
+
+
+def _number(value: Any) -> float:
+    return float("nan") if value is None else float(value)  # SQLite has no NaN
 
 
 def _event(kind: Any, first_ns: Any, second_ns: Any, data: Any) -> Event:

@@ -94,6 +94,19 @@ class OutlierRejection:
         self._decide({*rows, *self._brought_close})
         return self._verdicts()
 
+    def resume(self, decided: list[TrackedClosure]) -> list[ClosureVerdict]:
+        """Take closures in with the verdicts that they have, and solve the map once; nothing is decided anew."""
+        for tracked in decided:
+            row = self._take(tracked)
+            if tracked.verdict.reason == _BY_HAND:
+                self._revoked.add(row)
+        self._rescale()
+        self._solve()
+        open_rows = [row for row, tracked in enumerate(self.closures) if not tracked.accepted]
+        if open_rows:
+            self._look_again(open_rows)
+        return []
+
     def settle(self) -> list[ClosureVerdict]:
         """Decide what can wait no longer and bring the map to its exact optimum; returns changed verdicts."""
         self._changed = set()
@@ -201,6 +214,18 @@ class OutlierRejection:
         agreed = [row for row, *rest in numbers if self._agrees(row, *rest)]
         self._comparer.note(open_rows, found)
         return agreed
+
+    def _look_again(self, rows: list[int]) -> None:
+        """What the map says about closures whose verdicts stay."""
+        found = self._comparer.compare(rows)
+        self._comparer.note(rows, found)
+        for row, joined, ratio, misfit_m in zip(rows, found.joined, found.ratios, found.misfits_m, strict=True):
+            is_rejected = self.closures[row].verdict.state is State.REJECTED
+            self._ratios[row] = 1.0 if is_rejected else float(ratio)
+            if not joined:
+                self._unjoined.add(row)
+            if is_rejected and 0 < self._settings.max_correction_m < misfit_m:
+                self._too_far.add(row)
 
     def _agrees(self, row: int, distance: float, misfit_m: float, false_alarm: float, ratio: float) -> bool:
         """Note what the map says about a closure; returns whether its consistency with it suffices."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array, gtsam_to_ros_covariance, invert
 from umf_ros.pose_graph.closures import (
     ClosureVerdict,
+    Decision,
     State,
     TrackedClosure,
     check_closure,
@@ -64,6 +65,7 @@ class PoseGraph:
         self._rejection = OutlierRejection(self._settings, self._sessions)
         self._retrial: Retrial | None = None
         self._waiting: list[_Waiting] = []
+        self._held: list[TrackedClosure] = []
         self._seen: set[tuple[int, int, bytes]] = set()
         self._placed: set[tuple[int, int, int, int, bytes]] = set()
         self._refused: list[ClosureVerdict] = []
@@ -111,6 +113,39 @@ class PoseGraph:
         self._refresh()
         verdicts = [verdict for closure in closures if (verdict := self._receive(closure))]
         return verdicts + self.update()
+
+    def hold(self, closure: LoopClosure) -> None:
+        """Take one closure that was decided about before; `resume` puts it where it was."""
+        self._refresh()
+        self._receive(closure)
+        self._held += self._take_waiting()[1]
+
+    def resume(self, verdicts: Mapping[tuple[int, int], Decision]) -> bool:
+        """Give the closures that are held the verdicts that they had, and decide about those that had none.
+
+        Args:
+            verdicts: by the stamps of match and query.
+
+        Returns:
+            False when two closures go by the same stamps, so that the verdicts do not tell: nothing is done.
+        """
+        self._refresh()
+        held, self._held = self._held + self._take_waiting()[1], []
+        stamps = [(tracked.closure.match_stamp_ns, tracked.closure.query_stamp_ns) for tracked in held]
+        if len(set(stamps)) < len(stamps):
+            return False
+        decided, new = [], []
+        for pair, tracked in zip(stamps, held, strict=True):
+            decision = verdicts.get(pair)
+            if decision is None or decision[0] not in (State.ACCEPTED, State.REJECTED, State.UNDECIDED):
+                new.append(tracked)
+            else:
+                tracked.decide(*decision)
+                decided.append(tracked)
+        self._attempt(lambda: self._rejection.resume(decided))
+        if new:
+            self._attempt(lambda: self._rejection.consider(new))
+        return True
 
     def update(self) -> list[ClosureVerdict]:
         """Take in odometry that has arrived and decide about closures that waited for it; returns new verdicts."""

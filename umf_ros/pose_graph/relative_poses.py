@@ -17,7 +17,7 @@ from umf_ros.pose_graph.sessions import Sessions
 # metres at which an angular error counts like a displacement when ways through the graph are compared
 _LEVER_M = 10.0
 # pairs whose ways are looked for together: their trees fill some tens of megabytes
-_AT_ONCE = 256
+_AT_ONCE, _STEPS_AT_ONCE = 256, 10_000
 
 
 class Bounds(NamedTuple):
@@ -59,10 +59,13 @@ class RelativePoses:
     def bounds(self, match: Stops, query: Stops) -> Bounds:
         """Of the map's relative poses from N places to N others."""
         a, b = _Places(self._sessions, match), _Places(self._sessions, query)
-        every = np.arange(len(match.stamps))
-        parts = [self._bound(a, b, every[first : first + _AT_ONCE]) for first in range(0, len(every), _AT_ONCE)]
-        empty = np.empty((0, 6, 6)), np.empty(0)
-        return Bounds(*(np.concatenate(columns) for columns in zip(empty, *parts, strict=True)))
+        back = invert(b.poses)
+        covariances = self._variance_scale * a.noise_to(b, back)
+        lengths = _length(covariances)
+        order = np.argsort(lengths, kind="stable")
+        for rows in (order[first : first + _AT_ONCE] for first in range(0, len(order), _AT_ONCE)):
+            self._look_around(a, b, back, rows, covariances, lengths)
+        return Bounds(covariances, lengths)
 
     def lengths_through(self, match: Stops, query: Stops, first: Stops, second: Stops) -> Array:
         """(N,) m^2, at least: of the ways from N places to N others that use any of M edges, the shortest.
@@ -94,28 +97,30 @@ class RelativePoses:
             walked[mine] = np.abs(_turns(path.points.noise)[beside] - turns[mine, None])
         return vertices, self._variance_scale * walked
 
-    def _bound(self, a: _Places, b: _Places, rows: NDArray[np.int64]) -> tuple[Array, Array]:
-        """(M, 6, 6) bounds of some of the pairs, and (M,) lengths of their ways."""
-        back = invert(b.poses[rows])
-        near = [(place.vertices[rows], self._variance_scale * place.noise_to_vertices(rows, back)) for place in (a, b)]
+    def _look_around(
+        self, a: _Places, b: _Places, back: Array, rows: NDArray[np.int64], covariances: Array, lengths: Array
+    ) -> None:
+        """Replace the bounds of some pairs, which are those along the odometry, by those of shorter ways."""
+        near = [self._variance_scale * place.noise_to_vertices(rows, back[rows]) for place in (a, b)]
         # a way is the same from either end: trees grow from where there are fewer roots
-        (starts, leave), (stops, enter) = sorted(near, key=lambda one: len(np.unique(one[0])))
-        direct = self._variance_scale * a.noise_to(b, rows, back)
+        ends = zip((a.vertices[rows], b.vertices[rows]), near, strict=True)
+        (starts, leave), (stops, enter) = sorted(ends, key=lambda one: len(np.unique(one[0])))
         sources, of_source = np.unique(starts, return_inverse=True)
         of_source = of_source.reshape(starts.shape)
-        lengths, before = dijkstra(self._ways, directed=False, indices=sources, return_predecessors=True)
-        between = lengths[of_source[:, :, None], stops[:, None, :]]
+        found, before = dijkstra(
+            self._ways, directed=False, indices=sources, return_predecessors=True, limit=lengths[rows].max()
+        )
+        between = found[of_source[:, :, None], stops[:, None, :]]
         totals = (_length(leave)[:, :, None] + between + _length(enter)[:, None, :]).reshape(len(starts), -1)
-        best, row = totals.argmin(axis=1), np.arange(len(starts))
-        out, into = best // 2, best % 2
-        total, directly = totals[row, best], _length(direct)
-        straight = directly <= total
-        around = np.flatnonzero(np.isfinite(total) & ~straight)
-        bounds = np.where(straight[:, None, None], direct, np.diag(np.full(6, np.inf)))
-        chosen = leave[around, out[around]] + enter[around, into[around]]
-        trees, ends = before[of_source[around, out[around]]], stops[around, into[around]]
-        bounds[around] = chosen + self._along(trees, ends, back[around])
-        return bounds, np.minimum(directly, total)
+        best = totals.argmin(axis=1)
+        total = totals[np.arange(len(starts)), best]
+        around = np.flatnonzero(total < lengths[rows])
+        if not len(around):
+            return
+        chosen, out, into = rows[around], best[around] // 2, best[around] % 2
+        trees, last = before[of_source[around, out]], stops[around, into]
+        covariances[chosen] = leave[around, out] + enter[around, into] + self._along(trees, last, back[chosen])
+        lengths[chosen] = total[around]
 
     def _along(self, before: NDArray[np.int32], vertices: NDArray[np.int64], back: Array) -> Array:
         """(M, 6, 6) covariances along the ways that end at vertices, in the tangent spaces `back` leads to.
@@ -125,17 +130,20 @@ class RelativePoses:
             vertices: (M,) where the ways end.
             back: (M, 4, 4) from the map to the tangent space.
         """
-        sums, running = np.zeros((len(vertices), 6, 6)), np.arange(len(vertices))
-        here = vertices
+        ways, running, here = [], np.arange(len(vertices)), vertices
         while len(running):  # one step of every way that is not yet at its source
             there = before[running, here].astype(np.int64)
             goes_on = there >= 0
             running, here, there = running[goes_on], here[goes_on], there[goes_on]
-            keys = np.minimum(here, there) * len(self._poses) + np.maximum(here, there)
-            rows = self._rows[np.searchsorted(self._keys, keys)]
-            carry = adjoint(back[running] @ self._poses[self._edges.second[rows]])
-            sums[running] += propagate(carry, self._edges.covariances[rows])
+            ways.append((running, np.minimum(here, there) * len(self._poses) + np.maximum(here, there)))
             here = there
+        sums = np.zeros((len(vertices), 6, 6))
+        way, keys = np.concatenate([one for one, _ in ways]), np.concatenate([key for _, key in ways])
+        rows = self._rows[np.searchsorted(self._keys, keys)]
+        for first in range(0, len(way), _STEPS_AT_ONCE):
+            some = slice(first, first + _STEPS_AT_ONCE)
+            carry = adjoint(back[way[some]] @ self._poses[self._edges.second[rows[some]]])
+            np.add.at(sums, way[some], propagate(carry, self._edges.covariances[rows[some]]))
         return sums
 
 
@@ -168,12 +176,12 @@ class _Places:
         forward = np.where(self._is_before[rows, :, None, None], walked, -walked)
         return propagate(adjoint(back @ self._turns[rows])[:, None], forward)
 
-    def noise_to(self, other: _Places, rows: NDArray[np.int64], back: Array) -> Array:
-        """(M, 6, 6) noise of the odometry from M of them to other places; infinite on the diagonal between sessions."""
-        walked = other._noise[rows] - self._noise[rows]
-        is_before = (self._stamps[rows] <= other._stamps[rows])[:, None, None]
-        noise = propagate(adjoint(back @ other._turns[rows]), np.where(is_before, walked, -walked))
-        same = (self._sessions[rows] == other._sessions[rows])[:, None, None]
+    def noise_to(self, other: _Places, back: Array) -> Array:
+        """(N, 6, 6) noise of the odometry from them to other places; infinite on the diagonal between sessions."""
+        walked = other._noise - self._noise
+        is_before = (self._stamps <= other._stamps)[:, None, None]
+        noise = propagate(adjoint(back @ other._turns), np.where(is_before, walked, -walked))
+        same = (self._sessions == other._sessions)[:, None, None]
         return np.where(same, noise, np.diag(np.full(6, np.inf)))
 
 

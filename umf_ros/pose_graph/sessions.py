@@ -21,6 +21,10 @@ from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Stamps
 # where every keyframe is a vertex, one so close to a closure's endpoint adds nothing but rounding errors
 _TOO_CLOSE_NS = 10_000_000
 _REFINEMENTS = 4
+# a step of Gauss-Newton that moves no pose further (m) leaves the next a thousandth of that
+_REFINED_M = 1e-6
+# with more, the exact covariance of the last one takes seconds; condensed odometry tells it to a few percent
+_FEW_KEYFRAMES = 3000
 
 
 class Sessions:
@@ -157,7 +161,10 @@ class Sessions:
         points = self._points_at(stamps)
         for _ in range(_REFINEMENTS):
             starts, graph = self._graph(stamps, points, chosen, scale, self.components, unmoved)
-            self._refined = dict(enumerate(self._through(stamps, points, starts, self._refiner.solve(graph))))
+            poses = self._refiner.solve(graph)
+            self._refined = dict(enumerate(self._through(stamps, points, starts, poses)))
+            if np.abs(poses - graph.poses).max(initial=0.0) < _REFINED_M:
+                return
 
     def _points_at(self, stamps: list[Stamps]) -> list[PathPoints | None]:
         """The odometry at stamps of every session; None without odometry."""
@@ -180,7 +187,7 @@ class Sessions:
     def covariance(self, session: int, stamp_ns: int, scale: NoiseScale) -> Array:
         """(6, 6) marginal covariance of the pose at a stamp after the last solved one, in its tangent space."""
         path, last = self._refined.get(session), None
-        if path is not None:
+        if path is not None and len(path.stamps) < _FEW_KEYFRAMES:
             last = self._refiner.marginal((session, int(path.stamps[-1])))
         if path is None or last is None:
             path = self.path(session)

@@ -11,11 +11,11 @@ import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from umf_ros.config import Group, load_preset, problems
-from umf_ros.errors import CalibrationError, ConfigError
+from umf_ros.errors import CalibrationError, ConfigError, one_line
 from umf_ros.frames import StereoCamera
 from umf_ros.geometry import Array, from_quaternion
 from umf_ros.resources import dataset_names
-from umf_ros.sensors.rectification import Pinhole, RawCamera, StereoRectifier
+from umf_ros.sensors.rectification import LARGEST_IMAGE, Pinhole, RawCamera, StereoRectifier
 from umf_ros.yaml_files import read_values
 
 
@@ -81,6 +81,8 @@ def load_calibration(source: str | Path) -> Calibration:
         raise CalibrationError(str(error)) from None
     except ValidationError as error:
         raise CalibrationError(f"{path}: {problems(error)}") from None
+    except Exception as error:  # OpenCV raises anything on a pair that cannot be rectified
+        raise CalibrationError(f"{path} is no calibration of real sensors: {one_line(error)}") from None
 
 
 class _Pose(Group):
@@ -111,8 +113,8 @@ class _RawPair(Group):
     left: RawCamera
     right: RawCamera
     left_T_right: _Pose
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
+    width: int = Field(gt=0, le=LARGEST_IMAGE)
+    height: int = Field(gt=0, le=LARGEST_IMAGE)
 
     def rectifier(self) -> StereoRectifier:
         return StereoRectifier(self.left, self.right, self.left_T_right.matrix(), size=(self.width, self.height))
@@ -126,8 +128,8 @@ class _File(Group):
     body_T_camera: _Pose
     body_T_lidar: _Pose
     body_T_imu: _Pose
-    lidar_time_offset_s: float
-    min_intensity: float = Field(0.0, ge=0, allow_inf_nan=False)
+    lidar_time_offset_s: float = Field(ge=-3600, le=3600)
+    min_intensity: float = Field(0.0, ge=0)
     max_height_m: float = Field(0.0, ge=0)
 
     @model_validator(mode="after")

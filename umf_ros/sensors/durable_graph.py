@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from umf_ros.config import PoseGraphSettings
@@ -10,18 +11,22 @@ from umf_ros.errors import GraphError, OutputError
 from umf_ros.frames import LoopClosure
 from umf_ros.geometry import Array
 from umf_ros.pose_graph import journal
-from umf_ros.pose_graph.closures import ClosureVerdict
+from umf_ros.pose_graph.closures import ClosureVerdict, Decision
 from umf_ros.pose_graph.journal import Event, GraphJournal
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.sensors.odometry_feed import OdometryFeed
 from umf_ros.sensors.sessions import Reset
 
+MANY = 300
+"""From so many closures on the verdicts are taken up as they were written, rather than found again (*by hand*)."""
+
 
 class DurableGraph:
     """A pose graph, its odometry in sessions, and the journal of both.
 
-    The same events in the same order give the same graph: that is how it is taken up. A disk that is full costs the
-    journal, not the graph.
+    The same events in the same order give the same graph: that is how it is taken up. On a long way that takes minutes;
+    where the settings are those of before, the verdicts are believed instead, and the map is solved once. A disk that
+    is full costs the journal, not the graph.
 
     Args:
         settings: of the graph.
@@ -95,7 +100,10 @@ class DurableGraph:
         if self._journal is None:
             return None
         try:
-            return self._journal.set_aside()
+            kept, mark = self._journal, self._journal.settings_mark
+            old = kept.set_aside()
+            kept.mark_settings(mark)
+            return old
         except OutputError as error:
             self._on_fault(error)
             return None
@@ -111,6 +119,19 @@ class DurableGraph:
 
     def _take_up(self, kept: GraphJournal) -> None:
         before, self.unsettled = kept.verdicts(), kept.is_unsettled()
+        mark = zlib.crc32(self._settings.model_dump_json().encode()) >> 1
+        resumed = len(before) >= MANY and kept.settings_mark == mark and self._resume(kept, before)
+        if resumed or self._replay(kept):
+            self.feed.interrupted()
+            self._write(lambda found: found.add(journal.STARTED))
+        self._write(lambda found: found.mark_settings(mark))
+        verdicts = self.graph.closures()
+        self.taken_up = len(verdicts)
+        now = {(v.closure.match_stamp_ns, v.closure.query_stamp_ns): v.state for v in verdicts}
+        self.changed = sum(now.get(pair) != state for pair, (state, *_) in before.items())
+
+    def _replay(self, kept: GraphJournal) -> bool:
+        """Let everything happen once more; False when nothing did."""
         apply: dict[str, Callable[[Event], object]] = {
             journal.ODOMETRY: lambda event: self.feed.take(event.first_ns, event.data.reshape(4, 4)),
             journal.CLOSURE: lambda event: self.graph.add_closure(event.closure),
@@ -119,17 +140,30 @@ class DurableGraph:
             journal.STARTED: lambda _: self.feed.interrupted(),
             journal.UNSETTLED: lambda _: None,
         }
-        events = 0
+        happened = False
         for event in kept.events():
+            happened = True
             apply[event.kind](event)
-            events += 1
-        if events:
-            self.feed.interrupted()
-            self._write(lambda found: found.add(journal.STARTED))
-        verdicts = self.graph.closures()
-        self.taken_up = len(verdicts)
-        now = {(v.closure.match_stamp_ns, v.closure.query_stamp_ns): v.state.value for v in verdicts}
-        self.changed = sum(now.get(pair) != state for pair, state in before.items())
+        return happened
+
+    def _resume(self, kept: GraphJournal, verdicts: Mapping[tuple[int, int], Decision]) -> bool:
+        """Take up the verdicts instead of deciding all again, and solve once; False when they do not tell."""
+        revoked: list[Event] = []
+        apply: dict[str, Callable[[Event], object]] = {
+            journal.ODOMETRY: lambda event: self.feed.take(event.first_ns, event.data.reshape(4, 4)),
+            journal.CLOSURE: lambda event: self.graph.hold(event.closure),
+            journal.REVOKED: revoked.append,
+            journal.STARTED: lambda _: self.feed.interrupted(),
+        }
+        for event in kept.events():
+            if event.kind in apply:
+                apply[event.kind](event)
+        if not self.graph.resume(verdicts):
+            self._begin()
+            return False
+        for event in revoked:
+            self._revoke_again(event)
+        return True
 
     def _revoke_again(self, event: Event) -> None:
         try:

@@ -91,7 +91,7 @@ class Intake:
         except MessageError as error:
             self.refuse(topic, error)
         except Exception as error:  # whatever a message provokes, it is the message's fault
-            text = f"message provokes {type(error).__name__}: {' '.join(str(error).split())[:200]}"
+            text = f"message provokes {type(error).__name__}: {error}"
             self.refuse(topic, MessageError("unusable", text))
 
     def take_odometry(self, sample: OdometrySample) -> None:

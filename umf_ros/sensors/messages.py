@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from umf_ros.errors import MessageError
 from umf_ros.frames import Image, Points, StereoCamera
 from umf_ros.geometry import Array, from_quaternion
+from umf_ros.sensors.rectification import LARGEST_IMAGE
 
 # encoding -> channels, bytes per channel, OpenCV's conversion to grey
 _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
@@ -40,18 +41,20 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
 # sensor_msgs/PointField.datatype
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
+LAST_STAMP_NS = 2**31 * 10**9
+"""What a stamp with seconds of 32 bits stays below."""
 FURTHEST_M = 1e7
 """No odometry is further from its origin: a quarter of the earth."""
 NARROWEST_RAD, WIDEST_RAD = 0.02, 3.1
 """Angles of view that a rectified camera can have."""
-LARGEST_IMAGE = 20_000
-"""Pixels of a side."""
 LARGEST_RECORD = 4096
 """Bytes of a point; drivers have some dozens."""
 INTENSITY_NAMES = ("intensity", "reflectivity", "reflectance", "i")
 """Fields of the strength of a return, by whoever's driver."""
 TIME_NAMES = ("point_time_offset", "offset_time", "t", "time", "time_offset", "timestamp")
 """Fields of the time of a point: whole numbers are ns, others s; Blickfeld, Livox, Ouster, Velodyne, Hesai."""
+FURTHEST_RETURN_M = 1e4
+"""No LiDAR of a rover sees ten kilometres (*by hand*); grids over points further apart run out of cells."""
 LONGEST_SWEEP_NS = 1_000_000_000
 NO_RETURN_RANGE_M = 1.0
 """Range at which the Blickfeld driver puts the pulses that came back from nowhere, with intensity 0."""
@@ -89,12 +92,15 @@ def stamp_ns(message: Any) -> int:
     """Stamp of the message's header in nanoseconds.
 
     Raises:
-        MessageError: of kind "stamp" when the driver has not set it; it would look like a restart of the recording.
+        MessageError: of kind "stamp" when the driver has not set it, for it would look like a restart of the recording,
+            or when there is no such time.
     """
     stamp = message.header.stamp
     nanoseconds = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
     if nanoseconds <= 0:
         raise MessageError("stamp", "message without a stamp")
+    if nanoseconds >= LAST_STAMP_NS:  # could not be sent on
+        raise MessageError("stamp", f"message with a stamp of {stamp.sec} s and {stamp.nanosec} ns")
     return nanoseconds
 
 
@@ -152,14 +158,14 @@ def decode_cloud(message: Any) -> Cloud:
 
 
 def real_returns(points: Points, intensity: Points | None) -> NDArray[np.bool_]:
-    """(N,) which of the points (N, 3), m, are echoes: finite, away from the sensor, and no dummy of the Cube-1."""
+    """(N,) which of the points (N, 3), m, are echoes: away from the sensor, not too far, and no dummy of the Cube-1."""
     x, y, z = points.T
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is not finite, and no echo
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is too far
         squared = x * x + y * y + z * z
     dummy = np.abs(squared - NO_RETURN_RANGE_M**2) < 2e-5
     if intensity is not None:
         dummy &= intensity == 0
-    return np.isfinite(squared) & (squared > 0) & ~dummy
+    return (squared > 0) & (squared <= FURTHEST_RETURN_M**2) & ~dummy  # neither holds of what is not a number
 
 
 def _time_offsets_ns(records: NDArray[Any], message: Any) -> NDArray[np.int64] | None:

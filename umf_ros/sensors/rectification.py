@@ -10,12 +10,15 @@ from umf_ros.config import Group
 from umf_ros.frames import Image, StereoCamera
 from umf_ros.geometry import Array, invert, make_pose
 
+LARGEST_IMAGE = 20_000
+"""Pixels of a side."""
+
 
 class Pinhole(Group):
     """Pixels."""
 
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
+    width: int = Field(gt=0, le=LARGEST_IMAGE)
+    height: int = Field(gt=0, le=LARGEST_IMAGE)
     fx: float = Field(gt=0)
     fy: float = Field(gt=0)
     cx: float

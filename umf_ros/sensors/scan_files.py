@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.errors import SensorFileError, either
+from umf_ros.errors import SensorFileError, either, one_line
 from umf_ros.frames import Points
 from umf_ros.sensors.messages import Cloud, real_returns
 from umf_ros.sensors.pcd import Columns, parse_pcd
@@ -42,6 +42,8 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
         raise SensorFileError(f"cannot read {path}: {error.strerror}") from None
     except SensorFileError as error:
         raise SensorFileError(f"{path}: {error}") from None
+    except Exception as error:  # damaged bytes provoke anything
+        raise SensorFileError(f"{path} is damaged: {one_line(error)}") from None
     if not len(cloud.points):
         raise SensorFileError(f"{path} holds no return")
     return cloud

@@ -108,6 +108,13 @@ def test_a_malformed_line_is_named_and_the_rest_is_read(tmp_path: Path, line: st
     assert found.startswith("line 3: ") and problem in found
 
 
+def test_ids_beyond_all_numbers_are_named(tmp_path: Path) -> None:
+    edge = GOOD.split()
+    (tmp_path / "far.g2o").write_text(" ".join([edge[0], str(10**30), str(10**30 + 1), *edge[3:]]) + "\n")
+    with pytest.raises(GraphError, match="beyond all numbers"):
+        read_g2o(tmp_path / "far.g2o")
+
+
 def test_files_that_cannot_be_used(tmp_path: Path) -> None:
     with pytest.raises(GraphError, match="No such file"):
         read_g2o(tmp_path / "missing.g2o")

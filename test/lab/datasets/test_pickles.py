@@ -78,9 +78,24 @@ def test_a_data_frame_is_read_without_pandas(version: int) -> None:
     assert table["slam_position"][2] == pytest.approx([2.22, 0.2, 0.1])
 
 
+MANAGER = b"pandas.core.internals.managers\nBlockManager"
+
+
 def test_what_is_no_data_frame_is_said(tmp_path: Path) -> None:
     with pytest.raises(UmfError, match="holds a dict, not a pandas DataFrame"):
         load_data_frame(dump(tmp_path / "a.pkl", {"img_path": []}))
+
+
+@pytest.mark.parametrize(
+    "state",
+    [b"", b"}(X\x04\x00\x00\x00_mgrI3\nub", b"}(X\x04\x00\x00\x00_mgrc" + MANAGER + b"\n((I1\nI2\nt](I5\naltRub"],
+    ids=["none", "a number", "blocks that are none"],
+)
+def test_a_data_frame_that_lies_is_one_line(tmp_path: Path, state: bytes) -> None:
+    (tmp_path / "a.pkl").write_bytes(b"cpandas\nDataFrame\n)\x81" + state + b".")
+    with pytest.raises(UmfError) as caught:
+        load_data_frame(tmp_path / "a.pkl")
+    assert "\n" not in str(caught.value)
 
 
 def array_state(shape: object, kind: object, data: object) -> bytes:

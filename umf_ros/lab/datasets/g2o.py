@@ -33,6 +33,7 @@ from umf_ros.pose_graph.condensed import Edge
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
 PERIOD_NS = 1_000_000_000
+LARGEST_ID = 2**63 - 1
 _MOST_SOLUTIONS = 150
 _IGNORED = ("FIX", "PARAMS_", "VERTEX_XY", "VERTEX_TRACKXYZ", "EDGE_SE2_XY", "EDGE_SE3_TRACKXYZ")
 _SWAP = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
@@ -89,8 +90,8 @@ def _read_line(graph: G2oGraph, words: list[str]) -> None:
     if length != expected[tag]:
         raise GraphError(f"{tag} has {length - 1} values instead of {expected[tag] - 1}")
     ids = [int(word) for word in words[1 : 2 if tag.startswith("VERTEX") else 3]]
-    if min(ids) < 0:
-        raise GraphError("negative vertex id")
+    if not 0 <= min(ids) <= max(ids) <= LARGEST_ID:
+        raise GraphError("negative vertex id, or one beyond all numbers")
     values = np.array(words[1 + len(ids) :], dtype=float)
     if not np.isfinite(values).all():
         raise GraphError("value is not finite")
@@ -125,7 +126,7 @@ def _read_covariance(tag: str, values: Array) -> Array:
     kept = np.ix_([3, 4, 2], [3, 4, 2])
     information[kept] = plane
     information[0, 0] = information[1, 1] = plane[2, 2]
-    information[5, 5] = np.sqrt(plane[0, 0] * plane[1, 1])
+    information[5, 5] = np.sqrt(max(0.0, plane[0, 0] * plane[1, 1]))
     return _covariance_of(information)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.errors import UmfError
+from umf_ros.errors import UmfError, one_line
 
 Names = Mapping[str, Callable[..., Any]]
 
@@ -211,8 +211,15 @@ def load_data_frame(path: Path) -> dict[str, NDArray[Any]]:
         UmfError: the file cannot be read or is no DataFrame of plain columns.
     """
     frame = load_pickle(path, _PANDAS)
-    if not isinstance(frame, _Frame):
+    if not isinstance(frame, _Frame) or not isinstance(getattr(frame, "manager", None), _Manager):
         raise UmfError(f"{path} holds a {type(frame).__name__}, not a pandas DataFrame")
+    try:
+        return _columns(frame, path)
+    except (ValueError, TypeError, LookupError) as error:
+        raise UmfError(f"{path} is no DataFrame of plain columns: {one_line(error)}") from None
+
+
+def _columns(frame: _Frame, path: Path) -> dict[str, NDArray[Any]]:
     names = frame.manager.names
     columns: dict[str, NDArray[Any]] = {}
     for values, place in frame.manager.blocks:

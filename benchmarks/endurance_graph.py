@@ -1,0 +1,183 @@
+"""A pose graph of a long way, for `endurance.py`: what an event costs, and what the live node makes of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from endurance_live import MANY
+from endurance_nodes import BACK_END, Ears, NodeUnderTest, own_domain
+from nav_msgs.msg import Odometry
+from std_srvs.srv import Trigger
+
+from umf_ros.config import load_settings
+from umf_ros.geometry import Array
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops
+from umf_ros.nodes.conversions import closure_to_message, to_pose, to_time
+from umf_ros.nodes.qos import CLOSURES_QOS
+from umf_ros.pose_graph.closures import ClosureVerdict, State
+from umf_ros.pose_graph.journal import JOURNAL, GraphJournal
+from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.sensors.durable_graph import DurableGraph
+
+Figures = dict[str, Any]
+SEED = 10005
+SETTINGS = load_settings().pose_graph.model_copy(update={"max_gap_s": 3.0})
+BELIEVING = SETTINGS.model_copy(update={"reject_outliers": False})
+LATE = 40
+"""Closures whose cost is measured."""
+
+
+def timed(step: Callable[[], object]) -> tuple[float, float]:
+    """Milliseconds of a step by the clock on the wall, and of CPU: on a busy machine only those say how long it is."""
+    wall_s, cpu_s = time.perf_counter(), time.process_time()
+    step()
+    return 1e3 * (time.perf_counter() - wall_s), 1e3 * (time.process_time() - cpu_s)
+
+
+def spread(name: str, milliseconds: Array) -> Figures:
+    """Median, 95th percentile and worst of a cost."""
+    p50, p95, worst = np.percentile(milliseconds, [50, 95, 100]).round(1).tolist()
+    return {f"{name}_p50": p50, f"{name}_p95": p95, f"{name}_max": worst}
+
+
+def all_at_once(poses: int) -> Figures:
+    """Milliseconds of closures that come to a graph that got all others a moment ago, and is still busy with them."""
+    world = rover_loops(poses, SEED)
+    graph = PoseGraph(SETTINGS)
+    for k, pose in enumerate(world.odometry):
+        graph.add_odometry(k * PERIOD_NS, pose)
+    closures = [world.message(row) for row in range(len(world.closures))]
+    graph.add_closures(closures[:-LATE])
+    for _ in range(20):  # what the moved map comes close to is looked at with the next call
+        if not graph.update():
+            break
+    times = np.array([timed(partial(graph.add_closure, closure)) for closure in closures[-LATE:]])[20:]
+    wall, cpu = np.median(times, axis=0).round(1).tolist()
+    return {"event_ms_20k": wall, "event_cpu_ms_20k": cpu} | spread("event_cpu_ms_20k", times[:, 1])
+
+
+def one_by_one(poses: int) -> Figures:
+    """Milliseconds of CPU at the end of a drive all of whose closures are in the map, and of the pose that follows."""
+    world = rover_loops(poses, SEED)
+    graph, first = PoseGraph(BELIEVING), world.closures[-LATE].second
+    for k in range(first):
+        graph.add_odometry(k * PERIOD_NS, world.odometry[k])
+    graph.add_closures([world.message(row) for row in range(len(world.closures) - LATE)])
+    graph.retune(SETTINGS)
+    graph.update()
+    events, poses_ms, k = [], [], first
+    for row in range(len(world.closures) - LATE, len(world.closures)):
+        while k <= world.closures[row].second:
+            graph.add_odometry(k * PERIOD_NS, world.odometry[k])
+            k += 1
+        events.append(timed(partial(graph.add_closure, world.message(row)))[1])
+        poses_ms.append(timed(lambda: (graph.map_T_odom(), graph.covariance()))[1])
+    found = spread("drive_event_cpu_ms_20k", np.array(events[5:])) | spread("pose_cpu_ms_20k", np.array(poses_ms[5:]))
+    found["trajectory_cpu_ms_20k"] = round(timed(graph.trajectory)[1], 1)
+    return found
+
+
+def keep(world: GraphWorld, last: int, path: Path) -> int:
+    """A journal of a drive up to a pose, with every closure accepted; returns how many these are."""
+    begun = DurableGraph(SETTINGS, path, _ignore)  # as the node begins it, settings and all
+    begun.close()
+    journal, closures = GraphJournal(path), [row for row, c in enumerate(world.closures) if c.second < last]
+    for k in range(last):
+        journal.add_odometry((k + 1) * PERIOD_NS, world.odometry[k])
+    for row in closures:
+        journal.add_closure(_later(world, row))
+    journal.put_verdicts(
+        [ClosureVerdict(_later(world, row), State.ACCEPTED, "agrees with the map") for row in closures]
+    )
+    journal.close()
+    return len(closures)
+
+
+def live(poses: int, folder: Path) -> Figures:
+    """A node takes up a stored graph, hears the end of the drive, saves, and ends."""
+    world = rover_loops(poses, SEED)
+    first = world.closures[-LATE].second
+    results = folder / "long_graph"
+    results.mkdir(exist_ok=True)
+    (results / JOURNAL).unlink(missing_ok=True)
+    kept = keep(world, first, results / JOURNAL)
+    with own_domain():
+        ears = Ears()
+        odometry = ears.create_publisher(Odometry, "/odom", MANY)
+        closures = ears.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS)
+        started_s = time.monotonic()
+        node = NodeUnderTest(BACK_END, results, {"pose_graph.max_gap_s": 3.0})
+        known = ears.anew(BACK_END) and ears.value(BACK_END, "pose graph", "accepted")
+        figures: Figures = {"stored_closures_20k": kept, "taken_up_20k": known}
+        figures["reopen_s_20k"] = round(time.monotonic() - started_s, 1)
+        ears.wait(1.0)
+        for k in range(first, poses):
+            message = Odometry(child_frame_id="base_link")
+            message.header.stamp, message.header.frame_id = to_time((k + 1) * PERIOD_NS), "odom"
+            message.pose.pose = to_pose(world.odometry[k])
+            odometry.publish(message)
+            for row, closure in enumerate(world.closures):
+                if closure.second == k:
+                    closures.publish(closure_to_message(_later(world, row)))
+            ears.wait(0.05)
+        ears.wait(3.0)
+        figures["live_stall_ms_20k"] = ears.value(BACK_END, "pose graph", "executor_stall_max_ms")
+        figures["memory_mb_20k"] = _memory_mb(node)
+        shutdown_s, status = node.stop()
+        figures |= {"shutdown_s_20k": round(shutdown_s, 2), "fuzz_crashes": int(status != 0) + node.tracebacks()}
+        ears.destroy_node()
+    return figures
+
+
+def saved(poses: int, folder: Path) -> Figures:
+    """The executor's stall while the node of `live`, started again, settles and writes all."""
+    with own_domain():
+        ears = Ears()
+        node = NodeUnderTest(BACK_END, folder / "long_graph", {"pose_graph.max_gap_s": 3.0})
+        ears.anew(BACK_END)
+        client = ears.create_client(Trigger, f"/{BACK_END}/save")
+        client.wait_for_service(20.0)
+        started_s, answer = time.monotonic(), client.call_async(Trigger.Request())
+        ears.until(answer.done, 500.0)
+        save_s = time.monotonic() - started_s
+        ears.wait(1.5)
+        stall_ms = ears.value(BACK_END, "pose graph", "executor_stall_max_ms")
+        shutdown_s, _ = node.stop()
+        ears.destroy_node()
+    return {
+        "save_s_20k": round(save_s, 1),
+        "save_stall_ms_20k": stall_ms,
+        "settled_shutdown_s_20k": round(shutdown_s, 2),
+    }
+
+
+def long_graph(poses: int = 20_000) -> Figures:
+    """What an event costs at the end of a long way."""
+    return all_at_once(poses) | one_by_one(poses)
+
+
+def live_graph(folder: Path, poses: int = 20_000) -> Figures:
+    """What the node makes of it."""
+    return live(poses, folder) | saved(poses, folder)
+
+
+def _later(world: GraphWorld, row: int) -> Any:
+    """A closure as it is told where the first pose has the stamp of one second, not zero."""
+    closure, told = world.closures[row], world.message(row)
+    stamps = (closure.second + 1) * PERIOD_NS, (closure.first + 1) * PERIOD_NS
+    return type(told)(*stamps, told.match_T_query, told.covariance)
+
+
+def _memory_mb(node: NodeUnderTest) -> float:
+    """Resident memory of a process."""
+    pages = int(Path(f"/proc/{node.process.pid}/statm").read_text().split()[1])
+    return round(pages * 4096 / 1e6)
+
+
+def _ignore(_: Exception) -> None:
+    """A journal that cannot be written shows in what is found."""
