@@ -20,7 +20,8 @@ from umf_ros.lab.training.acceptance_examples import Example
 from umf_ros.verification import Verifier
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory
 from umf_ros.verification.measurement import SCAN, AlignedHypothesis, Measurement, beside, measure
-from umf_ros.verification.registration import ScanCache, align_scans
+from umf_ros.verification.prepared_scan import ScanCache
+from umf_ros.verification.registration import align_scans
 from umf_ros.verification.rerank import RankedCandidate, rerank
 
 RIGHT_M, RIGHT_DEG = 0.3, 2.5

@@ -36,7 +36,8 @@ from umf_ros.lab.simulation.seeds import VALIDATION
 from umf_ros.lab.training.covariance_fit import PoseSample, fit_scan_covariance, honesty, sample_of
 from umf_ros.loop_detector import LoopDetector, make_detector_embedder
 from umf_ros.verification.measurement import SCAN
-from umf_ros.verification.registration import PreparedScan, align_scans
+from umf_ros.verification.prepared_scan import PreparedScan
+from umf_ros.verification.registration import align_scans
 
 RIGHT_M, RIGHT_DEG = 1.0, 5.0
 NEAR_M = 0.1  # from so far the domains' pairs are aligned: it is the covariance that is fitted, not the search

@@ -142,7 +142,10 @@ class LoopDetector:
             self._foreseen.popleft()
         if not self._foreseen:
             self.foresee(frame)
-        keyframe, self.embed_ms = self._foreseen.popleft()[1].result()
+        coming = self._foreseen.popleft()[1]
+        if not coming.done() and len(self.database):
+            self._verifier.foresee(frame)  # the network computes elsewhere
+        keyframe, self.embed_ms = coming.result()
         travelled_m = self._selector.travelled_m(frame) + self._ahead_m
         return replace(keyframe, travelled_m=travelled_m, session=self._stored_session)
 

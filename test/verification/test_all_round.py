@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.geometry import Array, make_pose, relative, rotation_angle
 from umf_ros.verification.all_round import TurnedSurroundings, scout, search
-from umf_ros.verification.registration import PreparedScan
+from umf_ros.verification.prepared_scan import PreparedScan
 
 GROUND = landscape(3)
 

@@ -11,7 +11,8 @@ from umf_ros.geometry import Array, invert, make_pose, transform
 from umf_ros.verification import thin_scan
 from umf_ros.verification.free_space import Sight
 from umf_ros.verification.meeting import Meeting, meet, rivalry
-from umf_ros.verification.registration import PreparedScan, inspect
+from umf_ros.verification.prepared_scan import PreparedScan
+from umf_ros.verification.registration import inspect
 
 RNG = np.random.default_rng(5)
 UP = make_pose(np.eye(3), [0.0, 0.0, 1.5])  # the sensor on its mast

@@ -9,14 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.geometry import Array, invert, make_pose, relative, rotation_angle, transform
 from umf_ros.verification.constants import SEARCH_M
-from umf_ros.verification.registration import (
-    Alignment,
-    CovarianceModel,
-    PreparedScan,
-    align_scans,
-    covariance_of,
-    inspect,
-)
+from umf_ros.verification.prepared_scan import PreparedScan
+from umf_ros.verification.registration import Alignment, CovarianceModel, align_scans, covariance_of, inspect
 from umf_ros.verification.thinning import thin_scan
 
 GROUND = landscape(8)

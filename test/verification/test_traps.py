@@ -12,8 +12,8 @@ from umf_ros.config import Verification
 from umf_ros.frames import Candidate
 from umf_ros.verification import Verifier
 from umf_ros.verification.all_round import TurnedSurroundings, search
+from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.ransac import fit_homography
-from umf_ros.verification.registration import PreparedScan
 from umf_ros.verification.rerank import mutual_neighbours, similarities
 
 

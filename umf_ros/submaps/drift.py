@@ -10,7 +10,8 @@ import numpy as np
 from umf_ros.frames import Keyframe
 from umf_ros.geometry import Array, heading, relative
 from umf_ros.verification import constants as const
-from umf_ros.verification.registration import PreparedScan, align_scans, prepare
+from umf_ros.verification.prepared_scan import PreparedScan, prepare
+from umf_ros.verification.registration import align_scans
 
 
 class DriftMeter:

@@ -21,7 +21,8 @@ from umf_ros.verification.acceptance import Criterion, Logistic, log_ratio
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import TemporalMemory, prior_sigmas
 from umf_ros.verification.measurement import SUBMAP, Measurement
-from umf_ros.verification.registration import Alignment, CovarianceModel, covariance_of, levelled, nominal_deviations
+from umf_ros.verification.prepared_scan import levelled
+from umf_ros.verification.registration import Alignment, CovarianceModel, covariance_of, nominal_deviations
 
 SHIPPED = "config/verification/submaps.json"
 

@@ -10,7 +10,7 @@ import numpy as np
 from umf_ros.frames import Keyframe
 from umf_ros.geometry import Array, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.registration import PreparedScan
+from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.thinning import thin_scan
 
 

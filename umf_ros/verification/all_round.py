@@ -21,7 +21,8 @@ from umf_ros.geometry import Array, make_pose, transform
 from umf_ros.geometry import heading as heading_of
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate
-from umf_ros.verification.registration import PreparedScan, draw, levelled, unlevelled
+from umf_ros.verification.prepared_scan import PreparedScan, levelled, unlevelled
+from umf_ros.verification.registration import draw
 from umf_ros.verification.surroundings import SIDE, Spectra, Surroundings
 
 
@@ -57,7 +58,7 @@ class TurnedSurroundings:
 
     def __init__(self, scan: PreparedScan) -> None:
         self.scan = scan
-        self.cell_m = _cell_for(scan)
+        self.cell_m = scan.cell_m
         self.around = scan.around(self.cell_m)
         self._ready = np.zeros(len(const.ALL_HEADINGS), bool)
         self._spectra: Spectra = np.zeros((len(const.ALL_HEADINGS), 2, SIDE, SIDE // 2 + 1), np.complex64)
@@ -89,7 +90,7 @@ def search(match: PreparedScan, turned: TurnedSurroundings) -> list[Fit]:
 
 def scout(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
     """Draw a pose to the match by a few points, and see how many of them find a counterpart."""
-    cell_m = _cell_for(query)
+    cell_m = query.cell_m
     pose = draw(match, query.scouts_cloud, guess, const.SCOUT_REACH * cell_m, const.SCOUT_STEPS)
     squared = match.nearest(transform(pose, query.scouts))[1]
     near = squared < (const.SCOUT_NEAR * cell_m) ** 2
@@ -100,7 +101,7 @@ def scout(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
 
 def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
     """Where else the query could lie at the heading of a pose, drawn to the match: the peaks but that of the pose."""
-    cell_m, level = _cell_for(query), levelled(match, query, pose)
+    cell_m, level = query.cell_m, levelled(match, query, pose)
     theirs, ours, turn = match.around(cell_m), query.around(cell_m), float(heading_of(level))
     spectra: Spectra = scipy.fft.rfft2(ours.turned(turn).transpose(2, 0, 1)).conj()
     volumes = _correlate(theirs, spectra[None])
@@ -112,12 +113,6 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
         guess = settled(match, query, cell_m, turn, shift)
         found.append(draw(match, query.scouts_cloud, guess, const.SCOUT_REACH * cell_m, const.SCOUT_STEPS))
     return found
-
-
-def _cell_for(scan: PreparedScan) -> float:
-    """Side of a cell, m, as the place around a scan asks for it."""
-    steps = np.round(np.log2(scan.reach_m / const.REACH_CELLS) * 2) / 2
-    return float(np.clip(2.0**steps, *const.AROUND_CELL_M))
 
 
 def _correlate(around: Surroundings, turned: Spectra) -> NDArray[np.float32]:

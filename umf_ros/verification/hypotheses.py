@@ -16,8 +16,8 @@ from umf_ros.frames import Candidate, Keyframe
 from umf_ros.geometry import Array, relative, rotation_angle
 from umf_ros.verification import constants as const
 from umf_ros.verification.all_round import Fit, TurnedSurroundings, scout, search
+from umf_ros.verification.prepared_scan import PreparedScan, views_tell
 from umf_ros.verification.ransac import fit_rigid
-from umf_ros.verification.registration import PreparedScan, views_tell
 from umf_ros.verification.rerank import RankedCandidate
 from umf_ros.verification.views import PairedViews
 

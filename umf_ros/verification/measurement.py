@@ -21,15 +21,8 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, near, prior_sigmas
 from umf_ros.verification.meeting import meet, rivalry
-from umf_ros.verification.registration import (
-    Alignment,
-    CovarianceModel,
-    PreparedScan,
-    covariance_of,
-    joint_blur,
-    levelled,
-    nominal_deviations,
-)
+from umf_ros.verification.prepared_scan import PreparedScan, joint_blur, levelled
+from umf_ros.verification.registration import Alignment, CovarianceModel, covariance_of, nominal_deviations
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
 from umf_ros.verification.scan_motion import closure_covariance
 from umf_ros.verification.views import ViewAlignment

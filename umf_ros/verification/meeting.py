@@ -14,7 +14,8 @@ from umf_ros.geometry import Array, invert, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.all_round import alternatives
 from umf_ros.verification.free_space import Sight, visible
-from umf_ros.verification.registration import SEARCHED, PreparedScan, joint_blur
+from umf_ros.verification.prepared_scan import PreparedScan, joint_blur
+from umf_ros.verification.registration import SEARCHED
 
 Mask = NDArray[np.bool_]
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from umf_ros.config import Verification
-from umf_ros.frames import Candidate, Keyframe, LoopClosure, Points
+from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure, Points
 from umf_ros.geometry import heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
@@ -26,7 +26,8 @@ from umf_ros.verification.measurement import (
     measure_candidate,
     uncompared,
 )
-from umf_ros.verification.registration import ScanCache, align_scans, levelled, views_tell
+from umf_ros.verification.prepared_scan import ScanCache, levelled, views_tell
+from umf_ros.verification.registration import align_scans
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
 
 UNTESTED, NO_POSE = "less promising than others", "no pose fits, or others fit better"
@@ -111,6 +112,10 @@ class Verifier:
         """Forget earlier keyframes, as after a jump of the clock."""
         self._memory.reset()
         self._scans.clear()
+
+    def foresee(self, frame: Frame) -> None:
+        """Make ready what is asked of a scan whose keyframe is verified next."""
+        self._scans.foresee(frame)
 
     def verify(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[Verdict]:
         """One verdict per candidate, accepted ones first, then in the order of the reranking.

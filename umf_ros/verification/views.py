@@ -171,8 +171,9 @@ class PairedViews:
 
     def any_pose(self) -> Array | None:
         """A pose that enough features agree with: a guess for what sees better than cameras."""
-        ways = (getattr(self, name) for name in ("forward", "backward"))  # the second only where the first fails
-        return next((pose for pose in ways if self._agreeing(pose) >= const.MIN_PIXELS), None)
+        # by the depths of whichever saw more of them; the other way round finds next to nothing more
+        pose = self.forward if self.query.lifted.sum() >= self.match.lifted.sum() else self.backward
+        return pose if self._agreeing(pose) >= const.MIN_PIXELS else None
 
     def best_pose(self) -> tuple[Array, int] | None:
         """The pose that more features agree with, and how many do; None where too few do."""

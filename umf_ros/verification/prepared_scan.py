@@ -1,0 +1,242 @@
+"""The scan of a keyframe made ready for comparison: once, and each part when it is first asked for."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from functools import cached_property
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+
+from umf_ros.frames import Frame, Keyframe, Points
+from umf_ros.geometry import Array, invert, make_pose, transform
+from umf_ros.levelling import upright
+from umf_ros.verification import constants as const
+from umf_ros.verification.elevation_map import ElevationMap
+from umf_ros.verification.field_of_view import FieldOfView
+from umf_ros.verification.free_space import RangeImage
+from umf_ros.verification.surroundings import Surroundings
+from umf_ros.verification.thinning import thin_frame
+
+
+class PreparedScan:
+    """A keyframe's scan made ready for comparison, each part when it is first asked for."""
+
+    def __init__(self, points: Points, body_T_lidar: Array | None = None, blur_m: float = 0.0) -> None:
+        """Prepare nothing yet.
+
+        Args:
+            points: (M, 3) m, body frame, thinned.
+            body_T_lidar: where they were seen from; without it the origin.
+            blur_m: how far points may be off because the LiDAR moved during the scan, standard deviation.
+        """
+        self.blur_m = blur_m
+        self._lidar_T_body = np.eye(4) if body_T_lidar is None else invert(body_T_lidar)
+        self.points: Array = points.astype(float)
+        self._around: dict[float, Surroundings] = {}
+
+    def make_ready(self) -> None:
+        """Make at once what a query's scan is asked for in every comparison."""
+        if self.usable:
+            self.around(self.cell_m)
+            for part in ("elevation", "view", "range_image", "spacing", "scouts_cloud", "coarse_cloud", "sample_cloud"):
+                getattr(self, part)
+
+    @property
+    def usable(self) -> bool:
+        """Whether there is anything to align."""
+        return len(self.points) >= const.MIN_SCAN_POINTS
+
+    @cached_property
+    def bare(self) -> bool:
+        """Whether it shows bare, even ground alone, which could lie anywhere on such ground."""
+        return float(self.elevation.values.std()) < const.BARE_RELIEF_M if len(self.elevation.values) else False
+
+    @cached_property
+    def elevation(self) -> ElevationMap:
+        """Heights and relief, upright."""
+        return ElevationMap(self.upright_points)
+
+    @cached_property
+    def up(self) -> Array:
+        """Rotation (3, 3) that sets the scan upright."""
+        return upright(self.normals[self.picks])
+
+    @cached_property
+    def upright_points(self) -> Array:
+        """(M, 3) m."""
+        turned: Array = self.points @ self.up.T
+        return turned
+
+    @cached_property
+    def view(self) -> FieldOfView:
+        """The directions it looks into, upright."""
+        return FieldOfView(self.upright_points)
+
+    @cached_property
+    def reach_m(self) -> float:
+        """Median distance of the points, m."""
+        return float(np.median(np.linalg.norm(self.points, axis=1)))
+
+    @cached_property
+    def cell_m(self) -> float:
+        """Side of a cell of the map of its surroundings, m, as the place asks for it."""
+        steps = np.round(np.log2(self.reach_m / const.REACH_CELLS) * 2) / 2
+        return float(np.clip(2.0**steps, *const.AROUND_CELL_M))
+
+    def around(self, cell_m: float) -> Surroundings:
+        """Map of what stands around it, in cells of this size, m."""
+        if cell_m not in self._around:
+            self._around[cell_m] = Surroundings(self.upright_points, cell_m)
+        return self._around[cell_m]
+
+    @cached_property
+    def scouts(self) -> Array:
+        """(S, 3) a few points, evenly taken, m."""
+        return self.points[self._picks(const.SCOUTS)]
+
+    @cached_property
+    def scouts_cloud(self) -> small_gicp.PointCloud:
+        """The few with covariances of their own."""
+        return _cloud_of(self.scouts)
+
+    def _picks(self, count: int) -> NDArray[np.intp]:
+        return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(np.intp)
+
+    @cached_property
+    def cloud(self) -> small_gicp.PointCloud:
+        """Points, normals and covariances."""
+        return _cloud_of(self.points, self.tree)
+
+    @cached_property
+    def range_image(self) -> RangeImage:
+        """How far the LiDAR saw."""
+        return RangeImage(transform(self._lidar_T_body, self.points))
+
+    def look_at(self, points: Array) -> NDArray[np.int8]:
+        """(N,) what the rays of this scan say of points (N, 3) of its body frame, each a `Sight`."""
+        return self.range_image.look_at(transform(self._lidar_T_body, points))
+
+    @cached_property
+    def picks(self) -> NDArray[np.intp]:
+        """(S,) indices of at most 1500 points, evenly taken."""
+        return self._picks(const.SAMPLE)
+
+    @cached_property
+    def sample(self) -> Array:
+        """(S, 3) at most 1500 points, evenly taken."""
+        return self.points[self.picks]
+
+    @cached_property
+    def spacing(self) -> Array:
+        """(S,) m: how far the points of the sample are from the fifth of their neighbours."""
+        _, squared = self.tree.batch_knn_search(self.sample, const.SPACING_NEIGHBOURS, 1)
+        return np.sqrt(np.asarray(squared)[:, -1])
+
+    @cached_property
+    def sample_cloud(self) -> small_gicp.PointCloud:
+        """The sample with covariances of its own."""
+        return _cloud_of(self.sample)
+
+    @cached_property
+    def coarse_cloud(self) -> small_gicp.PointCloud:
+        """A third of the sample, likewise: enough for where there is far to go."""
+        return _cloud_of(self.sample[:: const.COARSE_EVERY])
+
+    @cached_property
+    def tree(self) -> small_gicp.KdTree:
+        """Nearest neighbours among the points."""
+        return small_gicp.KdTree(self.points)
+
+    @cached_property
+    def normals(self) -> Array:
+        """(M, 3) unit normals, zero where the neighbourhood is too small."""
+        return np.asarray(self.cloud.normals())[:, :3]
+
+    @cached_property
+    def noise_m(self) -> float:
+        """How far the points scatter about their neighbours' planes, m: sensor noise and roughness together."""
+        index, _ = self.tree.batch_knn_search(self.sample, const.NOISE_NEIGHBOURS, 1)
+        neighbours = np.asarray(index, np.intp)
+        offsets = self.points[neighbours[:, 1:]] - self.sample[:, None]
+        away = np.abs(np.einsum("nki,ni->nk", offsets, self.normals[neighbours[:, 0]]))
+        return 1.4826 * float(np.median(away))
+
+    def nearest(self, points: Array) -> tuple[NDArray[np.intp], Array]:
+        """Index (N,) of the nearest point to each of (N, 3), and its squared distance, m^2."""
+        index, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
+        return np.asarray(index, np.intp), np.asarray(squared)
+
+
+def _cloud_of(points: Array, tree: small_gicp.KdTree | None = None) -> small_gicp.PointCloud:
+    """Points (N, 3) with normals and covariances of their own."""
+    cloud = small_gicp.PointCloud(points)
+    small_gicp.estimate_normals_covariances(cloud, tree, const.NORMAL_NEIGHBOURS, 1)
+    return cloud
+
+
+def levelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
+    """The pose `match_T_query` (4, 4) between the upright frames of two scans."""
+    to_match, from_query = make_pose(match.up, np.zeros(3)), make_pose(query.up.T, np.zeros(3))
+    found: Array = to_match @ pose @ from_query
+    return found
+
+
+def unlevelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
+    """The pose `match_T_query` (4, 4) that is this one between the upright frames of two scans."""
+    from_match, to_query = make_pose(match.up.T, np.zeros(3)), make_pose(query.up, np.zeros(3))
+    found: Array = from_match @ pose @ to_query
+    return found
+
+
+def prepare(keyframe: Keyframe) -> PreparedScan:
+    """The scan of a keyframe; one whose motion was not removed is blurred."""
+    return PreparedScan(keyframe.points, keyframe.body_T_lidar, const.BLUR_M if keyframe.motion is None else 0.0)
+
+
+def prepare_frame(frame: Frame) -> PreparedScan:
+    """The same scan, before its frame is a keyframe."""
+    points, motion = thin_frame(frame)
+    return PreparedScan(points, frame.body_T_lidar, const.BLUR_M if motion is None else 0.0)
+
+
+def views_tell(match: PreparedScan, query: PreparedScan) -> bool:
+    """Whether images have to tell the pose, where there are any: a scan is wanting, or both show bare ground alone."""
+    return not (match.usable and query.usable) or (match.bare and query.bare)
+
+
+def joint_blur(match: PreparedScan, query: PreparedScan) -> float:
+    """How far points of two scans may be off together because a LiDAR moved, m."""
+    return max(match.blur_m, query.blur_m)
+
+
+class ScanCache:
+    """The most recently used scans; a cache, so it changes no result."""
+
+    def __init__(self) -> None:
+        self._scans: OrderedDict[tuple[int, int], PreparedScan] = OrderedDict()
+        self._foreseen: tuple[int, PreparedScan] | None = None
+
+    def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
+        key = (keyframe.session, keyframe.stamp_ns)
+        scan = self._scans.pop(key, None) or self._foreseen_of(keyframe) or prepare(keyframe)
+        self._scans[key] = scan
+        if len(self._scans) > const.SCANS_KEPT:
+            self._scans.popitem(last=False)
+        return scan
+
+    def foresee(self, frame: Frame) -> None:
+        """Make the scan ready of a frame that is about to become a keyframe."""
+        scan = prepare_frame(frame)
+        scan.make_ready()
+        self._foreseen = frame.stamp_ns, scan
+
+    def clear(self) -> None:
+        """Forget all scans, as when stamps start over."""
+        self._scans.clear()
+        self._foreseen = None
+
+    def _foreseen_of(self, keyframe: Keyframe) -> PreparedScan | None:
+        known, self._foreseen = self._foreseen, None
+        return known[1] if known is not None and known[0] == keyframe.stamp_ns else None
