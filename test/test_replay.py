@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import umf
 from recordings import small_settings, traverse, write_mcap
 
 from umf_ros.bags.frames import FrameReader
@@ -18,9 +19,9 @@ from umf_ros.config import Database, Settings, load_settings
 from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.errors import OutputError
 from umf_ros.frames import Frame
-from umf_ros.loop_detector import LoopDetector
+from umf_ros.loop_detector import Detection, LoopDetector
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.replay import Replay
+from umf_ros.replay import FAULTS, Replay
 from umf_ros.sensors.messages import OdometrySample
 
 TABLES = "candidates.csv closures.csv config.yaml descriptors.f16 inliers.csv keyframes.csv".split()
@@ -240,3 +241,39 @@ def test_a_full_disk_ends_the_replay_after_what_was_found_is_kept(
         list(replay.run(stream))
     replay.finish({})
     assert len(keyframes_in(tmp_path / "run")) == 1
+
+
+def test_a_fault_of_ours_at_one_frame_costs_that_frame_alone(
+    stream: Stream, settings: Settings, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, broken = frames_of(stream), frames_of(stream)[4].stamp_ns
+    process = LoopDetector.process
+
+    def faulty(self: LoopDetector, frame: Frame) -> Detection:
+        if frame.stamp_ns == broken:
+            raise ZeroDivisionError("no points in a submap")
+        return process(self, frame)
+
+    monkeypatch.setattr(LoopDetector, "process", faulty)
+    replay = Replay(folder, settings, LoopDetector(settings, ThumbnailEmbedder()))
+    found = list(replay.run(stream))
+    replay.finish({})
+    assert [one.frame_stamp_ns for one in found] == [frame.stamp_ns for frame in whole]
+    assert replay.faults == 1 and sum(one.keyframe is not None for one in found) > 3
+    log = (folder / FAULTS).read_text()
+    assert f"frame {broken}" in log and "ZeroDivisionError: no points in a submap" in log
+
+
+def test_the_command_says_so_in_one_line_and_fails(
+    settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = write_mcap(tmp_path / "a.mcap", traverse(2.0))
+
+    def faulty(self: LoopDetector, frame: Frame) -> Detection:
+        raise IndexError("out of bounds")
+
+    monkeypatch.setattr(LoopDetector, "process", faulty)
+    ended = umf("replay", bag, "--embedder", "thumbnail", "--out", tmp_path / "out")
+    assert ended.status == 1 and "frames were passed over for a fault of ours: please report " in ended.text
+    assert "Traceback" not in ended.text
+    assert (tmp_path / "out" / "latest" / "report.html").exists()

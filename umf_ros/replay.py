@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import traceback
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from umf_ros.config import Settings
+from umf_ros.errors import UmfError
 from umf_ros.frames import Frame, LoopClosure
 from umf_ros.lookahead import one_ahead
 from umf_ros.loop_detector import Detection, LoopDetector
@@ -15,6 +17,7 @@ from umf_ros.runs.recorder import RunRecorder
 from umf_ros.sensors.messages import OdometrySample
 from umf_ros.sensors.odometry_feed import OdometryFeed
 
+FAULTS = "faults.log"
 WARM_UP = 12
 """So many of the last keyframes before an interruption are looked at again: twice what verification remembers."""
 FLEET_PATIENCE_S = 30.0
@@ -31,6 +34,9 @@ class Replay:
         settings: all settings.
         detector: made with these settings, or over the store of the run that is resumed.
         resume: go on where an earlier replay of the same recording into this folder was cut off.
+
+    Attributes:
+        faults: frames that were passed over for a fault of the program; `faults.log` in the folder says which.
     """
 
     def __init__(self, folder: Path, settings: Settings, detector: LoopDetector, resume: bool = False) -> None:
@@ -40,6 +46,7 @@ class Replay:
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometryFeed(self._graph)
         self._policy = settings.keyframe
+        self.faults = 0
         self._has_odometry = False
         self._done = len(self._recorder.recorded) if resume else 0
         self._earlier: dict[int, list[LoopClosure]] = defaultdict(list)
@@ -60,7 +67,7 @@ class Replay:
             if self._done > WARM_UP:
                 yield self._pass_over(item)
                 continue
-            detection = self._detector.process(item)
+            detection = self._process(item)
             if detection.keyframe is not None and self._done:
                 self._done -= 1
             self._recorder.record(item, detection)
@@ -72,9 +79,31 @@ class Replay:
             if detection.fault is not None:
                 raise detection.fault
 
+    def _process(self, frame: Frame) -> Detection:
+        """What became of a frame: hours of a recording are not given up for one that we cannot deal with."""
+        try:
+            return self._detector.process(frame)
+        except UmfError:
+            raise
+        except Exception:
+            self.faults += 1
+            with (self._folder / FAULTS).open("a", encoding="utf-8") as file:
+                file.write(f"frame {frame.stamp_ns}\n{traceback.format_exc()}\n")
+            return Detection(frame.stamp_ns)
+
     def _foresee(self, frame: Frame) -> None:
         if self._done <= WARM_UP:
             self._detector.foresee(frame)
+
+    def confess(self) -> None:
+        """Say at the end, when everything else is written, that frames were passed over.
+
+        Raises:
+            UmfError: some were.
+        """
+        if self.faults:
+            log = self._folder / FAULTS
+            raise UmfError(f"{self.faults} frames were passed over for a fault of ours: please report {log}")
 
     def graph_counts(self) -> dict[str, int]:
         """How many closures the graph has in which state so far; none without odometry."""

@@ -23,3 +23,5 @@ def test_every_silent_input_is_one_line(absent: tuple[str, ...], tmp_path: Path)
     for topic, line in SAID.items():
         assert ended.text.count(line) == (1 if topic in absent else 0), ended.text
         assert (line[1:] in page) == (topic in absent)
+        if topic in absent:  # before the run, not after hours of it
+            assert ended.text.index(line) < ended.text.index("keyframes ")

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
-from umf_ros.bags.presets import calibration_of, topics_of
+from umf_ros.bags.presets import calibration_of, topics_of, uses_transforms
 from umf_ros.bags.reader import Bag, decode
 from umf_ros.bags.records import RawMessage
 from umf_ros.config import Settings, Topics
@@ -17,6 +17,7 @@ from umf_ros.sensors.intake import Intake, wanted_inputs
 from umf_ros.sensors.message_kinds import TYPES
 from umf_ros.sensors.messages import OdometrySample, stamp_ns
 from umf_ros.sensors.sessions import Input
+from umf_ros.sensors.static_transforms import TOPIC, Mounting, OdometryFrames, StaticTransforms
 from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.trajectory import Trajectory
 
@@ -63,7 +64,12 @@ class FrameReader:
         self._odometry = odometry
         self._synchronizer = Synchronizer(settings.sync, calibration, inputs, warn)
         self._samples: list[OdometrySample] = []
-        self._intake = Intake(self._synchronizer, topics, warn, self._samples.append)
+        transforms = read_transforms(bag) if uses_transforms(settings) else None
+        mounting, frames = None, None
+        if transforms is not None and transforms.version:
+            mounting = Mounting(calibration, transforms, settings.frames.base, warn)
+            frames = OdometryFrames(settings.frames, transforms, warn)
+        self._intake = Intake(self._synchronizer, topics, warn, self._samples.append, mounting, frames)
         if bag.warning:
             warn(bag.warning)
 
@@ -115,6 +121,15 @@ class _Cursor:
         while self._next < len(stamps) and stamps[self._next] <= end_ns:
             intake.take_odometry(OdometrySample(int(stamps[self._next]), self._trajectory.poses[self._next]))
             self._next += 1
+
+
+def read_transforms(bag: Bag) -> StaticTransforms:
+    """The static transforms of a recording, whenever they were said: they are latched."""
+    transforms = StaticTransforms()
+    if TOPIC in bag.topics:
+        for _, _, message in bag.messages([TOPIC]):
+            transforms.add(message)
+    return transforms
 
 
 def read_left_images(bag: Bag, settings: Settings, stamps_ns: Collection[int]) -> dict[int, Image]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from umf_ros.bags.reader import Bag
 from umf_ros.commands.inspection import Inspected
 from umf_ros.config import Topics
 from umf_ros.errors import MessageError
@@ -70,12 +69,3 @@ def _mapping(numbers: dict[str, float]) -> list[str]:
 def _pose_lines(name: str, pose: Array, note: str) -> list[str]:
     shift, turn = ([f"{value:.9g}" for value in values] for values in (pose[:3, 3], to_quaternion(pose)))
     return [f"{name}:  # {note}", f"  translation: [{', '.join(shift)}]", f"  quaternion: [{', '.join(turn)}]"]
-
-
-def read_transforms(bag: Bag) -> StaticTransforms:
-    """The static transforms of a recording."""
-    transforms = StaticTransforms()
-    if TOPIC in bag.topics:
-        for _, _, message in bag.messages([TOPIC]):
-            transforms.add(message)
-    return transforms

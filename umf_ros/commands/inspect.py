@@ -79,6 +79,7 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
 
 
 def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> None:
+    from umf_ros.bags.frames import read_transforms
     from umf_ros.commands import first_settings
     from umf_ros.errors import writing
     from umf_ros.runs.folder import write_atomically
@@ -89,7 +90,7 @@ def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> 
             raise OutputError(f"{path} is there already: nothing was written")
     with writing(f"to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-    text = first_settings.write_calibration(found, first_settings.read_transforms(recording))
+    text = first_settings.write_calibration(found, read_transforms(recording))
     write_atomically(calibration, text)
     write_atomically(settings, first_settings.write_settings(found, str(calibration.resolve())))
     guesses = text.count(first_settings.GUESS)

@@ -132,6 +132,7 @@ def command(
             viewer.finish(folder.path)
         inputs.remember(folder.path, reader.counters, interrupted(), odometry, odometry_frame)
         verdict = finish_run(folder.path, recording, console, ground_truth, inputs.told)
+    replay.confess()
     raise typer.Exit(verdict.exit_code)
 
 
