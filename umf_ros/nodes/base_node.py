@@ -27,6 +27,8 @@ from umf_ros.runs.folder import check_writable
 
 WATCH_S = 1.0
 HEARTBEAT_S = 0.05
+CLOCK_PATIENCE_S = 10.0
+"""So long a player takes to start beside us, before its silence is worth a word."""
 SIM_TIME_SILENT = "use_sim_time is set, but nothing comes on /clock: stamps of messages count, the pose's age does not"
 
 
@@ -54,6 +56,7 @@ class BaseNode(LifecycleNode, ABC):
         self._faults: Counter[str] = Counter()
         self._last_fault = ""
         self._throttle = Throttle()
+        self._clockless_s = 0.0
         self._active = self._opened = self._leaving = False
         self._unwritten: Exception | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -184,7 +187,8 @@ class BaseNode(LifecycleNode, ABC):
         for watch in self._watches:
             if watch.warning and self._throttle.lets_pass(f"input {watch.name}", 30.0):
                 self.get_logger().warning(watch.warning)
-        if self._lacks_clock() and self._throttle.lets_pass("clock", 30.0):
+        self._clockless_s = self._clockless_s + WATCH_S if self._lacks_clock() else 0.0
+        if self._clockless_s >= CLOCK_PATIENCE_S and self._throttle.lets_pass("clock", 30.0):
             self.get_logger().warning(SIM_TIME_SILENT)
 
     def _lacks_clock(self) -> bool:
