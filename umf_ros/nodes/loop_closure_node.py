@@ -78,7 +78,7 @@ class LoopClosureNode(BaseNode):
         self._worker: Worker[Frame] = Worker(self._detect, self._complain, settings.worker.queue_size)
         self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._complain, 1)
         self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._complain, INTAKE_QUEUE)
-        hear_static_transforms(self, transforms, self._guarded)
+        hear_static_transforms(self, transforms, self._guarded, self._settings.frames.extrinsics)
         for name, topic in topics.model_dump().items():
             if topic:
                 take = partial(self._enqueue, topic)

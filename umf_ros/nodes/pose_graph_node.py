@@ -87,7 +87,7 @@ class PoseGraphNode(BaseNode):
         topics, transforms = topics_of(settings), StaticTransforms()
         warn = self.get_logger().warning
         self._odometry_frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
-        hear_static_transforms(self, transforms, self._guarded)
+        hear_static_transforms(self, transforms, self._guarded, self._settings.frames.extrinsics)
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
             self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)

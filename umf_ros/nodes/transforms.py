@@ -15,15 +15,23 @@ QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE, durabilit
 
 
 def hear_static_transforms(
-    node: Node, transforms: StaticTransforms, guarded: Callable[[str, Callable[..., Any]], Callable[..., Any]]
+    node: Node,
+    transforms: StaticTransforms,
+    guarded: Callable[[str, Callable[..., Any]], Callable[..., Any]],
+    extrinsics: str = "tf",
 ) -> None:
     """Fill `transforms` from `/tf_static`; without tf2_msgs, which Jazzy from PyPI lacks, they stay empty.
 
-    `guarded` keeps the faults of a callback in, as that of `BaseNode`.
+    Args:
+        node: hears them.
+        transforms: to be filled.
+        guarded: keeps the faults of a callback in, as that of `BaseNode`.
+        extrinsics: where the poses of the sensors come from; if not "tf", nobody misses them.
     """
     try:
         from tf2_msgs.msg import TFMessage
     except ImportError:
-        node.get_logger().info("tf2_msgs is not installed: the calibration file alone says where the sensors are")
+        if extrinsics == "tf":
+            node.get_logger().info("tf2_msgs is not installed: the calibration file alone says where the sensors are")
         return
     node.create_subscription(TFMessage, TOPIC, guarded("transforms", transforms.add), QOS)

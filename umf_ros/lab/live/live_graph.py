@@ -25,8 +25,8 @@ STOP_TIMEOUT_S = 60.0
 READY = "ready"
 PLAYER = "umf_ros.lab.live.bag_player_node"
 NODES = ("umf_ros.nodes.loop_closure_node", "umf_ros.nodes.pose_graph_node")
-# a recording on this machine must arrive whole, however busy the machine is
-WHOLE = ("qos.reliability:=reliable", "qos.depth:=200")
+# a recording of the simulator must arrive whole, however busy the machine is; its sensors are where its file says
+WHOLE = ("qos.reliability:=reliable", "qos.depth:=200", "frames.extrinsics:=calibration")
 
 
 class NodeProcess:
