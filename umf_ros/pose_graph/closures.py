@@ -192,6 +192,22 @@ class ClosureColumns(Table):
         return ChosenClosures(closures, *(self[name][rows] for name in names))
 
 
+@dataclass
+class WaitingClosure:
+    """A closure without odometry, its covariance in GTSAM's order, and the newest stamp when it came, None without."""
+
+    closure: LoopClosure
+    covariance: Array
+    since_ns: int | None
+    announced: bool = False
+
+    def waited_ns(self, newest_ns: int | None) -> int:
+        """How far the odometry has come since, from its first message on."""
+        if self.since_ns is None:
+            self.since_ns = newest_ns
+        return 0 if newest_ns is None or self.since_ns is None else newest_ns - self.since_ns
+
+
 def check_closure(closure: LoopClosure, max_length_m: float) -> Array:
     """The covariance of a usable closure in GTSAM's convention.
 

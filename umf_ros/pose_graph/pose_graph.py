@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from umf_ros.pose_graph.closures import (
     Decision,
     State,
     TrackedClosure,
+    WaitingClosure,
     check_closure,
     check_covariance,
     check_pose,
@@ -37,22 +37,6 @@ _NO_ODOMETRY_YET = "its odometry has not arrived"
 _BEFORE_ODOMETRY = "no odometry at its keyframes: it began later"
 
 
-@dataclass
-class _Waiting:
-    """A closure without odometry, its covariance in GTSAM's order, and the newest stamp when it came, None without."""
-
-    closure: LoopClosure
-    covariance: Array
-    since_ns: int | None
-    announced: bool = False
-
-    def waited_ns(self, newest_ns: int | None) -> int:
-        """How far the odometry has come since, from its first message on."""
-        if self.since_ns is None:
-            self.since_ns = newest_ns
-        return 0 if newest_ns is None or self.since_ns is None else newest_ns - self.since_ns
-
-
 class PoseGraph:
     """Takes odometry and loop closures in any order and keeps the best trajectory they allow.
 
@@ -64,7 +48,7 @@ class PoseGraph:
         self._sessions = Sessions(self._settings)
         self._rejection = OutlierRejection(self._settings, self._sessions)
         self._retrial: Retrial | None = None
-        self._waiting: list[_Waiting] = []
+        self._waiting: list[WaitingClosure] = []
         self._held: list[TrackedClosure] = []
         self._settled = False
         self._seen: set[tuple[int, int, bytes]] = set()
@@ -233,7 +217,7 @@ class PoseGraph:
             return None
         self._seen.add(message)
         self._settled = False
-        self._waiting.append(_Waiting(closure, covariance, self._sessions.newest_ns))
+        self._waiting.append(WaitingClosure(closure, covariance, self._sessions.newest_ns))
         return None
 
     def _refuse(self, closure: LoopClosure, reason: str) -> ClosureVerdict:
@@ -279,7 +263,7 @@ class PoseGraph:
         oldest_ns = self._sessions.oldest_ns
         return oldest_ns is not None and min(closure.match_stamp_ns, closure.query_stamp_ns) < oldest_ns
 
-    def _locate(self, entry: _Waiting) -> TrackedClosure | None:
+    def _locate(self, entry: WaitingClosure) -> TrackedClosure | None:
         query = self._sessions.find(entry.closure.query_stamp_ns)
         match = self._sessions.find(entry.closure.match_stamp_ns, before=query)
         if query is None or match is None:
