@@ -16,7 +16,7 @@ from umf_ros.errors import SensorFileError, UmfError
 from umf_ros.frames import Frame, Keyframe
 from umf_ros.loop_detector import make_keyframe
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.sensors.scan_files import read_scan
+from umf_ros.sensors.scan_files import OUT_OF_REACH, read_scan
 from umf_ros.sensors.snapshots import UNCALIBRATED, fit_image, make_snapshot, read_image
 
 KEPT = 1000
@@ -118,7 +118,7 @@ class KeyframeSource:
     def _from_files(self, view: PlaceView) -> Keyframe:
         keyframe = make_keyframe(self._snapshot(view), self._embedder)
         if not view.left and not len(keyframe.points):
-            raise SensorFileError(f"{view.scan} has no return within reach: expected metres, from the sensor")
+            raise SensorFileError(f"{view.scan} has {OUT_OF_REACH}")
         return keyframe
 
     def _snapshot(self, view: PlaceView) -> Frame:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from umf_ros.errors import SensorFileError, either, one_line
 from umf_ros.frames import Points
-from umf_ros.sensors.messages import Cloud, real_returns
+from umf_ros.sensors.messages import FURTHEST_RETURN_M, Cloud, real_returns
 from umf_ros.sensors.pcd import Columns, parse_pcd
 from umf_ros.sensors.ply import parse_ply
 
@@ -20,6 +20,9 @@ _INTENSITY = ("intensity", "scalar_intensity", "reflectivity", "reflectance", "r
 """Names under which drivers and CloudCompare store the strength of a return, the usual ones first."""
 _MOST_NEGATIVE = 0.01
 """Share of negative numbers that no column of intensities has: every other coordinate is negative."""
+
+
+OUT_OF_REACH = "no return within reach: expected metres, from the sensor"
 
 
 def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
@@ -45,8 +48,12 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
     except Exception as error:  # damaged bytes provoke anything
         raise SensorFileError(f"{path} is damaged: {one_line(error)}") from None
     if not len(cloud.points):
-        raise SensorFileError(f"{path} holds no return")
+        raise SensorFileError(f"{path} has {OUT_OF_REACH}" if _has_far_points(columns) else f"{path} holds no return")
     return cloud
+
+
+def _has_far_points(columns: Columns) -> bool:
+    return any(bool((np.abs(columns[axis]) > FURTHEST_RETURN_M).any()) for axis in "xyz")
 
 
 def _cloud_of(columns: Columns) -> Cloud:
