@@ -40,6 +40,8 @@ SECONDS = [0, 5, 2**31 - 1, -1]
 SIZES = [0, 1, 688, 512, 2**31, 2**32 - 1]
 MANY = QoSProfile(depth=500)
 FIRST_LOOP = 215
+DISCOVERY_S = 1.0
+"""The writer knows its reader before the reader knows it, and what is sent between is nobody's."""
 """Poses until the first loops of the world are closed."""
 
 
@@ -156,6 +158,7 @@ def fuzz_back_end(folder: Path, count: int, rng: np.random.Generator) -> Figures
         node = NodeUnderTest(BACK_END, folder / f"fuzz_{BACK_END}_{int(rng.integers(10**9))}", {})
         crashes = 0 if ears.anew(BACK_END) else 1
         ears.until(lambda: all(publisher.get_subscription_count() for publisher in publishers), 10.0)
+        ears.wait(DISCOVERY_S)
         sent: Counter[str] = Counter()
         for number in range(count):
             kind = ("odometry", "closures", "reject")[number % 3]
@@ -199,6 +202,7 @@ def fuzz_front_end(folder: Path, count: int, config: Path, rng: np.random.Genera
         node = NodeUnderTest(FRONT_END, folder / f"fuzz_{FRONT_END}_{int(rng.integers(10**9))}", {}, config=config)
         crashes = 0 if ears.anew(FRONT_END) else 1
         ears.until(lambda: all(publisher.get_subscription_count() for publisher in publishers.values()), 10.0)
+        ears.wait(DISCOVERY_S)
         sent: Counter[str] = Counter()
         for number in range(count):
             name = list(kinds)[number % len(kinds)]

@@ -158,10 +158,7 @@ class PoseGraphNode(BaseNode):
 
     def _on_odometry(self, message: Odometry) -> None:
         sample = decode_odometry(message)
-        odom_T_body = self._odometry_frames.to_body(message, sample.odom_T_body)
-        if odom_T_body is None:
-            return
-        sample = OdometrySample(sample.stamp_ns, odom_T_body)
+        sample = OdometrySample(sample.stamp_ns, self._odometry_frames.to_body(message, sample.odom_T_body))
         if self._odometry_frames.odom != self._frames.odom:
             self._frames = self._frames.model_copy(update={"odom": self._odometry_frames.odom})
         self._worker.submit(lambda: self._add_odometry(sample))

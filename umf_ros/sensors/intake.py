@@ -79,9 +79,7 @@ class Intake:
         entry = self._entries[topic]
         try:
             if entry == ODOMETRY:
-                sample = self._of_body(message, decode_odometry(message))
-                if sample is not None:
-                    self.take_odometry(sample)
+                self.take_odometry(self._of_body(message, decode_odometry(message)))
             elif entry in ("left_info", "right_info"):
                 self._use_info(entry, message)
             else:
@@ -106,11 +104,10 @@ class Intake:
             self._warned.add((topic, error.kind))
             self._warn(f"{topic}: {error}; such messages are skipped")
 
-    def _of_body(self, message: Any, sample: OdometrySample) -> OdometrySample | None:
+    def _of_body(self, message: Any, sample: OdometrySample) -> OdometrySample:
         if self._odometry_frames is None:
             return sample
-        odom_T_body = self._odometry_frames.to_body(message, sample.odom_T_body)
-        return None if odom_T_body is None else OdometrySample(sample.stamp_ns, odom_T_body)
+        return OdometrySample(sample.stamp_ns, self._odometry_frames.to_body(message, sample.odom_T_body))
 
     def _mount(self, entry: str, message: Any) -> None:
         if self._mounting is None or entry == "right_image":

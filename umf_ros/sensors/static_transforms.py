@@ -141,11 +141,12 @@ class OdometryFrames:
         self._first_ns = 0
         self.odom = frames.odom
 
-    def to_body(self, message: Any, odom_T_part: Array) -> Array | None:
-        """(4, 4) `odom_T_body` of a nav_msgs/Odometry whose pose is `odom_T_part`; None while the transforms may come.
+    def to_body(self, message: Any, odom_T_part: Array) -> Array:
+        """(4, 4) `odom_T_body` of a nav_msgs/Odometry whose pose is `odom_T_part`.
 
         Raises:
-            MessageError: of kind "frame" when its frames are not those of the first message.
+            MessageError: of kind "frame" when its frames are not those of the first message; of kind "transforms" while
+                these may still come.
         """
         names = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
         if self._names is None:
@@ -157,7 +158,10 @@ class OdometryFrames:
             raise MessageError("frame", f"odometry from {now}, after that from {before}: two sources on one topic?")
         if self._part_T_body is None:
             self._part_T_body = self._look_up(names[1], stamp_ns(message) - self._first_ns)
-        return None if self._part_T_body is None else odom_T_part @ self._part_T_body
+        if self._part_T_body is None:
+            raise MessageError("transforms", f"odometry of {names[1]} waits for {TOPIC} to say where that is")
+        found: Array = odom_T_part @ self._part_T_body
+        return found
 
     def _look_up(self, part: str, waited_ns: int) -> Array | None:
         """Where the body is on `part`; None while it is worth waiting."""
