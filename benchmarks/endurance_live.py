@@ -146,6 +146,11 @@ def _stored_places(path: Path) -> set[int]:
         return {stamp for (stamp,) in connection.execute("SELECT stamp_ns FROM keyframe")}
 
 
+def _fresh(folder: Path, name: str) -> Path:
+    """A folder of its own: one that is used again is gone on with."""
+    return Path(tempfile.mkdtemp(prefix=f"{name}_", dir=folder))
+
+
 def fuzz_back_end(folder: Path, count: int, rng: np.random.Generator) -> Figures:
     """Messages to the back-end that nobody sends: each has to show in the diagnostics, by what became of it."""
     with own_domain():
@@ -155,7 +160,7 @@ def fuzz_back_end(folder: Path, count: int, rng: np.random.Generator) -> Figures
             ears.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS),
             ears.create_publisher(String, f"/{BACK_END}/reject_edge", MANY),
         ]
-        node = NodeUnderTest(BACK_END, folder / f"fuzz_{BACK_END}_{int(rng.integers(10**9))}", {})
+        node = NodeUnderTest(BACK_END, _fresh(folder, BACK_END), {})
         crashes = 0 if ears.anew(BACK_END) else 1
         ears.until(lambda: all(publisher.get_subscription_count() for publisher in publishers), 10.0)
         ears.wait(DISCOVERY_S)
@@ -199,7 +204,7 @@ def fuzz_front_end(folder: Path, count: int, config: Path, rng: np.random.Genera
     with own_domain():
         ears = Ears()
         publishers = {name: ears.create_publisher(kind, getattr(topics, name), MANY) for name, kind in kinds.items()}
-        node = NodeUnderTest(FRONT_END, folder / f"fuzz_{FRONT_END}_{int(rng.integers(10**9))}", {}, config=config)
+        node = NodeUnderTest(FRONT_END, _fresh(folder, FRONT_END), {}, config=config)
         crashes = 0 if ears.anew(FRONT_END) else 1
         ears.until(lambda: all(publisher.get_subscription_count() for publisher in publishers.values()), 10.0)
         ears.wait(DISCOVERY_S)
@@ -305,7 +310,7 @@ def two_robots(folder: Path, bag: Path, config: Path) -> Figures:
 
 def play_live(folder: Path, bag: Path, config: Path) -> Figures:
     """Milliseconds from the stamp of a scan to its closure, by the recording's clock, at its own pace."""
-    run = Path(tempfile.mkdtemp(prefix="live_", dir=folder))  # a folder that is used again is gone on with
+    run = _fresh(folder, "live")
     delays_ms: list[float] = []
     with own_domain():
         ears = Ears()
