@@ -75,6 +75,7 @@ def run_replay(recording: Bag, settings: Settings, folder: Path, console: Consol
         for _ in replay.run(reader.stream()):
             bar.update(task, completed=reader.progress)
     replay.finish(count_drops(reader.counters))
+    replay.confess()
 
 
 def read_rows(path: Path) -> list[Row]:

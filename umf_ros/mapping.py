@@ -128,6 +128,7 @@ def replay_session(recording: Path, opening: Opening, folder: Path, heard: Heard
     if not len(log):
         log = _track(folder, settings)
     log.save(folder)
+    replay.confess()
 
 
 def _track(folder: Path, settings: Settings) -> OdometryLog:

@@ -108,6 +108,7 @@ def replay(task: SensorTask) -> None:
     for _ in run.run(reader.stream()):
         pass
     run.finish(count_drops(reader.counters))
+    run.confess()
     remember_recording(task.folder, recording)
     if task.report:
         finish_run(task.folder, recording, Console(file=StringIO()))
