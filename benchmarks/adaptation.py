@@ -34,8 +34,8 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.frames import Frame, Image, ScanMotion
-from umf_ros.geometry import Array
+from umf_ros.core.frames import Frame, Image, ScanMotion
+from umf_ros.core.geometry import Array
 from umf_ros.lab.datasets.labels import label, places_of
 from umf_ros.lab.evaluation.protocol import THESIS_RULE, place_recognition
 from umf_ros.lab.evaluation.retrieval import rank

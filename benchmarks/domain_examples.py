@@ -11,18 +11,18 @@ import numpy as np
 from domain_pairs import ELSEWHERE, QUICK, Pair, Place, pairs_of, places_of
 from scipy.spatial.transform import Rotation
 
-from umf_ros.config import Verification
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Candidate, Keyframe
+from umf_ros.core.geometry import Array, invert, make_pose, relative, rotation_angle, transform
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.frames import Candidate, Keyframe
-from umf_ros.geometry import Array, invert, make_pose, relative, rotation_angle, transform
 from umf_ros.lab.simulation.domains import Domain
 from umf_ros.lab.training.acceptance_examples import Example
 from umf_ros.verification import Verifier
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory
 from umf_ros.verification.measurement import SCAN, AlignedHypothesis, Measurement, beside, measure
 from umf_ros.verification.prepared_scan import ScanCache
-from umf_ros.verification.registration import align_scans
 from umf_ros.verification.rerank import RankedCandidate, rerank
+from umf_ros.verification.scan_alignment import align_scans
 
 RIGHT_M, RIGHT_DEG = 0.3, 2.5
 WRONG_M, WRONG_DEG = 0.75, 4.0  # what lies between is neither

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from umf_ros.core.frames import Keyframe, ScanMotion
+from umf_ros.core.geometry import Array, relative, rotation_angle
+from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.frames import Keyframe, ScanMotion
-from umf_ros.geometry import Array, relative, rotation_angle
 from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
 from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, SAME_WAY
-from umf_ros.loop_detector import make_keyframe
-from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.snapshots import make_snapshot
 
 SAME_M, ELSEWHERE_M = 4.0, 12.0

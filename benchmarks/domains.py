@@ -26,10 +26,10 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from umf_ros.config import EmbeddingSettings, Verification
+from umf_ros.core.config import EmbeddingSettings, Verification
+from umf_ros.core.frames import Candidate, LoopClosure
+from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.embedding import make_embedder
-from umf_ros.frames import Candidate, LoopClosure
-from umf_ros.geometry import Array, relative, rotation_angle
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
 from umf_ros.lab.simulation.seeds import TEST
 from umf_ros.lab.training.acceptance_examples import load_examples

@@ -14,15 +14,15 @@ import numpy as np
 from rich.progress import track
 from scipy.spatial.transform import Rotation
 
+from umf_ros.core.frames import Frame, Image, Keyframe, ScanMotion, StereoCamera
+from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle, transform
+from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.frames import Frame, Image, Keyframe, ScanMotion, StereoCamera
-from umf_ros.geometry import Array, make_pose, relative, rotation_angle, transform
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, resized
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.passes import SETTINGS, plan_passes
 from umf_ros.lab.simulation.shards import Survey
 from umf_ros.lab.simulation.world import World, ground
-from umf_ros.loop_detector import make_keyframe
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
 SPEED_M_S = 1.0
@@ -51,9 +51,9 @@ class Drive:
     depths: Array
 
     @property
-    def travelled(self) -> Array:
+    def path_length(self) -> Array:
         """Metres (N,) driven up to each frame."""
-        return travelled(self.truth)
+        return path_length(self.truth)
 
     def overlap(self, query: int, match: int) -> float:
         """Share of what the query's camera sees (nearer than 40 m) that the match's camera sees too."""
@@ -109,10 +109,10 @@ def simulate(seed: int, family: str, aliasing: float, step_m: float = STEP_M) ->
 def embedded(drive: Drive, embedder: Embedder) -> list[Keyframe]:
     """A keyframe for every frame of a drive."""
     frames = track(drive.frames, f"embedding {drive.name}", transient=True)
-    return [make_keyframe(frame, embedder, metres) for frame, metres in zip(frames, drive.travelled, strict=True)]
+    return [make_keyframe(frame, embedder, metres) for frame, metres in zip(frames, drive.path_length, strict=True)]
 
 
-def travelled(poses: Array) -> Array:
+def path_length(poses: Array) -> Array:
     """Metres (N,) driven up to each of the poses (N, 4, 4)."""
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
@@ -130,7 +130,7 @@ def _frames(
     camera = resized(calibration.camera, *TRAINING_SIZE)
     odometry = _drifting(truth, np.random.default_rng([seed, 17]))
     frames = []
-    for image, cloud, distance, odom in zip(images, points, travelled(truth), odometry, strict=True):
+    for image, cloud, distance, odom in zip(images, points, path_length(truth), odometry, strict=True):
         returns = cloud[np.isfinite(cloud[:, 0])].astype(np.float32)
         frames.append(
             Frame(

@@ -32,8 +32,8 @@ from endurance_live import fuzz_back_end, fuzz_front_end, kill_back_end, kill_fr
 from rich.console import Console
 from rich.table import Table
 
-from umf_ros.config import Database, Loop
-from umf_ros.frames import Embedding
+from umf_ros.core.config import Database, Loop
+from umf_ros.core.frames import Embedding
 from umf_ros.places.database import PlaceDatabase
 
 Figures = dict[str, Any]
@@ -157,7 +157,7 @@ def many_places(rng: np.random.Generator, count: int = 100_000) -> Figures:
     for number in range(count):
         seen = Embedding(descriptors[number % 1000])
         stamp_ns, session = number * 10**9, number // 1000
-        places.add(replace(blank, stamp_ns=stamp_ns, embedding=seen, session=session, travelled_m=float(number)))
+        places.add(replace(blank, stamp_ns=stamp_ns, embedding=seen, session=session, path_length_m=float(number)))
     used = resident() - before
     query = replace(some_keyframe(count * 10**9 + 10**12, rng), embedding=Embedding(descriptors[3]))
     times = [timed(lambda: places.query(query, Loop())) for _ in range(30)]

@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.config import Database, load_settings
-from umf_ros.frames import Embedding, Keyframe, StereoCamera
+from umf_ros.core.config import Database, load_settings
+from umf_ros.core.frames import Embedding, Keyframe, StereoCamera
+from umf_ros.core.resources import find
 from umf_ros.lab.datasets.g2o import as_recording, read_g2o
 from umf_ros.lab.datasets.pickles import load_data_frame, load_pickle
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.networks.weights import load_weights
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.upkeep import stored_identity, stored_sessions
-from umf_ros.resources import find
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.durable_graph import DurableGraph
 from umf_ros.sensors.scan_files import read_scan

@@ -33,13 +33,13 @@ from rosbags.typesys import Stores, get_typestore
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import calibration_of, topics_of
 from umf_ros.bags.reader import Bag, decode, open_bag
-from umf_ros.config import Settings, load_settings
-from umf_ros.errors import UmfError
-from umf_ros.loop_detector import LoopDetector, make_detector_embedder
+from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.errors import UmfError
+from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.pose_graph.pose_graph import PoseGraph
-from umf_ros.sensors.intake import Intake, wanted_inputs
-from umf_ros.sensors.messages import OdometrySample
-from umf_ros.sensors.odometry_feed import OdometryFeed
+from umf_ros.sensors.decode import OdometrySample
+from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
+from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
 
 MEMORY = 2 * 2**30
@@ -74,10 +74,10 @@ class Rover:
         calibration = calibration_of(settings)
         self.synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(self.topics), lambda _: None)
         self._samples: list[OdometrySample] = []
-        self.intake = Intake(self.synchronizer, self.topics, lambda _: None, self._samples.append)
+        self.intake = MessageRouter(self.synchronizer, self.topics, lambda _: None, self._samples.append)
         self._detector = LoopDetector(settings, make_detector_embedder(settings))
         self._graph = PoseGraph(settings.pose_graph)
-        self._feed = OdometryFeed(self._graph)
+        self._feed = OdometrySessionSplitter(self._graph)
 
     def take(self, topic: str, message: Any) -> None:
         """One message, and whatever follows from it."""

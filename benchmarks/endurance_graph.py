@@ -14,8 +14,8 @@ from endurance_nodes import BACK_END, Ears, NodeUnderTest, own_domain
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
 
-from umf_ros.config import load_settings
-from umf_ros.geometry import Array
+from umf_ros.core.config import load_settings
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops
 from umf_ros.nodes.conversions import closure_to_message, to_pose, to_time
 from umf_ros.nodes.qos import CLOSURES_QOS

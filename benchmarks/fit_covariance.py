@@ -26,18 +26,18 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.config import EmbeddingSettings
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.core.errors import BagError
+from umf_ros.core.frames import Keyframe
+from umf_ros.core.geometry import Array, relative, rotation_angle
+from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.embedding import make_embedder
-from umf_ros.errors import BagError
-from umf_ros.frames import Keyframe
-from umf_ros.geometry import Array, relative, rotation_angle
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
 from umf_ros.lab.simulation.seeds import VALIDATION
 from umf_ros.lab.training.covariance_fit import PoseSample, fit_scan_covariance, honesty, sample_of
-from umf_ros.loop_detector import LoopDetector, make_detector_embedder
 from umf_ros.verification.measurement import SCAN
 from umf_ros.verification.prepared_scan import PreparedScan
-from umf_ros.verification.registration import align_scans
+from umf_ros.verification.scan_alignment import align_scans
 
 RIGHT_M, RIGHT_DEG = 1.0, 5.0
 NEAR_M = 0.1  # from so far the domains' pairs are aligned: it is the covariance that is fitted, not the search

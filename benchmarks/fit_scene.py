@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from umf_ros.frames import Image
+from umf_ros.core.frames import Image
 from umf_ros.lab.datasets.labels import Places
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.simulation.survey import shard_plan, survey_world

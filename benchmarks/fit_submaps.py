@@ -23,15 +23,15 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from umf_ros.config import Database, KeyframePolicy, Loop, Verification
-from umf_ros.frames import Embedding, Frame, Keyframe, StereoCamera
-from umf_ros.geometry import Array, make_pose, relative
-from umf_ros.keyframes import KeyframeSelector, is_past
+from umf_ros.core.config import Database, KeyframePolicy, Loop, Verification
+from umf_ros.core.frames import Embedding, Frame, Keyframe, StereoCamera
+from umf_ros.core.geometry import Array, make_pose, relative
+from umf_ros.core.keyframes import KeyframeSelector, is_past
 from umf_ros.lab.simulation.presets import find_preset
 from umf_ros.lab.simulation.simulator import Simulator
 from umf_ros.lab.training.acceptance_fit import fit_weights
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.runs.honesty import normalised_errors, pose_error, share_inside
+from umf_ros.runs.consistency import normalised_errors, pose_error, share_inside
 from umf_ros.runs.truth import POSE_TOLERANCE_DEG, POSE_TOLERANCE_M, find_revisits
 from umf_ros.submaps import SubmapFinder
 from umf_ros.submaps.finder import Tested
@@ -94,7 +94,7 @@ def drive_of(preset: str, seed: int, family: str, aliasing: float, folder: Path 
         where = Frame(stamp, NO_CAMERA, np.eye(4), np.eye(4), odom_T_body=simulator.odometry_at(stamp))
         if selector.select(where):
             frame = simulator.scan_frame(number)
-            points, metres = thin_scan(frame.points), selector.travelled_m(where)
+            points, metres = thin_scan(frame.points), selector.path_length_m(where)
             blind = Embedding(np.zeros(1, np.float32))
             keyframes.append(
                 Keyframe(stamp, blind, NO_CAMERA, np.eye(4), points, where.odom_T_body, metres, 0, frame.body_T_lidar)
@@ -132,10 +132,10 @@ def examples_of(number: int, drive: Drive) -> Iterator[Example]:
 def _found_by_scan(drive: Drive) -> dict[int, list[tuple[Keyframe, Array]]]:
     """The nearest earlier keyframe of every revisit in the same direction, with the true pose."""
     stamps = np.array([one.stamp_ns for one in drive.keyframes], np.int64)
-    travelled = np.array([one.travelled_m for one in drive.keyframes])
+    path_length = np.array([one.path_length_m for one in drive.keyframes])
     positions, found = drive.truth[:, :3, 3], {}
-    for i in np.flatnonzero(find_revisits(stamps, drive.truth, travelled, Loop())):
-        past = is_past(stamps[i] - stamps[:i], travelled[i] - travelled[:i], Loop())
+    for i in np.flatnonzero(find_revisits(stamps, drive.truth, path_length, Loop())):
+        past = is_past(stamps[i] - stamps[:i], path_length[i] - path_length[:i], Loop())
         away = np.where(past, np.linalg.norm(positions[:i] - positions[i], axis=1), np.inf)
         nearest = int(away.argmin())
         found[int(i)] = [(drive.keyframes[nearest], relative(drive.truth[nearest], drive.truth[i]))]
@@ -144,15 +144,15 @@ def _found_by_scan(drive: Drive) -> dict[int, list[tuple[Keyframe, Array]]]:
 
 def _wrong_answers(number: int, truth: Truth, finder: SubmapFinder, query: Keyframe) -> Iterator[Example]:
     """What looks alike and is another place, poses beside the right ones, and poses anywhere."""
-    if query.travelled_m < const.SUBMAP_BEFORE_M:
+    if query.path_length_m < const.SUBMAP_BEFORE_M:
         return
     rng = np.random.default_rng([number, query.stamp_ns % 2**32])
     rows = rng.permutation(len(finder.trail.stops))[:ANYWHERE].tolist()
     proposals = finder.lookalikes(query) + [Proposal(row, _anywhere(rng), planar=True) for row in rows]
-    here, way_m = truth[query.stamp_ns], query.travelled_m - const.SUBMAP_BEFORE_M
+    here, way_m = truth[query.stamp_ns], query.path_length_m - const.SUBMAP_BEFORE_M
     right = {row: relative(truth[stop.stamp_ns], here) for row, stop in enumerate(finder.trail.stops)}
     near = [row for row, pose in right.items() if np.linalg.norm(pose[:3, 3]) < BESIDE_M]
-    near = [row for row in near if finder.trail.stops[row].travelled_m < way_m]
+    near = [row for row in near if finder.trail.stops[row].path_length_m < way_m]
     proposals += [Proposal(row, _beside(rng) @ right[row]) for row in rng.permutation(near)[:1].tolist()]
     for proposal in proposals:
         tested = finder.test(query, proposal)

@@ -27,10 +27,10 @@ from rich.console import Console
 from rich.progress import track
 from traps import TRAPS
 
-from umf_ros.config import Database, EmbeddingSettings, Loop, Verification
+from umf_ros.core.config import Database, EmbeddingSettings, Loop, Verification
+from umf_ros.core.frames import Candidate, Keyframe
+from umf_ros.core.geometry import Array
 from umf_ros.embedding import make_embedder
-from umf_ros.frames import Candidate, Keyframe
-from umf_ros.geometry import Array
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
 from umf_ros.lab.simulation.seeds import VALIDATION
 from umf_ros.lab.training.acceptance_examples import Example, save_examples

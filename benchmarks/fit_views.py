@@ -27,10 +27,11 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.config import Loop, Verification
-from umf_ros.frames import Candidate, Frame, Keyframe
-from umf_ros.geometry import Array, heading, relative, wrap_angle
-from umf_ros.keyframes import Mask, is_past
+from umf_ros.core.config import Loop, Verification
+from umf_ros.core.frames import Candidate, Frame, Keyframe
+from umf_ros.core.geometry import Array, heading, relative, wrap_angle
+from umf_ros.core.keyframes import Mask, is_past
+from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.training.acceptance_fit import (
     Example,
     fit_covariance,
@@ -38,12 +39,11 @@ from umf_ros.lab.training.acceptance_fit import (
     inside_ellipsoid,
     save_acceptance,
 )
-from umf_ros.loop_detector import LoopDetector, make_detector_embedder
 from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, POSE_TOLERANCE_DEG, POSE_TOLERANCE_M
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, Logistic, load_acceptance, scores
 from umf_ros.verification.measurement import IMAGE
-from umf_ros.verification.registration import covariance_of
+from umf_ros.verification.scan_alignment import covariance_of
 from umf_ros.verification.verifier import JudgedHypothesis
 
 DEFAULT_OUT = Path(__file__).parent.parent / "config" / "verification" / "calibration.json"
@@ -68,7 +68,7 @@ class Recording:
     def past(self, query: int) -> Mask:
         """Which earlier keyframes may be matches, (query,) bool."""
         stamps = np.array([one.stamp_ns for one in self.keyframes[: query + 1]])
-        driven = np.array([one.travelled_m for one in self.keyframes[: query + 1]])
+        driven = np.array([one.path_length_m for one in self.keyframes[: query + 1]])
         return is_past(stamps[query] - stamps[:query], driven[query] - driven[:query], Loop())
 
     def near(self, query: int) -> Mask:
@@ -199,7 +199,7 @@ def _examined(
 
 
 def _untracked(keyframe: Keyframe) -> Keyframe:
-    return replace(keyframe, odom_T_body=None, travelled_m=float("nan"))
+    return replace(keyframe, odom_T_body=None, path_length_m=float("nan"))
 
 
 def kept(folder: Path | None, bag: Path) -> Recording:

@@ -40,18 +40,18 @@ from pgvector.psycopg import register_vector
 from postgres import PASSWORD, CuttableLink, PostgresServer
 from sessions import QUICK, Size, mapped, simulated, truth_of
 
-from umf_ros.config import Database, Settings
-from umf_ros.fleet.encounters import Encounter, Encounters
+from umf_ros.core.config import Database, Settings
+from umf_ros.core.frames import Keyframe, LoopClosure
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatcher
 from umf_ros.fleet.migrations import add_rover, migrate
 from umf_ros.fleet.server import FleetServer, OutgoingPlace
-from umf_ros.frames import Keyframe, LoopClosure
 from umf_ros.lab.evaluation.places_bench import made_up_drives
 from umf_ros.mapping import open_places
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.places.store import KeyframeStore
 from umf_ros.places.upkeep import stored_identity
 from umf_ros.runs.truth import judge_closure
-from umf_ros.trajectory import Trajectory
 
 ROVERS = 4
 CUTS, KILLS = 20, 5
@@ -90,25 +90,27 @@ class Rover:
         self._database = Database(path=str(folder / f"{self.name}.sqlite"), backend="postgres", server=address)
         known = {"embedder": identity[0], "dimension": str(identity[1])}
         self.store = KeyframeStore(Path(self._database.path), known, 400, outgoing=True)
-        self.encounters = Encounters(Settings(database=self._database), self.store, identity)
+        self.inter_robot = InterRobotMatcher(Settings(database=self._database), self.store, identity)
 
     def drive(self) -> Iterator[None]:
         """Store one keyframe after the other, and verify what comes back meanwhile."""
         for keyframe in self.keyframes:
-            self.encounters.link.remembered(self.store.add(keyframe))
-            encounter = self.encounters.next()
-            if encounter is not None:
-                self._note(encounter)
+            self.inter_robot.link.remembered(self.store.add(keyframe))
+            inter_closure = self.inter_robot.next()
+            if inter_closure is not None:
+                self._note(inter_closure)
             yield
 
     def finish(self) -> None:
         """Wait until the server has everything, and has answered everything."""
-        for encounter in self.encounters.rest(600):
-            self._note(encounter)
+        for inter_closure in self.inter_robot.rest(600):
+            self._note(inter_closure)
 
-    def _note(self, encounter: Encounter) -> None:
-        self.accepted += [(encounter.robot, one.closure) for one in encounter.verdicts if one.closure is not None]
-        self.published += [(encounter.robot, closure) for closure in encounter.closures]
+    def _note(self, inter_closure: InterRobotClosure) -> None:
+        self.accepted += [
+            (inter_closure.robot, one.closure) for one in inter_closure.verdicts if one.closure is not None
+        ]
+        self.published += [(inter_closure.robot, closure) for closure in inter_closure.closures]
 
 
 def rovers_of(folder: MapFolder) -> list[Rover]:
@@ -177,7 +179,7 @@ def disturb(server: PostgresServer, rovers: list[Rover], seed: int) -> dict[str,
             next(drive, None)
         if step in cuts:
             rover = rng.choice(rovers)
-            wait_for(lambda rover=rover: rover.encounters.link.connected)
+            wait_for(lambda rover=rover: rover.inter_robot.link.connected)
             before = rover.link.cuts
             threading.Thread(target=rover.link.cut, args=(CUT_S,)).start()
             wait_for(lambda rover=rover, before=before: rover.link.cuts > before)
@@ -267,7 +269,7 @@ def measure(folder: MapFolder, places: int, seed: int) -> dict[str, Any]:
                 row = connection.execute("SELECT count(*) FROM place").fetchone()
             figures["places"] = row[0] if row else 0
             for rover in rovers:
-                rover.encounters.close()
+                rover.inter_robot.close()
                 rover.store.close()
     return {name: round(value, 2) if isinstance(value, float) else value for name, value in figures.items()}
 

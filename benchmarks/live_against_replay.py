@@ -22,9 +22,9 @@ from rich.table import Table
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import Bag
 from umf_ros.commands.recordings import BagPath, ConfigPath, open_recording
-from umf_ros.config import Settings, dump_settings
+from umf_ros.core.config import Settings, dump_settings
+from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.live.live_graph import LiveGraph
-from umf_ros.loop_detector import LoopDetector, make_detector_embedder
 from umf_ros.replay import Replay
 from umf_ros.runs.recorder import count_drops, read_summary
 
@@ -75,7 +75,7 @@ def run_replay(recording: Bag, settings: Settings, folder: Path, console: Consol
         for _ in replay.run(reader.stream()):
             bar.update(task, completed=reader.progress)
     replay.finish(count_drops(reader.counters))
-    replay.confess()
+    replay.raise_if_frames_failed()
 
 
 def read_rows(path: Path) -> list[Row]:

@@ -23,8 +23,8 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.geometry import Array, invert
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.geometry import Array, invert
 from umf_ros.lab.datasets.g2o import PERIOD_NS, as_recording, read_g2o
 from umf_ros.lab.simulation.pose_graphs import (
     WORLDS,
@@ -37,7 +37,7 @@ from umf_ros.lab.simulation.pose_graphs import (
     with_wrong_closures,
 )
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.condensed import Edge, between
+from umf_ros.pose_graph.odometry_preintegration import Edge, between
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
 FIRST_SEED = 20_000

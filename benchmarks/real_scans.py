@@ -27,13 +27,13 @@ from rich.console import Console
 from rich.progress import track
 
 from umf_ros.comparison.comparer import judge
-from umf_ros.config import EmbeddingSettings, Verification
+from umf_ros.core.config import EmbeddingSettings, Verification
+from umf_ros.core.frames import Keyframe
+from umf_ros.core.geometry import Array, from_quaternion
+from umf_ros.detector import make_keyframe
 from umf_ros.embedding import make_embedder
-from umf_ros.frames import Keyframe
-from umf_ros.geometry import Array, from_quaternion
 from umf_ros.lab.training.acceptance_fit import inside_ellipsoid
-from umf_ros.loop_detector import make_keyframe
-from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.scan_files import read_scan
 from umf_ros.sensors.snapshots import make_snapshot
 from umf_ros.verification import Verdict, Verifier

@@ -32,17 +32,17 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.config import EmbeddingSettings, Settings
+from umf_ros.core.config import EmbeddingSettings, Settings
+from umf_ros.core.errors import BagError
+from umf_ros.core.frames import Candidate, Frame, Keyframe, LoopClosure
+from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.errors import BagError
-from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure
-from umf_ros.geometry import Array
 from umf_ros.lab.evaluation.worlds import FULL, QUICK, TestWorld
 from umf_ros.lab.simulation.seeds import VALIDATION
-from umf_ros.loop_detector import LoopDetector, make_detector_embedder
 from umf_ros.runs.truth import find_revisits, judge_closure
-from umf_ros.trajectory import Trajectory
 
 PLACES = (0, 1_000, 10_000, 100_000)
 NOISE = 0.05  # length of what is added to a unit descriptor; scans of one place a second apart differ by about as much
@@ -125,7 +125,7 @@ class Recording:
         for (frame, whole), descriptor in zip(self._keyframes, self._descriptors[method], strict=True):
             detector.select(frame)
             keyframe = replace(whole, embedding=replace(whole.embedding, descriptor=descriptor))
-            verdicts = detector.look_around(keyframe, detector.verify(keyframe, detector.query(keyframe)))
+            verdicts = detector.match_submaps(keyframe, detector.verify(keyframe, detector.query(keyframe)))
             closures += [verdict.closure for verdict in verdicts if verdict.closure is not None]
             detector.remember(keyframe)
         return self._judge(closures)
@@ -133,9 +133,9 @@ class Recording:
     def _judge(self, closures: list[LoopClosure]) -> float:
         stamps = np.array([keyframe.stamp_ns for _, keyframe in self._keyframes], np.int64)
         poses, known = self._truth.at(stamps)
-        travelled = np.array([keyframe.travelled_m for _, keyframe in self._keyframes])
+        path_length = np.array([keyframe.path_length_m for _, keyframe in self._keyframes])
         again = stamps[known][
-            find_revisits(stamps[known], poses[known], travelled[known], self._settings.loop, same_view=False)
+            find_revisits(stamps[known], poses[known], path_length[known], self._settings.loop, same_view=False)
         ]
         true = {closure.query_stamp_ns for closure in closures if self._is_true(closure)}
         return float(np.isin(again, list(true)).mean()) if len(again) else float("nan")

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import Embedding, Keyframe, LocalFeatures, StereoCamera
-from umf_ros.geometry import Array, invert, make_pose, transform
+from umf_ros.core.frames import Embedding, Keyframe, LocalFeatures, StereoCamera
+from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.verification import thin_scan
 
 CAMERA = StereoCamera(688, 512, 579.488, 579.488, 342.133, 255.806, 0.2003)
@@ -70,7 +70,7 @@ def take(ground: Landscape, world_T_body: Array, stamp_s: float, seed: int = 0, 
         BODY_T_CAMERA,
         _scan(ground, world_T_body, rng),
         odom_T_body=odom,
-        travelled_m=stamp_s if odom is not None else float("nan"),
+        path_length_m=stamp_s if odom is not None else float("nan"),
         body_T_lidar=make_pose(np.eye(3), [0.0, 0.0, LIDAR_HEIGHT_M]),
     )
 

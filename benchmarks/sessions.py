@@ -32,25 +32,25 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.config import Settings
-from umf_ros.frames import Frame
-from umf_ros.geometry import Array, align, heading, relative, rotation_angle, wrap_angle
+from umf_ros.core.config import Settings
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import Array, align, heading, relative, rotation_angle, wrap_angle
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.presets import SESSION
 from umf_ros.lab.simulation.recording import record
 from umf_ros.lab.simulation.seeds import TEST
 from umf_ros.lab.simulation.simulator import Simulator
-from umf_ros.loop_detector import LoopDetector, make_detector_embedder
 from umf_ros.mapping import Opening, add_session, match_session, replay_session, unmatched
 from umf_ros.maps.joint_graph import JointMap, solve
 from umf_ros.maps.localizer import Localizer
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.outputs import read_poses, write_results
 from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, absolute_trajectory_error, judge_closure
-from umf_ros.sensors.messages import OdometrySample
-from umf_ros.sensors.odometry_feed import OdometryFeed
-from umf_ros.trajectory import Trajectory
+from umf_ros.sensors.decode import OdometrySample
+from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
 
 WITHIN_KEYFRAMES = 20
 WRONG_M, WRONG_DEG = 1.0, 5.0
@@ -185,7 +185,7 @@ def wake(
     """One cold start."""
     detector.end_session()
     localizer = Localizer(read_poses(folder.path), settings.pose_graph)
-    feed, keyframes, found, wrong = OdometryFeed(localizer), 0, None, False
+    feed, keyframes, found, wrong = OdometrySessionSplitter(localizer), 0, None, False
     for item in stream:
         if isinstance(item, OdometrySample):
             feed.take(item.stamp_ns, item.odom_T_body)

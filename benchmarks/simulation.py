@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from umf_ros.frames import Image, StereoCamera
-from umf_ros.geometry import Array, heading, invert, relative, transform, wrap_angle
+from umf_ros.core.frames import Image, StereoCamera
+from umf_ros.core.geometry import Array, heading, invert, relative, transform, wrap_angle
 from umf_ros.lab.simulation.camera import Rendering
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.lidar import PERIOD_NS, Lidar

@@ -35,11 +35,11 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.config import Loop
-from umf_ros.geometry import Array, relative, rotation_angle
+from umf_ros.core.config import Loop
+from umf_ros.core.geometry import Array, relative, rotation_angle
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.tables import read_closures, read_keyframes
 from umf_ros.runs.truth import find_revisits, trajectory_error
-from umf_ros.trajectory import Trajectory
 
 WINDOW_M = 25.0
 TRUE_M, TRUE_DEG = 3.0, 15.0
@@ -195,12 +195,12 @@ def _drive(
     bag: Path, truth: Trajectory, scans: NDArray[np.int64], odom_T_body: Array, loop: Loop, files: Path
 ) -> Drive:
     steps = np.linalg.norm(np.diff(odom_T_body[:, :3, 3], axis=0), axis=1)
-    travelled = np.concatenate([[0], np.cumsum(steps)])
-    kept = np.unique(np.searchsorted(travelled, np.arange(0, travelled[-1], 0.5)).clip(max=len(scans) - 1))
+    path_length = np.concatenate([[0], np.cumsum(steps)])
+    kept = np.unique(np.searchsorted(path_length, np.arange(0, path_length[-1], 0.5)).clip(max=len(scans) - 1))
     poses, known = truth.at(scans[kept])
     kept, poses = kept[known], poses[known]
-    same, again = (find_revisits(scans[kept], poses, travelled[kept], loop, view) for view in (True, False))
-    window = (travelled[kept] // WINDOW_M).astype(int)
+    same, again = (find_revisits(scans[kept], poses, path_length[kept], loop, view) for view in (True, False))
+    window = (path_length[kept] // WINDOW_M).astype(int)
     return Drive(bag, len(scans), truth, scans[kept], same, again, window, files)
 
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scenes import CAMERA, Landscape, landscape, pose_at, take
 
-from umf_ros.frames import Candidate, Keyframe, LocalFeatures
-from umf_ros.geometry import Array
+from umf_ros.core.frames import Candidate, Keyframe, LocalFeatures
+from umf_ros.core.geometry import Array
 from umf_ros.verification import Verdict, Verifier
 
 Pair = tuple[Keyframe, Keyframe]

@@ -27,11 +27,11 @@ from rich.progress import track
 from rich.table import Table
 from traps import TRAPS, spring
 
-from umf_ros.config import Database, EmbeddingSettings, Loop, Verification
+from umf_ros.core.config import Database, EmbeddingSettings, Loop, Verification
+from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
+from umf_ros.core.geometry import Array, heading, wrap_angle
+from umf_ros.core.keyframes import is_past
 from umf_ros.embedding import make_embedder
-from umf_ros.frames import Candidate, Keyframe, LoopClosure
-from umf_ros.geometry import Array, heading, wrap_angle
-from umf_ros.keyframes import is_past
 from umf_ros.lab.simulation.seeds import TEST
 from umf_ros.lab.training.acceptance_fit import inside_ellipsoid
 from umf_ros.places.database import PlaceDatabase
@@ -151,9 +151,9 @@ def _record(
 
 def _revisited(drive: Drive, query: int) -> set[int]:
     """Earlier keyframes within 5 m and 30 deg whose view overlaps by 30 % or more."""
-    rules, truth, travelled = Loop(), drive.truth, drive.travelled
+    rules, truth, path_length = Loop(), drive.truth, drive.path_length
     stamps = np.array([frame.stamp_ns for frame in drive.frames[: query + 1]])
-    earlier = is_past(stamps[query] - stamps[:query], travelled[query] - travelled[:query], rules)
+    earlier = is_past(stamps[query] - stamps[:query], path_length[query] - path_length[:query], rules)
     away = np.linalg.norm(truth[:query, :2, 3] - truth[query, :2, 3], axis=1)
     turned = np.abs(wrap_angle(heading(truth[:query]) - heading(truth[query])))
     near = np.flatnonzero(earlier & (away <= REVISIT_M) & (turned <= np.radians(REVISIT_DEG)))

@@ -14,7 +14,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 from umf_ros.nodes.launching import check_parameter_file, full_name, is_true
 
 ARGUMENTS = [

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from umf_ros.frames import Embedding, Frame, Keyframe, LocalFeatures, StereoCamera, SuperFeatures
-from umf_ros.geometry import make_pose
+from umf_ros.core.frames import Embedding, Frame, Keyframe, LocalFeatures, StereoCamera, SuperFeatures
+from umf_ros.core.geometry import make_pose
 
 if TYPE_CHECKING:
     from umf_ros.lab.simulation.relief import Relief
@@ -39,7 +39,7 @@ def unit(vector: np.ndarray) -> np.ndarray:
 
 def make_keyframe(
     stamp_s: float,
-    travelled_m: float = float("nan"),
+    path_length_m: float = float("nan"),
     seed: int = 0,
     session: int = 0,
     dimension: int = 16,
@@ -60,8 +60,8 @@ def make_keyframe(
         camera=CAMERA,
         body_T_camera=make_pose(np.eye(3), rng.standard_normal(3)),
         points=rng.standard_normal((20, 3)).astype(np.float32),
-        odom_T_body=np.eye(4) if np.isfinite(travelled_m) else None,
-        travelled_m=travelled_m,
+        odom_T_body=np.eye(4) if np.isfinite(path_length_m) else None,
+        path_length_m=path_length_m,
         session=session,
     )
 

@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.config import Settings, load_settings
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, make_pose, relative
+from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, make_pose, relative
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.finished_run import FinishedRun
 from umf_ros.runs.sensor_check import SensorReport
 from umf_ros.runs.tables import GraphVerdict, KeyframeRow, TestedCandidate
 from umf_ros.runs.true_places import TruePlaces
 from umf_ros.runs.truth import JudgedRun, judge_closure
-from umf_ros.runs.why import GateKeeper
-from umf_ros.trajectory import Trajectory
+from umf_ros.runs.why import GateDiagnosis
 
 START_NS = 1_600_000_000 * 10**9
 LAP_S = 40
@@ -128,4 +128,4 @@ def examined(
             ate_optimized_m=ate and ate[1],
         )
     places = TruePlaces(run)
-    return ExaminedRun(run, judged, places, GateKeeper(run, places), None, sensors or SensorReport())
+    return ExaminedRun(run, judged, places, GateDiagnosis(run, places), None, sensors or SensorReport())

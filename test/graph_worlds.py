@@ -8,14 +8,14 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.geometry import Array, expmap, invert, make_pose, relative
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.geometry import Array, expmap, invert, make_pose, relative
 from umf_ros.lab.datasets.g2o import G2oGraph, GraphRecording
 from umf_ros.lab.datasets.g2o import drive as drive_recording
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, WorldClosure
 from umf_ros.pose_graph.closures import ClosureVerdict, State, TrackedClosure
-from umf_ros.pose_graph.condensed import Edge, between
 from umf_ros.pose_graph.odometry import OdometryChain
+from umf_ros.pose_graph.odometry_preintegration import Edge, between
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
 SETTINGS = PoseGraphSettings(keyframe_spacing_m=1e-6, max_gap_s=1.5)

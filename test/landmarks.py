@@ -8,8 +8,8 @@ import numpy as np
 from conftest import CAMERA
 from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import Embedding, Frame, LocalFeatures, SuperFeatures
-from umf_ros.geometry import Array, make_pose
+from umf_ros.core.frames import Embedding, Frame, LocalFeatures, SuperFeatures
+from umf_ros.core.geometry import Array, make_pose
 from umf_ros.lab.evaluation.worlds import FIRST, OPPOSITE, REVISIT, SAME_LIGHT, Visit
 
 SPACING_M = 8.0

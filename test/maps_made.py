@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.config import Settings
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, expmap, make_pose, relative
+from umf_ros.core.config import Settings
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, expmap, make_pose, relative
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
 from umf_ros.maps.odometry_log import OdometryLog
 from umf_ros.runs.tables import CLOSURES, KEYFRAMES, CsvTable, closure_row

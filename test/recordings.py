@@ -15,8 +15,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.config import Settings, load_settings
-from umf_ros.geometry import Array, make_pose, to_quaternion
+from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.geometry import Array, make_pose, to_quaternion
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 START_NS = 1_625_680_800_000_000_000

@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 
 Task = tuple[Path, int]
 

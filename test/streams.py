@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from recordings import drive
 
-from umf_ros.frames import Frame
-from umf_ros.sensors.messages import Cloud
+from umf_ros.core.frames import Frame
+from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.synchronizer import Synchronizer
 
 S = 10**9

@@ -9,7 +9,8 @@ import pytest
 from recordings import CALIBRATION, ODOMETRY, START_NS, drive, traverse, write_mcap
 
 from umf_ros.bags.reader import open_bag
-from umf_ros.errors import BagError, UmfError
+from umf_ros.core.errors import BagError, UmfError
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.mapping import (
     Opening,
     add_session,
@@ -22,7 +23,6 @@ from umf_ros.mapping import (
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.odometry_log import OdometryLog
 from umf_ros.places.upkeep import stored_sessions
-from umf_ros.trajectory import Trajectory, write_tum
 
 DAY_NS = 86_400 * 10**9
 

@@ -13,7 +13,7 @@ import pytest
 from processes import Process
 from sources import PACKAGE, ROOT, distributions, imports, required
 
-from umf_ros.resources import LAB_PACKAGES
+from umf_ros.core.resources import LAB_PACKAGES
 
 PARTS = ["package.xml", "setup.py", "setup.cfg", "NOTICE", "umf_ros", "resource"]
 PARTS += ["config", "launch", "models", "tools"]

@@ -15,14 +15,14 @@ from recordings import small_settings, traverse, write_mcap
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_tum
-from umf_ros.config import Database, Settings, load_settings
-from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
-from umf_ros.errors import OutputError
-from umf_ros.frames import Frame
-from umf_ros.loop_detector import Detection, LoopDetector
+from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.core.config import Database, Settings, load_settings
+from umf_ros.core.errors import OutputError
+from umf_ros.core.frames import Frame
+from umf_ros.detector import Detection, LoopDetector
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.replay import FAULTS, Replay
-from umf_ros.sensors.messages import OdometrySample
+from umf_ros.sensors.decode import OdometrySample
 
 TABLES = "candidates.csv closures.csv config.yaml descriptors.f16 inliers.csv keyframes.csv".split()
 TABLES += ["latencies.csv", "summary.json"]

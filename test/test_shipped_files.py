@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import umf_ros
-from umf_ros.errors import UmfError
-from umf_ros.resources import find, share_folders
+from umf_ros.core.errors import UmfError
+from umf_ros.core.resources import find, share_folders
 
 PACKAGE = Path(umf_ros.__file__).parent
 CONFIG = "config/calibration/simulated.yaml"
@@ -28,7 +28,7 @@ def install(site_packages: Path) -> None:
 def found_by(site_packages: Path, relative: str) -> str:
     """Where a fresh interpreter with this installation finds a file, or what it says."""
     code = (
-        "import sys\nfrom umf_ros.resources import find\nfrom umf_ros.errors import UmfError\n"
+        "import sys\nfrom umf_ros.core.resources import find\nfrom umf_ros.core.errors import UmfError\n"
         "try:\n    print(find(sys.argv[1]))\nexcept UmfError as error:\n    print(error)"
     )
     done = subprocess.run(

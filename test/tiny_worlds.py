@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from umf_ros.core.frames import StereoCamera
+from umf_ros.core.geometry import make_pose
 from umf_ros.embedding.inputs import pack, prepare_scan
 from umf_ros.embedding.torch_runtimes import to_tensors
-from umf_ros.frames import StereoCamera
-from umf_ros.geometry import make_pose
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.datasets.views import View, ViewMaker
 from umf_ros.networks.config import NetworkConfig

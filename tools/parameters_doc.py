@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from umf_ros.config import Settings
+from umf_ros.core.config import Settings
 
 TARGET = Path(__file__).parent.parent / "docs" / "parameters.md"
 HEAD = """# Parameters

@@ -12,8 +12,8 @@ from typing import Annotated, NoReturn
 import typer
 
 from umf_ros import __version__
-from umf_ros.errors import UmfError, one_line, shortened
-from umf_ros.resources import FLEET_PACKAGES, LAB_PACKAGES
+from umf_ros.core.errors import UmfError, one_line, shortened
+from umf_ros.core.resources import FLEET_PACKAGES, LAB_PACKAGES
 
 COMMANDS = {
     "demo": "umf_ros.lab.commands.demo",

@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.config import Settings
-from umf_ros.frames import Frame
-from umf_ros.geometry import to_quaternion
-from umf_ros.lookahead import one_ahead
-from umf_ros.loop_detector import Detection, LoopDetector
+from umf_ros.core.config import Settings
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import to_quaternion
+from umf_ros.core.trajectory import Trajectory, write_tum
+from umf_ros.detector import Detection, LoopDetector
 from umf_ros.maps.localizer import Localization, Localizer
 from umf_ros.maps.outputs import read_poses
+from umf_ros.prefetch import one_ahead
 from umf_ros.runs.recorder import RunRecorder, read_summary, write_summary
 from umf_ros.runs.tables import POSE, SIGMA, CsvTable
-from umf_ros.sensors.messages import OdometrySample
-from umf_ros.sensors.odometry_feed import OdometryFeed
-from umf_ros.trajectory import Trajectory, write_tum
+from umf_ros.sensors.decode import OdometrySample
+from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
 
 COLUMNS = ["stamp_ns", *POSE, *SIGMA, "probability"]
 TABLE = "localization.csv"
@@ -65,7 +65,7 @@ class LocalizingReplay:
         self._folder = folder
         self._detector = detector
         self._localizer = Localizer(read_poses(Path(settings.map)), settings.pose_graph)
-        self._feed = OdometryFeed(self._localizer)
+        self._feed = OdometrySessionSplitter(self._localizer)
         self._policy = settings.keyframe
         self._recorder = RunRecorder(folder, settings, detector.embedder_name)
         self._table = CsvTable(folder / TABLE, COLUMNS)
@@ -78,7 +78,7 @@ class LocalizingReplay:
         Raises:
             OutputError: the disk is full.
         """
-        for item in one_ahead(stream, self._policy, self._detector.foresee):
+        for item in one_ahead(stream, self._policy, self._detector.prefetch):
             if isinstance(item, OdometrySample):
                 self._feed.take(item.stamp_ns, item.odom_T_body)
                 continue

@@ -19,10 +19,11 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.trajectories import read_odometry
-from umf_ros.config import Database, Settings
-from umf_ros.errors import BagError, writing
-from umf_ros.frames import Keyframe
-from umf_ros.loop_detector import Detection, LoopDetector, make_detector_embedder
+from umf_ros.core.config import Database, Settings
+from umf_ros.core.errors import BagError, writing
+from umf_ros.core.frames import Keyframe
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
 from umf_ros.maps.matching import Match, match_between
 from umf_ros.maps.odometry_log import OdometryLog
@@ -34,7 +35,6 @@ from umf_ros.runs.finished_run import describe_recording, remember_recording
 from umf_ros.runs.recorder import count_drops
 from umf_ros.runs.resumption import PLACES
 from umf_ros.runs.tables import CLOSURES, CsvTable, closure_row
-from umf_ros.trajectory import Trajectory
 
 Heard = Callable[[float, Detection], None]
 """Told of every frame: the part of the recording that is done, 0 to 1, and what became of it."""
@@ -128,7 +128,7 @@ def replay_session(recording: Path, opening: Opening, folder: Path, heard: Heard
     if not len(log):
         log = _track(folder, settings)
     log.save(folder)
-    replay.confess()
+    replay.raise_if_frames_failed()
 
 
 def _track(folder: Path, settings: Settings) -> OdometryLog:

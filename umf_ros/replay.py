@@ -7,15 +7,15 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from umf_ros.config import Settings
-from umf_ros.errors import UmfError
-from umf_ros.frames import Frame, LoopClosure
-from umf_ros.lookahead import one_ahead
-from umf_ros.loop_detector import Detection, LoopDetector
+from umf_ros.core.config import Settings
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Frame, LoopClosure
+from umf_ros.detector import Detection, LoopDetector
 from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.prefetch import one_ahead
 from umf_ros.runs.recorder import RunRecorder
-from umf_ros.sensors.messages import OdometrySample
-from umf_ros.sensors.odometry_feed import OdometryFeed
+from umf_ros.sensors.decode import OdometrySample
+from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
 
 FAULTS = "faults.log"
 WARM_UP = 12
@@ -44,7 +44,7 @@ class Replay:
         self._detector = detector
         self._graph = PoseGraph(settings.pose_graph)
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
-        self._feed = OdometryFeed(self._graph)
+        self._feed = OdometrySessionSplitter(self._graph)
         self._policy = settings.keyframe
         self.faults = 0
         self._has_odometry = False
@@ -59,7 +59,7 @@ class Replay:
         Raises:
             OutputError: the disk is full.
         """
-        for item in one_ahead(stream, self._policy, self._foresee):
+        for item in one_ahead(stream, self._policy, self._prefetch):
             if isinstance(item, OdometrySample):
                 self._has_odometry = True
                 self._feed.take(item.stamp_ns, item.odom_T_body)
@@ -73,8 +73,8 @@ class Replay:
             self._recorder.record(item, detection)
             for closure in detection.closures:
                 self._graph.add_closure(closure)
-            while (encounter := self._detector.meet()) is not None:
-                self._recorder.record_encounter(encounter)
+            while (inter_closure := self._detector.meet()) is not None:
+                self._recorder.record_encounter(inter_closure)
             yield detection
             if detection.fault is not None:
                 raise detection.fault
@@ -91,11 +91,11 @@ class Replay:
                 file.write(f"frame {frame.stamp_ns}\n{traceback.format_exc()}\n")
             return Detection(frame.stamp_ns)
 
-    def _foresee(self, frame: Frame) -> None:
+    def _prefetch(self, frame: Frame) -> None:
         if self._done <= WARM_UP:
-            self._detector.foresee(frame)
+            self._detector.prefetch(frame)
 
-    def confess(self) -> None:
+    def raise_if_frames_failed(self) -> None:
         """Say at the end, when everything else is written, that frames were passed over.
 
         Raises:
@@ -121,9 +121,9 @@ class Replay:
 
     def finish(self, drops: Mapping[str, int]) -> bool:
         """Write the summary, and trajectories and graph where there was odometry; returns whether there was."""
-        if self._detector.encounters is not None:
-            for encounter in self._detector.encounters.rest(FLEET_PATIENCE_S):
-                self._recorder.record_encounter(encounter)
+        if self._detector.inter_robot is not None:
+            for inter_closure in self._detector.inter_robot.rest(FLEET_PATIENCE_S):
+                self._recorder.record_encounter(inter_closure)
         self._recorder.write_summary(drops)
         self._recorder.close()
         self._detector.close()

@@ -11,8 +11,8 @@ from recordings import CLOUD, LEFT, ODOMETRY, START_NS, Entry, header, make, sma
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
-from umf_ros.frames import Frame
-from umf_ros.geometry import invert, make_pose, to_quaternion
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import invert, make_pose, to_quaternion
 
 CAMERA = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.4, 0.1, 1.2])
 LIDAR = make_pose(np.eye(3), [0.3, 0.0, 1.3])

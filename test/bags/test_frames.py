@@ -25,10 +25,10 @@ from rosbags.typesys import Stores, get_typestore
 from umf_ros.bags.frames import FrameReader, read_left_images
 from umf_ros.bags.presets import detect_dataset
 from umf_ros.bags.reader import open_bag
-from umf_ros.config import load_preset, load_settings
-from umf_ros.errors import BagError
-from umf_ros.sensors.messages import OdometrySample
-from umf_ros.trajectory import Trajectory
+from umf_ros.core.config import load_preset, load_settings
+from umf_ros.core.errors import BagError
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.sensors.decode import OdometrySample
 
 ENTRIES = traverse(3.0)
 SCANS = int(3.0 * 4.7)

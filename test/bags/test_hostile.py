@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.unpacking import unpack_bz2, unpack_lz4
-from umf_ros.errors import BagError
+from umf_ros.core.errors import BagError
 
 ENTRIES = traverse(0.4)
 NOETIC = traverse(0.4, get_typestore(Stores.ROS1_NOETIC))

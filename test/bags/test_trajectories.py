@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_odometry, read_tum
-from umf_ros.config import load_settings
-from umf_ros.errors import BagError, OutputError
-from umf_ros.geometry import make_pose
+from umf_ros.core.config import load_settings
+from umf_ros.core.errors import BagError, OutputError
+from umf_ros.core.geometry import make_pose
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.trajectory import Trajectory, write_tum
 
 S = 10**9
 

@@ -10,7 +10,7 @@ import pytest
 from adaptation import ROVERS, Rover, StrangeSensors, calibration_of
 from conftest import make_frame
 
-from umf_ros.frames import Frame, ScanMotion
+from umf_ros.core.frames import Frame, ScanMotion
 from umf_ros.sensors.calibration import load_calibration
 
 COUNT = 600

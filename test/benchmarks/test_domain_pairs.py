@@ -9,8 +9,8 @@ from domain_pairs import ELSEWHERE, SAME, TURNED, Pair, Place, pairs_of
 from domains import Outcome, summary
 from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import make_pose
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import make_pose
 from umf_ros.lab.simulation.domains import Domain, DomainScan
 from umf_ros.lab.simulation.domains.sweeps import Sweep
 

@@ -8,7 +8,7 @@ import planted_faults
 import pytest
 
 from umf_ros.bags.reader import open_bag
-from umf_ros.config import load_settings
+from umf_ros.core.config import load_settings
 
 QUICK = {"embedding": {"method": "thumbnail"}, "loop": {"min_time_gap_s": 8.0}, "verification": {"refine_best": 1}}
 

@@ -8,9 +8,9 @@ from conftest import make_keyframe
 from measurements import GOOD
 from real_scans import RealPair, cropped, draw_pairs, read_pairs, summary
 
-from umf_ros.frames import Candidate, LoopClosure
-from umf_ros.geometry import make_pose
-from umf_ros.sensors.messages import Cloud
+from umf_ros.core.frames import Candidate, LoopClosure
+from umf_ros.core.geometry import make_pose
+from umf_ros.sensors.decode import Cloud
 from umf_ros.verification import Verdict
 
 

@@ -7,8 +7,8 @@ import pytest
 from conftest import make_keyframe, unit
 from retrieval_at_scale import METHODS, CrowdedDetector, crowd_of
 
-from umf_ros.config import Settings
-from umf_ros.frames import Embedding, Frame
+from umf_ros.core.config import Settings
+from umf_ros.core.frames import Embedding, Frame
 
 DIMENSION = 16
 

@@ -9,9 +9,9 @@ import pytest
 from system_peers import Scans, found
 from systems import OURS, SETTINGS, FoundClosure, SystemRun, _drive, judge
 
-from umf_ros.config import Loop
-from umf_ros.geometry import make_pose, relative
-from umf_ros.trajectory import Trajectory
+from umf_ros.core.config import Loop
+from umf_ros.core.geometry import make_pose, relative
+from umf_ros.core.trajectory import Trajectory
 
 SECOND = 10**9
 LAP = 100

@@ -11,8 +11,8 @@ from command_line import only_line, umf
 
 from umf_ros import __version__
 from umf_ros.commands import checks
-from umf_ros.errors import either
-from umf_ros.resources import dataset_names
+from umf_ros.core.errors import either
+from umf_ros.core.resources import dataset_names
 
 COMMANDS = "demo simulate replay compare play report evaluate explain train export doctor".split()
 GROUPS = {"pretrain": ["image", "lidar"], "graph": ["optimize", "plot"]}

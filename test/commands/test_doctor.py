@@ -12,7 +12,7 @@ import pytest
 from umf_ros import embedding
 from umf_ros.commands import checks
 from umf_ros.commands.doctor import command
-from umf_ros.errors import WeightsError
+from umf_ros.core.errors import WeightsError
 
 
 def broken_package(folder: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> str:

@@ -9,8 +9,8 @@ import pytest
 from command_line import only_line, umf
 from postgres import PASSWORD, PostgresServer, free_port
 
-from umf_ros.config import parse_settings
-from umf_ros.errors import ConfigError
+from umf_ros.core.config import parse_settings
+from umf_ros.core.errors import ConfigError
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from conftest import make_keyframe
 from rich.console import Console
 
 from umf_ros.commands.progress import WARNING, FrameProgress, stop_on_interrupt, undisturbed
-from umf_ros.frames import Candidate, LoopClosure
-from umf_ros.loop_detector import Detection
+from umf_ros.core.frames import Candidate, LoopClosure
+from umf_ros.detector import Detection
 from umf_ros.verification import Measurement, Verdict
 
 SIGNALS = signal.SIGINT, signal.SIGTERM

@@ -19,9 +19,9 @@ from recordings import ODOMETRY, TRUTH, traverse, write_mcap
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
-from umf_ros.errors import either
-from umf_ros.geometry import invert, relative, rotation_angle
-from umf_ros.resources import dataset_names
+from umf_ros.core.errors import either
+from umf_ros.core.geometry import invert, relative, rotation_angle
+from umf_ros.core.resources import dataset_names
 from umf_ros.runs.tables import read_closures
 
 FILES = (
@@ -87,10 +87,10 @@ def test_the_tables_tell_the_same_story(run: Path) -> None:
     assert accepted == [(c["query_stamp_ns"], c["match_stamp_ns"]) for c in closures]
     stamps = [int(keyframe["stamp_ns"]) for keyframe in keyframes]
     assert stamps == sorted(set(stamps))
-    travelled = {int(k["stamp_ns"]): float(k["travelled_m"]) for k in keyframes}
+    path_length = {int(k["stamp_ns"]): float(k["travelled_m"]) for k in keyframes}
     for candidate in candidates:
         query, match = int(candidate["query_stamp_ns"]), int(candidate["match_stamp_ns"])
-        assert query - match >= 8e9 and travelled[query] - travelled[match] >= 15.0
+        assert query - match >= 8e9 and path_length[query] - path_length[match] >= 15.0
         assert candidate["reason"] and -1 <= float(candidate["similarity"]) <= 1
         assert all(isinstance(value, float) for value in json.loads(candidate["numbers"]).values())
     summary = json.loads((run / "summary.json").read_text())

@@ -8,7 +8,7 @@ import pytest
 from command_line import only_line, umf
 from recordings import START_NS, small_settings, traverse, write_mcap
 
-from umf_ros.config import dump_settings
+from umf_ros.core.config import dump_settings
 
 
 @pytest.fixture(scope="module")

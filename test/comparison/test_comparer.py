@@ -11,12 +11,12 @@ import pytest
 from recordings import CALIBRATION
 from scenes import landscape, pose_at, take, without_image
 
+from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.comparison.comparer import NO_CALIBRATION, NO_DEPTH, Comparer, judge, similarity_of
 from umf_ros.comparison.views import KeyframeSource, PlaceView, ReadingRules
-from umf_ros.config import Verification
-from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
-from umf_ros.errors import SensorFileError
-from umf_ros.geometry import make_pose
+from umf_ros.core.config import Verification
+from umf_ros.core.errors import SensorFileError
+from umf_ros.core.geometry import make_pose
 from umf_ros.verification import Verifier
 
 GROUND = landscape(20)
@@ -43,8 +43,8 @@ def test_a_pair_does_not_depend_on_where_and_when_it_was_taken() -> None:
     verifier = Verifier(Verification())
     alone = judge(verifier, MATCH, QUERY)
     far = make_pose(np.eye(3), [500.0, 0.0, 0.0])
-    elsewhere = replace(QUERY, stamp_ns=3, odom_T_body=far, travelled_m=500.0, session=2)
-    told_otherwise = judge(verifier, replace(MATCH, odom_T_body=np.eye(4), travelled_m=1.0), elsewhere)
+    elsewhere = replace(QUERY, stamp_ns=3, odom_T_body=far, path_length_m=500.0, session=2)
+    told_otherwise = judge(verifier, replace(MATCH, odom_T_body=np.eye(4), path_length_m=1.0), elsewhere)
     np.testing.assert_equal(alone.numbers, told_otherwise.numbers)
     assert alone.reason == told_otherwise.reason
     assert alone.candidate.similarity == pytest.approx(similarity_of(MATCH, QUERY))

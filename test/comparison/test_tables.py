@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from umf_ros.comparison.comparer import Comparison
 from umf_ros.comparison.tables import POSE, RESULT_COLUMNS, SIGMA, failed_row, read_pairs, result_row, view_row
 from umf_ros.comparison.views import PlaceView
-from umf_ros.errors import ConfigError
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import from_quaternion, make_pose
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import from_quaternion, make_pose
 
 
 def listed(folder: Path, text: str) -> Path:

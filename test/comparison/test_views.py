@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from recordings import CALIBRATION, traverse, write_mcap
 
+from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
 from umf_ros.comparison import views
 from umf_ros.comparison.views import KeyframeSource, PlaceView, ReadingRules
-from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
-from umf_ros.errors import CalibrationError, SensorFileError, UmfError
-from umf_ros.frames import Embedding, Frame
+from umf_ros.core.errors import CalibrationError, SensorFileError, UmfError
+from umf_ros.core.frames import Embedding, Frame
 
 
 class CountingEmbedder(ThumbnailEmbedder):

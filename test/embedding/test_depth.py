@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from umf_ros.core.frames import Embedding, Frame, LocalFeatures, StereoCamera
+from umf_ros.core.geometry import make_pose, transform
 from umf_ros.embedding.depth import disparities, lift
-from umf_ros.frames import Embedding, Frame, LocalFeatures, StereoCamera
-from umf_ros.geometry import make_pose, transform
 
 CAMERA = StereoCamera(688, 512, 579.488, 579.488, 342.133, 255.806, 0.2003)
 BODY_T_CAMERA = make_pose(Rotation.from_euler("ZYX", [-90, 0, -96], degrees=True).as_matrix(), [0.3, 0.1, 1.1])

@@ -13,16 +13,16 @@ from scipy.spatial.transform import Rotation
 from tiny_worlds import TINY, some_scan
 
 from umf_ros import embedding
-from umf_ros.config import EmbeddingSettings
+from umf_ros.baselines.gradients_embedder import GradientsEmbedder
+from umf_ros.baselines.scan_context_embedder import ScanContextEmbedder
+from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.core.errors import ConfigError, WeightsError, either
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import transform
 from umf_ros.embedding import make_embedder
-from umf_ros.embedding.embedder import Asked
-from umf_ros.embedding.gradients_embedder import GradientsEmbedder
-from umf_ros.embedding.scan_context_embedder import ScanContextEmbedder
-from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.umf_embedder import UmfEmbedder
-from umf_ros.errors import ConfigError, WeightsError, either
-from umf_ros.frames import Frame
-from umf_ros.geometry import transform
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
 
@@ -49,7 +49,7 @@ def shared_cache(converted, monkeypatch):
 
 @pytest.fixture
 def embedder(weights):
-    return UmfEmbedder(weights, EmbeddingSettings(runtime="torch", threads=1), Asked(supers=True))
+    return UmfEmbedder(weights, EmbeddingSettings(runtime="torch", threads=1), FeatureRequest(supers=True))
 
 
 def test_what_comes_out(embedder):
@@ -109,9 +109,9 @@ def test_positions_belong_to_the_image_given(embedder, shape):
 def test_openvino_agrees_with_torch_and_is_kept(tmp_path, monkeypatch):
     """With the shipped weights: OpenVINO's CPU plugin hangs on networks as narrow as the tests' own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    plain = UmfEmbedder(None, EmbeddingSettings(runtime="torch", threads=1), Asked(supers=True))
-    fast = UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), Asked(supers=True))
-    kept = UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), Asked(supers=True))
+    plain = UmfEmbedder(None, EmbeddingSettings(runtime="torch", threads=1), FeatureRequest(supers=True))
+    fast = UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), FeatureRequest(supers=True))
+    kept = UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), FeatureRequest(supers=True))
     assert len(list((tmp_path / "cache" / "umf_ros").glob("*.xml"))) == 1
     for frame in (some_frame(), some_frame(1, left=None), some_frame(2, points=None, intensity=None)):
         wanted = plain.embed(frame)
@@ -123,7 +123,8 @@ def test_openvino_agrees_with_torch_and_is_kept(tmp_path, monkeypatch):
 
 def test_what_is_not_asked_for_is_left_out_and_changes_nothing_else():
     whole, bare = (
-        UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), Asked(image)) for image in (True, False)
+        UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), FeatureRequest(image))
+        for image in (True, False)
     )
     one, other = whole.embed(some_frame()), bare.embed(some_frame())
     assert one.image is not None and other.image is None and one.cloud is not None and other.cloud is not None

@@ -11,13 +11,13 @@ import torch
 from tiny_worlds import TINY, some_scan
 from torch import Tensor, nn
 
-from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.embedder import Asked
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.core.errors import ConfigError, OutputError
+from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.export import cached, convert, kept_or_made, openvino_core, save
 from umf_ros.embedding.inputs import pack, prepare_scan
 from umf_ros.embedding.runtimes import OUTPUTS, SUPERS, make_runtime, outputs_of
 from umf_ros.embedding.torch_runtimes import TorchRuntime, to_tensors
-from umf_ros.errors import ConfigError, OutputError
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights_files import locate_weights
 
@@ -58,15 +58,15 @@ def test_torch_says_by_name_what_the_network_says(network):
 
 
 def test_only_what_is_asked_for_is_computed():
-    assert outputs_of(Asked()) == OUTPUTS
-    assert outputs_of(Asked(supers=True)) == (*OUTPUTS, *SUPERS)
-    assert outputs_of(Asked(image=False)) == ("descriptor", "cloud", "cloud_saliency")
+    assert outputs_of(FeatureRequest()) == OUTPUTS
+    assert outputs_of(FeatureRequest(supers=True)) == (*OUTPUTS, *SUPERS)
+    assert outputs_of(FeatureRequest(image=False)) == ("descriptor", "cloud", "cloud_saliency")
 
 
 @pytest.mark.parametrize(("runtime", "device"), [("openvino", "cuda"), ("torch", "abacus"), ("auto", "abacus")])
 def test_what_cannot_run_is_refused_in_one_line(runtime, device):
     with pytest.raises(ConfigError, match="embedding") as raised:
-        make_runtime(locate_weights(None), EmbeddingSettings(runtime=runtime, device=device), Asked())
+        make_runtime(locate_weights(None), EmbeddingSettings(runtime=runtime, device=device), FeatureRequest())
     assert "\n" not in str(raised.value)
 
 

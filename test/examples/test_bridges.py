@@ -13,7 +13,7 @@ from recordings import START_NS, odometry
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from umf_ros.geometry import make_pose, relative
+from umf_ros.core.geometry import make_pose, relative
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

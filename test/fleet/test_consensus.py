@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 from conftest import make_keyframe, make_pose
 
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, invert
 from umf_ros.fleet.consensus import EncounterPair, FleetConsensus
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, invert
 
 DRIFT = 0.05
 MEETING = make_pose(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([30.0, -4, 0]))

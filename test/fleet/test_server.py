@@ -9,7 +9,7 @@ from conftest import make_keyframe
 from fleets import IDENTITY, administrator, stored
 from postgres import PASSWORD, PostgresServer, free_port
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 from umf_ros.fleet.migrations import MIGRATIONS, add_rover, migrate
 from umf_ros.fleet.server import FleetServer, LinkError, OutgoingPlace
 from umf_ros.places.packing import pack, unpack
@@ -20,7 +20,7 @@ STORE = uuid4()
 def place(second: int, session: int = 0) -> OutgoingPlace:
     keyframe = make_keyframe(second, seed=second, session=session)
     descriptor = keyframe.embedding.descriptor
-    return OutgoingPlace(session, keyframe.stamp_ns, keyframe.travelled_m, descriptor, pack(keyframe))
+    return OutgoingPlace(session, keyframe.stamp_ns, keyframe.path_length_m, descriptor, pack(keyframe))
 
 
 def connect(server: PostgresServer, rover: str, store: UUID = STORE) -> FleetServer:

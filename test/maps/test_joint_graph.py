@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from maps_made import MadeSession, made_map, on_circle, tie
 
-from umf_ros.geometry import transform
+from umf_ros.core.geometry import transform
 from umf_ros.maps.joint_graph import JointMap, solve
 from umf_ros.maps.outputs import read_poses, write_results
 from umf_ros.pose_graph.closures import State

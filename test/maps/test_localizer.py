@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from maps_made import COVARIANCE, START_NS, on_circle
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, expmap, invert, make_pose, relative, rotation_angle
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, expmap, invert, make_pose, relative, rotation_angle
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.maps.localizer import BELIEVED, Localizer
-from umf_ros.trajectory import Trajectory
 
 SECOND_NS = 10**9
 LATER_NS = START_NS + 5000 * SECOND_NS

@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 from maps_made import MadeSession, made_map
 
-from umf_ros.config import Settings, load_settings
-from umf_ros.errors import UmfError
+from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.errors import UmfError
 from umf_ros.maps.map_folder import APART_NS, MapFolder
 
 DAY_NS = 86_400 * 10**9

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scenes import landscape, pose_at, take
 
-from umf_ros.config import Verification
-from umf_ros.frames import Keyframe
-from umf_ros.geometry import Array, relative
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Keyframe
+from umf_ros.core.geometry import Array, relative
 from umf_ros.maps.tracking import track
 
 GROUND = landscape(20)
@@ -26,7 +26,7 @@ def test_neighbours_are_chained_to_a_way() -> None:
     for found, true in zip(tracked, poses, strict=True):
         assert found.odom_T_body is not None
         assert np.linalg.norm((found.odom_T_body - relative(poses[0], true))[:3, 3]) < 0.15
-    assert np.all(np.diff([one.travelled_m for one in tracked]) > 0.5)
+    assert np.all(np.diff([one.path_length_m for one in tracked]) > 0.5)
     assert len(log.trajectory) == 4
 
 
@@ -35,4 +35,4 @@ def test_where_the_chain_breaks_another_way_begins() -> None:
     elsewhere = take(landscape(99), pose_at(landscape(99), -10.0, 5.0, 40.0), 12.0)
     _, tracked = track([*keyframes, elsewhere], Verification())
     assert [one.session for one in tracked] == [0, 0, 1]
-    assert tracked[-1].travelled_m == 0 and np.array_equal(tracked[-1].odom_T_body, np.eye(4))
+    assert tracked[-1].path_length_m == 0 and np.array_equal(tracked[-1].odom_T_body, np.eye(4))

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from published import published_tensors
 from torch import Tensor
 
-from umf_ros.errors import WeightsError
+from umf_ros.core.errors import WeightsError
 from umf_ros.networks.efficientnet import (
     CONTRAST,
     EPSILON,

@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from tiny_worlds import TINY, some_input
 
-from umf_ros.errors import WeightsError
+from umf_ros.core.errors import WeightsError
 from umf_ros.lab.training.networks import PRESETS, read_card, save_weights
 from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import UMF

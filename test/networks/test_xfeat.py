@@ -9,9 +9,9 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from umf_ros.errors import WeightsError
+from umf_ros.core.errors import WeightsError
+from umf_ros.core.resources import find
 from umf_ros.networks.xfeat import XFeat, load_xfeat
-from umf_ros.resources import find
 
 ROWS, COLUMNS = np.mgrid[:96, :128]
 WAVES = 60 * np.sin(COLUMNS / 7.0) * np.cos(ROWS / 5.0)

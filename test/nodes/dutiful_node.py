@@ -9,7 +9,7 @@ import sys
 import rclpy
 from rclpy.node import Node
 
-from umf_ros.errors import ConfigError, OutputError
+from umf_ros.core.errors import ConfigError, OutputError
 from umf_ros.nodes.process import run
 
 FAILED: list[int] = []

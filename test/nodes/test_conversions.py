@@ -5,9 +5,9 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 
-from umf_ros.errors import MessageError
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import make_pose
+from umf_ros.core.errors import MessageError
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import make_pose
 from umf_ros.nodes import conversions
 from umf_ros.nodes.conversions import Odometry, closure_from_message, closure_to_message
 

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 
-from umf_ros.config import Qos
+from umf_ros.core.config import Qos
 from umf_ros.nodes import diagnostics
 from umf_ros.nodes.diagnostics import Heartbeat, InputWatch, Throttle, memory_mb, status
 from umf_ros.nodes.qos import sensor_qos

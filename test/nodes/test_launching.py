@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 from umf_ros.nodes.launching import check_parameter_file, full_name, is_true
 
 NODES = ["/red/loop_closure_node", "/red/pose_graph_node"]

@@ -14,7 +14,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from umf_ros.errors import OutputError
+from umf_ros.core.errors import OutputError
 from umf_ros.nodes.pose_graph_node import PoseGraphNode
 
 

@@ -17,8 +17,8 @@ from processes import Process, wait_until
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_tum
-from umf_ros.config import load_settings
-from umf_ros.loop_detector import LoopDetector, make_detector_embedder
+from umf_ros.core.config import load_settings
+from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.replay import Replay
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "slam_subscriber.py"

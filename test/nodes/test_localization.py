@@ -17,13 +17,13 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from std_srvs.srv import Trigger
 
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import relative
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import relative
 from umf_ros.maps.joint_graph import solve
 from umf_ros.maps.outputs import read_poses, write_results
-from umf_ros.nodes.announcer import CLOSURES_QOS
+from umf_ros.nodes.closure_publisher import CLOSURES_QOS
 from umf_ros.nodes.conversions import closure_to_message, to_pose, to_time
-from umf_ros.sensors.messages import decode_pose
+from umf_ros.sensors.decode import decode_pose
 
 MODULE = "umf_ros.nodes.pose_graph_node"
 LATER_NS = 1_800_000_000 * 10**9

@@ -17,8 +17,8 @@ from recordings import POINT
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_srvs.srv import SetBool, Trigger
 
-from umf_ros.config import Database, Settings
-from umf_ros.loop_detector import make_detector_embedder
+from umf_ros.core.config import Database, Settings
+from umf_ros.detector import make_detector_embedder
 from umf_ros.nodes.conversions import to_time
 from umf_ros.places.database import PlaceDatabase
 

@@ -11,8 +11,8 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from umf_ros.config import Settings, load_settings
-from umf_ros.errors import ConfigError
+from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.errors import ConfigError
 from umf_ros.nodes.parameters import CHANGEABLE, changed_settings, declare
 
 made: list[tuple[Node, Context]] = []

@@ -10,7 +10,7 @@ import pytest
 import rclpy
 from rclpy.parameter import Parameter
 
-from umf_ros.frames import Frame, StereoCamera
+from umf_ros.core.frames import Frame, StereoCamera
 from umf_ros.nodes.loop_closure_node import LoopClosureNode
 
 

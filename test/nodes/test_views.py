@@ -11,8 +11,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy
 from sources import ROOT
 
-from umf_ros.config import Frames, Topics
-from umf_ros.nodes.announcer import Announcer
+from umf_ros.core.config import FrameIds, Topics
+from umf_ros.nodes.closure_publisher import ClosurePublisher
 from umf_ros.nodes.pose_graph_node import PoseGraphNode
 
 LATCHED = QoSDurabilityPolicy.TRANSIENT_LOCAL
@@ -28,7 +28,7 @@ SHOWN_AS = {
 def published(ros_context: None) -> Iterator[dict[str, tuple[str, bool]]]:
     """Every topic, with its type and whether it is latched."""
     back, front = PoseGraphNode(), Node("loop_closure_node")
-    Announcer(front, Frames())
+    ClosurePublisher(front, FrameIds())
     made = [*back.publishers, *front.publishers]
     topics = {item.topic_name: (item.msg_type.__name__, item.qos_profile.durability == LATCHED) for item in made}
     yield topics | {Topics().left_image: ("Image", False)}
@@ -47,7 +47,7 @@ def test_rviz_shows_what_is_there(published: dict[str, tuple[str, bool]]) -> Non
         kind, latched = published[f"/{topic['Value']}"]
         assert kind == SHOWN_AS[display["Class"]]
         assert (topic.get("Durability Policy") == "Transient Local") == latched, topic
-    assert manager["Global Options"]["Fixed Frame"] == Frames().map
+    assert manager["Global Options"]["Fixed Frame"] == FrameIds().map
 
 
 def test_foxglove_shows_what_is_there(published: dict[str, tuple[str, bool]]) -> None:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from conftest import make_keyframe, unit
 
-from umf_ros.config import Database, Loop
-from umf_ros.errors import OutputError, UmfError
-from umf_ros.frames import Keyframe
+from umf_ros.core.config import Database, Loop
+from umf_ros.core.errors import OutputError, UmfError
+from umf_ros.core.frames import Keyframe
 from umf_ros.places.database import VISITS, PlaceDatabase
 from umf_ros.places.packing import pack, unpack
 from umf_ros.places.upkeep import stored_identity
@@ -26,7 +26,7 @@ def database(path: Path | None = None, embedder: str = "test", cached: int = 400
 def assert_same(a: Keyframe, b: Keyframe) -> None:
     assert (a.stamp_ns, a.session, a.camera) == (b.stamp_ns, b.session, b.camera)
     np.testing.assert_array_equal(a.points, b.points)
-    np.testing.assert_array_equal(a.travelled_m, b.travelled_m)
+    np.testing.assert_array_equal(a.path_length_m, b.path_length_m)
     assert (a.odom_T_body is None) == (b.odom_T_body is None)
     for name in ("image", "cloud", "super_image", "super_cloud"):
         left, right = getattr(a.embedding, name), getattr(b.embedding, name)
@@ -36,9 +36,9 @@ def assert_same(a: Keyframe, b: Keyframe) -> None:
             assert getattr(left, item.name).dtype == getattr(right, item.name).dtype
 
 
-@pytest.mark.parametrize("travelled_m", [3.5, math.nan])
-def test_packing_loses_nothing(travelled_m: float) -> None:
-    keyframe = make_keyframe(1667.123456789, travelled_m, session=3)
+@pytest.mark.parametrize("path_length_m", [3.5, math.nan])
+def test_packing_loses_nothing(path_length_m: float) -> None:
+    keyframe = make_keyframe(1667.123456789, path_length_m, session=3)
     assert_same(unpack(pack(keyframe)), keyframe)
 
 
@@ -48,8 +48,8 @@ def stamps_found(places: PlaceDatabase, query: Keyframe) -> list[float]:
 
 def test_matches_must_be_old_and_far_along_the_path() -> None:
     places = database()
-    for stamp_s, travelled_m in [(0, 0), (10, 80), (30, 86), (79, 90), (81, 10)]:
-        places.add(make_keyframe(stamp_s, travelled_m))
+    for stamp_s, path_length_m in [(0, 0), (10, 80), (30, 86), (79, 90), (81, 10)]:
+        places.add(make_keyframe(stamp_s, path_length_m))
     # (30, 86): old enough but 14 m back; (79, 90) and (81, 10): too recent
     assert stamps_found(places, make_keyframe(100, 100)) == [0, 10]
 
@@ -132,9 +132,9 @@ def test_the_same_measurement_is_recognised_and_another_of_that_stamp_is_not() -
     places = database()
     places.add(make_keyframe(1, seed=1))
     row = places.add(make_keyframe(1, seed=2, session=3))
-    assert places.recognise(make_keyframe(1, seed=2, session=9)) == row
-    assert places.recognise(make_keyframe(1, seed=5)) is None
-    assert places.recognise(make_keyframe(2, seed=2)) is None
+    assert places.find_duplicate(make_keyframe(1, seed=2, session=9)) == row
+    assert places.find_duplicate(make_keyframe(1, seed=5)) is None
+    assert places.find_duplicate(make_keyframe(2, seed=2)) is None
     assert places.newest_at(10**9) == row and places.newest_at(7) is None
 
 
@@ -169,8 +169,8 @@ def test_an_unwritable_copy_is_one_clear_error(tmp_path: Path) -> None:
 def test_places_of_named_sessions_are_found_whatever_their_age(tmp_path: Path) -> None:
     places = database(tmp_path / "a.sqlite")
     for session, stamp in ((0, 500.0), (1, 10.0), (2, 900.0)):
-        places.add(make_keyframe(stamp, travelled_m=0.0, seed=session, session=session))
-    query = make_keyframe(20.0, travelled_m=0.0, seed=1, session=2)
+        places.add(make_keyframe(stamp, path_length_m=0.0, seed=session, session=session))
+    query = make_keyframe(20.0, path_length_m=0.0, seed=1, session=2)
     assert [found.index for found in places.query(query, Loop())] == []
     assert sorted(found.index for found in places.query(query, Loop(), range(2))) == [0, 1]
     assert [found.index for found in places.query(query, Loop(), range(1, 2))] == [1]

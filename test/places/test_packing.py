@@ -10,7 +10,7 @@ from conftest import make_keyframe, unit
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from umf_ros.frames import Embedding, Keyframe, LocalFeatures, ScanMotion
+from umf_ros.core.frames import Embedding, Keyframe, LocalFeatures, ScanMotion
 from umf_ros.places.packing import pack, unpack
 
 GROUPS = ("image", "cloud", "super_image", "super_cloud")

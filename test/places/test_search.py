@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conftest import make_keyframe, unit
 
-from umf_ros.config import Database, Loop
-from umf_ros.frames import Keyframe
+from umf_ros.core.config import Database, Loop
+from umf_ros.core.frames import Keyframe
 from umf_ros.places import search as search_module
 from umf_ros.places.approximate import ApproximateIndex
 from umf_ros.places.codes import CodeTable, Rows

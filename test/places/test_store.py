@@ -16,8 +16,8 @@ import pytest
 from conftest import make_keyframe
 from recordings import traverse, write_db3
 
-from umf_ros.config import Database, Loop
-from umf_ros.errors import OutputError, UmfError
+from umf_ros.core.config import Database, Loop
+from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import KeyframeStore
 
@@ -55,7 +55,7 @@ def test_keys_and_descriptors_are_those_of_the_keyframes(tmp_path: Path) -> None
     for i in range(5):
         keyframe = opened[i]
         assert (opened.keys["stamp_ns"][i], opened.keys["session"][i]) == (keyframe.stamp_ns, keyframe.session)
-        np.testing.assert_array_equal(opened.keys["travelled_m"][i], keyframe.travelled_m)
+        np.testing.assert_array_equal(opened.keys["travelled_m"][i], keyframe.path_length_m)
     rows = np.array([4, 0, 2])
     expected = np.stack([opened[i].embedding.descriptor for i in rows])
     np.testing.assert_array_equal(opened.descriptors(rows), expected)

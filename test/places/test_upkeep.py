@@ -9,8 +9,8 @@ from conftest import make_keyframe
 from typer.testing import CliRunner
 
 from umf_ros.commands.places import app
-from umf_ros.config import Database
-from umf_ros.errors import UmfError
+from umf_ros.core.config import Database
+from umf_ros.core.errors import UmfError
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.upkeep import StoredSession, delete_sessions, stored_identity, stored_sessions
 

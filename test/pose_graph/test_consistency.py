@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from graph_worlds import SETTINGS, chain_of, closing, lap_pairs, tracked, two_laps
 
-from umf_ros.config import PoseGraphSettings
+from umf_ros.core.config import PoseGraphSettings
 from umf_ros.lab.simulation.pose_graphs import GraphWorld
 from umf_ros.pose_graph.closures import ClosureArrays
 from umf_ros.pose_graph.consistency import ConsistencyGraph, false_alarm_probability, likelihood_ratio

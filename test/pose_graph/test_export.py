@@ -22,12 +22,12 @@ from graph_worlds import (
 )
 
 from umf_ros.bags.trajectories import read_tum
-from umf_ros.errors import OutputError
-from umf_ros.geometry import make_pose
+from umf_ros.core.errors import OutputError
+from umf_ros.core.geometry import make_pose
 from umf_ros.lab.datasets.g2o import PERIOD_NS, as_recording, drive, read_g2o
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS
-from umf_ros.pose_graph.condensed import Edge
 from umf_ros.pose_graph.export import verdict_table, write_g2o
+from umf_ros.pose_graph.odometry_preintegration import Edge
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
 WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from umf_ros.errors import GraphError
-from umf_ros.geometry import Array, expmap, invert
+from umf_ros.core.errors import GraphError
+from umf_ros.core.geometry import Array, expmap, invert
 from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops
 from umf_ros.pose_graph import incremental
-from umf_ros.pose_graph.condensed import Edges, Graph, Optimizer
 from umf_ros.pose_graph.incremental import IncrementalOptimizer
+from umf_ros.pose_graph.odometry_preintegration import Edges, Graph, Optimizer
 
 WORLD = rover_loops(400, 10002)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from graph_worlds import SETTINGS, chain_of, closing, drive, feed_odometry, lap_pairs, tracked, two_laps
 
-from umf_ros.geometry import Array, expmap
+from umf_ros.core.geometry import Array, expmap
 from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops, with_wrong_closures
 from umf_ros.pose_graph.closures import ClosureArrays
 from umf_ros.pose_graph.consistency import squared_mahalanobis

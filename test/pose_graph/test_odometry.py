@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from graph_worlds import SETTINGS
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.geometry import Array, adjoint, expmap, invert, propagate, relative
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.geometry import Array, adjoint, expmap, invert, propagate, relative
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.pose_graph.odometry import OdometryChain
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from graph_worlds import SETTINGS, accepted, batch_optimum, drive, feed_odometry, right, rms
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.errors import GraphError
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, expmap, invert, make_pose
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.errors import GraphError
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, expmap, invert, make_pose
 from umf_ros.lab.datasets.g2o import read_g2o
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops, with_wrong_closures
 from umf_ros.pose_graph.closures import State
@@ -200,8 +200,8 @@ def test_two_sessions_are_joined_by_their_closures() -> None:
 def test_the_newest_pose_has_the_marginal_of_the_full_graph() -> None:
     import gtsam
 
-    from umf_ros.geometry import ros_to_gtsam_covariance
-    from umf_ros.pose_graph.condensed import Edge, between
+    from umf_ros.core.geometry import ros_to_gtsam_covariance
+    from umf_ros.pose_graph.odometry_preintegration import Edge, between
 
     world = rover_loops(300, 12)
     graph = drive(world)

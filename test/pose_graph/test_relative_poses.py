@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from graph_worlds import closing, drive, lap_pairs, two_laps
 
-from umf_ros.geometry import invert
+from umf_ros.core.geometry import invert
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
-from umf_ros.pose_graph.closures import Stops
-from umf_ros.pose_graph.condensed import Edge, between
+from umf_ros.pose_graph.closures import PoseSamples
+from umf_ros.pose_graph.odometry_preintegration import Edge, between
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
 
-def stop(graph: PoseGraph, *poses: int) -> Stops:
+def stop(graph: PoseGraph, *poses: int) -> PoseSamples:
     """Where poses of the first session are."""
     stamps = np.array(poses, np.int64) * PERIOD_NS
-    return Stops(np.zeros(len(poses), np.int64), stamps, graph._sessions.chains[0].at(stamps))
+    return PoseSamples(np.zeros(len(poses), np.int64), stamps, graph._sessions.chains[0].at(stamps))
 
 
 def test_the_bound_of_a_relative_covariance_is_never_below_the_true_one() -> None:

@@ -20,10 +20,10 @@ from graph_worlds import (
     two_laps,
 )
 
-from umf_ros.geometry import Array, expmap, invert
+from umf_ros.core.geometry import Array, expmap, invert
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.condensed import Edge, between
+from umf_ros.pose_graph.odometry_preintegration import Edge, between
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.sessions import CorrectedPath
 

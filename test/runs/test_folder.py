@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from umf_ros.errors import OutputError
+from umf_ros.core.errors import OutputError
 from umf_ros.runs.folder import check_writable, create_run_folder, write_atomically
 
 

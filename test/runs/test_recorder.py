@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from conftest import make_frame, make_keyframe
 
-from umf_ros.config import Settings, load_settings
-from umf_ros.errors import OutputError, UmfError
-from umf_ros.frames import Candidate, LoopClosure
-from umf_ros.geometry import make_pose
-from umf_ros.loop_detector import Detection
+from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.errors import OutputError, UmfError
+from umf_ros.core.frames import Candidate, LoopClosure
+from umf_ros.core.geometry import make_pose
+from umf_ros.detector import Detection
 from umf_ros.runs import recorder as recorder_module
 from umf_ros.runs.recorder import RunRecorder, count_drops, read_summary
 from umf_ros.runs.tables import read_closures

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from umf_ros.config import Settings, dump_settings, load_settings
-from umf_ros.errors import UmfError
+from umf_ros.core.config import Settings, dump_settings, load_settings
+from umf_ros.core.errors import UmfError
 from umf_ros.runs.resumption import PLACES, ReplayFolder
 
 BAG = Path("some.mcap")

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
-from umf_ros.config import load_settings
-from umf_ros.frames import Frame
-from umf_ros.geometry import make_pose, transform
+from umf_ros.core.config import load_settings
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import make_pose, transform
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.sensor_check import SensorCheck, SensorReport
 from umf_ros.runs.sensor_motion import MIN_PAIRS, Step, compare_motion
-from umf_ros.sensors.messages import OdometrySample
-from umf_ros.trajectory import Trajectory
+from umf_ros.sensors.decode import OdometrySample
 
 Drive = tuple[list[Frame], Trajectory]
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.errors import OutputError, UmfError
-from umf_ros.frames import Candidate, LoopClosure
-from umf_ros.geometry import make_pose
+from umf_ros.core.errors import OutputError, UmfError
+from umf_ros.core.frames import Candidate, LoopClosure
+from umf_ros.core.geometry import make_pose
 from umf_ros.runs.tables import (
     CANDIDATES,
     CLOSURES,

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.config import Loop
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, make_pose, relative, transform
+from umf_ros.core.config import Loop
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, make_pose, relative, transform
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.tables import KEYFRAMES, CsvTable
 from umf_ros.runs.truth import (
     JudgedRun,
@@ -23,7 +24,6 @@ from umf_ros.runs.truth import (
     positions_in_truth,
     trajectory_error,
 )
-from umf_ros.trajectory import Trajectory
 
 START_NS = 1_600_000_000 * 10**9
 RULES = Loop(min_time_gap_s=20, min_travel_m=15)
@@ -274,9 +274,9 @@ def test_revisits_are_counted_like_the_database_admits_them() -> None:
     yaws = [0] * 40 + [180] * 40 + [0] * 40
     poses = np.stack([place(x, 0, yaw) for x, yaw in zip(xs, yaws, strict=True)])
     stamps = np.arange(120) * 10**9
-    travelled = np.arange(120, dtype=float)
+    path_length = np.arange(120, dtype=float)
     rules = Loop(min_time_gap_s=20, min_travel_m=15)
-    assert find_revisits(stamps, poses, travelled, rules).sum() == 40
-    assert find_revisits(stamps, poses, travelled, rules, same_view=False).sum() > 60
+    assert find_revisits(stamps, poses, path_length, rules).sum() == 40
+    assert find_revisits(stamps, poses, path_length, rules, same_view=False).sum() > 60
     assert find_revisits(stamps, poses, np.full(120, np.nan), rules).sum() == 40
-    assert not find_revisits(stamps, poses, travelled, Loop(min_time_gap_s=1000)).any()
+    assert not find_revisits(stamps, poses, path_length, Loop(min_time_gap_s=1000)).any()

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from finished_runs import BELOW, candidate, closure, examined, stamp, trajectory
 
-from umf_ros.config import load_settings
+from umf_ros.core.config import load_settings
 from umf_ros.runs.descriptors import DescriptorFile
 from umf_ros.runs.findings import ExaminedRun
-from umf_ros.runs.why import Why
+from umf_ros.runs.why import ClosureDiagnosis
 from umf_ros.verification.verifier import NO_POSE, UNTESTED
 
 
@@ -21,7 +21,7 @@ def write_descriptors(folder: Path, descriptors: np.ndarray) -> None:
     file.close()
 
 
-def why(about: ExaminedRun, second: float) -> Why:
+def why(about: ExaminedRun, second: float) -> ClosureDiagnosis:
     row = about.places.row(stamp(second))
     assert row is not None
     return about.gates.explain(row)

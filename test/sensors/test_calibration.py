@@ -8,10 +8,10 @@ import pytest
 import yaml
 from recordings import CALIBRATION, camera_info
 
-from umf_ros.errors import CalibrationError
-from umf_ros.geometry import make_pose, transform
+from umf_ros.core.errors import CalibrationError
+from umf_ros.core.geometry import make_pose, transform
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.sensors.messages import decode_camera_info
+from umf_ros.sensors.decode import decode_camera_info
 from umf_ros.sensors.rectification import RawCamera, StereoRectifier
 
 DATASETS = ("simulated", "s3li-etna", "s3li-vulcano")

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from umf_ros.config import PoseGraphSettings, Settings, dump_settings
-from umf_ros.errors import OutputError, UmfError
-from umf_ros.frames import LoopClosure
+from umf_ros.core.config import PoseGraphSettings, Settings, dump_settings
+from umf_ros.core.errors import OutputError, UmfError
+from umf_ros.core.frames import LoopClosure
 from umf_ros.lab.live.live_graph import settle_left
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
 from umf_ros.pose_graph.journal import JOURNAL

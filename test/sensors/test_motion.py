@@ -6,7 +6,7 @@ import numpy as np
 from recordings import drive
 from scipy.spatial.transform import Rotation
 
-from umf_ros.geometry import Array, invert, make_pose, transform
+from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.sensors.assembly import deskew
 from umf_ros.sensors.buffers import OdometryBuffer
 

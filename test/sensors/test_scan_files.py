@@ -9,7 +9,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from umf_ros.errors import SensorFileError
+from umf_ros.core.errors import SensorFileError
 from umf_ros.sensors.scan_files import read_scan
 
 COUNT = 500

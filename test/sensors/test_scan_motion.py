@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.geometry import Array, make_pose
+from umf_ros.core.geometry import Array, make_pose
 from umf_ros.sensors.buffers import OdometryBuffer
 from umf_ros.sensors.scan_motion import UNKNOWN_NOISE, odometry_noise, scan_motion, twists
 

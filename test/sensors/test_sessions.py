@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from recordings import drive
 
-from umf_ros.geometry import Array, make_pose
-from umf_ros.sensors.odometry_feed import OdometryFeed
-from umf_ros.sensors.sessions import Arrival, Input, SessionClock
+from umf_ros.core.geometry import Array, make_pose
+from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
+from umf_ros.sensors.sessions import Input, SessionClock, StampedInput
 
 S = 10**9
 T0 = 1_625_680_800 * S
@@ -21,7 +21,7 @@ def ns(second: float) -> int:
 def heard(*messages: tuple[Input, float]) -> SessionClock:
     clock = SessionClock()
     for name, second in messages:
-        clock.take(Arrival(name, ns(second), np.eye(4)))
+        clock.take(StampedInput(name, ns(second), np.eye(4)))
     return clock
 
 
@@ -31,17 +31,17 @@ def heard(*messages: tuple[Input, float]) -> SessionClock:
 )
 def test_a_stamp_is_judged_by_its_own_input(second: float, fault: str, held: bool) -> None:
     clock = heard(("left", 5.0), ("cloud", 9.0))
-    usable = clock.take(Arrival("left", ns(second))).usable
+    usable = clock.take(StampedInput("left", ns(second))).usable
     assert [one.fault for one in usable] == ([] if held else [fault])
-    (first,) = clock.take(Arrival("odometry", ns(0), np.eye(4))).usable  # the first of its input
+    (first,) = clock.take(StampedInput("odometry", ns(0), np.eye(4))).usable  # the first of its input
     assert first.fault == "" and clock.session == 0
 
 
 def test_two_inputs_that_went_back_agree_and_the_clock_runs_anew() -> None:
     clock = heard(("left", 5.0), ("cloud", 9.0))
     assert (clock.elapsed_ns, clock.has_heard("cloud")) == (4 * S, True)
-    assert clock.take(Arrival("left", ns(0.5), "image")).usable == []
-    ruling = clock.take(Arrival("cloud", ns(0.6)))
+    assert clock.take(StampedInput("left", ns(0.5), "image")).usable == []
+    ruling = clock.take(StampedInput("cloud", ns(0.6)))
     assert (
         ruling.reset is not None and ruling.reset.of_clock and ruling.reset.reason == "the clock of the left went back"
     )
@@ -53,13 +53,13 @@ def test_what_comes_late_from_before_a_reset_is_stale() -> None:
     clock = heard(("left", 5.0), ("cloud", 9.0), ("left", 0.5), ("left", 0.6))
     assert clock.session == 1
     # nearer to the end of the session before than to the new beginning
-    assert [one.fault for one in clock.take(Arrival("cloud", ns(8.9))).usable] == ["stale"]
-    assert [one.fault for one in clock.take(Arrival("cloud", ns(0.7))).usable] == [""]
+    assert [one.fault for one in clock.take(StampedInput("cloud", ns(8.9))).usable] == ["stale"]
+    assert [one.fault for one in clock.take(StampedInput("cloud", ns(0.7))).usable] == [""]
 
 
 def test_what_is_still_held_at_the_end_was_wrong() -> None:
     clock = heard(("left", 5.0), ("odometry", 5.0), ("left", 1.0))
-    clock.take(Arrival("odometry", ns(5.1), make_pose(np.eye(3), [50, 0, 0])))
+    clock.take(StampedInput("odometry", ns(5.1), make_pose(np.eye(3), [50, 0, 0])))
     assert [(one.name, one.fault) for one in clock.give_up()] == [
         ("left", "clock jump"),
         ("odometry", "position jump"),
@@ -70,11 +70,11 @@ def test_what_is_still_held_at_the_end_was_wrong() -> None:
 def test_an_odometry_reset_leaves_the_other_inputs_in_line() -> None:
     clock = heard(("left", 5.0), ("odometry", 5.0))
     away = make_pose(np.eye(3), [50, 0, 0])
-    assert clock.take(Arrival("odometry", ns(5.1), away)).usable == []
-    assert [one.fault for one in clock.take(Arrival("left", ns(5.1))).usable] == [""]
-    ruling = clock.take(Arrival("odometry", ns(5.2), away))
+    assert clock.take(StampedInput("odometry", ns(5.1), away)).usable == []
+    assert [one.fault for one in clock.take(StampedInput("left", ns(5.1))).usable] == [""]
+    ruling = clock.take(StampedInput("odometry", ns(5.2), away))
     assert ruling.reset is not None and not ruling.reset.of_clock and len(ruling.usable) == 2
-    assert [one.fault for one in clock.take(Arrival("left", ns(5.1))).usable] == ["duplicate"]
+    assert [one.fault for one in clock.take(StampedInput("left", ns(5.1))).usable] == ["duplicate"]
 
 
 class Chains:
@@ -112,7 +112,7 @@ def test_a_process_that_hears_the_odometry_alone_finds_the_same_sessions_of_it(
     everything: list[tuple[float, Input]] = [(i / odometry_hz, "odometry") for i in range(25 * odometry_hz)]
     everything += [(i / 30 + 0.003, "left") for i in range(25 * 30)] + [(i / 4.7 + 0.21, "cloud") for i in range(117)]
     graph = Chains()
-    feed, clock = OdometryFeed(graph), SessionClock()
+    feed, clock = OdometrySessionSplitter(graph), SessionClock()
     sessions: list[list[int]] = [[]]
     for number, (second, name) in enumerate(sorted(everything)):
         stamp, pose = ns(clock_of(second)), drive(second)
@@ -121,7 +121,7 @@ def test_a_process_that_hears_the_odometry_alone_finds_the_same_sessions_of_it(
             stamp, pose = (12 * S, pose) if number == 500 else (stamp, make_pose(np.eye(3), [-90.0, 0, 0]))
         if name == "odometry":
             feed.take(stamp, pose)
-        ruling = clock.take(Arrival(name, stamp, pose))
+        ruling = clock.take(StampedInput(name, stamp, pose))
         if ruling.reset is not None:
             sessions.append([])
         sessions[-1] += [one.stamp_ns for one in ruling.usable if one.name == "odometry"]

@@ -5,12 +5,12 @@ import pytest
 from recordings import drive
 from streams import MS, OFFSET, T0, Measurement, S, check_accounts, feed, in_order, picture, points, rover, same
 
-from umf_ros.config import Sync
-from umf_ros.errors import MessageError
-from umf_ros.frames import Frame, StereoCamera
-from umf_ros.geometry import invert, transform
+from umf_ros.core.config import Sync
+from umf_ros.core.errors import MessageError
+from umf_ros.core.frames import Frame, StereoCamera
+from umf_ros.core.geometry import invert, transform
 from umf_ros.sensors.calibration import Calibration
-from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.synchronizer import INPUTS, Synchronizer
 
 

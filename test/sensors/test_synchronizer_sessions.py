@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from streams import T0, S, check_accounts, feed, in_order, rover, same
 
-from umf_ros.config import Sync
+from umf_ros.core.config import Sync
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.synchronizer import Synchronizer
 

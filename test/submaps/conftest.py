@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 from submaps_drives import Drive, drive, rough_ground
 
-from umf_ros.config import Database
+from umf_ros.core.config import Database
 from umf_ros.places.database import PlaceDatabase
 
 

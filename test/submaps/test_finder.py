@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from submaps_drives import Drive, drive, rough_ground
 
-from umf_ros.config import Database, Loop, Verification
-from umf_ros.geometry import invert, relative, rotation_angle
+from umf_ros.core.config import Database, Loop, Verification
+from umf_ros.core.geometry import invert, relative, rotation_angle
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
 from umf_ros.submaps.proposals import Proposal

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from umf_ros.config import Verification
+from umf_ros.core.config import Verification
 from umf_ros.verification import Verifier
 
 

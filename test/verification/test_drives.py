@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drives import DEPTH_STRIDE, Drive, kept, travelled, worlds
+from drives import DEPTH_STRIDE, Drive, kept, path_length, worlds
 from scenes import BODY_T_CAMERA
 from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import Frame, StereoCamera
-from umf_ros.geometry import Array, make_pose, relative
+from umf_ros.core.frames import Frame, StereoCamera
+from umf_ros.core.geometry import Array, make_pose, relative
 from umf_ros.lab.simulation.families import FAMILIES
 
 SQUARE = StereoCamera(224, 224, 190.0, 190.0, 112.0, 112.0, 0.2)
@@ -60,7 +60,7 @@ def test_error_is_measured_in_the_axes_of_the_match() -> None:
 
 def test_way_is_summed_along_the_path() -> None:
     path = np.array([make_pose(np.eye(3), place) for place in ([0, 0, 0], [3, 4, 0], [3, 4, 2])], float)
-    assert travelled(path).tolist() == [0, 5, 7]
+    assert path_length(path).tolist() == [0, 5, 7]
 
 
 def test_worlds_take_turns_in_family_and_aliasing() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from umf_ros.geometry import invert, make_pose, transform
+from umf_ros.core.geometry import invert, make_pose, transform
 from umf_ros.verification.free_space import RangeImage, Sight, visible
 
 RNG = np.random.default_rng(3)

@@ -7,8 +7,8 @@ import pytest
 from conftest import make_frame
 from scenes import landscape, pose_at, take
 
-from umf_ros.config import Verification
-from umf_ros.frames import Candidate, Frame, Keyframe
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Candidate, Frame, Keyframe
 from umf_ros.verification import Verifier, thin_frame
 from umf_ros.verification.constants import SCANS_KEPT
 from umf_ros.verification.prepared_scan import PreparedScan, ScanCache, prepare, prepare_frame
@@ -29,7 +29,7 @@ def frame_and_keyframe(stamp_s: float) -> tuple[Frame, Keyframe]:
 def test_a_scan_that_was_foreseen_is_the_keyframes_own_and_ready() -> None:
     frame, keyframe = frame_and_keyframe(100.0)
     scans = ScanCache()
-    scans.foresee(frame)
+    scans.prefetch(frame)
     scan = scans[keyframe]
     assert set(READY) <= set(vars(scan))  # nothing of it is made again
     other = prepare(keyframe)
@@ -42,10 +42,10 @@ def test_a_scan_that_was_foreseen_is_the_keyframes_own_and_ready() -> None:
 def test_a_foreseen_scan_is_nobody_elses() -> None:
     frame, keyframe = frame_and_keyframe(100.0)
     scans = ScanCache()
-    scans.foresee(frame)
+    scans.prefetch(frame)
     other = take(GROUND, THERE, 10.0)
     assert (scans[other].points == other.points).all()
-    scans.foresee(frame)
+    scans.prefetch(frame)
     scans.clear()  # stamps start over
     assert not set(READY) & set(vars(scans[keyframe]))
 
@@ -57,7 +57,7 @@ def test_verdicts_are_the_same_whether_or_not_the_scan_was_foreseen() -> None:
     for ahead in (True, False):
         verifier = Verifier(Verification(min_probability=0.0))
         if ahead:
-            verifier.foresee(frame)
+            verifier.prefetch(frame)
         found.append(verifier.verify(query, [(Candidate(0, match.stamp_ns, 0.7), match)])[0])
     (one, other) = found
     assert one.closure is not None and other.closure is not None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.geometry import make_pose, transform
+from umf_ros.core.geometry import make_pose, transform
 from umf_ros.verification.ransac import fit_homography, fit_rigid, kabsch
 
 HOMOGRAPHY = np.array([[0.95, 0.08, 12.0], [-0.05, 1.04, -7.0], [1e-4, -5e-5, 1.0]])

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.verification.surroundings import SIDE, Surroundings
 
 

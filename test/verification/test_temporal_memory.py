@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scenes import BODY_T_CAMERA, CAMERA, landscape, pose_at
 
-from umf_ros.frames import Embedding, Keyframe
-from umf_ros.geometry import make_pose, relative
+from umf_ros.core.frames import Embedding, Keyframe
+from umf_ros.core.geometry import make_pose, relative
 from umf_ros.verification.constants import MEMORY_KEYFRAMES
 from umf_ros.verification.hypotheses import TemporalMemory, prior_sigmas
 
@@ -92,7 +92,7 @@ def test_expected_place_needs_an_accepted_closure() -> None:
 def test_prior_is_soft_after_a_long_way_and_unknown_without_odometry() -> None:
     query, match, pose = pair(0.0)
     near = prior_sigmas(query, match, pose, drift=0.05)
-    far = prior_sigmas(replace(query, travelled_m=1000.0), match, pose, drift=0.05)
+    far = prior_sigmas(replace(query, path_length_m=1000.0), match, pose, drift=0.05)
     assert 0 < far < near / 5
     assert math.isnan(prior_sigmas(replace(query, odom_T_body=None), match, pose, drift=0.05))
     assert math.isnan(prior_sigmas(replace(query, session=3), match, pose, drift=0.05))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from conftest import make_frame
 
-from umf_ros.frames import Frame, Points, ScanMotion
+from umf_ros.core.frames import Frame, Points, ScanMotion
 from umf_ros.verification import thin_frame, thin_scan
 
 

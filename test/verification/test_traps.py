@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from traps import TRAPS, spring
 
-from umf_ros.config import Verification
-from umf_ros.frames import Candidate
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Candidate
 from umf_ros.verification import Verifier
-from umf_ros.verification.all_round import TurnedSurroundings, search
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.ransac import fit_homography
 from umf_ros.verification.rerank import mutual_neighbours, similarities
+from umf_ros.verification.yaw_search import RotatedElevationMap, search
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -61,7 +61,7 @@ def test_the_crowded_trap_is_a_real_one() -> None:
 def test_no_relief_no_pose_from_it(name: str) -> None:
     query, match = TRAPS[name](0)
     scan = PreparedScan(query.points)
-    assert not scan.usable or search(PreparedScan(match.points), TurnedSurroundings(scan)) == []
+    assert not scan.usable or search(PreparedScan(match.points), RotatedElevationMap(scan)) == []
 
 
 @pytest.mark.parametrize("name", list(TRAPS))
@@ -70,7 +70,7 @@ def test_neighbouring_keyframes_do_not_talk_a_trap_into_a_closure(name: str) -> 
     verifier = Verifier(Verification())
     query, match = TRAPS[name](0)
     for step in range(4):
-        here = replace(query, stamp_ns=query.stamp_ns + step, odom_T_body=np.eye(4), travelled_m=100.0)
-        there = replace(match, stamp_ns=match.stamp_ns + step, odom_T_body=np.eye(4), travelled_m=10.0)
+        here = replace(query, stamp_ns=query.stamp_ns + step, odom_T_body=np.eye(4), path_length_m=100.0)
+        there = replace(match, stamp_ns=match.stamp_ns + step, odom_T_body=np.eye(4), path_length_m=10.0)
         verdict = verifier.verify(here, [(Candidate(0, there.stamp_ns, 0.97), there)])[0]
         assert verdict.closure is None, verdict.numbers

@@ -9,17 +9,17 @@ from typing import Any
 from umf_ros.bags.presets import calibration_of, topics_of, uses_transforms
 from umf_ros.bags.reader import Bag, decode
 from umf_ros.bags.records import RawMessage
-from umf_ros.config import Settings, Topics
-from umf_ros.errors import BagError, MessageError, either
-from umf_ros.frames import Frame, Image
+from umf_ros.core.config import Settings, Topics
+from umf_ros.core.errors import BagError, MessageError, either
+from umf_ros.core.frames import Frame, Image
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.buffers import InputCounter
-from umf_ros.sensors.intake import Intake, wanted_inputs
+from umf_ros.sensors.decode import OdometrySample, stamp_ns
 from umf_ros.sensors.message_kinds import TYPES
-from umf_ros.sensors.messages import OdometrySample, stamp_ns
+from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.sessions import Input
-from umf_ros.sensors.static_transforms import TOPIC, Mounting, OdometryFrames, StaticTransforms
 from umf_ros.sensors.synchronizer import Synchronizer
-from umf_ros.trajectory import Trajectory
+from umf_ros.sensors.tf import TOPIC, OdometryFrames, StaticTransforms, TfExtrinsics
 
 _log = logging.getLogger(__name__)
 
@@ -67,9 +67,9 @@ class FrameReader:
         transforms = read_transforms(bag) if uses_transforms(settings) else None
         mounting, frames = None, None
         if transforms is not None and transforms.version:
-            mounting = Mounting(calibration, transforms, settings.frames.base, warn)
+            mounting = TfExtrinsics(calibration, transforms, settings.frames.base, warn)
             frames = OdometryFrames(settings.frames, transforms, warn)
-        self._intake = Intake(self._synchronizer, topics, warn, self._samples.append, mounting, frames)
+        self._intake = MessageRouter(self._synchronizer, topics, warn, self._samples.append, mounting, frames)
         if bag.warning:
             warn(bag.warning)
 
@@ -111,7 +111,7 @@ class _Cursor:
         self._trajectory = trajectory
         self._next = 0
 
-    def feed(self, intake: Intake, message: Any) -> None:
+    def feed(self, intake: MessageRouter, message: Any) -> None:
         """Add the poses up to the message's stamp that were not added before."""
         try:
             end_ns = stamp_ns(message)

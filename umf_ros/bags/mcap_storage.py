@@ -19,7 +19,7 @@ from zstandard import ZstdError, frame_content_size
 
 from umf_ros.bags.records import LARGEST_CHUNK, RawMessage, TopicInfo
 from umf_ros.bags.unpacking import unpack_lz4
-from umf_ros.errors import BagError, one_line
+from umf_ros.core.errors import BagError, one_line
 
 # what the mcap library and the decompressors raise on damaged data
 _DAMAGE = (McapError, struct.error, ZstdError, ValueError, RuntimeError, EOFError, LookupError, TypeError, MemoryError)

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from umf_ros.errors import BagError
-from umf_ros.frames import Frame
+from umf_ros.core.errors import BagError
+from umf_ros.core.frames import Frame
 
 REACH_NS = 10**9
 """A frame further than this from a moment is none of it."""

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from umf_ros.bags.reader import Bag
-from umf_ros.config import DatasetPreset, Settings, Topics, load_preset, load_settings
-from umf_ros.errors import BagError
-from umf_ros.resources import DEFAULT_DATASET, dataset_names
+from umf_ros.core.config import DatasetPreset, Settings, Topics, load_preset, load_settings
+from umf_ros.core.errors import BagError
+from umf_ros.core.resources import DEFAULT_DATASET, dataset_names
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
 GROUND_TRUTH_TOPIC = "/ground_truth/pose"

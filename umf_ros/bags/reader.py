@@ -9,7 +9,7 @@ from typing import Any
 
 from umf_ros.bags.records import RawMessage, Storage, message_types
 from umf_ros.bags.storages import open_storage
-from umf_ros.errors import BagError, MessageError, one_line, shortened
+from umf_ros.core.errors import BagError, MessageError, one_line, shortened
 
 
 class Bag:

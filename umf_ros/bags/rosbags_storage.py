@@ -19,7 +19,7 @@ from rosbags.serde import SerdeError
 
 from umf_ros.bags.records import RawMessage, TopicInfo, message_types
 from umf_ros.bags.unpacking import unpack_bz2, unpack_lz4
-from umf_ros.errors import BagError
+from umf_ros.core.errors import BagError
 
 _LIMITED: dict[Any, Any] = {bz2.decompress: unpack_bz2, lz4.frame.decompress: unpack_lz4}
 """What unpacks a chunk, and what does so with a limit."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from umf_ros.bags.mcap_storage import McapStorage
 from umf_ros.bags.records import Storage
 from umf_ros.bags.rosbags_storage import RosbagsStorage
-from umf_ros.errors import BagError
+from umf_ros.core.errors import BagError
 
 _MCAP, _SQLITE, _ROS1 = b"\x89MCAP0\r\n", b"SQLite format 3\x00", b"#ROSBAG V2.0"
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 
-from umf_ros.config import EmbeddingSettings
-from umf_ros.errors import UmfError
-from umf_ros.resources import LAB_PACKAGES
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.core.errors import UmfError
+from umf_ros.core.resources import LAB_PACKAGES
 
 TIMEOUT_S = 60
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from umf_ros.commands.recordings import ConfigPath, DatasetName, EmbedderName, WeightsPath
-from umf_ros.errors import ConfigError, UmfError
+from umf_ros.core.errors import ConfigError, UmfError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -59,8 +59,8 @@ def command(
     from umf_ros.comparison.comparer import Comparer
     from umf_ros.comparison.tables import read_pairs
     from umf_ros.comparison.views import KeyframeSource, ReadingRules
-    from umf_ros.config import load_settings
-    from umf_ros.loop_detector import make_detector_embedder
+    from umf_ros.core.config import load_settings
+    from umf_ros.detector import make_detector_embedder
 
     if pairs is not None:
         asked = read_pairs(pairs)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from umf_ros.commands.inspection import Inspected
-from umf_ros.config import Topics
-from umf_ros.errors import MessageError
-from umf_ros.geometry import Array, make_pose, to_quaternion
-from umf_ros.sensors.messages import decode_camera_info
-from umf_ros.sensors.static_transforms import TOPIC, StaticTransforms
+from umf_ros.core.config import Topics
+from umf_ros.core.errors import MessageError
+from umf_ros.core.geometry import Array, make_pose, to_quaternion
+from umf_ros.sensors.decode import decode_camera_info
+from umf_ros.sensors.tf import TOPIC, StaticTransforms
 
 OPTICAL = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """`body_T_camera` of a camera that looks ahead, at the origin: what stands in for a mounting nobody told."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 
 if TYPE_CHECKING:
     from psycopg import Connection
@@ -56,7 +56,7 @@ def _connected(server: str) -> Iterator[Connection]:
     """A connection whose faults are one line."""
     import psycopg
 
-    from umf_ros.config import SecretError, without_password
+    from umf_ros.core.config import SecretError, without_password
 
     try:
         with psycopg.connect(without_password(server), autocommit=True, connect_timeout=10) as connection:

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from umf_ros.bags.reader import Bag
 from umf_ros.commands.progress import WARNING
-from umf_ros.config import Settings
+from umf_ros.core.config import Settings
 from umf_ros.runs.finished_run import remember_recording
 from umf_ros.runs.inputs import absent_inputs, input_counts
 from umf_ros.sensors.buffers import InputCounter

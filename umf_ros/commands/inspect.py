@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from umf_ros.commands.recordings import BagPath, check_files
-from umf_ros.errors import OutputError
+from umf_ros.core.errors import OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -81,7 +81,7 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
 def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> None:
     from umf_ros.bags.frames import read_transforms
     from umf_ros.commands import first_settings
-    from umf_ros.errors import writing
+    from umf_ros.core.errors import writing
     from umf_ros.runs.folder import write_atomically
 
     settings, calibration = folder / "my_rover.yaml", folder / "my_calibration.yaml"

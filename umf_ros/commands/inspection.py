@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, decode
-from umf_ros.config import Settings, Topics
-from umf_ros.errors import MessageError, UmfError
+from umf_ros.core.config import Settings, Topics
+from umf_ros.core.errors import MessageError, UmfError
 from umf_ros.runs.inputs import Advice
+from umf_ros.sensors.decode import decode_camera_info, decode_odometry
 from umf_ros.sensors.message_kinds import CLOUD, COMPRESSED, IMAGE, LIVOX, decode_any_cloud, decode_any_image
-from umf_ros.sensors.messages import decode_camera_info, decode_odometry
 
 SAMPLES = 20
 """Messages of a topic that are decoded."""

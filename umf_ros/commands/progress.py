@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from umf_ros.loop_detector import Detection
+from umf_ros.detector import Detection
 
 Handler = Callable[[int, FrameType | None], Any] | int | signal.Handlers | None
 

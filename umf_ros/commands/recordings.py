@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from umf_ros.core.errors import BagError, ConfigError, UmfError, either
+from umf_ros.core.resources import dataset_names
 from umf_ros.embedding import CHOICES
-from umf_ros.errors import BagError, ConfigError, UmfError, either
-from umf_ros.resources import dataset_names
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.reader import Bag
-    from umf_ros.config import Settings
+    from umf_ros.core.config import Settings
 
 BagPath = Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")]
 ConfigPath = Annotated[Path | None, typer.Option("--config", help="Parameter file (YAML).")]

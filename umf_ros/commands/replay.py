@@ -23,7 +23,7 @@ from umf_ros.commands.recordings import (
     open_frames,
     open_recording,
 )
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.reader import Bag
     from umf_ros.commands.inputs import InputConsole
-    from umf_ros.config import Settings
+    from umf_ros.core.config import Settings
     from umf_ros.embedding.embedder import Embedder
 
 MinProbability = Annotated[
@@ -80,7 +80,7 @@ def command(
     from umf_ros.bags.trajectories import read_ground_truth
     from umf_ros.commands.inputs import InputConsole
     from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
-    from umf_ros.loop_detector import LoopDetector, make_detector_embedder
+    from umf_ros.detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
     from umf_ros.runs.recorder import count_drops
     from umf_ros.runs.report import finish_run
@@ -132,7 +132,7 @@ def command(
             viewer.finish(folder.path)
         inputs.remember(folder.path, reader.counters, interrupted(), odometry, odometry_frame)
         verdict = finish_run(folder.path, recording, console, ground_truth, inputs.told)
-    replay.confess()
+    replay.raise_if_frames_failed()
     raise typer.Exit(verdict.exit_code)
 
 
@@ -147,8 +147,8 @@ def _localize(
 ) -> int:
     """Find the rover of a recording in a map; 3 where it was not found."""
     from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.detector import LoopDetector
     from umf_ros.localization import LocalizingReplay
-    from umf_ros.loop_detector import LoopDetector
     from umf_ros.runs.finished_run import remember_recording
     from umf_ros.runs.folder import create_run_folder
     from umf_ros.runs.recorder import count_drops

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from umf_ros.commands.recordings import TruthPath, check_run
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from umf_ros.bags.reader import Bag
     from umf_ros.runs.findings import ExaminedRun
-    from umf_ros.runs.why import Why
+    from umf_ros.runs.why import ClosureDiagnosis
 
 SHOWN = 8
 """Candidates and criteria in the terminal."""
@@ -62,7 +62,7 @@ def _stamp(text: str, start_ns: int) -> int:
     return moment if isinstance(moment, int) else start_ns + round(moment * 1e9)
 
 
-def _tell(console: Console, about: ExaminedRun, row: int, why: Why) -> None:
+def _tell(console: Console, about: ExaminedRun, row: int, why: ClosureDiagnosis) -> None:
     from rich.markup import escape
     from rich.table import Table
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from umf_ros.comparison.views import KeyframeSource, PlaceView
-from umf_ros.config import Verification
-from umf_ros.errors import SensorFileError, UmfError
-from umf_ros.frames import Candidate, Keyframe, LoopClosure
+from umf_ros.core.config import Verification
+from umf_ros.core.errors import SensorFileError, UmfError
+from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.verification import Verdict, Verifier
 
 NO_CALIBRATION = "no calibration: images alone give no pose without one"
@@ -80,7 +80,7 @@ class Comparer:
 def judge(verifier: Verifier, match: Keyframe, query: Keyframe) -> Verdict:
     """The verdict about one pair of keyframes: the way between them and earlier pairs are left out."""
     match, query = (
-        replace(keyframe, stamp_ns=stamp_ns, odom_T_body=None, travelled_m=float("nan"), session=0)
+        replace(keyframe, stamp_ns=stamp_ns, odom_T_body=None, path_length_m=float("nan"), session=0)
         for stamp_ns, keyframe in enumerate((match, query), 1)
     )
     verifier.reset()

@@ -11,8 +11,8 @@ import numpy as np
 
 from umf_ros.comparison.comparer import Comparison
 from umf_ros.comparison.views import PlaceView
-from umf_ros.errors import ConfigError
-from umf_ros.geometry import to_quaternion
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.geometry import to_quaternion
 
 Pair = tuple[PlaceView, PlaceView]
 Row = dict[str, Any]

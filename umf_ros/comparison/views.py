@@ -11,10 +11,10 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.moments import Moment, nearest_frames, parse_moment, split_reference
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
+from umf_ros.core.errors import SensorFileError, UmfError
+from umf_ros.core.frames import Frame, Keyframe
+from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.errors import SensorFileError, UmfError
-from umf_ros.frames import Frame, Keyframe
-from umf_ros.loop_detector import make_keyframe
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.scan_files import OUT_OF_REACH, read_scan
 from umf_ros.sensors.snapshots import UNCALIBRATED, fit_image, make_snapshot, read_image

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import pkgutil
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from umf_ros.errors import ConfigError, either
+from umf_ros.core.errors import ConfigError, either
 
 if TYPE_CHECKING:
-    from umf_ros.config import EmbeddingSettings
+    from umf_ros.core.config import EmbeddingSettings
     from umf_ros.embedding.embedder import Embedder
 
 SUFFIX = "_embedder"
@@ -23,7 +24,8 @@ OWN_FEATURES = "umf"
 
 def find_methods() -> tuple[str, ...]:
     """Names of the methods that have a file here, the default first."""
-    names = (module.name for module in pkgutil.iter_modules(__path__) if module.name.endswith(SUFFIX))
+    folders = [*__path__, str(Path(__file__).parents[1] / "baselines")]
+    names = (module.name for module in pkgutil.iter_modules(folders) if module.name.endswith(SUFFIX))
     return tuple(sorted((name.removesuffix(SUFFIX) for name in names), key=lambda name: (name != DEFAULT, name)))
 
 
@@ -46,10 +48,11 @@ def make_embedder(settings: EmbeddingSettings, super_features: bool = False, fea
     """
     if settings.method not in METHODS:
         raise ConfigError(f"embedding.method: unknown method {settings.method!r}; known: {', '.join(METHODS)}")
-    from umf_ros.embedding.embedder import Asked
+    from umf_ros.embedding.embedder import FeatureRequest
 
-    asked = Asked(image=features == OWN_FEATURES, supers=super_features)
-    embedder: Embedder = import_module(f"{__name__}.{settings.method}{SUFFIX}").make(settings, asked)
+    asked = FeatureRequest(image=features == OWN_FEATURES, supers=super_features)
+    package = __name__ if settings.method == DEFAULT else "umf_ros.baselines"
+    embedder: Embedder = import_module(f"{package}.{settings.method}{SUFFIX}").make(settings, asked)
     if asked.image:
         return embedder
     from umf_ros.embedding.image_features import with_xfeat

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from umf_ros.frames import Embedding, Frame, Image, LocalFeatures, Points, StereoCamera
-from umf_ros.geometry import Array, transform
+from umf_ros.core.frames import Embedding, Frame, Image, LocalFeatures, Points, StereoCamera
+from umf_ros.core.geometry import Array, transform
 
 NEIGHBOURS = 4  # LiDAR returns that vote on a pixel's depth
 MAX_SPREAD = 0.1  # relative depth difference above which they lie on different surfaces

@@ -6,11 +6,11 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from umf_ros.frames import Embedding, Frame, Points
-from umf_ros.geometry import Array
+from umf_ros.core.frames import Embedding, Frame, Points
+from umf_ros.core.geometry import Array
 
 
-class Asked(NamedTuple):
+class FeatureRequest(NamedTuple):
     """Which local features an embedder is asked for, of those that it has; what is not asked for costs nothing.
 
     Attributes:

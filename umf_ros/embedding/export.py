@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from umf_ros.errors import OutputError
+from umf_ros.core.errors import OutputError
 
 if TYPE_CHECKING:
     from torch import nn

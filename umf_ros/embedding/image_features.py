@@ -11,15 +11,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.config import EmbeddingSettings
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.core.frames import Embedding, Frame, Image, LocalFeatures, Points
+from umf_ros.core.geometry import Array
+from umf_ros.core.resources import find
 from umf_ros.embedding.depth import lift_features
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.inputs import is_blank
 from umf_ros.embedding.runtimes import XFeatRuntime, make_xfeat_runtime
-from umf_ros.frames import Embedding, Frame, Image, LocalFeatures, Points
-from umf_ros.geometry import Array
 from umf_ros.networks.config import XFEAT_CELL, XFEAT_STRIDE
-from umf_ros.resources import find
 
 WEIGHTS = "models/xfeat.safetensors"
 LIMIT = 500

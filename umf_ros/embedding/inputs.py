@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from umf_ros.core.frames import Frame, Image, Points
+from umf_ros.core.geometry import transform
+from umf_ros.core.levelling import level
 from umf_ros.embedding.voxels import VoxelScan, voxelise
-from umf_ros.frames import Frame, Image, Points
-from umf_ros.geometry import transform
-from umf_ros.levelling import level
 from umf_ros.networks.config import NetworkConfig
 
 

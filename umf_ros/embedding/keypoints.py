@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.frames import Points
+from umf_ros.core.frames import Points
 
 
 def select_salient(saliency: Points, group: NDArray[np.int64], threshold: float, limit: int) -> NDArray[np.int64]:

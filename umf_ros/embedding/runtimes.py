@@ -10,12 +10,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.embedder import Asked
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.frames import Points
+from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.export import cached, kept_or_made, openvino_core
 from umf_ros.embedding.inputs import InputArrays
-from umf_ros.errors import ConfigError
-from umf_ros.frames import Points
 
 Outputs = dict[str, NDArray[np.float32]]
 
@@ -24,7 +24,7 @@ OUTPUTS = ("descriptor", "image", "image_saliency", "cloud", "cloud_saliency")
 SUPERS = ("super_image", "super_image_strength", "super_cloud", "super_cloud_strength")
 
 
-def outputs_of(asked: Asked) -> tuple[str, ...]:
+def outputs_of(asked: FeatureRequest) -> tuple[str, ...]:
     """Names of the network's outputs that are needed: the others are not computed."""
     own = tuple(name for name in OUTPUTS if asked.image or not name.startswith("image"))
     return own + (SUPERS if asked.supers else ())
@@ -65,7 +65,7 @@ class OpenVinoRuntime:
         return dict(zip(self._outputs, values, strict=True))
 
 
-def make_runtime(weights: Path, settings: EmbeddingSettings, asked: Asked) -> Runtime:
+def make_runtime(weights: Path, settings: EmbeddingSettings, asked: FeatureRequest) -> Runtime:
     """The runtime that the settings name; "auto" prefers OpenVINO on a CPU where it is installed.
 
     Args:

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.frames import Points
 from umf_ros.embedding.export import convert
 from umf_ros.embedding.inputs import InputArrays, blank_input
-from umf_ros.errors import ConfigError
-from umf_ros.frames import Points
 from umf_ros.networks.umf import UMF, NetworkInput, NetworkOutput
 from umf_ros.networks.weights import load_weights
 from umf_ros.networks.xfeat import load_xfeat

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.embedder import Asked
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.core.frames import Embedding, Frame, LocalFeatures, Points, SuperFeatures
+from umf_ros.core.geometry import Array, invert, transform
+from umf_ros.core.levelling import level
+from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.inputs import is_blank, pack, prepare_image, prepare_scan
 from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_salient
 from umf_ros.embedding.runtimes import Outputs, make_runtime
 from umf_ros.embedding.voxels import VoxelScan
-from umf_ros.frames import Embedding, Frame, LocalFeatures, Points, SuperFeatures
-from umf_ros.geometry import Array, invert, transform
-from umf_ros.levelling import level
 from umf_ros.networks.weights_files import locate_weights, read_config
 
 KEYPOINTS = 400
@@ -44,7 +44,7 @@ class UmfEmbedder:
         self,
         weights: Path | None = None,
         settings: EmbeddingSettings | None = None,
-        asked: Asked = Asked(),  # noqa: B008 (a tuple)
+        asked: FeatureRequest = FeatureRequest(),  # noqa: B008 (a tuple)
     ) -> None:
         path = locate_weights(weights)
         self._config = read_config(path)
@@ -92,7 +92,7 @@ class UmfEmbedder:
         return image, SuperFeatures(found["super_cloud"].astype(np.float16), found["super_cloud_strength"])
 
 
-def make(settings: EmbeddingSettings, asked: Asked) -> UmfEmbedder:
+def make(settings: EmbeddingSettings, asked: FeatureRequest) -> UmfEmbedder:
     """With the weights that the settings name."""
     return UmfEmbedder(Path(settings.weights) if settings.weights else None, settings, asked)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.frames import Points
+from umf_ros.core.frames import Points
 
 ORIGIN_M = np.array([0.0, -20.0, -6.0], np.float32)
 VOXEL_M = np.array([1.0, 1.0, 0.3], np.float32)

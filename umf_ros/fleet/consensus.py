@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from umf_ros.frames import Keyframe, LoopClosure
-from umf_ros.geometry import invert, relative, rotation_angle
+from umf_ros.core.frames import Keyframe, LoopClosure
+from umf_ros.core.geometry import invert, relative, rotation_angle
 
 APART_M = 8.0
 """Closures nearer to each other along the way show one place: what misleads one misleads the other (*by hand*)."""
@@ -65,8 +65,8 @@ class FleetConsensus:
             return False
         here, there = relative(query_one, query_other), relative(match_one, match_other)
         ways = [float(np.linalg.norm(move[:3, 3])) for move in (here, there)]
-        driven = abs(one.query.travelled_m - other.query.travelled_m)
-        driven += abs(one.match.travelled_m - other.match.travelled_m)
+        driven = abs(one.query.path_length_m - other.query.path_length_m)
+        driven += abs(one.match.path_length_m - other.match.path_length_m)
         if min(ways) < APART_M or driven > REACH_M:
             return False
         predicted = invert(there) @ one.closure.match_T_query @ here

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from umf_ros.config import Database
+from umf_ros.core.config import Database
+from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.fleet.server import FleetKey, FleetServer, LinkError, OutgoingPlace
-from umf_ros.frames import Candidate, Keyframe
 from umf_ros.places.packing import pack, unpack
 from umf_ros.places.store import KeyframeStore
 
@@ -188,4 +188,4 @@ class FleetLink:
 
 def _outgoing(keyframe: Keyframe) -> OutgoingPlace:
     descriptor = np.asarray(keyframe.embedding.descriptor, np.float32)
-    return OutgoingPlace(keyframe.session, keyframe.stamp_ns, keyframe.travelled_m, descriptor, pack(keyframe))
+    return OutgoingPlace(keyframe.session, keyframe.stamp_ns, keyframe.path_length_m, descriptor, pack(keyframe))

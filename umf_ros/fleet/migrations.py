@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from psycopg import Connection, sql
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 
 ROVERS = "umf_rover"
 """The group of all rovers: whoever is in it reads everything and adds rows of its own name, and no more."""

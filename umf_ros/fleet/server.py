@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pgvector import HalfVector
 from pgvector.psycopg import register_vector
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 from umf_ros.fleet.migrations import MIGRATIONS, version_of
 
 LOOKED_AT = 100
@@ -56,14 +56,14 @@ class OutgoingPlace:
 
     Attributes:
         session, stamp_ns: its key in its store.
-        travelled_m: metres driven, NaN where they are unknown.
+        path_length_m: metres driven, NaN where they are unknown.
         descriptor: (D,) float32.
         data: the keyframe, packed.
     """
 
     session: int
     stamp_ns: int
-    travelled_m: float
+    path_length_m: float
     descriptor: NDArray[np.float32]
     data: bytes
 
@@ -114,7 +114,7 @@ class FleetServer:
         """
         key = [(self._store, place.session, place.stamp_ns) for place in places]
         rows = [
-            (*one, None if np.isnan(place.travelled_m) else place.travelled_m, HalfVector(place.descriptor))
+            (*one, None if np.isnan(place.path_length_m) else place.path_length_m, HalfVector(place.descriptor))
             for one, place in zip(key, places, strict=True)
         ]
         with _link(), self._connection.transaction(), self._connection.cursor() as cursor:

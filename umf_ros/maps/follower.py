@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.config import Settings
-from umf_ros.errors import GraphError, writing
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array
+from umf_ros.core.config import Settings
+from umf_ros.core.errors import GraphError, writing
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.maps.localizer import Localization, Localizer
 from umf_ros.maps.outputs import read_poses
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.sensors.odometry_feed import OdometryFeed
+from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
 from umf_ros.sensors.sessions import Reset
-from umf_ros.trajectory import Trajectory, write_tum
 
 Stamps = NDArray[np.int64]
 _SPACING_M = 0.25
@@ -139,7 +139,7 @@ class MapFollower:
 
     def _begin(self) -> None:
         self._localizer = Localizer(read_poses(Path(self._settings.map)), self._settings.pose_graph)
-        self.feed = OdometryFeed(self._localizer)
+        self.feed = OdometrySessionSplitter(self._localizer)
         self._way: list[Localization] = []
         self._verdicts: Counter[State] = Counter()
         self.counts: Counter[str] = Counter()

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
 from umf_ros.maps.odometry_log import OdometryLog
 from umf_ros.pose_graph.closures import ClosureVerdict, State

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.errors import GraphError
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import (
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.errors import GraphError
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import (
     Array,
     adjoint,
     expmap,
@@ -23,8 +23,8 @@ from umf_ros.geometry import (
     relative,
     rotation_angle,
 )
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import check_closure, check_pose
-from umf_ros.trajectory import Trajectory
 
 BELIEVED = log(0.999 / 0.001)
 """A pose is told from these odds on, nats (*by hand*: one wrong in a thousand)."""

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from umf_ros.config import Settings, dump_settings, load_settings
-from umf_ros.errors import UmfError, writing
+from umf_ros.core.config import Settings, dump_settings, load_settings
+from umf_ros.core.errors import UmfError, writing
 from umf_ros.places.database import PLACES_OF_MAP
 from umf_ros.runs.folder import write_atomically
 

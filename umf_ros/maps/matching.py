@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from umf_ros.config import Settings
-from umf_ros.frames import Keyframe
+from umf_ros.core.config import Settings
+from umf_ros.core.frames import Keyframe
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verdict, Verifier
 

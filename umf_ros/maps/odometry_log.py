@@ -9,12 +9,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.errors import UmfError, writing
-from umf_ros.geometry import Array
+from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.pose_graph import PoseGraph
-from umf_ros.sensors.messages import OdometrySample
-from umf_ros.sensors.odometry_feed import OdometryFeed
-from umf_ros.trajectory import Trajectory
+from umf_ros.sensors.decode import OdometrySample
+from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
 
 NAME = "odometry.npz"
 Item = TypeVar("Item")
@@ -65,7 +65,7 @@ class OdometryLog:
     def feed(self, graph: PoseGraph, shift_ns: int) -> None:
         """Give every message to a graph whose newest session is empty, on another clock."""
         if not self.covariances:
-            feed = OdometryFeed(graph)
+            feed = OdometrySessionSplitter(graph)
             for stamp, pose in zip(self.stamps, self.poses, strict=True):
                 feed.take(stamp + shift_ns, pose)
             return

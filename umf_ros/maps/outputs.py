@@ -13,8 +13,9 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from umf_ros.errors import UmfError, writing
-from umf_ros.geometry import Array
+from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.maps.joint_graph import JointMap, JointSession
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.point_cloud import Crispness, write_cloud
@@ -23,7 +24,6 @@ from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.export import verdict_table
 from umf_ros.runs.folder import write_atomically
 from umf_ros.runs.plots import plot_trajectories
-from umf_ros.trajectory import Trajectory, write_tum
 
 POSES = "poses.npz"
 """Every place that has a pose in the map: `stamps` (N,) on the map's clock, `poses` (N, 4, 4) `map_T_body`."""

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from umf_ros.errors import writing
-from umf_ros.frames import Points
-from umf_ros.geometry import Array, invert, transform
+from umf_ros.core.errors import writing
+from umf_ros.core.frames import Points
+from umf_ros.core.geometry import Array, invert, transform
 from umf_ros.maps.joint_graph import JointMap
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.places.database import PlaceDatabase

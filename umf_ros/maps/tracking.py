@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from umf_ros.config import Verification
-from umf_ros.frames import Candidate, Keyframe
-from umf_ros.geometry import Array
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Candidate, Keyframe
+from umf_ros.core.geometry import Array
 from umf_ros.maps.odometry_log import OdometryLog
 from umf_ros.verification import Verifier
 
@@ -37,7 +37,7 @@ def track(keyframes: Iterable[Keyframe], settings: Verification) -> tuple[Odomet
             step, covariance = found
             pose, way_m = pose @ step, way_m + float(np.linalg.norm(step[:3, 3]))
         log.append(keyframe.stamp_ns, pose, covariance)
-        tracked.append(replace(keyframe, odom_T_body=pose, travelled_m=way_m, session=session))
+        tracked.append(replace(keyframe, odom_T_body=pose, path_length_m=way_m, session=session))
     return log, tracked
 
 

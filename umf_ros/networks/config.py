@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
-from umf_ros.errors import WeightsError, one_line
+from umf_ros.core.errors import WeightsError, one_line
 
 XFEAT_CELL = 8
 """Pixels along a side of the cell that one descriptor of XFeat stands for."""

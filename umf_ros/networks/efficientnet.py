@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from umf_ros.errors import WeightsError
+from umf_ros.core.errors import WeightsError
 
 EPSILON = 1e-3
 """Of the batch normalisations that are folded."""

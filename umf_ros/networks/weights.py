@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from umf_ros.errors import WeightsError
+from umf_ros.core.errors import WeightsError
 from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import UMF, channels_last
 from umf_ros.networks.weights_files import open_weights, parse_architecture

@@ -10,9 +10,9 @@ from typing import Any
 
 from safetensors import safe_open
 
-from umf_ros.errors import WeightsError, one_line, shortened
+from umf_ros.core.errors import WeightsError, one_line, shortened
+from umf_ros.core.resources import find
 from umf_ros.networks.config import NetworkConfig
-from umf_ros.resources import find
 
 SHIPPED = ("umf_scene", "umf_light")
 DEFAULT = "umf_scene"

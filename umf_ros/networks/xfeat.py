@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from umf_ros.errors import WeightsError
+from umf_ros.core.errors import WeightsError
 from umf_ros.networks.config import XFEAT_CELL
 
 DESCRIPTOR = 64

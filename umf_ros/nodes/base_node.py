@@ -18,8 +18,8 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
-from umf_ros.config import Settings, Topics
-from umf_ros.errors import MessageError, OutputError, UmfError
+from umf_ros.core.config import Settings, Topics
+from umf_ros.core.errors import MessageError, OutputError, UmfError
 from umf_ros.nodes.conversions import from_time
 from umf_ros.nodes.diagnostics import WARN, Heartbeat, InputWatch, Throttle
 from umf_ros.nodes.parameters import changed_settings, declare

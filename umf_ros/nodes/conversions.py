@@ -13,10 +13,10 @@ from nav_msgs.msg import Odometry
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
-from umf_ros.errors import MessageError
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, to_quaternion
-from umf_ros.sensors.messages import LAST_STAMP_NS, decode_pose
+from umf_ros.core.errors import MessageError
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, to_quaternion
+from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose
 
 GREEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.5)

@@ -14,24 +14,24 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
 from umf_ros.bags.presets import calibration_of, topics_of, uses_transforms
-from umf_ros.config import Settings
-from umf_ros.frames import Frame, LoopClosure
-from umf_ros.geometry import rotation_angle
-from umf_ros.loop_detector import Detection, LoopDetector, make_detector_embedder
-from umf_ros.nodes.announcer import Announcer
+from umf_ros.core.config import Settings
+from umf_ros.core.frames import Frame, LoopClosure
+from umf_ros.core.geometry import rotation_angle
+from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.nodes.base_node import BaseNode
+from umf_ros.nodes.closure_publisher import ClosurePublisher
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
 from umf_ros.nodes.process import leave, run
 from umf_ros.nodes.qos import sensor_qos
 from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.nodes.worker import Worker
 from umf_ros.runs.recorder import RunRecorder, count_drops
-from umf_ros.sensors.intake import Intake, wanted_inputs
-from umf_ros.sensors.static_transforms import PATIENCE_S, Mounting, OdometryFrames, StaticTransforms
+from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
+from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms, TfExtrinsics
 
 if TYPE_CHECKING:
-    from umf_ros.fleet.encounters import Encounter
+    from umf_ros.fleet.inter_robot_closures import InterRobotClosure
 
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
 INTAKE_QUEUE = 400
@@ -63,12 +63,14 @@ class LoopClosureNode(BaseNode):
         self._synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(topics), warn)
         transforms = StaticTransforms()
         self._odometry_frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
-        mounting = Mounting(calibration, transforms, settings.frames.base, warn) if uses_transforms(settings) else None
+        mounting = (
+            TfExtrinsics(calibration, transforms, settings.frames.base, warn) if uses_transforms(settings) else None
+        )
         frames = self._odometry_frames
-        self._intake = Intake(self._synchronizer, topics, warn, mounting=mounting, odometry_frames=frames)
+        self._intake = MessageRouter(self._synchronizer, topics, warn, mounting=mounting, odometry_frames=frames)
         folder = Path(self._results)
         self._recorder = RunRecorder(folder, settings, embedder.name) if self._results else None
-        self._announcer = Announcer(self, settings.frames)
+        self._announcer = ClosurePublisher(self, settings.frames)
         self._lock = threading.Lock()
         self._paused = False
         self._wanted: Settings | None = None
@@ -134,16 +136,16 @@ class LoopClosureNode(BaseNode):
         if self._recorder is not None:
             self._recorder.record(frame, detection)
         with self._lock:
-            encounter = self._detector.meet()
-        if encounter is not None:
-            self._meet(encounter)
+            inter_closure = self._detector.meet()
+        if inter_closure is not None:
+            self._meet(inter_closure)
 
-    def _meet(self, encounter: Encounter) -> None:
+    def _meet(self, inter_closure: InterRobotClosure) -> None:
         """Tell of the closures with another rover of the fleet."""
-        self._announcer.announce_encounter(encounter)
-        self._between += len(encounter.closures)
+        self._announcer.announce_encounter(inter_closure)
+        self._between += len(inter_closure.closures)
         if self._recorder is not None:
-            self._recorder.record_encounter(encounter)
+            self._recorder.record_encounter(inter_closure)
 
     def _drops(self) -> dict[str, int]:
         return count_drops(self._synchronizer.counters, self._worker.dropped + self._decoder.dropped)
@@ -185,9 +187,9 @@ class LoopClosureNode(BaseNode):
 
     def _fleet(self) -> dict[str, Any]:
         """How the fleet's server is doing, where there is one."""
-        if self._detector.encounters is None:
+        if self._detector.inter_robot is None:
             return {}
-        link = self._detector.encounters.link
+        link = self._detector.inter_robot.link
         known = {"fleet_connected": link.connected, "fleet_waiting": link.waiting(), "fleet_pushed": link.pushed}
         return {**known, "fleet_closures": self._between, "fleet_trouble": link.trouble or "none"}
 

@@ -13,8 +13,8 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from umf_ros.config import Settings, nest, parse_settings
-from umf_ros.errors import ConfigError
+from umf_ros.core.config import Settings, nest, parse_settings
+from umf_ros.core.errors import ConfigError
 
 # parameters rclpy itself brings along
 BUILT_IN = ("use_sim_time", "qos_overrides", "start_type_description_service")

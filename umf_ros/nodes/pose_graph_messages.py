@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from umf_ros.config import Frames
-from umf_ros.geometry import Array
+from umf_ros.core.config import FrameIds
+from umf_ros.core.geometry import Array
 from umf_ros.nodes import conversions
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 
@@ -19,7 +19,7 @@ MAX_POSES = 2000
 MAX_LINES = 500
 
 
-def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: Frames) -> Path:
+def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: FrameIds) -> Path:
     """The trajectory as a path, evenly thinned to at most `MAX_POSES` poses."""
     if not len(stamps_ns):
         return Path(header=Header(frame_id=frames.map))
@@ -28,7 +28,7 @@ def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: Frames) -> Pat
     return Path(header=conversions.to_header(int(stamps_ns[-1]), frames.map), poses=poses)
 
 
-def pose(stamp_ns: int, map_T_body: Array, covariance: Array, frames: Frames) -> PoseWithCovarianceStamped:
+def pose(stamp_ns: int, map_T_body: Array, covariance: Array, frames: FrameIds) -> PoseWithCovarianceStamped:
     """A pose in the map with its (6, 6) covariance in ROS order."""
     message = PoseWithCovarianceStamped(header=conversions.to_header(stamp_ns, frames.map))
     message.pose.pose = conversions.to_pose(map_T_body)
@@ -36,7 +36,7 @@ def pose(stamp_ns: int, map_T_body: Array, covariance: Array, frames: Frames) ->
     return message
 
 
-def transform(stamp_ns: int, map_T_odom: Array, frames: Frames) -> TransformStamped:
+def transform(stamp_ns: int, map_T_odom: Array, frames: FrameIds) -> TransformStamped:
     """`map_T_odom` as a transform."""
     message = TransformStamped(header=conversions.to_header(stamp_ns, frames.map), child_frame_id=frames.odom)
     rigid = conversions.to_pose(map_T_odom)
@@ -45,7 +45,7 @@ def transform(stamp_ns: int, map_T_odom: Array, frames: Frames) -> TransformStam
     return message
 
 
-def markers(verdicts: list[ClosureVerdict], lines: Array, stamp_ns: int, frames: Frames) -> MarkerArray:
+def markers(verdicts: list[ClosureVerdict], lines: Array, stamp_ns: int, frames: FrameIds) -> MarkerArray:
     """Closures as lines from match to query: accepted green, the others red."""
     accepted = np.array([verdict.state is State.ACCEPTED for verdict in verdicts], bool)
     header = conversions.to_header(stamp_ns, frames.map)

@@ -22,9 +22,9 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from umf_ros.bags.presets import topics_of
-from umf_ros.config import Settings
-from umf_ros.errors import UmfError
-from umf_ros.geometry import Array
+from umf_ros.core.config import Settings
+from umf_ros.core.errors import UmfError
+from umf_ros.core.geometry import Array
 from umf_ros.maps.follower import MapFollower
 from umf_ros.nodes import pose_graph_messages as messages
 from umf_ros.nodes.base_node import BaseNode
@@ -36,9 +36,9 @@ from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.nodes.worker import Worker
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.journal import JOURNAL
+from umf_ros.sensors.decode import OdometrySample, decode_odometry
 from umf_ros.sensors.durable_graph import DurableGraph
-from umf_ros.sensors.messages import OdometrySample, decode_odometry
-from umf_ros.sensors.static_transforms import PATIENCE_S, OdometryFrames, StaticTransforms
+from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works

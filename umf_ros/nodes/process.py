@@ -17,7 +17,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from umf_ros.errors import ConfigError, UmfError, one_line
+from umf_ros.core.errors import ConfigError, UmfError, one_line
 
 LONGEST_WAIT_S = 60.0
 """So long a node that was asked to end may wait for those that it hears."""

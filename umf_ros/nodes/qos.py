@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
-from umf_ros.config import Qos
+from umf_ros.core.config import Qos
 
 # with their history: a SLAM system that joins late gets every closure and verdict of the run
 CLOSURES_QOS = QoSProfile(

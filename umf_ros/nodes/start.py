@@ -18,8 +18,8 @@ def start(module: str) -> None:
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))  # nothing is made yet that could be lost
-    from umf_ros.errors import UmfError
-    from umf_ros.resources import check_packages
+    from umf_ros.core.errors import UmfError
+    from umf_ros.core.resources import check_packages
 
     try:
         check_packages()

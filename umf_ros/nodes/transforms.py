@@ -8,7 +8,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
-from umf_ros.sensors.static_transforms import TOPIC, StaticTransforms
+from umf_ros.sensors.tf import TOPIC, StaticTransforms
 
 # latched by every broadcaster, each with its own part of the tree
 QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)

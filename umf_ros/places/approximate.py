@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.errors import writing
+from umf_ros.core.errors import writing
 from umf_ros.places.codes import CodeTable, Rows, Scores
 from umf_ros.places.projection import principal_axes
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.errors import OutputError, writing
+from umf_ros.core.errors import OutputError, writing
 from umf_ros.places.codes import CodeTable, Records
 from umf_ros.places.index import Fetch
 from umf_ros.places.store import Keys

@@ -7,7 +7,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.places.columns import Columns
 
 BLOCK = 1024

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.config import Database, Loop
-from umf_ros.errors import UmfError
-from umf_ros.frames import Candidate, Keyframe
-from umf_ros.keyframes import is_past
+from umf_ros.core.config import Database, Loop
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Candidate, Keyframe
+from umf_ros.core.keyframes import is_past
 from umf_ros.places.codes import Rows
 from umf_ros.places.index import Mask
 from umf_ros.places.search import PlaceSearch
@@ -81,7 +81,7 @@ class PlaceDatabase:
         """Index of the newest keyframe of a stamp; None when there is none."""
         return next(reversed(self.store.rows_at(stamp_ns)), None)
 
-    def recognise(self, keyframe: Keyframe) -> int | None:
+    def find_duplicate(self, keyframe: Keyframe) -> int | None:
         """Index of the same measurement, stored before, as when a recording is played again; or None."""
         rows = self.store.rows_at(keyframe.stamp_ns)
         if not rows:
@@ -158,7 +158,7 @@ class PlaceDatabase:
     def _admissible(self, keyframe: Keyframe, rules: Loop, rows: Rows | slice) -> Mask:
         keys = self.store.keys
         age_ns = keyframe.stamp_ns - keys["stamp_ns"][rows]
-        way_m = keyframe.travelled_m - keys["travelled_m"][rows]
+        way_m = keyframe.path_length_m - keys["travelled_m"][rows]
         return is_past(age_ns, way_m, rules, keys["session"][rows] == keyframe.session)
 
     def _of_sessions(self, sessions: range, rows: Rows | slice) -> Mask:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import load, save
 
-from umf_ros.frames import Embedding, Keyframe, LocalFeatures, ScanMotion, StereoCamera, SuperFeatures
+from umf_ros.core.frames import Embedding, Keyframe, LocalFeatures, ScanMotion, StereoCamera, SuperFeatures
 
 MOTION = "motion"
 FEATURES: dict[str, type[LocalFeatures] | type[SuperFeatures]] = {
@@ -32,7 +32,7 @@ def pack(keyframe: Keyframe) -> bytes:
         "body_T_camera": keyframe.body_T_camera,
         "body_T_lidar": keyframe.body_T_lidar,
         "points": keyframe.points,
-        "travelled_m": np.array([keyframe.travelled_m]),
+        "travelled_m": np.array([keyframe.path_length_m]),
         "descriptor": embedding.descriptor,
     }
     if keyframe.odom_T_body is not None:
@@ -66,7 +66,7 @@ def unpack(blob: bytes) -> Keyframe:
         body_T_lidar=arrays["body_T_lidar"],
         points=arrays["points"],
         odom_T_body=arrays.get("odom_T_body"),
-        travelled_m=float(arrays["travelled_m"][0]),
+        path_length_m=float(arrays["travelled_m"][0]),
         session=session,
         motion=_group(arrays, MOTION, ScanMotion),
     )

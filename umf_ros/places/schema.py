@@ -6,8 +6,8 @@ import json
 import sqlite3
 from typing import Any
 
-from umf_ros.errors import UmfError
-from umf_ros.sqlite_files import survive_crashes, tables_of
+from umf_ros.core.errors import UmfError
+from umf_ros.core.sqlite_files import survive_crashes, tables_of
 
 KIND = "place database"
 SCHEMA_VERSION = 3

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from umf_ros.errors import OutputError
+from umf_ros.core.errors import OutputError
 from umf_ros.places.approximate import APPROXIMATE_FROM, ApproximateIndex, Builder, has_faiss
 from umf_ros.places.code_file import CodeFile
 from umf_ros.places.codes import CodeTable, Rows, Scores

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
-from umf_ros.errors import UmfError, writing
-from umf_ros.frames import Keyframe
-from umf_ros.locks import FileLock
+from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.frames import Keyframe
+from umf_ros.core.locks import FileLock
+from umf_ros.core.sqlite_files import open_sqlite, take_up
 from umf_ros.places.columns import Columns
 from umf_ros.places.outbox import Outbox
 from umf_ros.places.packing import pack, unpack
 from umf_ros.places.schema import KIND, check_identity, prepare
-from umf_ros.sqlite_files import open_sqlite, take_up
 
 Keys = Columns
 """`id` in the file, `stamp_ns`, `session` and `travelled_m` of every keyframe; metres are NaN without odometry."""
@@ -129,7 +129,7 @@ class KeyframeStore:
         """
         with self._lock:
             row = int(self.keys["id"][-1]) + 1 if len(self.keys) else 1
-            key = {"stamp_ns": keyframe.stamp_ns, "session": keyframe.session, "travelled_m": keyframe.travelled_m}
+            key = {"stamp_ns": keyframe.stamp_ns, "session": keyframe.session, "travelled_m": keyframe.path_length_m}
             descriptor = np.ascontiguousarray(keyframe.embedding.descriptor, np.float32).tobytes()
             values = (row, *key.values(), descriptor, pack(keyframe))
             with writing(self._name, sqlite3.Error), self._connection:

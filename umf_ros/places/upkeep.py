@@ -6,10 +6,10 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from umf_ros.errors import UmfError
-from umf_ros.locks import FileLock
+from umf_ros.core.errors import UmfError
+from umf_ros.core.locks import FileLock
+from umf_ros.core.sqlite_files import looked_at
 from umf_ros.places.schema import KIND, read_identity
-from umf_ros.sqlite_files import looked_at
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.errors import GraphError
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, ros_to_gtsam_covariance
+from umf_ros.core.errors import GraphError
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, ros_to_gtsam_covariance
 from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Stamps, Table
 
 VERDICT_COLUMNS = ("match_stamp_ns", "query_stamp_ns", "verdict", "reason", "mahalanobis", "misfit_m")
@@ -90,7 +90,7 @@ class TrackedClosure:
         self.verdict = ClosureVerdict(self.closure, state, reason, residual, residual_m)
 
 
-class Stops(NamedTuple):
+class PoseSamples(NamedTuple):
     """N places: (N,) their sessions and stamps, and the odometry there."""
 
     sessions: NDArray[np.int64]
@@ -119,9 +119,11 @@ class Endpoints(Table):
             self["travel"][mine] = chain.travel_at(stamps)
             self["pose"][mine], self["noise"][mine] = chain.at(stamps)
 
-    def stops(self, rows: slice | NDArray[np.int64]) -> Stops:
+    def stops(self, rows: slice | NDArray[np.int64]) -> PoseSamples:
         """Those at some rows."""
-        return Stops(self["session"][rows], self["stamp"][rows], PathPoints(self["pose"][rows], self["noise"][rows]))
+        return PoseSamples(
+            self["session"][rows], self["stamp"][rows], PathPoints(self["pose"][rows], self["noise"][rows])
+        )
 
     def distances(self, row: int) -> Array:
         """(N,) metres along the path from endpoint `row` to every other; infinite between sessions."""

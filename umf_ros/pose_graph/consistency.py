@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.geometry import Array
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.geometry import Array
 from umf_ros.pose_graph.closures import ClosureArrays
 from umf_ros.pose_graph.noise_scale import LoopResiduals, NoiseScale, loop_residuals
 

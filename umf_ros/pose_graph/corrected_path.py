@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array, adjoint, expmap, invert, logmap
+from umf_ros.core.geometry import Array, adjoint, expmap, invert, logmap
 from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Rows, Stamps
 
 

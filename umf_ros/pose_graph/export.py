@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.errors import writing
-from umf_ros.geometry import Array, heading, to_quaternion
+from umf_ros.core.errors import writing
+from umf_ros.core.geometry import Array, heading, to_quaternion
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureVerdict
-from umf_ros.pose_graph.condensed import Edge
+from umf_ros.pose_graph.odometry_preintegration import Edge
 
 _ROTATION_LAST, _IN_PLANE = np.array([3, 4, 5, 0, 1, 2]), np.array([3, 4, 2])
 

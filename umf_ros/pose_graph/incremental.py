@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array
-from umf_ros.pose_graph.condensed import (
+from umf_ros.core.geometry import Array
+from umf_ros.pose_graph.odometry_preintegration import (
     SMALL_STEP_M,
     SMALL_TURN_RAD,
     Edge,

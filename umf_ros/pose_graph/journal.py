@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.errors import UmfError, writing
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array
-from umf_ros.locks import FileLock
+from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array
+from umf_ros.core.locks import FileLock
+from umf_ros.core.sqlite_files import open_sqlite, survive_crashes, tables_of
 from umf_ros.pose_graph.closures import ClosureVerdict, Decision, State
-from umf_ros.sqlite_files import open_sqlite, survive_crashes, tables_of
 
 _TABLES = (
     "CREATE TABLE event (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, first_ns INTEGER, second_ns INTEGER, data BLOB)",

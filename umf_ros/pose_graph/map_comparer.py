@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.geometry import Array, invert, logmap
-from umf_ros.pose_graph.closures import ClosureArrays, Endpoints, Stops
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.geometry import Array, invert, logmap
+from umf_ros.pose_graph.closures import ClosureArrays, Endpoints, PoseSamples
 from umf_ros.pose_graph.consistency import false_alarm_probability, likelihood_ratio, squared_mahalanobis
-from umf_ros.pose_graph.looks import Looks, MapComparisons, Rows
+from umf_ros.pose_graph.gate_cache import GateCache, MapComparisons, Rows
 from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.relative_poses import Bounds, RelativePoses
 from umf_ros.pose_graph.sessions import Sessions
@@ -30,7 +30,7 @@ class MapComparer:
         self._arrays, self._sessions, self._settings = arrays, sessions, settings
         self._map: RelativePoses | None = None
         self._scale = NoiseScale()
-        self._looks = Looks()
+        self._looks = GateCache()
 
     @property
     def has_map(self) -> bool:
@@ -116,6 +116,6 @@ class MapComparer:
             found.lengths[new] = bounds.lengths
         return found
 
-    def _stops(self, rows: NDArray[np.int64]) -> tuple[Stops, Stops]:
+    def _stops(self, rows: NDArray[np.int64]) -> tuple[PoseSamples, PoseSamples]:
         """Where the matches and the queries of closures are."""
         return self._arrays.match.stops(rows), self._arrays.query.stops(rows)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array, adjoint, invert, logmap, propagate
+from umf_ros.core.geometry import Array, adjoint, invert, logmap, propagate
 from umf_ros.pose_graph.closures import ClosureArrays, Endpoints
 
 Rows = NDArray[np.int64]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.geometry import Array, adjoint, interpolate, orthonormal, propagate, relative, ros_to_gtsam_covariance
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.geometry import Array, adjoint, interpolate, orthonormal, propagate, relative, ros_to_gtsam_covariance
 
 Stamps = NDArray[np.int64]
 Rows = NDArray[np.int64]

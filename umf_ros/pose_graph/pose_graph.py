@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.errors import GraphError, writing
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, gtsam_to_ros_covariance, invert
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.errors import GraphError, writing
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, gtsam_to_ros_covariance, invert
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.pose_graph.closures import (
     ClosureVerdict,
     Decision,
@@ -27,10 +28,9 @@ from umf_ros.pose_graph.closures import (
 from umf_ros.pose_graph.export import verdict_table, write_g2o, write_vertex_table
 from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.odometry import OdometryChain, Stamps
-from umf_ros.pose_graph.outlier_rejection import OutlierRejection
-from umf_ros.pose_graph.retrial import Retrial, in_order
+from umf_ros.pose_graph.rejection import OutlierRejection
+from umf_ros.pose_graph.reprocess import Reprocessing, in_order
 from umf_ros.pose_graph.sessions import Sessions
-from umf_ros.trajectory import Trajectory, write_tum
 
 logger = logging.getLogger(__name__)
 _NO_ODOMETRY_YET = "its odometry has not arrived"
@@ -47,7 +47,7 @@ class PoseGraph:
         self._settings = settings or PoseGraphSettings()
         self._sessions = Sessions(self._settings)
         self._rejection = OutlierRejection(self._settings, self._sessions)
-        self._retrial: Retrial | None = None
+        self._retrial: Reprocessing | None = None
         self._waiting: list[WaitingClosure] = []
         self._held: list[TrackedClosure] = []
         self._settled = False
@@ -170,10 +170,10 @@ class PoseGraph:
         self._settled = True
         return verdicts
 
-    def _trial(self, order: list[TrackedClosure]) -> Retrial:
+    def _trial(self, order: list[TrackedClosure]) -> Reprocessing:
         """The trial anew of closures, as far as it has come."""
         if self._retrial is None or not self._retrial.holds(order, self._sessions):
-            self._retrial = Retrial(self._settings, self._sessions)
+            self._retrial = Reprocessing(self._settings, self._sessions)
         return self._retrial
 
     def _refresh(self) -> None:

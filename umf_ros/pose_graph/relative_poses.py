@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from umf_ros.geometry import Array, adjoint, invert, propagate
-from umf_ros.pose_graph.closures import Stops
+from umf_ros.core.geometry import Array, adjoint, invert, propagate
+from umf_ros.pose_graph.closures import PoseSamples
 from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.sessions import Sessions
 
@@ -56,7 +56,7 @@ class RelativePoses:
         ends = (low[self._rows], high[self._rows])
         self._ways = csr_matrix((lengths[self._rows], ends), shape=(size, size))
 
-    def bounds(self, match: Stops, query: Stops) -> Bounds:
+    def bounds(self, match: PoseSamples, query: PoseSamples) -> Bounds:
         """Of the map's relative poses from N places to N others."""
         a, b = _Places(self._sessions, match), _Places(self._sessions, query)
         back = invert(b.poses)
@@ -67,7 +67,7 @@ class RelativePoses:
             self._look_around(a, b, back, rows, covariances, lengths)
         return Bounds(covariances, lengths)
 
-    def lengths_through(self, match: Stops, query: Stops, first: Stops, second: Stops) -> Array:
+    def lengths_through(self, match: PoseSamples, query: PoseSamples, first: PoseSamples, second: PoseSamples) -> Array:
         """(N,) m^2, at least: of the ways from N places to N others that use any of M edges, the shortest.
 
         Args:
@@ -86,7 +86,7 @@ class RelativePoses:
         found: Array = np.maximum(*ways).min(axis=0)
         return found
 
-    def _approach(self, stops: Stops) -> tuple[NDArray[np.int64], Array]:
+    def _approach(self, stops: PoseSamples) -> tuple[NDArray[np.int64], Array]:
         """(N, 2) the solved vertices before places and at or after them, and (N, 2) the least length up to there."""
         vertices, walked = np.zeros((len(stops.stamps), 2), np.int64), np.zeros((len(stops.stamps), 2))
         turns = _turns(stops.points.noise)
@@ -155,7 +155,7 @@ class _Places:
         vertices: (N, 2) the solved vertices before and after, twice the same at an end.
     """
 
-    def __init__(self, sessions: Sessions, stops: Stops) -> None:
+    def __init__(self, sessions: Sessions, stops: PoseSamples) -> None:
         count = len(stops.stamps)
         self._sessions, self._stamps, self._noise = stops.sessions, stops.stamps, stops.points.noise
         self.poses, self.vertices = np.zeros((count, 4, 4)), np.zeros((count, 2), np.int64)

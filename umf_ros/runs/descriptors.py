@@ -9,8 +9,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.errors import UmfError, writing
-from umf_ros.frames import Points
+from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.frames import Points
 
 NAME = "descriptors.f16"
 _HEAD = np.dtype("<i4")

@@ -11,13 +11,13 @@ import numpy as np
 from umf_ros.bags.reader import Bag
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs import sensor_findings
+from umf_ros.runs.consistency import in_words
 from umf_ros.runs.finished_run import FinishedRun
-from umf_ros.runs.honesty import in_words
 from umf_ros.runs.inputs import Advice, absent_inputs, useless_inputs
 from umf_ros.runs.sensor_check import SensorReport
 from umf_ros.runs.true_places import TruePlaces
 from umf_ros.runs.truth import JudgedRun
-from umf_ros.runs.why import GateKeeper, Why
+from umf_ros.runs.why import ClosureDiagnosis, GateDiagnosis
 
 PENDING = (State.UNDECIDED, State.WAITING)
 MUCH_MISSED, MUCH_REJECTED, WELL_COVERED = 0.3, 0.2, 0.5
@@ -43,7 +43,7 @@ class ExaminedRun:
     run: FinishedRun
     judged: JudgedRun
     places: TruePlaces
-    gates: GateKeeper
+    gates: GateDiagnosis
     bag: Bag | None = None
     sensors: SensorReport = field(default_factory=SensorReport)
 
@@ -56,7 +56,7 @@ class ExaminedRun:
         """How many closures the graph left in which state."""
         return Counter(verdict.state for verdict in self.run.verdicts.values())
 
-    def missed(self) -> list[Why]:
+    def missed(self) -> list[ClosureDiagnosis]:
         """Why each missed revisit was missed."""
         chosen = self.judged.missed[:: max(1, len(self.judged.missed) // MOST_EXPLAINED)]
         rows = [self.places.row(stamp) for stamp in chosen]
@@ -128,7 +128,7 @@ def _gaps(about: ExaminedRun) -> Iterator[Advice]:
     ):
         return
     seconds = (int(about.places.stamps[-1]) - int(about.places.stamps[0])) * 1e-9
-    metres = np.nanmax([row.travelled_m for row in about.run.keyframes] + [0.0])
+    metres = np.nanmax([row.path_length_m for row in about.run.keyframes] + [0.0])
     yield Advice(
         "fault",
         f"the gap rules exclude every pair: a match must be {rules.min_time_gap_s:g} s older and "

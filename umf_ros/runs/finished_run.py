@@ -11,13 +11,13 @@ import numpy as np
 
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
-from umf_ros.config import Settings, load_settings
-from umf_ros.errors import UmfError
-from umf_ros.frames import LoopClosure, Points
+from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import LoopClosure, Points
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs import tables
 from umf_ros.runs.descriptors import read_descriptors
 from umf_ros.runs.recorder import read_summary, write_summary
-from umf_ros.trajectory import Trajectory
 
 CLOCK_SLACK_NS = 5_000_000_000
 """Stamps of sensors may lie this far from the times of recording."""

@@ -7,7 +7,7 @@ from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
-from umf_ros.errors import OutputError, writing
+from umf_ros.core.errors import OutputError, writing
 
 
 def create_run_folder(out: Path) -> Path:

@@ -11,13 +11,13 @@ import numpy as np
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import Bag
-from umf_ros.config import Settings
-from umf_ros.frames import Frame, Image, Points
-from umf_ros.geometry import transform
+from umf_ros.core.config import Settings
+from umf_ros.core.frames import Frame, Image, Points
+from umf_ros.core.geometry import transform
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.height_map import MAP_REACH_M, HeightMap
 from umf_ros.runs.sensor_check import SensorCheck, SensorReport
-from umf_ros.sensors.messages import OdometrySample
-from umf_ros.trajectory import Trajectory
+from umf_ros.sensors.decode import OdometrySample
 from umf_ros.verification import thin_scan
 
 PHOTO_WIDTH, PHOTO_QUALITY = 360, 60  # by hand: rocks are still rocks, at some 15 kB

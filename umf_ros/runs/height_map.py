@@ -7,7 +7,7 @@ import math
 import cv2
 import numpy as np
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 
 MAP_CELLS, MAP_REACH_M = 700, 25.0  # by hand: bounds the picture
 

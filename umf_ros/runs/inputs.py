@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import Bag
-from umf_ros.config import Settings
+from umf_ros.core.config import Settings
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.message_kinds import TYPES
 from umf_ros.sensors.sessions import Input

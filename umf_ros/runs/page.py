@@ -12,12 +12,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as Grid
 
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import rotation_angle
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import rotation_angle
 from umf_ros.pose_graph.closures import State
+from umf_ros.runs.consistency import MEDIAN_EXPECTED, in_words
 from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.folder import write_atomically
-from umf_ros.runs.honesty import MEDIAN_EXPECTED, in_words
 from umf_ros.runs.inputs import Advice
 from umf_ros.runs.rendering import render
 from umf_ros.runs.truth import JudgedClosure, endpoints

@@ -10,8 +10,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from umf_ros.frames import Image
-from umf_ros.geometry import Array
+from umf_ros.core.frames import Image
+from umf_ros.core.geometry import Array
 
 TRUTH, ODOMETRY, OPTIMISED = "#222222", "#e07b00", "#1f6fb4"
 RIGHT, WRONG, UNJUDGED = "#2ca02c", "#d62728", "#64748b"

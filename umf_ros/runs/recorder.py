@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from umf_ros import __version__
-from umf_ros.config import Settings, dump_settings
-from umf_ros.errors import UmfError
-from umf_ros.frames import Frame, LoopClosure
-from umf_ros.loop_detector import Detection
+from umf_ros.core.config import Settings, dump_settings
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Frame, LoopClosure
+from umf_ros.detector import Detection
 from umf_ros.runs import tables
 from umf_ros.runs.descriptors import DescriptorFile
 from umf_ros.runs.folder import write_atomically
@@ -26,7 +26,7 @@ from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
 if TYPE_CHECKING:
-    from umf_ros.fleet.encounters import Encounter
+    from umf_ros.fleet.inter_robot_closures import InterRobotClosure
 
 COUNTS = ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected")
 STAGES = tables.STAGES
@@ -104,18 +104,18 @@ class RunRecorder:
             self._closures.append([tables.closure_row(verdict.closure, verdict.candidate.similarity)])
             self._inliers.append(tables.inlier_rows(keyframe.stamp_ns, verdict))
         # last: a keyframe that is there is there with all that was found for it
-        self._keyframes.append([[keyframe.stamp_ns, keyframe.session, f"{keyframe.travelled_m:.4f}"]])
+        self._keyframes.append([[keyframe.stamp_ns, keyframe.session, f"{keyframe.path_length_m:.4f}"]])
         self.recorded.add((keyframe.stamp_ns, keyframe.session))
         for stage, milliseconds in detection.latency_ms.items():
             self._latency[stage].append(milliseconds)
 
-    def record_encounter(self, encounter: Encounter) -> None:
+    def record_encounter(self, inter_closure: InterRobotClosure) -> None:
         """Write down the closures with another rover of a fleet."""
-        if not encounter.closures:
+        if not inter_closure.closures:
             return
         if self._between is None:
             self._between = tables.CsvTable(self.folder / "closures_between.csv", tables.CLOSURES_BETWEEN)
-        rows = [[encounter.robot, *tables.closure_row(closure, float("nan"))] for closure in encounter.closures]
+        rows = [[inter_closure.robot, *tables.closure_row(closure, float("nan"))] for closure in inter_closure.closures]
         self._between.append(rows)
 
     def count(self, frame: Frame) -> None:

@@ -12,9 +12,10 @@ from rich.console import Console
 
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_odometry
-from umf_ros.errors import UmfError
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.findings import ExaminedRun, look_first
 from umf_ros.runs.finished_run import FinishedRun, read_run
 from umf_ros.runs.gallery import Gallery, walk
@@ -27,8 +28,7 @@ from umf_ros.runs.tables import INLIERS, Endpoints, read_table
 from umf_ros.runs.true_places import TruePlaces
 from umf_ros.runs.truth import JudgedRun, endpoints, judge_run, positions_in_truth
 from umf_ros.runs.verdict import RunVerdict, conclude
-from umf_ros.runs.why import GateKeeper
-from umf_ros.trajectory import Trajectory
+from umf_ros.runs.why import GateDiagnosis
 
 MAX_SHOWN = 400
 """Keyframes that are photographed; the page shows as many as find room."""
@@ -91,7 +91,7 @@ def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> Examin
     if keep:
         write_summary(run.folder, run.summary)
     places = TruePlaces(run)
-    return ExaminedRun(run, judged, places, GateKeeper(run, places), bag)
+    return ExaminedRun(run, judged, places, GateDiagnosis(run, places), bag)
 
 
 def draw_trajectory(run: FinishedRun, judged: JudgedRun) -> None:

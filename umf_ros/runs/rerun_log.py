@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from umf_ros.bags.trajectories import read_tum
-from umf_ros.errors import ConfigError, OutputError
-from umf_ros.frames import Frame, Keyframe
-from umf_ros.geometry import Array
+from umf_ros.core.errors import ConfigError, OutputError
+from umf_ros.core.frames import Frame, Keyframe
+from umf_ros.core.geometry import Array
 
 if TYPE_CHECKING:
-    from umf_ros.loop_detector import Detection
+    from umf_ros.detector import Detection
 
 Item = TypeVar("Item")
 GREY, BLUE, GREEN = (150, 150, 150), (60, 120, 216), (40, 160, 60)

@@ -6,8 +6,8 @@ import json
 from contextlib import suppress
 from pathlib import Path
 
-from umf_ros.config import Settings, load_settings
-from umf_ros.errors import UmfError
+from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.errors import UmfError
 from umf_ros.runs.folder import create_run_folder, write_atomically
 
 PLACES = "places.sqlite"

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.geometry import Array, align
+from umf_ros.core.geometry import Array, align
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.finished_run import FinishedRun
 from umf_ros.runs.gallery import SCAN_UNIT_M, Gallery, encode_scans
 from umf_ros.runs.scene_pairs import Pair, by_need, describe
 from umf_ros.runs.tables import Endpoints
 from umf_ros.runs.truth import positions_in_truth
-from umf_ros.trajectory import Trajectory
 
 MAX_POINTS = 3000
 """Of a curve."""
@@ -110,7 +110,7 @@ def _keyframes(about: ExaminedRun) -> dict[str, Any]:
     return {
         "t": [round((int(stamp) - start) * 1e-9, 3) for stamp in places.stamps],
         "xy": _rounded(_positions(about)).tolist(),
-        "way": [_or_none(row.travelled_m) for row in run.keyframes],
+        "way": [_or_none(row.path_length_m) for row in run.keyframes],
         "similarity": [_or_none(best.get(int(stamp), np.nan)) for stamp in places.stamps],
         "latency": [_or_none(run.latencies_ms.get(int(stamp), np.nan)) for stamp in places.stamps],
     }

@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, relative, rotation_angle
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.findings import PENDING, ExaminedRun
 from umf_ros.runs.tables import Endpoints, TestedCandidate
 from umf_ros.runs.truth import JudgedClosure
-from umf_ros.runs.why import Why
+from umf_ros.runs.why import ClosureDiagnosis
 
 Kind = Literal["accepted", "pending", "rejected", "false", "missed", "tested"]
 ORDER: tuple[Kind, ...] = ("false", "missed", "rejected", "pending", "tested", "accepted")
@@ -43,7 +43,7 @@ class Pair:
     closure: LoopClosure | None = None
     judged: JudgedClosure | None = None
     candidate: TestedCandidate | None = None
-    why: Why | None = None
+    why: ClosureDiagnosis | None = None
 
 
 def pairs_of(about: ExaminedRun) -> list[Pair]:

@@ -8,11 +8,11 @@ from math import nan
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.embedding.depth import disparities
-from umf_ros.frames import Frame
-from umf_ros.geometry import Array
 from umf_ros.runs.sensor_motion import Disagreement, MeasuredScan, Step, compare_motion, scan_turn, view_turn
-from umf_ros.trajectory import Trajectory
 
 MIN_STEP_S, MAX_STEP_S = 0.18, 1.0  # between frames whose motion is compared, by hand
 MAX_STEPS = 150  # by hand: bounds the time

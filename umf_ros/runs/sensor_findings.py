@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from umf_ros.config import Settings
+from umf_ros.core.config import Settings
 from umf_ros.runs.inputs import Advice
 from umf_ros.runs.sensor_check import SensorReport
 from umf_ros.runs.sensor_motion import Disagreement

@@ -11,9 +11,9 @@ import small_gicp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from umf_ros.frames import Frame, Image, Points
-from umf_ros.geometry import Array
-from umf_ros.trajectory import Trajectory
+from umf_ros.core.frames import Frame, Image, Points
+from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory
 
 SCAN_CELL_M, SCAN_REACH_M, SCAN_NEIGHBOURS = 0.4, 1.0, 10  # by hand: consecutive scans, a quarter of a metre apart
 CELL_MASK = 2**21 - 1  # three coordinates in one number: a scan is far narrower than two million cells

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 import numpy as np
 
-from umf_ros.errors import UmfError, writing
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, from_quaternion, to_quaternion
+from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class KeyframeRow:
 
     stamp_ns: int
     session: int
-    travelled_m: float
+    path_length_m: float
 
 
 class CsvTable:

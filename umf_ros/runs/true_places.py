@@ -7,8 +7,8 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array, heading, wrap_angle
-from umf_ros.keyframes import is_past
+from umf_ros.core.geometry import Array, heading, wrap_angle
+from umf_ros.core.keyframes import is_past
 from umf_ros.runs.finished_run import FinishedRun
 from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M
 
@@ -22,7 +22,7 @@ class TruePlaces:
     def __init__(self, run: FinishedRun) -> None:
         self._rules = run.settings.loop
         self.stamps = run.stamps
-        self._travelled: Array = np.array([row.travelled_m for row in run.keyframes], float)
+        self._travelled: Array = np.array([row.path_length_m for row in run.keyframes], float)
         self._sessions = np.array([row.session for row in run.keyframes], int)
         self._has_orientation = run.truth is not None and run.truth.has_orientation
         self.poses: Array

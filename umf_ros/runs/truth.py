@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.config import Loop
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, align, heading, invert, relative, rotation_angle, transform, wrap_angle
-from umf_ros.keyframes import is_past
-from umf_ros.runs.honesty import normalised_errors, pose_error, share_inside
+from umf_ros.core.config import Loop
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, align, heading, invert, relative, rotation_angle, transform, wrap_angle
+from umf_ros.core.keyframes import is_past
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.runs.consistency import normalised_errors, pose_error, share_inside
 from umf_ros.runs.tables import Endpoints, read_keyframes
-from umf_ros.trajectory import Trajectory
 
 PLACE_RADIUS_M = 12.0
 PLACE_ANGLE_DEG = 30.0
@@ -112,12 +112,12 @@ def judge_run(
     """Hold closures, odometry and optimised trajectory of a run folder against the truth."""
     rows = read_keyframes(folder / "keyframes.csv")
     stamps = np.array([row.stamp_ns for row in rows], np.int64)
-    travelled = np.array([row.travelled_m for row in rows], float)
+    path_length = np.array([row.path_length_m for row in rows], float)
     poses, known = truth.at(stamps)
-    stamps, poses, travelled = stamps[known], poses[known], travelled[known]
+    stamps, poses, path_length = stamps[known], poses[known], path_length[known]
     judged = _judge_closures(closures, truth)
-    again = find_revisits(stamps, poses, travelled, rules, same_view=False)
-    same_view = find_revisits(stamps, poses, travelled, rules, truth.has_orientation)
+    again = find_revisits(stamps, poses, path_length, rules, same_view=False)
+    same_view = find_revisits(stamps, poses, path_length, rules, truth.has_orientation)
     published = {closure.query_stamp_ns for closure in closures}
     true_queries = {one.closure.query_stamp_ns for one in judged if one.is_true}
     closed = np.isin(stamps[again], list(true_queries))
@@ -157,14 +157,14 @@ def judge_closure(
 
 
 def find_revisits(
-    stamps: Stamps, world_T_body: Array, travelled_m: Array, rules: Loop, same_view: bool = True
+    stamps: Stamps, world_T_body: Array, path_length_m: Array, rules: Loop, same_view: bool = True
 ) -> NDArray[np.bool_]:
     """Which keyframes (N,) saw a place again: an admissible earlier keyframe within 12 m, and 30 deg of heading.
 
     Args:
         stamps: (N,) ns, ascending.
         world_T_body: (N, 4, 4) true poses.
-        travelled_m: (N,) path length, NaN where unknown.
+        path_length_m: (N,) path length, NaN where unknown.
         rules: which earlier keyframes are admissible.
         same_view: whether headings count; without, a place may be seen again from any side.
     """
@@ -174,7 +174,7 @@ def find_revisits(
         near = np.linalg.norm(positions[:i] - positions[i], axis=1) <= PLACE_RADIUS_M
         if same_view:
             near &= np.abs(wrap_angle(headings[:i] - headings[i])) <= radians(PLACE_ANGLE_DEG)
-        past = is_past(stamps[i] - stamps[:i], travelled_m[i] - travelled_m[:i], rules)
+        past = is_past(stamps[i] - stamps[:i], path_length_m[i] - path_length_m[:i], rules)
         revisits[i] = bool((near & past).any())
     return revisits
 

@@ -23,7 +23,7 @@ _FIELDS = {one.name for one in fields(Measurement)} - {"kind"}
 
 
 @dataclass(frozen=True, slots=True)
-class Why:
+class ClosureDiagnosis:
     """What became of one keyframe's search.
 
     Attributes:
@@ -46,7 +46,7 @@ class Why:
     contributions: dict[str, float]
 
 
-class GateKeeper:
+class GateDiagnosis:
     """Says of each keyframe of a run why it did not close a loop."""
 
     def __init__(self, run: FinishedRun, places: TruePlaces) -> None:
@@ -61,7 +61,7 @@ class GateKeeper:
         """The candidates of a keyframe, in the order of the reranking."""
         return self._tested[stamp_ns]
 
-    def explain(self, row: int) -> Why:
+    def explain(self, row: int) -> ClosureDiagnosis:
         """Why the keyframe at this place among all found nothing, or that it did."""
         stamp = int(self._places.stamps[row])
         allowed = np.flatnonzero(self._places.admissible(row))
@@ -104,7 +104,7 @@ class GateKeeper:
         tested = [one for one in self._tested[stamp_ns] if one.reason == "accepted" or one.reason.startswith(BELOW)]
         return max(tested, key=lambda one: one.probability or 0, default=None)
 
-    def _gaps(self, row: int, stamp: int) -> Why:
+    def _gaps(self, row: int, stamp: int) -> ClosureDiagnosis:
         rules = self._run.settings.loop
         age_s = (stamp - int(self._places.stamps[0])) * 1e-9
         what = (
@@ -112,12 +112,14 @@ class GateKeeper:
             f"{rules.min_travel_m:g} m back; the first is {age_s:.1f} s older"
         )
         parameter = "loop.min_time_gap_s and loop.min_travel_m: smaller ones match a place with what was just seen"
-        return Why(stamp, None, float("inf"), "gap rules", what, parameter, {})
+        return ClosureDiagnosis(stamp, None, float("inf"), "gap rules", what, parameter, {})
 
-    def _retrieval(self, row: int, stamp: int, allowed: np.ndarray, right: np.ndarray) -> Why:
+    def _retrieval(self, row: int, stamp: int, allowed: np.ndarray, right: np.ndarray) -> ClosureDiagnosis:
         count = len(self._tested[stamp])
         if not len(right):
-            return Why(stamp, None, float("inf"), "retrieval", f"the database returned {count} candidates", "", {})
+            return ClosureDiagnosis(
+                stamp, None, float("inf"), "retrieval", f"the database returned {count} candidates", "", {}
+            )
         rank, similarity, match = self._best_rank(row, allowed, right)
         distance = float(self._places.distances(row)[match])
         what = f"the database returned {count} candidates, none of them the place {distance:.1f} m away"
@@ -129,7 +131,7 @@ class GateKeeper:
             )
         if similarity < self._run.settings.loop.min_similarity:
             parameter = f"loop.min_similarity: {similarity:.2f} (now {self._run.settings.loop.min_similarity:g})"
-        return Why(stamp, int(self._places.stamps[match]), distance, "retrieval", what, parameter, {})
+        return ClosureDiagnosis(stamp, int(self._places.stamps[match]), distance, "retrieval", what, parameter, {})
 
     def _best_rank(self, row: int, allowed: np.ndarray, right: np.ndarray) -> tuple[int, float, int]:
         """Rank, similarity and row of the most similar right place; rank 0 without descriptors."""
@@ -141,11 +143,11 @@ class GateKeeper:
         best = int(own.argmax())
         return int((similarities > own[best]).sum()) + 1, float(own[best]), int(right[best])
 
-    def _decision(self, stamp: int, best: TestedCandidate) -> Why:
+    def _decision(self, stamp: int, best: TestedCandidate) -> ClosureDiagnosis:
         gate, what, parameter = self._gate(best)
         row, match = self._places.row(stamp), self._places.row(best.match_stamp_ns)
         distance = float("inf") if row is None or match is None else float(self._places.distances(row)[match])
-        return Why(stamp, best.match_stamp_ns, distance, gate, what, parameter, self.contributions(best))
+        return ClosureDiagnosis(stamp, best.match_stamp_ns, distance, gate, what, parameter, self.contributions(best))
 
     def _gate(self, best: TestedCandidate) -> tuple[Gate, str, str]:
         chosen, reason = self._run.settings.verification, best.reason

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import Frame, Image, Points, ScanMotion
-from umf_ros.geometry import Array, invert, relative, transform
+from umf_ros.core.frames import Frame, Image, Points, ScanMotion
+from umf_ros.core.geometry import Array, invert, relative, transform
 from umf_ros.sensors.buffers import OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
-from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.scan_motion import scan_motion
 
 

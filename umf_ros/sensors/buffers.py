@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.frames import Image
-from umf_ros.geometry import Array, interpolate
+from umf_ros.core.frames import Image
+from umf_ros.core.geometry import Array, interpolate
 
 SURPLUS = "surplus"
 """Reason of the images that lie nearest to no scan: cameras are faster than LiDARs, nothing is wrong."""

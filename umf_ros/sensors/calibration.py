@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from umf_ros.config import Group, load_preset, problems
-from umf_ros.errors import CalibrationError, ConfigError, one_line
-from umf_ros.frames import StereoCamera
-from umf_ros.geometry import Array, from_quaternion
-from umf_ros.resources import dataset_names
+from umf_ros.core.config import Group, load_preset, problems
+from umf_ros.core.errors import CalibrationError, ConfigError, one_line
+from umf_ros.core.frames import StereoCamera
+from umf_ros.core.geometry import Array, from_quaternion
+from umf_ros.core.resources import dataset_names
+from umf_ros.core.yaml_files import read_values
 from umf_ros.sensors.rectification import LARGEST_IMAGE, Pinhole, RawCamera, StereoRectifier
-from umf_ros.yaml_files import read_values
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,15 +6,15 @@ import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.errors import GraphError, OutputError
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.errors import GraphError, OutputError
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array
 from umf_ros.pose_graph import journal
 from umf_ros.pose_graph.closures import ClosureVerdict, Decision
 from umf_ros.pose_graph.journal import Event, GraphJournal
 from umf_ros.pose_graph.pose_graph import PoseGraph
-from umf_ros.sensors.odometry_feed import OdometryFeed
+from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
 from umf_ros.sensors.sessions import Reset
 
 MANY = 300
@@ -115,7 +115,7 @@ class DurableGraph:
 
     def _begin(self) -> None:
         self.graph = PoseGraph(self._settings)
-        self.feed = OdometryFeed(self.graph)
+        self.feed = OdometrySessionSplitter(self.graph)
 
     def _take_up(self, kept: GraphJournal) -> None:
         before, self.unsettled = kept.verdicts(), kept.is_unsettled()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.sensors.calibration import Calibration
-from umf_ros.sensors.messages import Cloud
+from umf_ros.sensors.decode import Cloud
 
 MOST = 0.8
 """A limit that would drop more than this share of all returns so far was written for another sensor (*by hand*: the

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.errors import MessageError
-from umf_ros.frames import Image
-from umf_ros.sensors.messages import Cloud, decode_cloud, decode_image, real_returns
+from umf_ros.core.errors import MessageError
+from umf_ros.core.frames import Image
+from umf_ros.sensors.decode import Cloud, decode_cloud, decode_image, real_returns
 
 IMAGE, COMPRESSED, CLOUD = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2"
 LIVOX = ("livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg")

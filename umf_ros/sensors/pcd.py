@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.errors import SensorFileError
+from umf_ros.core.errors import SensorFileError
 
 Columns = dict[str, NDArray[Any]]
 _KINDS = {"F": "f", "U": "u", "I": "i"}

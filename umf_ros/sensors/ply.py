@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.errors import SensorFileError
+from umf_ros.core.errors import SensorFileError
 from umf_ros.sensors.pcd import Columns
 
 _TYPES = {

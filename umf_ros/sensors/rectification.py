@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from pydantic import Field, field_validator
 
-from umf_ros.config import Group
-from umf_ros.frames import Image, StereoCamera
-from umf_ros.geometry import Array, invert, make_pose
+from umf_ros.core.config import Group
+from umf_ros.core.frames import Image, StereoCamera
+from umf_ros.core.geometry import Array, invert, make_pose
 
 LARGEST_IMAGE = 20_000
 """Pixels of a side."""

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.errors import SensorFileError, either, one_line
-from umf_ros.frames import Points
-from umf_ros.sensors.messages import FURTHEST_RETURN_M, Cloud, real_returns
+from umf_ros.core.errors import SensorFileError, either, one_line
+from umf_ros.core.frames import Points
+from umf_ros.sensors.decode import FURTHEST_RETURN_M, Cloud, real_returns
 from umf_ros.sensors.pcd import Columns, parse_pcd
 from umf_ros.sensors.ply import parse_ply
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import ScanMotion
-from umf_ros.geometry import Array, invert
+from umf_ros.core.frames import ScanMotion
+from umf_ros.core.geometry import Array, invert
 from umf_ros.sensors.buffers import OdometryBuffer
 
 Path = tuple[NDArray[np.int64], list[Array]]

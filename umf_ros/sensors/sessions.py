@@ -24,7 +24,7 @@ LEAST_JUMP_M = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
+class StampedInput:
     """A message as it arrives.
 
     Attributes:
@@ -55,7 +55,7 @@ class Reset:
 
 
 @dataclass(frozen=True, slots=True)
-class Ruling:
+class SessionUpdate:
     """What is to be done when a message has arrived.
 
     Attributes:
@@ -65,8 +65,8 @@ class Ruling:
     """
 
     reset: Reset | None = None
-    usable: list[Arrival] = field(default_factory=list)
-    dropped: list[Arrival] = field(default_factory=list)
+    usable: list[StampedInput] = field(default_factory=list)
+    dropped: list[StampedInput] = field(default_factory=list)
 
 
 class SessionClock:
@@ -85,8 +85,8 @@ class SessionClock:
         self._now_ns: int | None = None
         self._start_ns = 0
         self._previous_end_ns: int | None = None
-        self._newest: dict[Input, Arrival] = {}
-        self._held: dict[Input, tuple[Arrival, Reset]] = {}
+        self._newest: dict[Input, StampedInput] = {}
+        self._held: dict[Input, tuple[StampedInput, Reset]] = {}
 
     @property
     def elapsed_ns(self) -> int:
@@ -106,17 +106,17 @@ class SessionClock:
         """Whether a message of input `name` has come on this clock."""
         return name in self._newest
 
-    def take(self, arrival: Arrival) -> Ruling:
+    def take(self, arrival: StampedInput) -> SessionUpdate:
         """Take one message."""
         newest = self._newest.get(arrival.name)
         reset = None if newest is None else _reset(newest, arrival)
         if reset is None:
-            return Ruling(usable=[self._advance(arrival)], dropped=self._drop({arrival.name}))
+            return SessionUpdate(usable=[self._advance(arrival)], dropped=self._drop({arrival.name}))
         agreeing = {name for name, held in self._held.items() if _agree(*held, arrival, reset)}
         if not agreeing:
             dropped = self._drop({arrival.name})
             self._held[arrival.name] = arrival, reset
-            return Ruling(dropped=dropped)
+            return SessionUpdate(dropped=dropped)
         return self._begin(agreeing, arrival)
 
     @property
@@ -124,11 +124,11 @@ class SessionClock:
         """Messages whose fate is open."""
         return len(self._held)
 
-    def give_up(self) -> list[Arrival]:
+    def give_up(self) -> list[StampedInput]:
         """Drop what is still held, at the end of the stream."""
         return self._drop(set(self._held))
 
-    def _begin(self, agreeing: set[Input], arrival: Arrival) -> Ruling:
+    def _begin(self, agreeing: set[Input], arrival: StampedInput) -> SessionUpdate:
         held = [self._held.pop(name) for name in list(self._held) if name in agreeing]
         reset = held[0][1]
         self.session += 1
@@ -138,13 +138,13 @@ class SessionClock:
         else:
             del self._newest[arrival.name]
         dropped = self._drop(set(self._held) if reset.of_clock else {arrival.name})
-        return Ruling(reset, [self._advance(one) for one in (*(one for one, _ in held), arrival)], dropped)
+        return SessionUpdate(reset, [self._advance(one) for one in (*(one for one, _ in held), arrival)], dropped)
 
-    def _drop(self, names: set[Input]) -> list[Arrival]:
+    def _drop(self, names: set[Input]) -> list[StampedInput]:
         pairs = [self._held.pop(name) for name in list(self._held) if name in names]
         return [replace(one, fault="clock jump" if reset.of_clock else "position jump") for one, reset in pairs]
 
-    def _advance(self, arrival: Arrival) -> Arrival:
+    def _advance(self, arrival: StampedInput) -> StampedInput:
         """Take note of a message that is in line, and tell its fault."""
         newest = self._newest.get(arrival.name)
         if newest is None and self._is_stale(arrival.stamp_ns):
@@ -152,7 +152,9 @@ class SessionClock:
         if newest is not None and arrival.stamp_ns <= newest.stamp_ns:
             return replace(arrival, fault="duplicate" if arrival.stamp_ns == newest.stamp_ns else "out of order")
         # an image is not kept alive for its stamp
-        self._newest[arrival.name] = arrival if arrival.name == ODOMETRY else Arrival(arrival.name, arrival.stamp_ns)
+        self._newest[arrival.name] = (
+            arrival if arrival.name == ODOMETRY else StampedInput(arrival.name, arrival.stamp_ns)
+        )
         if self._now_ns is None:
             self._now_ns = self._start_ns = arrival.stamp_ns
         self._now_ns = max(self._now_ns, arrival.stamp_ns)
@@ -165,7 +167,7 @@ class SessionClock:
         return abs(self._previous_end_ns - stamp_ns) < stamp_ns - self._now_ns
 
 
-def _reset(before: Arrival, after: Arrival) -> Reset | None:
+def _reset(before: StampedInput, after: StampedInput) -> Reset | None:
     """Why the second message of an input cannot go on from the first; None when it can."""
     elapsed_ns = after.stamp_ns - before.stamp_ns
     if elapsed_ns <= -CLOCK_STEP_NS:
@@ -178,7 +180,7 @@ def _reset(before: Arrival, after: Arrival) -> Reset | None:
     return None
 
 
-def _agree(held: Arrival, why: Reset, arrival: Arrival, reset: Reset) -> bool:
+def _agree(held: StampedInput, why: Reset, arrival: StampedInput, reset: Reset) -> bool:
     """Whether two messages out of line tell of the same new session."""
     if abs(arrival.stamp_ns - held.stamp_ns) > AGREEMENT_NS:
         return False

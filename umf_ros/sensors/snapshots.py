@@ -9,13 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from umf_ros.errors import SensorFileError
-from umf_ros.frames import Frame, Image, StereoCamera
+from umf_ros.core.errors import SensorFileError
+from umf_ros.core.frames import Frame, Image, StereoCamera
 from umf_ros.sensors.assembly import Anchor, assemble
 from umf_ros.sensors.buffers import OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.limits import ScanLimits
-from umf_ros.sensors.messages import Cloud
 
 _log = logging.getLogger(__name__)
 

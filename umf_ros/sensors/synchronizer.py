@@ -7,16 +7,16 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from umf_ros.config import Sync
-from umf_ros.errors import MessageError
-from umf_ros.frames import Frame, Image, StereoCamera
-from umf_ros.geometry import Array
+from umf_ros.core.config import Sync
+from umf_ros.core.errors import MessageError
+from umf_ros.core.frames import Frame, Image, StereoCamera
+from umf_ros.core.geometry import Array
 from umf_ros.sensors.assembly import Anchor, assemble
 from umf_ros.sensors.buffers import ImageBuffer, InputCounter, OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.limits import ScanLimits
-from umf_ros.sensors.messages import Cloud
-from umf_ros.sensors.sessions import ODOMETRY, Arrival, Input, Reset, SessionClock
+from umf_ros.sensors.sessions import ODOMETRY, Input, Reset, SessionClock, StampedInput
 
 _log = logging.getLogger(__name__)
 
@@ -106,7 +106,7 @@ class Synchronizer:
         """
         if name in ("left", "right"):
             self._check_size(value)
-        ruling = self._clock.take(Arrival(name, stamp_ns, value))
+        ruling = self._clock.take(StampedInput(name, stamp_ns, value))
         self._count_dropped(ruling.dropped)
         if ruling.reset is not None:
             self._begin_session(ruling.reset)
@@ -138,7 +138,7 @@ class Synchronizer:
         self._clear()
         return self.pop()
 
-    def _count_dropped(self, wrong: list[Arrival]) -> None:
+    def _count_dropped(self, wrong: list[StampedInput]) -> None:
         for one in wrong:
             self.reject(one.name, one.fault)
 

@@ -7,21 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from umf_ros.config import Loop, Verification
-from umf_ros.frames import Candidate, Keyframe, LoopClosure
-from umf_ros.geometry import Array, heading
+from umf_ros.core.config import Loop, Verification
+from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
+from umf_ros.core.geometry import Array, heading
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.submaps.drift import DriftMeter
 from umf_ros.submaps.judgement import load_submap_acceptance, measure_submaps
+from umf_ros.submaps.odometry_drift import DriftMeter
 from umf_ros.submaps.proposals import Expectation, Found, Lookalikes, Proposal
 from umf_ros.submaps.submap import Submap
-from umf_ros.submaps.trail import Trail
+from umf_ros.submaps.submap_history import SubmapHistory
 from umf_ros.verification import Measurement, Verdict
 from umf_ros.verification import constants as const
-from umf_ros.verification.all_round import settled
 from umf_ros.verification.field_of_view import FieldOfView
 from umf_ros.verification.hypotheses import TemporalMemory
-from umf_ros.verification.registration import Alignment, align_scans
+from umf_ros.verification.scan_alignment import Alignment, align_scans
+from umf_ros.verification.yaw_search import settled
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class SubmapFinder:
     def __init__(self, settings: Verification, rules: Loop, database: PlaceDatabase) -> None:
         self._settings, self._rules = settings, rules
         self._acceptance = load_submap_acceptance()
-        self.trail = Trail(database)
+        self.trail = SubmapHistory(database)
         self._drift = DriftMeter()
         self._lookalikes = Lookalikes(self.trail, rules)
         self.reset()
@@ -118,10 +118,10 @@ class SubmapFinder:
     def test(self, query: Keyframe, proposal: Proposal) -> Tested | None:
         """Align the submaps of a proposal; None where there is too little way for two that share no scan."""
         stop = self.trail.stops[proposal.row]
-        way_m, last_m = const.SUBMAP_BEFORE_M, stop.travelled_m + const.SUBMAP_AFTER_M
+        way_m, last_m = const.SUBMAP_BEFORE_M, stop.path_length_m + const.SUBMAP_AFTER_M
         if stop.session == query.session:
-            way_m = min(way_m, (query.travelled_m - stop.travelled_m) / 2)
-            last_m = min(last_m, query.travelled_m - way_m)
+            way_m = min(way_m, (query.path_length_m - stop.path_length_m) / 2)
+            last_m = min(last_m, query.path_length_m - way_m)
         if way_m < const.MIN_SUBMAP_M:
             return None
         ours, theirs = self.trail.behind(query, way_m), self.trail.around(proposal.row, last_m)
@@ -146,9 +146,9 @@ class SubmapFinder:
         expected = self._expectation.propose(query)
         if expected is not None:
             return [expected]
-        if query.travelled_m - self._asked_m < const.ASKED_EVERY_M:
+        if query.path_length_m - self._asked_m < const.ASKED_EVERY_M:
             return []
-        self._asked_m = query.travelled_m
+        self._asked_m = query.path_length_m
         return self.lookalikes(query)[: const.LOOKALIKES]
 
     def _judge(self, tested: Tested) -> Verdict:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from umf_ros.errors import ConfigError
-from umf_ros.geometry import Array, make_pose
-from umf_ros.resources import find
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.geometry import Array, make_pose
+from umf_ros.core.resources import find
 from umf_ros.submaps.submap import Submap
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import Criterion, Logistic, log_ratio
@@ -22,7 +22,7 @@ from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import TemporalMemory, prior_sigmas
 from umf_ros.verification.measurement import SUBMAP, Measurement
 from umf_ros.verification.prepared_scan import levelled
-from umf_ros.verification.registration import Alignment, CovarianceModel, covariance_of, nominal_deviations
+from umf_ros.verification.scan_alignment import Alignment, CovarianceModel, covariance_of, nominal_deviations
 
 SHIPPED = "config/verification/submaps.json"
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from umf_ros.config import Loop
-from umf_ros.frames import Keyframe
-from umf_ros.geometry import Array, make_pose, relative
+from umf_ros.core.config import Loop
+from umf_ros.core.frames import Keyframe
+from umf_ros.core.geometry import Array, make_pose, relative
 from umf_ros.submaps.index import KeypointIndex
 from umf_ros.submaps.keypoints import find_keypoints
 from umf_ros.submaps.submap import Submap
-from umf_ros.submaps.trail import Trail
+from umf_ros.submaps.submap_history import SubmapHistory
 from umf_ros.verification import constants as const
 
 
@@ -44,7 +44,7 @@ class Found:
 class Expectation:
     """Where odometry puts the rover: from the latest closure on, and over a short way alone."""
 
-    def __init__(self, trail: Trail, rules: Loop) -> None:
+    def __init__(self, trail: SubmapHistory, rules: Loop) -> None:
         self._trail, self.rules = trail, rules
         self.latest: Found | None = None
 
@@ -68,18 +68,18 @@ class Expectation:
         found, reach_m = self.latest, const.ODOMETRY_REACH_M
         if found is not None and found.query.session == query.session:
             then, there = found.query.odom_T_body, found.match.odom_T_body
-            near = query.travelled_m - found.query.travelled_m < reach_m
+            near = query.path_length_m - found.query.path_length_m < reach_m
             if near and then is not None and there is not None:
-                middle_m = found.match.travelled_m
+                middle_m = found.match.path_length_m
                 where = there @ found.match_T_query @ relative(then, now)
                 yield found.match.session, where, middle_m - reach_m, middle_m + reach_m
-        yield query.session, now, query.travelled_m - const.ODOMETRY_ALONE_M, query.travelled_m
+        yield query.session, now, query.path_length_m - const.ODOMETRY_ALONE_M, query.path_length_m
 
 
 class Lookalikes:
     """Stops whose submaps show the same keypoints of the ground, whatever the heading."""
 
-    def __init__(self, trail: Trail, rules: Loop) -> None:
+    def __init__(self, trail: SubmapHistory, rules: Loop) -> None:
         self._trail, self.rules = trail, rules
         self._index = KeypointIndex()
         self._rows = np.empty(0, np.intp)
@@ -89,8 +89,8 @@ class Lookalikes:
         stops = self._trail.stops
         first = int(self._rows[-1]) + const.DESCRIBED_STOPS if len(self._rows) else 0
         for row in range(first, len(stops), const.DESCRIBED_STOPS):
-            last_m = stops[row].travelled_m + const.SUBMAP_AFTER_M
-            if stops[row].session == stops[-1].session and stops[-1].travelled_m < last_m:
+            last_m = stops[row].path_length_m + const.SUBMAP_AFTER_M
+            if stops[row].session == stops[-1].session and stops[-1].path_length_m < last_m:
                 return
             submap = self._trail.around(row, last_m)
             self._index.add(find_keypoints(submap.scan.elevation.relief))
@@ -102,7 +102,7 @@ class Lookalikes:
         admissible = self._trail.past(query.keyframe, self._rows, self.rules)
         # scans that both submaps hold are alike for no other reason
         apart = [
-            stop.session != query.keyframe.session or stop.travelled_m + const.SUBMAP_AFTER_M < query.first_m
+            stop.session != query.keyframe.session or stop.path_length_m + const.SUBMAP_AFTER_M < query.first_m
             for stop in stops
         ]
         guesses = self._index.search(find_keypoints(query.scan.elevation.relief), admissible & np.array(apart, bool))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from umf_ros.frames import Keyframe
-from umf_ros.geometry import Array, transform
+from umf_ros.core.frames import Keyframe
+from umf_ros.core.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.thinning import thin_scan
@@ -46,7 +46,7 @@ def merge(centre: Keyframe, keyframes: Sequence[Keyframe]) -> Submap:
     body_T_odom = np.linalg.inv(_odometry(centre))
     points = [transform(body_T_odom @ _odometry(one), one.points) for one in keyframes]
     thinned = thin_scan(np.concatenate(points), const.SUBMAP_CELL_M)
-    metres = [one.travelled_m for one in keyframes]
+    metres = [one.path_length_m for one in keyframes]
     return Submap(centre, PreparedScan(thinned), min(metres), max(metres))
 
 

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.errors import ConfigError
-from umf_ros.resources import find
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.resources import find
 from umf_ros.verification import constants as const
 from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
-from umf_ros.verification.registration import CovarianceModel
+from umf_ros.verification.scan_alignment import CovarianceModel
 
 SHIPPED = "config/verification/calibration.json"
 KINDS = (SCAN, IMAGE)

@@ -3,8 +3,8 @@
 Where values come from: *geometry* follows from the sensors the package was made for (S3LI's Cube-1 LiDAR, 70 deg wide,
 ten thousand returns up to 28 m; a camera of 688 x 512 pixels and 61 deg); *measured* was compared with its
 alternatives; *by hand* is an engineer's choice, held since by `benchmarks/verification.py`. What a user may want to
-change is a setting (`umf_ros.config.Verification`), what is fitted stands in `config/verification/calibration.json`,
-and the range of each criterion beside the criterion, in `acceptance`.
+change is a setting (`umf_ros.core.config.Verification`), what is fitted stands in
+`config/verification/calibration.json`, and the range of each criterion beside the criterion, in `acceptance`.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.frames import Points
-from umf_ros.geometry import Array, transform
+from umf_ros.core.frames import Points
+from umf_ros.core.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.relief import Grid, relief_of
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 
 

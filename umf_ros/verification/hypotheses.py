@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from umf_ros.config import Verification
-from umf_ros.frames import Candidate, Keyframe
-from umf_ros.geometry import Array, relative, rotation_angle
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Candidate, Keyframe
+from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.verification import constants as const
-from umf_ros.verification.all_round import Fit, TurnedSurroundings, scout, search
 from umf_ros.verification.prepared_scan import PreparedScan, views_tell
 from umf_ros.verification.ransac import fit_rigid
 from umf_ros.verification.rerank import RankedCandidate
-from umf_ros.verification.views import PairedViews
+from umf_ros.verification.view_alignment import PairedViews
+from umf_ros.verification.yaw_search import Fit, RotatedElevationMap, scout, search
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Hypothesis:
 def find_hypotheses(
     query: Keyframe,
     ranked: RankedCandidate,
-    turned: TurnedSurroundings | None,
+    turned: RotatedElevationMap | None,
     match: PreparedScan,
     settings: Verification,
 ) -> list[Hypothesis]:
@@ -142,7 +142,7 @@ def prior_sigmas(query: Keyframe, match: Keyframe, match_T_query: Array, drift: 
     if query.odom_T_body is None or match.odom_T_body is None or query.session != match.session:
         return float("nan")
     predicted = relative(match.odom_T_body, query.odom_T_body)
-    driven = abs(query.travelled_m - match.travelled_m)
+    driven = abs(query.path_length_m - match.path_length_m)
     return float(np.linalg.norm(predicted[:3, 3] - match_T_query[:3, 3]) / (const.PRIOR_M + drift * driven))
 
 

@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.frames import Candidate, Keyframe, Points
-from umf_ros.geometry import Array, transform
+from umf_ros.core.frames import Candidate, Keyframe, Points
+from umf_ros.core.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, near, prior_sigmas
-from umf_ros.verification.meeting import meet, rivalry
 from umf_ros.verification.prepared_scan import PreparedScan, joint_blur, levelled
-from umf_ros.verification.registration import Alignment, CovarianceModel, covariance_of, nominal_deviations
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
+from umf_ros.verification.scan_alignment import Alignment, CovarianceModel, covariance_of, nominal_deviations
+from umf_ros.verification.scan_consistency import meet, rivalry
 from umf_ros.verification.scan_motion import closure_covariance
-from umf_ros.verification.views import ViewAlignment
+from umf_ros.verification.view_alignment import ViewAlignment
 
 SCAN, IMAGE, SUBMAP = "scan", "image", "submap"
 

@@ -9,9 +9,9 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
-from umf_ros.frames import Frame, Keyframe, Points
-from umf_ros.geometry import Array, invert, make_pose, transform
-from umf_ros.levelling import upright
+from umf_ros.core.frames import Frame, Keyframe, Points
+from umf_ros.core.geometry import Array, invert, make_pose, transform
+from umf_ros.core.levelling import upright
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import ElevationMap
 from umf_ros.verification.field_of_view import FieldOfView
@@ -216,7 +216,7 @@ class ScanCache:
 
     def __init__(self) -> None:
         self._scans: OrderedDict[tuple[int, int], PreparedScan] = OrderedDict()
-        self._foreseen: tuple[int, PreparedScan] | None = None
+        self._prefetched: tuple[int, PreparedScan] | None = None
 
     def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
         key = (keyframe.session, keyframe.stamp_ns)
@@ -226,17 +226,17 @@ class ScanCache:
             self._scans.popitem(last=False)
         return scan
 
-    def foresee(self, frame: Frame) -> None:
+    def prefetch(self, frame: Frame) -> None:
         """Make the scan ready of a frame that is about to become a keyframe."""
         scan = prepare_frame(frame)
         scan.make_ready()
-        self._foreseen = frame.stamp_ns, scan
+        self._prefetched = frame.stamp_ns, scan
 
     def clear(self) -> None:
         """Forget all scans, as when stamps start over."""
         self._scans.clear()
-        self._foreseen = None
+        self._prefetched = None
 
     def _foreseen_of(self, keyframe: Keyframe) -> PreparedScan | None:
-        known, self._foreseen = self._foreseen, None
+        known, self._prefetched = self._prefetched, None
         return known[1] if known is not None and known[0] == keyframe.stamp_ns else None

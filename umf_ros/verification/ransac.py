@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array, align
+from umf_ros.core.geometry import Array, align
 from umf_ros.verification import constants as const
 
 Mask = NDArray[np.bool_]

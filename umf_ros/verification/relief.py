@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 
 Grid = NDArray[np.float32]

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.config import Verification
-from umf_ros.frames import Candidate, Keyframe, LocalFeatures, SuperFeatures
-from umf_ros.geometry import Array, relative
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Candidate, Keyframe, LocalFeatures, SuperFeatures
+from umf_ros.core.geometry import Array, relative
 from umf_ros.verification import constants as const
 from umf_ros.verification.ransac import Consensus, fit_homography, fit_rigid
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from umf_ros.frames import Keyframe, ScanMotion
-from umf_ros.geometry import Array, propagate, skew
+from umf_ros.core.frames import Keyframe, ScanMotion
+from umf_ros.core.geometry import Array, propagate, skew
 from umf_ros.verification import constants as const
-from umf_ros.verification.registration import Alignment, CovarianceModel, covariance_of
+from umf_ros.verification.scan_alignment import Alignment, CovarianceModel, covariance_of
 
 
 def closure_covariance(match: Keyframe, query: Keyframe, alignment: Alignment, model: CovarianceModel) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 from umf_ros.verification.relief import Grid, relief_of
 

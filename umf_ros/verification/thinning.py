@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from umf_ros.frames import Frame, Points, ScanMotion
+from umf_ros.core.frames import Frame, Points, ScanMotion
 from umf_ros.verification import constants as const
 
 

@@ -9,12 +9,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from umf_ros.config import Verification
-from umf_ros.frames import Candidate, Frame, Keyframe, LoopClosure, Points
-from umf_ros.geometry import heading
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Candidate, Frame, Keyframe, LoopClosure, Points
+from umf_ros.core.geometry import heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
-from umf_ros.verification.all_round import TurnedSurroundings
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, find_hypotheses, near
 from umf_ros.verification.measurement import (
     AlignedHypothesis,
@@ -27,8 +26,9 @@ from umf_ros.verification.measurement import (
     uncompared,
 )
 from umf_ros.verification.prepared_scan import ScanCache, levelled, views_tell
-from umf_ros.verification.registration import align_scans
 from umf_ros.verification.rerank import RankedCandidate, rerank, select
+from umf_ros.verification.scan_alignment import align_scans
+from umf_ros.verification.yaw_search import RotatedElevationMap
 
 UNTESTED, NO_POSE = "less promising than others", "no pose fits, or others fit better"
 FOUND_BEFORE = "not compared: one was found"
@@ -113,9 +113,9 @@ class Verifier:
         self._memory.reset()
         self._scans.clear()
 
-    def foresee(self, frame: Frame) -> None:
+    def prefetch(self, frame: Frame) -> None:
         """Make ready what is asked of a scan whose keyframe is verified next."""
-        self._scans.foresee(frame)
+        self._scans.prefetch(frame)
 
     def verify(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[Verdict]:
         """One verdict per candidate, accepted ones first, then in the order of the reranking.
@@ -157,7 +157,7 @@ class Verifier:
             return rerank(query, candidates, self._settings)
 
     def _refine(
-        self, query: Keyframe, ranked: list[RankedCandidate], turned: TurnedSurroundings | None
+        self, query: Keyframe, ranked: list[RankedCandidate], turned: RotatedElevationMap | None
     ) -> list[JudgedHypothesis]:
         """The best hypotheses about some candidates, judged."""
         with self._timed("refine"):
@@ -175,11 +175,11 @@ class Verifier:
         yield
         self.latency_ms[name] += 1e3 * (time.perf_counter() - start)
 
-    def _turned(self, query: Keyframe) -> TurnedSurroundings | None:
-        return TurnedSurroundings(self._scans[query]) if self._scans[query].usable else None
+    def _turned(self, query: Keyframe) -> RotatedElevationMap | None:
+        return RotatedElevationMap(self._scans[query]) if self._scans[query].usable else None
 
     def _hypotheses(
-        self, query: Keyframe, ranked: list[RankedCandidate], turned: TurnedSurroundings | None
+        self, query: Keyframe, ranked: list[RankedCandidate], turned: RotatedElevationMap | None
     ) -> list[Hypothesis]:
         """Hypotheses about the given candidates, the most promising first."""
         found: list[Hypothesis] = []

@@ -11,8 +11,8 @@ import pytest
 from command_line import Ended, only_line, umf
 from recordings import LEFT, ODOMETRY, START_NS, image, small_settings, traverse, write_mcap
 
-from umf_ros.config import dump_settings
-from umf_ros.frames import Image
+from umf_ros.core.config import dump_settings
+from umf_ros.core.frames import Image
 
 
 def probability(ended: Ended) -> float:

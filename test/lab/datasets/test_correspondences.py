@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tiny_worlds import CAMERA, TINY, flat_sample, plain_view, pose_at
 
-from umf_ros.geometry import transform
+from umf_ros.core.geometry import transform
 from umf_ros.lab.datasets.correspondences import cell_points, match_cells, match_voxels
 from umf_ros.lab.datasets.views import Augmentation, ViewMaker, view_points
 

@@ -14,14 +14,14 @@ from recordings import START_NS, drive, small_settings, traverse, write_mcap, wr
 from rosbags.typesys import Stores, get_typestore
 from tiny_worlds import world_arrays
 
-from umf_ros.config import Settings
-from umf_ros.errors import ConfigError, UmfError
-from umf_ros.geometry import heading
+from umf_ros.core.config import Settings
+from umf_ros.core.errors import ConfigError, UmfError
+from umf_ros.core.geometry import heading
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.lab.datasets import listed
 from umf_ros.lab.datasets.listed import SequenceList, open_source
 from umf_ros.lab.datasets.s3li import read_bag
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.trajectory import Trajectory, write_tum
 
 DOCS = Path(__file__).parents[3] / "docs" / "training.md"
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy._core.multiarray import _reconstruct
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 from umf_ros.lab.datasets.pickles import load_data_frame, load_pickle
 
 DATA = Path(__file__).parent / "data"

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from umf_ros.lab.datasets.recorded import course, detours, travelled
+from umf_ros.lab.datasets.recorded import course, detours, path_length
 
 
 def test_a_rover_heads_where_it_drives() -> None:
@@ -28,5 +28,5 @@ def test_a_standing_rover_has_a_heading_all_the_same() -> None:
 
 def test_a_drive_is_a_pass_later_after_a_detour() -> None:
     path = np.stack([np.arange(0, 130, 30.0), np.zeros(5), np.zeros(5)], axis=1)
-    assert travelled(path)[-1] == 120
+    assert path_length(path)[-1] == 120
     assert detours(path).tolist() == [0, 0.5, 1, 1.5, 2]

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 from umf_ros.lab.datasets.labels import label, places_of
 from umf_ros.lab.datasets.robotcar import read_evaluation, read_training
 from umf_ros.lab.evaluation.protocol import ROBOTCAR_RULE, place_recognition

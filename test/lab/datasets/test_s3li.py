@@ -11,11 +11,11 @@ from etna import entries, write_pos
 from recordings import START_NS, drive, small_settings, traverse, write_mcap, write_ros1
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.errors import BagError, UmfError
-from umf_ros.geometry import heading, transform
+from umf_ros.core.errors import BagError, UmfError
+from umf_ros.core.geometry import heading, transform
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.lab.datasets.s3li import ETNA_TEST, ETNA_TRAINING, read_bag, read_toolkit
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.trajectory import Trajectory, write_tum
 
 DATA = Path(__file__).parent / "data"
 

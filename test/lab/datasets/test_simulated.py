@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tiny_worlds import BODY_T_CAMERA, CAMERA, world_arrays
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
 
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 from tiny_worlds import CAMERA, TINY, flat_sample, pose_at
 
-from umf_ros.geometry import rotation_angle, transform
+from umf_ros.core.geometry import rotation_angle, transform
 from umf_ros.lab.datasets.views import Augmentation, View, ViewMaker, relative_pose, view_points
 
 HEIGHT, WIDTH = TINY.image_size

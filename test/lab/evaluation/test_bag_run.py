@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from landmarks import PLACES, LandmarkEmbedder, frame_of
 
-from umf_ros.config import Settings, load_settings
-from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
-from umf_ros.errors import UmfError
-from umf_ros.frames import Frame
-from umf_ros.geometry import Array, make_pose
+from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import Array, make_pose
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.detector import LoopDetector
 from umf_ros.lab.evaluation.bag_run import BagEvaluation, BagResult
-from umf_ros.loop_detector import LoopDetector
-from umf_ros.trajectory import Trajectory
 
 LAPS = 2
 START_NS = 1_625_680_800_000_000_000
@@ -94,7 +94,11 @@ def test_keyframes_are_those_of_the_live_detector(settings: Settings) -> None:
     live = [found.keyframe for found in map(detector.process, often) if found.keyframe is not None]
     assert len(often) > 2 * len(live) > 0
     for ours, theirs in zip(evaluation.keyframes, live, strict=True):
-        assert (ours.stamp_ns, ours.travelled_m, ours.session) == (theirs.stamp_ns, theirs.travelled_m, theirs.session)
+        assert (ours.stamp_ns, ours.path_length_m, ours.session) == (
+            theirs.stamp_ns,
+            theirs.path_length_m,
+            theirs.session,
+        )
         np.testing.assert_array_equal(ours.embedding.descriptor, theirs.embedding.descriptor)
 
 

@@ -11,8 +11,8 @@ from recordings import ODOMETRY, TRUTH, small_settings, traverse, write_mcap
 from tiny_worlds import TINY, pose_at, world_arrays
 from typer.testing import CliRunner
 
-from umf_ros.config import dump_settings
-from umf_ros.errors import ConfigError, UmfError
+from umf_ros.core.config import dump_settings
+from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.lab.commands import evaluate, pretrain
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF

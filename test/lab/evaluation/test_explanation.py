@@ -9,8 +9,8 @@ import pytest
 from command_line import umf
 from scenes import landscape, pose_at, take
 
-from umf_ros.config import Verification
-from umf_ros.errors import OutputError
+from umf_ros.core.config import Verification
+from umf_ros.core.errors import OutputError
 from umf_ros.lab.evaluation.explanation import Explanation, draw, explain
 
 GROUND = landscape(20)

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 from umf_ros.lab.commands import evaluate
 from umf_ros.lab.evaluation import all_methods, methods_run
 from umf_ros.lab.evaluation.all_methods import compare_methods

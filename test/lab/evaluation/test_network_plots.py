@@ -9,10 +9,10 @@ import torch
 from scipy.spatial.distance import cdist
 from tiny_worlds import TINY
 
-from umf_ros.config import EmbeddingSettings
-from umf_ros.embedding.embedder import Asked
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.core.frames import Frame
+from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.umf_embedder import UmfEmbedder
-from umf_ros.frames import Frame
 from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures, tsne
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
@@ -57,7 +57,7 @@ def test_attention_and_key_points_are_drawn(tmp_path: Path, rng: np.random.Gener
     weights = tmp_path / "tiny.safetensors"
     save_weights(UMF(TINY).eval(), weights, {})
     embedder, network = (
-        UmfEmbedder(weights, EmbeddingSettings(runtime="torch"), Asked(supers=True)),
+        UmfEmbedder(weights, EmbeddingSettings(runtime="torch"), FeatureRequest(supers=True)),
         load_weights(weights),
     )
     from conftest import CAMERA

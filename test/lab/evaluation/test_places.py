@@ -11,9 +11,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from umf_ros.config import EmbeddingSettings, Verification
+from umf_ros.core.config import EmbeddingSettings, Verification
+from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.embedding import make_embedder
-from umf_ros.errors import ConfigError, UmfError
 from umf_ros.lab.commands import evaluate
 from umf_ros.lab.evaluation.places import lists_place_sets, read_place_sets, read_truth, score_places
 

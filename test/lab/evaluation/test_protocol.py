@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.config import Loop
-from umf_ros.geometry import make_pose
+from umf_ros.core.config import Loop
+from umf_ros.core.geometry import make_pose
 from umf_ros.lab.evaluation.protocol import ROBOTCAR_RULE, loop_closure, place_recognition, revisits
 from umf_ros.lab.evaluation.retrieval import rank
 from umf_ros.lab.evaluation.scores import score
@@ -50,21 +50,21 @@ def drive() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_each_sample_is_compared_with_its_own_past() -> None:
-    stamps, truth, travelled = drive()
-    task = loop_closure(stamps, truth, travelled, GAPS)
+    stamps, truth, path_length = drive()
+    task = loop_closure(stamps, truth, path_length, GAPS)
     assert task.admissible.sum(axis=1).tolist() == [0, 0, 1, 2, 3, 4, 5, 6]
     assert np.argwhere(task.positive).tolist() == [[7, 1]]
 
 
 def test_without_headings_distance_alone_decides() -> None:
-    stamps, truth, travelled = drive()
-    task = loop_closure(stamps, truth, travelled, GAPS, has_orientation=False)
+    stamps, truth, path_length = drive()
+    task = loop_closure(stamps, truth, path_length, GAPS, has_orientation=False)
     assert np.argwhere(task.positive).tolist() == [[4, 2], [5, 1], [6, 0], [7, 1], [7, 5]]
 
 
 def test_a_match_lies_back_along_the_path_where_the_path_is_known() -> None:
-    stamps, truth, travelled = drive()
-    slow = loop_closure(stamps, truth, travelled / 10, GAPS)  # 2 m a step
+    stamps, truth, path_length = drive()
+    slow = loop_closure(stamps, truth, path_length / 10, GAPS)  # 2 m a step
     assert slow.admissible.sum() == 0
     unknown = loop_closure(stamps, truth, np.full(8, np.nan), GAPS)
     assert unknown.admissible.sum(axis=1).tolist() == [0, 0, 1, 2, 3, 4, 5, 6]

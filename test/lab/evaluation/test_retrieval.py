@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from landmarks import PLACES, LandmarkEmbedder, at, frame_of
 
-from umf_ros.config import Verification
-from umf_ros.frames import Keyframe
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Keyframe
 from umf_ros.lab.evaluation.retrieval import (
     METHODS,
     MODES,

@@ -14,7 +14,7 @@ import torch
 from landmarks import LandmarkEmbedder, frame_of
 from tiny_worlds import TINY
 
-from umf_ros.frames import Embedding, Frame
+from umf_ros.core.frames import Embedding, Frame
 from umf_ros.lab.evaluation import summary as summary_module
 from umf_ros.lab.evaluation.retrieval import METHODS
 from umf_ros.lab.evaluation.scores import Scores, YawBin, precision_recall

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from umf_ros.geometry import wrap_angle
+from umf_ros.core.geometry import wrap_angle
 from umf_ros.lab.evaluation.worlds import FIRST, FIRST_SEEDS, FULL, OPPOSITE, QUICK, REVISIT, SAME_LIGHT
 from umf_ros.lab.evaluation.worlds import test_worlds as make_worlds
 from umf_ros.lab.evaluation.worlds_run import work

@@ -10,7 +10,7 @@ import torch
 from landmarks import CONFUSED, PLACES, LandmarkEmbedder, LineWorld
 from tiny_worlds import TINY
 
-from umf_ros.config import Verification
+from umf_ros.core.config import Verification
 from umf_ros.lab.evaluation import worlds_run
 from umf_ros.lab.evaluation.summary import WorldResult, cost_of_weights
 from umf_ros.lab.evaluation.worlds_run import PICTURES, WorldEvaluation, WorldsRun

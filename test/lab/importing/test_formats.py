@@ -14,8 +14,8 @@ from command_line import only_line, umf
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.config import load_settings
-from umf_ros.frames import Frame
+from umf_ros.core.config import load_settings
+from umf_ros.core.frames import Frame
 from umf_ros.lab.commands.import_data import KINDS
 from umf_ros.lab.importing import FORMATS
 

@@ -24,8 +24,8 @@ from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import open_bag
 from umf_ros.lab.live.bag_player_node import TRANSPORT
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.sensors.intake import Intake, wanted_inputs
-from umf_ros.sensors.messages import decode_cloud, decode_image, stamp_ns
+from umf_ros.sensors.decode import decode_cloud, decode_image, stamp_ns
+from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
 
 
@@ -154,7 +154,7 @@ def test_frames_over_dds_equal_those_read_from_the_file(ros_context: None, tmp_p
     topics = topics_of(settings).model_copy(update={"left_info": "", "right_info": ""})
     calibration = load_calibration(settings.calibration)
     synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(topics))
-    intake = Intake(synchronizer, topics, pytest.fail)
+    intake = MessageRouter(synchronizer, topics, pytest.fail)
     node = Node("frames")
     for topic, kind in ((LEFT, Image), (RIGHT, Image), (CLOUD, PointCloud2), (ODOMETRY, Odometry)):
         node.create_subscription(kind, topic, partial(intake.take, topic), 200)

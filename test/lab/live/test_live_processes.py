@@ -16,7 +16,7 @@ from processes import wait_until
 from recordings import traverse, write_mcap
 from rich.console import Console
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 from umf_ros.lab.live.live_graph import PLAYER, LiveGraph, NodeProcess
 
 SCANS = 14

@@ -11,7 +11,7 @@ from typing import get_type_hints
 import pytest
 from processes import wait_until
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 from umf_ros.lab.commands.simulate import command
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.presets import PRESETS

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from umf_ros.errors import ConfigError
-from umf_ros.geometry import heading, relative, rotation_angle, wrap_angle
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.geometry import heading, relative, rotation_angle, wrap_angle
 from umf_ros.lab.simulation.odometry import Drift, drifting
 from umf_ros.lab.simulation.passes import SETTINGS, plan_passes
 from umf_ros.lab.simulation.presets import DEMO, ETNA, SESSION, find_preset
@@ -31,7 +31,7 @@ def walker(seed: int = 0) -> Walker:
 def test_a_second_lap_is_labelled_an_offset_revisit_near_the_first():
     route = walker().forward(251).forward(200, lateral_m=3).route(0)
     assert [label for label, _, _ in route.legs()] == ["first", "offset"]
-    again = route.path[route.travelled > 260]
+    again = route.path[route.path_length > 260]
     away = np.abs(np.linalg.norm(again, axis=1) - 40)
     assert 0.5 < away.max() < 3.2
 
@@ -77,7 +77,7 @@ def test_the_demo_comes_back_after_20_s_and_15_m(relief):
     route = DEMO.route(relief, 3)
     first, _ = route.legs()[0], route.legs()[-1]
     assert route.length_m > 2 * first[2]
-    start, later = route.path[8], route.path[route.travelled > 30]
+    start, later = route.path[8], route.path[route.path_length > 30]
     assert np.linalg.norm(later - start, axis=1).min() < 1.5
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.trajectories import east_north_up, read_rtklib
-from umf_ros.geometry import heading, make_pose, relative
+from umf_ros.core.geometry import heading, make_pose, relative
 from umf_ros.lab.simulation import gnss, imu
 from umf_ros.lab.simulation.motion import Motion
 from umf_ros.lab.simulation.odometry import Drift, drifting
@@ -86,7 +86,7 @@ def test_rates_are_those_of_the_poses():
 def test_the_way_driven_is_the_length_of_the_path():
     motion = move(circle(8))
     times = np.linspace(0, motion.duration_s, 3000)
-    way = motion.travelled(times)
+    way = motion.path_length(times)
     assert (np.diff(way) >= 0).all() and way[0] == 0
     driven = np.linalg.norm(np.diff(motion.poses(times)[:, :3, 3], axis=0), axis=1).sum()
     assert way[-1] == pytest.approx(driven, rel=0.02)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.geometry import from_quaternion, heading, make_pose
+from umf_ros.core.geometry import from_quaternion, heading, make_pose
 from umf_ros.lab.simulation.camera import _smeared
 from umf_ros.lab.simulation.gnss import ORIGIN, to_geodetic
 from umf_ros.lab.simulation.lidar import POINTS, Scan

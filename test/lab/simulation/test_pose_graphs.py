@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from umf_ros.geometry import invert, logmap
+from umf_ros.core.geometry import invert, logmap
 from umf_ros.lab.simulation.pose_graphs import (
     WORLDS,
     GraphWorld,

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 from umf_ros.lab.simulation.families import FAMILIES, draw_traits
 from umf_ros.lab.simulation.noise import detail_texture, spectral_noise
 from umf_ros.lab.simulation.relief import CELL_M, SIZE_M, Pan

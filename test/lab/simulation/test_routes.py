@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from umf_ros.errors import ConfigError
-from umf_ros.geometry import wrap_angle
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.geometry import wrap_angle
 from umf_ros.lab.simulation.passes import SETTINGS, plan_passes, resample
 from umf_ros.lab.simulation.presets import DEMO, ETNA, PRESETS, SENSORS, find_preset, gentle_loop
 from umf_ros.lab.simulation.relief import SIZE_M
@@ -119,7 +119,7 @@ def test_legs_follow_each_other_without_a_gap():
     legs = route.legs()
     assert legs[0][1] == 0 and legs[-1][2] == pytest.approx(route.length_m)
     assert all(0 < after[1] - before[2] < 3 * STEP_M for before, after in pairwise(legs))
-    assert len(route.labels) == len(route.path) == len(route.travelled) == len(route.yaw)
+    assert len(route.labels) == len(route.path) == len(route.path_length) == len(route.yaw)
     assert {"first", "crossing", "opposite"} <= set(route.labels)
 
 
@@ -150,11 +150,11 @@ def test_the_drive_for_the_sensors_passes_even_ground_twice_and_rocks_by_night(d
     route = SENSORS.route(drive.world.relief, 31)
     legs = {label: (start, end) for label, start, end in route.legs()}
     assert set(legs) == {"first", "flat ground", "rocks by day", NIGHT}
-    on_pan = np.interp(legs["flat ground"], route.travelled, np.hypot(*route.path.T))
+    on_pan = np.interp(legs["flat ground"], route.path_length, np.hypot(*route.path.T))
     assert SENSORS.pan is not None and (on_pan < SENSORS.pan.radius_m - 30).all()
     for label in ("flat ground", "rocks by day", NIGHT):
-        there = (route.travelled >= legs[label][0] + 1) & (route.travelled <= legs[label][1] - 1)
-        before = route.travelled < legs[label][0] - 1
+        there = (route.path_length >= legs[label][0] + 1) & (route.path_length <= legs[label][1] - 1)
+        before = route.path_length < legs[label][0] - 1
         assert cKDTree(route.path[before]).query(route.path[there])[0].max() < 1.0
 
 

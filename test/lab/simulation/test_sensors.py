@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from umf_ros.core.geometry import invert, relative, transform
 from umf_ros.embedding.inputs import is_blank
-from umf_ros.geometry import invert, relative, transform
 from umf_ros.lab.simulation import gnss, imu
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, resized
 from umf_ros.lab.simulation.lidar import PERIOD_NS, POINTS, Lidar

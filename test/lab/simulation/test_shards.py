@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from umf_ros.errors import OutputError
-from umf_ros.geometry import invert, transform
+from umf_ros.core.errors import OutputError
+from umf_ros.core.geometry import invert, transform
 from umf_ros.lab.simulation.camera import resized
 from umf_ros.lab.simulation.contact_sheet import contact_sheet
 from umf_ros.lab.simulation.passes import SETTINGS, plan_passes
@@ -48,7 +48,7 @@ def test_points_of_a_shard_are_returns_in_the_body_frame(shard):
 
 def test_points_and_depth_of_a_shard_agree(shard):
     """Float16 and 16 pixels per cell of depth: within 3 % in the median."""
-    from umf_ros.frames import StereoCamera
+    from umf_ros.core.frames import StereoCamera
 
     names = ("width", "height", "fx", "fy", "cx", "cy", "baseline")
     full = StereoCamera(*(shard[name].item() for name in names))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from umf_ros.errors import ConfigError, OutputError
+from umf_ros.core.errors import ConfigError, OutputError
 from umf_ros.lab.commands.simulate import command
 from umf_ros.lab.datasets.simulated import SimulatedWorld
 from umf_ros.lab.simulation.bag_writer import BagWriter

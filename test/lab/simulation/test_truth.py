@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from umf_ros.geometry import invert, make_pose, transform
+from umf_ros.core.geometry import invert, make_pose, transform
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, resized
 from umf_ros.lab.simulation.lidar import LINES, PERIOD_NS, POINTS, PULSES, RANGE_M, Lidar, pulse_directions, pulse_times
 from umf_ros.lab.simulation.lighting import Sun

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from umf_ros.geometry import make_pose
+from umf_ros.core.geometry import make_pose
 from umf_ros.lab.simulation.camera import Camera
 from umf_ros.lab.simulation.lighting import Sun
 from umf_ros.lab.simulation.relief import SIZE_M

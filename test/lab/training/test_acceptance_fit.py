@@ -20,7 +20,7 @@ from umf_ros.lab.training.acceptance_fit import (
 from umf_ros.verification import Measurement
 from umf_ros.verification.acceptance import scores
 from umf_ros.verification.measurement import IMAGE, SCAN
-from umf_ros.verification.registration import CovarianceModel, covariance_of
+from umf_ros.verification.scan_alignment import CovarianceModel, covariance_of
 
 
 def examples(count: int, rng: np.random.Generator) -> list[Example]:

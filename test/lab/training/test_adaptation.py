@@ -14,8 +14,8 @@ from rich.console import Console
 from tiny_worlds import TINY, pose_at
 from typer.testing import CliRunner
 
-from umf_ros.config import dump_settings
-from umf_ros.errors import ConfigError, UmfError
+from umf_ros.core.config import dump_settings
+from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.lab.commands import adapt as command
 from umf_ros.lab.training.adaptation import Adaptation, Lesson, Recall, adapt, measure
 from umf_ros.lab.training.drives import Drive

@@ -9,16 +9,16 @@ import pytest
 import torch
 from tiny_worlds import CAMERA, TINY, pose_at, some_scan
 
-from umf_ros.config import Settings
-from umf_ros.errors import UmfError
-from umf_ros.frames import Frame
+from umf_ros.core.config import Settings
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Frame
 from umf_ros.lab.training.drives import Drive, DriveReader, label_drive
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.lab.training.scene_fit import with_scene
 from umf_ros.networks.efficientnet import EfficientNetLite0
 from umf_ros.networks.scene import DEPTH
 from umf_ros.networks.umf import UMF
-from umf_ros.sensors.messages import OdometrySample
+from umf_ros.sensors.decode import OdometrySample
 
 STEP_M = 5.0
 LAP = 20
@@ -122,7 +122,7 @@ def test_a_recording_becomes_a_drive_that_can_be_kept(weights: Path, tmp_path: P
     assert drive.seen.shape == drive.felt.shape == (5, TINY.tokens) and drive.cells.shape == (5, 15 * 112)
     assert drive.image_present.all() and drive.cloud_present.all() and drive.closures.shape == (0, 2)
     np.testing.assert_allclose(drive.map_T_body[:, 0, 3], 3.0 * np.arange(5), atol=1e-6)
-    np.testing.assert_allclose(drive.travelled_m, 3.0 * np.arange(5), atol=1e-6)
+    np.testing.assert_allclose(drive.path_length_m, 3.0 * np.arange(5), atol=1e-6)
     drive.save(tmp_path / "drive.npz")
     again = Drive.load(tmp_path / "drive.npz")
     np.testing.assert_array_equal(again.seen, drive.seen)

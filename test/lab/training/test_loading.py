@@ -13,7 +13,7 @@ import pytest
 SCRIPT = """
 import json, os, sys
 from pathlib import Path
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 from umf_ros.lab.training.loading import made_ahead
 
 workers, folder = int(sys.argv[1]), Path(sys.argv[2])

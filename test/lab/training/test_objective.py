@@ -6,7 +6,7 @@ import csv
 
 import pytest
 
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 from umf_ros.lab import training
 from umf_ros.lab.training.networks import read_card
 from umf_ros.lab.training.objective import find_methods, generator

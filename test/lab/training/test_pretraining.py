@@ -10,7 +10,7 @@ import pytest
 import torch
 from tiny_worlds import TINY, flat_sample, world_arrays, write_world
 
-from umf_ros.errors import ConfigError, WeightsError
+from umf_ros.core.errors import ConfigError, WeightsError
 from umf_ros.lab.datasets.simulated import WorldFolder
 from umf_ros.lab.training.distributed import Team
 from umf_ros.lab.training.masked_images_objective import MaskedImagesObjective

@@ -18,7 +18,7 @@ import yaml
 from tiny_worlds import TINY, pose_at, some_input, write_world
 from typer.testing import CliRunner
 
-from umf_ros.errors import ConfigError, OutputError, UmfError, WeightsError
+from umf_ros.core.errors import ConfigError, OutputError, UmfError, WeightsError
 from umf_ros.lab.commands import pretrain as pretrain_command
 from umf_ros.lab.commands import train as train_command
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder

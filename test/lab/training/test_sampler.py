@@ -10,7 +10,7 @@ import pytest
 import torch
 from tiny_worlds import TINY, pose_at
 
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 from umf_ros.lab.datasets.correspondences import cell_points, match_cells
 from umf_ros.lab.datasets.labels import Places, Rule, distances, label, places_of
 from umf_ros.lab.datasets.sample import Sample

@@ -14,7 +14,7 @@ import pytest
 import torch
 from tiny_worlds import TINY, write_world
 
-from umf_ros.errors import ConfigError, UmfError, WeightsError
+from umf_ros.core.errors import ConfigError, UmfError, WeightsError
 from umf_ros.lab.datasets.labels import Rule
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.lab.datasets.views import Augmentation, ViewMaker

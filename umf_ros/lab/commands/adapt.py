@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from umf_ros.commands.recordings import ConfigPath, DatasetName, WeightsPath, check_files, open_frames, open_recording
-from umf_ros.errors import ConfigError, UmfError
+from umf_ros.core.errors import ConfigError, UmfError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -72,7 +72,7 @@ def _drive(
 ) -> Drive:
     """What one recording teaches, from the folder where it is there."""
     from umf_ros.commands.progress import WARNING, FrameProgress
-    from umf_ros.errors import writing
+    from umf_ros.core.errors import writing
     from umf_ros.lab.training.drives import Drive, DriveReader
 
     rules = config.read_bytes() if config and config.is_file() else b""

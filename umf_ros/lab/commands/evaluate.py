@@ -17,10 +17,10 @@ from umf_ros.commands.recordings import (
     WeightsPath,
     check_files,
 )
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.yaml_files import is_yaml
 from umf_ros.embedding import CHOICES
-from umf_ros.errors import ConfigError
 from umf_ros.lab.commands.evaluation_inputs import RecordingOptions, choose_worlds, note_on_worlds, progress_bar
-from umf_ros.yaml_files import is_yaml
 
 if TYPE_CHECKING:
     from umf_ros.lab.evaluation.results import Figures
@@ -143,8 +143,8 @@ def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Pa
 def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
+    from umf_ros.core.frames import Frame
     from umf_ros.embedding import make_embedder
-    from umf_ros.frames import Frame
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
     from umf_ros.runs.folder import create_run_folder
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 from umf_ros.lab.commands.evaluation_inputs import RecordingOptions, choose_worlds, note_on_worlds, progress_bar
 
 if TYPE_CHECKING:

@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from umf_ros.commands.recordings import check_odometry_options, open_frames, open_recording
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-    from umf_ros.config import Settings
-    from umf_ros.frames import Frame
+    from umf_ros.core.config import Settings
+    from umf_ros.core.frames import Frame
+    from umf_ros.core.trajectory import Trajectory
     from umf_ros.lab.evaluation.worlds import TestWorld
-    from umf_ros.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.errors import ConfigError, writing
+from umf_ros.core.errors import ConfigError, writing
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,7 +38,7 @@ def optimize(
     from rich.console import Console
     from rich.progress import track
 
-    from umf_ros.config import PoseGraphSettings
+    from umf_ros.core.config import PoseGraphSettings
     from umf_ros.lab.datasets.g2o import as_recording, drive, read_g2o
     from umf_ros.pose_graph.export import verdict_table
     from umf_ros.pose_graph.pose_graph import PoseGraph

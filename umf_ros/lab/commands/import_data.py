@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from umf_ros.errors import BagError, ConfigError, OutputError, either
+from umf_ros.core.errors import BagError, ConfigError, OutputError, either
 
 KINDS = ("kitti-odometry", "kitti-raw", "euroc", "tum-rgbd", "nuscenes", "folder")
 

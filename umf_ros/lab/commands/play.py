@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from umf_ros.commands.recordings import BagPath, check_files
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 
 
 def command(

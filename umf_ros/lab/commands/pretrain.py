@@ -45,7 +45,7 @@ def command(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
 ) -> None:
     """Pretrain the encoder that the subcommand names."""
-    from umf_ros.errors import ConfigError
+    from umf_ros.core.errors import ConfigError
     from umf_ros.lab.training.run import load_run
 
     encoder = str(context.info_name)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.errors import ConfigError, OutputError
+from umf_ros.core.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -127,8 +127,8 @@ def _write_shards(
 def _spread_shards(
     folder: Path, worlds: str, every: int, sequences: str, workers: int, ray: str, console: Console
 ) -> None:
+    from umf_ros.core.tasks import spread
     from umf_ros.lab.simulation.shards import write_world
-    from umf_ros.spread import spread
 
     if sequences:
         raise ConfigError("--ray spreads --worlds, not --sequences")

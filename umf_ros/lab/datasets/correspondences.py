@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from umf_ros.frames import Points
-from umf_ros.geometry import Array, invert, transform
+from umf_ros.core.frames import Points
+from umf_ros.core.geometry import Array, invert, transform
 from umf_ros.lab.datasets.views import View, relative_pose, view_points
 
 CELL = 4

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.config import PoseGraphSettings
-from umf_ros.errors import GraphError
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import (
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.errors import GraphError
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import (
     Array,
     adjoint,
     from_quaternion,
@@ -29,7 +29,7 @@ from umf_ros.geometry import (
     propagate,
 )
 from umf_ros.pose_graph.closures import check_covariance
-from umf_ros.pose_graph.condensed import Edge
+from umf_ros.pose_graph.odometry_preintegration import Edge
 from umf_ros.pose_graph.pose_graph import PoseGraph
 
 PERIOD_NS = 1_000_000_000

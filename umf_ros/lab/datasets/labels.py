@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array, heading, wrap_angle
+from umf_ros.core.geometry import Array, heading, wrap_angle
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.errors import UmfError, one_line
+from umf_ros.core.errors import UmfError, one_line
 
 Names = Mapping[str, Callable[..., Any]]
 

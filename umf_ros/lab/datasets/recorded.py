@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.datasets.sample import Sample
 
 DETOUR_M = 60.0
@@ -45,14 +45,14 @@ class RecordedSequence:
         return self._load(index)
 
 
-def travelled(positions: Array) -> Array:
+def path_length(positions: Array) -> Array:
     """(N,) metres along the path of (N, 3) positions."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
 
 
 def detours(positions: Array) -> Array:
     """(N,) passes of one drive through (N, 3) positions: a detour later it is the next one."""
-    return travelled(positions) / DETOUR_M
+    return path_length(positions) / DETOUR_M
 
 
 def course(positions: Array) -> Array:
@@ -61,7 +61,7 @@ def course(positions: Array) -> Array:
     The heading is that of the chord from a metre before to a metre after; a rover that stands keeps
     its last one.
     """
-    way = travelled(positions)
+    way = path_length(positions)
     reach = [
         np.stack([np.interp(way + side, way, positions[:, axis]) for axis in (0, 1)], 1)
         for side in (-BASELINE_M, BASELINE_M)

@@ -17,9 +17,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from umf_ros.errors import UmfError
-from umf_ros.frames import Image, Points, StereoCamera
-from umf_ros.geometry import Array, make_pose
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Image, Points, StereoCamera
+from umf_ros.core.geometry import Array, make_pose
 from umf_ros.lab.datasets.pickles import load_pickle
 from umf_ros.lab.datasets.recorded import RecordedSequence, course, poses_of
 from umf_ros.lab.datasets.sample import Sample

@@ -15,16 +15,16 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import east_north_up, read_ground_truth, read_odometry
-from umf_ros.config import Settings
+from umf_ros.core.config import Settings
+from umf_ros.core.errors import BagError, UmfError
+from umf_ros.core.frames import Frame, Image
+from umf_ros.core.geometry import Array, align, transform
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.embedding.inputs import shrink
-from umf_ros.errors import BagError, UmfError
-from umf_ros.frames import Frame, Image
-from umf_ros.geometry import Array, align, transform
 from umf_ros.lab.datasets.pickles import load_data_frame
-from umf_ros.lab.datasets.recorded import RecordedSequence, course, detours, poses_of, travelled
+from umf_ros.lab.datasets.recorded import RecordedSequence, course, detours, path_length, poses_of
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.sensors.calibration import Calibration, load_calibration
-from umf_ros.trajectory import Trajectory
 
 ETNA_TEST = ("s3li_loops", "s3li_traverse_1")
 ETNA_TRAINING = ("s3li_traverse_2", "s3li_crater", "s3li_crater_inout", "s3li_mapping", "s3li_landmarks")
@@ -135,7 +135,7 @@ def _aligned(estimate: Array, positions: Array) -> Array:
     """(N, 3, 3) rotations of estimated (N, 4, 4) poses in the frame of (N, 3) positions; the course if they differ."""
     truth_T_estimate = align(estimate[:, :3, 3], positions)[0]
     misfit = np.linalg.norm(transform(truth_T_estimate, estimate[:, :3, 3]) - positions, axis=1)
-    if np.sqrt(np.mean(misfit**2)) > MAX_MISFIT * travelled(positions)[-1]:
+    if np.sqrt(np.mean(misfit**2)) > MAX_MISFIT * path_length(positions)[-1]:
         return course(positions)
     return truth_T_estimate[:3, :3] @ estimate[:, :3, :3]
 

@@ -7,8 +7,8 @@ from typing import Protocol
 
 from numpy.typing import NDArray
 
-from umf_ros.frames import Image, Points, StereoCamera
-from umf_ros.geometry import Array
+from umf_ros.core.frames import Image, Points, StereoCamera
+from umf_ros.core.geometry import Array
 
 
 @dataclass(frozen=True, slots=True)

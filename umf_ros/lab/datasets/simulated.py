@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.errors import UmfError
-from umf_ros.frames import StereoCamera
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import StereoCamera
 from umf_ros.lab.datasets.sample import Sample
 
 NUMBERS = ("fx", "fy", "cx", "cy")

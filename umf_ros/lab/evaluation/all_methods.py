@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 from umf_ros.lab.evaluation.methods_run import FrameSet, MethodsRun, make_others
 from umf_ros.lab.evaluation.results import EvaluationReport
 

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.config import Database, Settings
+from umf_ros.core.config import Database, Settings
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Frame, Keyframe
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.detector import LoopDetector
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.errors import UmfError
-from umf_ros.frames import Frame, Keyframe
 from umf_ros.lab.evaluation.protocol import RetrievalTask, loop_closure
 from umf_ros.lab.evaluation.results import (
     HEADINGS,
@@ -24,8 +26,6 @@ from umf_ros.lab.evaluation.results import (
 )
 from umf_ros.lab.evaluation.retrieval import METHODS, rank, rerank_all
 from umf_ros.lab.evaluation.scores import Scores, score
-from umf_ros.loop_detector import LoopDetector
-from umf_ros.trajectory import Trajectory
 
 PICTURES = {"Precision and recall": "precision_recall.png", "Recall": "recall.png"}
 SHOWN = ("fused", "superfeatures both", "ransac both")
@@ -103,8 +103,8 @@ class BagEvaluation:
         if not known.any():
             raise UmfError(f"the ground truth covers none of the {len(keyframes)} keyframes; do the clocks agree?")
         rows = np.flatnonzero(known)
-        travelled = np.array([keyframe.travelled_m for keyframe in keyframes])
-        task = loop_closure(stamps[rows], poses[rows], travelled[rows], self._settings.loop, truth.has_orientation)
+        path_length = np.array([keyframe.path_length_m for keyframe in keyframes])
+        task = loop_closure(stamps[rows], poses[rows], path_length[rows], self._settings.loop, truth.has_orientation)
         return BagResult(len(rows), self._scores(task, rows, report))
 
     def _scores(self, task: RetrievalTask, rows: np.ndarray, report: Callable[[], None]) -> dict[str, Scores]:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.config import Verification
-from umf_ros.errors import writing
-from umf_ros.frames import Candidate, Image, Keyframe, Points
-from umf_ros.geometry import transform
+from umf_ros.core.config import Verification
+from umf_ros.core.errors import writing
+from umf_ros.core.frames import Candidate, Image, Keyframe, Points
+from umf_ros.core.geometry import transform
 from umf_ros.verification.acceptance import load_acceptance
 from umf_ros.verification.verifier import JudgedHypothesis, Verifier
 

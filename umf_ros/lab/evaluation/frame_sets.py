@@ -6,11 +6,13 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from umf_ros.config import Database, Loop, Settings
-from umf_ros.embedding.thumbnail_embedder import ThumbnailEmbedder
-from umf_ros.errors import UmfError
-from umf_ros.frames import Frame, ScanMotion
-from umf_ros.geometry import Array
+from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.core.config import Database, Loop, Settings
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Frame, ScanMotion
+from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.detector import LoopDetector
 from umf_ros.lab.datasets.labels import Rule
 from umf_ros.lab.datasets.s3li import ETNA_TEST
 from umf_ros.lab.datasets.sample import SampleSequence
@@ -22,8 +24,6 @@ from umf_ros.lab.simulation.camera import resized
 from umf_ros.lab.simulation.passes import thinned
 from umf_ros.lab.simulation.sequences import etna_surveys
 from umf_ros.lab.simulation.survey import Survey
-from umf_ros.loop_detector import LoopDetector
-from umf_ros.trajectory import Trajectory
 
 SPEED_M_S = 1.0
 """Of a simulated sequence, whose samples have no stamps of their own."""
@@ -72,14 +72,14 @@ def recording_set(name: str, frames: Iterable[Frame], truth: Trajectory, setting
             if frame.session:
                 return
             if detector.select(frame) and truth.at(np.array([frame.stamp_ns]))[1][0]:
-                kept.append((frame.stamp_ns, detector.embed(frame).travelled_m))
+                kept.append((frame.stamp_ns, detector.embed(frame).path_length_m))
                 yield frame
 
     def task() -> RetrievalTask:
         if not kept:
             raise UmfError("the ground truth covers none of the keyframes; do the clocks agree?")
-        stamps, travelled = np.array([one[0] for one in kept], np.int64), np.array([one[1] for one in kept])
-        return loop_closure(stamps, truth.at(stamps)[0], travelled, settings.loop, truth.has_orientation)
+        stamps, path_length = np.array([one[0] for one in kept], np.int64), np.array([one[1] for one in kept])
+        return loop_closure(stamps, truth.at(stamps)[0], path_length, settings.loop, truth.has_orientation)
 
     return FrameSet(name, keyframes(), task, unanswerable_count=True)
 
@@ -96,11 +96,11 @@ def _drive_set(name: str, survey: Survey) -> FrameSet:
     steps = [(number, step) for number, drive in enumerate(survey.passes) for step in range(len(drive.path))]
     world_T_body = np.stack([survey.pose(*step) for step in steps])
     moved = np.linalg.norm(np.diff(world_T_body[:, :3, 3], axis=0), axis=1)
-    travelled_m = np.concatenate([[0.0], np.cumsum(moved)])
-    stamps = (travelled_m / SPEED_M_S * 1e9).astype(np.int64)
+    path_length_m = np.concatenate([[0.0], np.cumsum(moved)])
+    stamps = (path_length_m / SPEED_M_S * 1e9).astype(np.int64)
     seen = (survey.sample(*step) for step in steps)
     frames = (visit_of(at, one, survey.calibration).frame for at, one in zip(stamps.tolist(), seen, strict=True))
-    return FrameSet(name, frames, lambda: loop_closure(stamps, world_T_body, travelled_m, Loop()), True)
+    return FrameSet(name, frames, lambda: loop_closure(stamps, world_T_body, path_length_m, Loop()), True)
 
 
 def still_set(places: PlaceSet) -> FrameSet:

@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from umf_ros.errors import OutputError
-from umf_ros.geometry import Array
+from umf_ros.core.errors import OutputError
+from umf_ros.core.geometry import Array
 from umf_ros.lab.datasets.g2o import GraphRecording
 
 

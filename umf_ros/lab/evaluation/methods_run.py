@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.config import EmbeddingSettings, Verification
+from umf_ros.core.config import EmbeddingSettings, Verification
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.frames import Frame, Keyframe, LocalFeatures, SuperFeatures
 from umf_ros.embedding import DEFAULT, make_embedder
 from umf_ros.embedding import METHODS as EMBEDDERS
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.errors import ConfigError
-from umf_ros.frames import Frame, Keyframe, LocalFeatures, SuperFeatures
 from umf_ros.lab.evaluation.methods import (
     MethodAnswers,
     MethodCost,

@@ -18,13 +18,13 @@ from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 from torch import Tensor
 
+from umf_ros.core.frames import Embedding, Frame, Image, Points
+from umf_ros.core.geometry import Array, transform
+from umf_ros.core.levelling import level
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.inputs import prepare_scan, read_frame
 from umf_ros.embedding.torch_runtimes import to_tensors
-from umf_ros.frames import Embedding, Frame, Image, Points
-from umf_ros.geometry import Array, transform
 from umf_ros.lab.evaluation.retrieval import Indices
-from umf_ros.levelling import level
 from umf_ros.networks.attention import received
 from umf_ros.networks.umf import UMF, NetworkOutput
 from umf_ros.verification.rerank import eligible_superfeatures

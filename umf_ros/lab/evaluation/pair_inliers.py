@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from umf_ros.config import Verification
-from umf_ros.frames import Candidate, Keyframe
-from umf_ros.geometry import Array
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Candidate, Keyframe
+from umf_ros.core.geometry import Array
 from umf_ros.lab.evaluation.retrieval import METHODS, NOTHING, TOP_K, Ranking
 from umf_ros.verification.rerank import rerank
 

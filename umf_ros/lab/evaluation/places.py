@@ -20,18 +20,18 @@ import cv2
 import numpy as np
 from pydantic import Field, ValidationError
 
-from umf_ros.config import Group, Verification, problems
+from umf_ros.core.config import Group, Verification, problems
+from umf_ros.core.errors import ConfigError, UmfError
+from umf_ros.core.frames import Frame, Image, Points, StereoCamera
+from umf_ros.core.geometry import transform
+from umf_ros.core.yaml_files import read_yaml
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.errors import ConfigError, UmfError
-from umf_ros.frames import Frame, Image, Points, StereoCamera
-from umf_ros.geometry import transform
 from umf_ros.lab.evaluation.protocol import RetrievalTask
 from umf_ros.lab.evaluation.results import Figures, TextTable, percent, rounded
 from umf_ros.lab.evaluation.retrieval import Mask, PlaceCollection, rank, rerank_all
 from umf_ros.lab.evaluation.scores import Scores, score
 from umf_ros.sensors.calibration import Calibration, load_calibration
 from umf_ros.sensors.scan_files import SUFFIXES, read_scan
-from umf_ros.yaml_files import read_yaml
 
 IMAGES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 RERANKER = "ransac both"

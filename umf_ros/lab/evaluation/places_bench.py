@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from umf_ros.config import Database, Loop
-from umf_ros.frames import Embedding, Keyframe, Points, StereoCamera
+from umf_ros.core.config import Database, Loop
+from umf_ros.core.frames import Embedding, Keyframe, Points, StereoCamera
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.packing import pack
 from umf_ros.places.search import PlaceSearch
@@ -189,11 +189,11 @@ def _dimension(path: Path) -> int:
         return int(connection.execute("SELECT length(descriptor) FROM keyframe LIMIT 1").fetchone()[0]) // 4
 
 
-def _keyframe(stamp_ns: int, session: int, travelled_m: float, descriptor: Points) -> Keyframe:
+def _keyframe(stamp_ns: int, session: int, path_length_m: float, descriptor: Points) -> Keyframe:
     camera = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)
     points = np.empty((0, 3), np.float32)
     return Keyframe(
-        stamp_ns, Embedding(descriptor), camera, np.eye(4), points, travelled_m=travelled_m, session=session
+        stamp_ns, Embedding(descriptor), camera, np.eye(4), points, path_length_m=path_length_m, session=session
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from umf_ros.config import EmbeddingSettings, Verification
+from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.evaluation.places import read_place_sets, score_places, table_of
 from umf_ros.lab.evaluation.results import EvaluationReport

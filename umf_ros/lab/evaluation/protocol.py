@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.config import Loop
-from umf_ros.geometry import Array
-from umf_ros.keyframes import is_past
+from umf_ros.core.config import Loop
+from umf_ros.core.geometry import Array
+from umf_ros.core.keyframes import is_past
 from umf_ros.lab.datasets.labels import Rule, distances, label, places_of
 from umf_ros.lab.evaluation.retrieval import Indices, Mask
 
@@ -80,7 +80,7 @@ def revisits(world_T_body: Array, pass_index: NDArray, rule: Rule = THESIS_RULE)
 def loop_closure(
     stamps: NDArray[np.int64],
     world_T_body: Array,
-    travelled_m: Array,
+    path_length_m: Array,
     gaps: Loop,
     has_orientation: bool = True,
     rule: Rule = THESIS_RULE,
@@ -90,13 +90,13 @@ def loop_closure(
     Args:
         stamps: (N,) ns, ascending.
         world_T_body: (N, 4, 4) true poses.
-        travelled_m: (N,) path length, NaN where unknown.
+        path_length_m: (N,) path length, NaN where unknown.
         gaps: how far back in time and along the path a match must lie.
         has_orientation: whether the truth knows headings; without them distance alone decides.
         rule: what is a true match.
     """
     every = np.arange(len(stamps))
-    past = is_past(stamps[:, None] - stamps[None], travelled_m[:, None] - travelled_m[None], gaps)
+    past = is_past(stamps[:, None] - stamps[None], path_length_m[:, None] - path_length_m[None], gaps)
     admissible = (every[None] < every[:, None]) & past
     if not has_orientation:
         flat = np.tile(np.eye(4), (len(stamps), 1, 1))

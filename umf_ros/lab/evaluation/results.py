@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 from rich.table import Table as Grid
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.evaluation.scores import PrecisionRecall, Scores
 from umf_ros.runs.folder import write_atomically
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.config import Verification
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Candidate, Embedding, Frame, Keyframe
+from umf_ros.core.geometry import Array
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.frames import Candidate, Embedding, Frame, Keyframe
-from umf_ros.geometry import Array
 from umf_ros.verification.rerank import rerank
 
 Indices = NDArray[np.int64]

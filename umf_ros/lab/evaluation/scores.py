@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.evaluation.protocol import THESIS_RULE, RetrievalTask
 from umf_ros.lab.evaluation.retrieval import Indices, Mask, Ranking
 

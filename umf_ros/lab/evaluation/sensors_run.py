@@ -16,15 +16,15 @@ from rich.console import Console
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
+from umf_ros.core.tasks import spread
+from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.evaluation.results import TextTable
-from umf_ros.loop_detector import LoopDetector, make_detector_embedder
 from umf_ros.replay import Replay
 from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.finished_run import read_run, remember_recording
 from umf_ros.runs.recorder import count_drops
 from umf_ros.runs.report import finish_run, judge
-from umf_ros.spread import spread
 
 _NOTHING = "/none"
 SENSORS: dict[str, dict[str, Any]] = {
@@ -108,7 +108,7 @@ def replay(task: SensorTask) -> None:
     for _ in run.run(reader.stream()):
         pass
     run.finish(count_drops(reader.counters))
-    run.confess()
+    run.raise_if_frames_failed()
     remember_recording(task.folder, recording)
     if task.report:
         finish_run(task.folder, recording, Console(file=StringIO()))

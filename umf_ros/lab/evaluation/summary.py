@@ -11,11 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from umf_ros.config import EmbeddingSettings
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import Array
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.umf_embedder import UmfEmbedder
-from umf_ros.frames import Frame
-from umf_ros.geometry import Array
 from umf_ros.lab.evaluation.results import Figures, TextTable, mean, percent, rounded, scores_table
 from umf_ros.lab.evaluation.retrieval import METHODS, RERANKERS, TOP_K, Indices
 from umf_ros.lab.evaluation.scores import Scores, YawBin

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from umf_ros.frames import Frame, ScanMotion
-from umf_ros.geometry import Array
+from umf_ros.core.frames import Frame, ScanMotion
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.camera import resized
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.passes import SETTINGS, Pass, plan_passes, thinned

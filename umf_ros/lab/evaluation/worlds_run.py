@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.config import EmbeddingSettings, Verification
+from umf_ros.core.config import EmbeddingSettings, Verification
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import Array
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.frames import Frame
-from umf_ros.geometry import Array
 from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures
 from umf_ros.lab.evaluation.protocol import RetrievalTask, place_recognition
 from umf_ros.lab.evaluation.results import EvaluationReport, plot_precision_recall, plot_recall

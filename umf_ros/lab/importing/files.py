@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from umf_ros.errors import SensorFileError
-from umf_ros.geometry import Array
+from umf_ros.core.errors import SensorFileError
+from umf_ros.core.geometry import Array
 from umf_ros.sensors.snapshots import read_image
 
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.errors import SensorFileError
-from umf_ros.geometry import Array, make_pose, to_quaternion
-from umf_ros.sensors.messages import Cloud
-from umf_ros.trajectory import Trajectory
+from umf_ros.core.errors import SensorFileError
+from umf_ros.core.geometry import Array, make_pose, to_quaternion
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.sensors.decode import Cloud
 
 OPTICAL = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """`body_T_camera` where the camera is the body: x ahead, y left, z up."""

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.errors import SensorFileError
-from umf_ros.geometry import Array, from_quaternion
+from umf_ros.core.errors import SensorFileError
+from umf_ros.core.geometry import Array, from_quaternion
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.lab.importing.files import size_of
 from umf_ros.lab.importing.imported import Imported, pinhole
 from umf_ros.sensors.scan_files import read_scan
-from umf_ros.trajectory import Trajectory
 
 CAMERA, LIDAR = "CAM_FRONT", "LIDAR_TOP"
 SCAN_COLUMNS = 5

@@ -23,9 +23,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rosgraph_msgs.msg import Clock
 
 from umf_ros.bags.reader import Bag, open_bag
-from umf_ros.errors import BagError, UmfError
+from umf_ros.core.errors import BagError, UmfError
+from umf_ros.core.resources import find
 from umf_ros.nodes.process import complain, init
-from umf_ros.resources import find
 
 CLOCK_PERIOD_NS = 10_000_000
 TRANSPORT, TRANSPORT_FILE = "FASTRTPS_DEFAULT_PROFILES_FILE", "config/dds/large_messages.xml"

@@ -15,8 +15,8 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from umf_ros.config import load_settings
-from umf_ros.errors import UmfError
+from umf_ros.core.config import load_settings
+from umf_ros.core.errors import UmfError
 from umf_ros.pose_graph.journal import JOURNAL, GraphJournal
 from umf_ros.sensors.durable_graph import DurableGraph
 

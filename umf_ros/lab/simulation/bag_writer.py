@@ -11,7 +11,7 @@ from typing import IO, Any
 from mcap.writer import CompressionType, Writer
 
 from umf_ros.bags.records import message_types
-from umf_ros.errors import OutputError, writing
+from umf_ros.core.errors import OutputError, writing
 
 
 class BagWriter:

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.frames import Image, StereoCamera
-from umf_ros.geometry import Array
+from umf_ros.core.frames import Image, StereoCamera
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.lighting import Sun
 from umf_ros.lab.simulation.noise import Field
 from umf_ros.lab.simulation.shading import RayHits, Shader, cast

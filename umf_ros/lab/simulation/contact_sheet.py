@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from umf_ros.errors import writing
-from umf_ros.frames import Image
-from umf_ros.geometry import transform
+from umf_ros.core.errors import writing
+from umf_ros.core.frames import Image
+from umf_ros.core.geometry import transform
 from umf_ros.lab.simulation.camera import Camera
 from umf_ros.lab.simulation.lidar import FIELD_OF_VIEW_DEG, RANGE_M
 from umf_ros.lab.simulation.noise import Field

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 
 Range = tuple[float, float]
 

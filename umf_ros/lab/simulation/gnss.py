@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.motion import Motion
 
 ORIGIN = (37.7437, 15.0165, 2600.0)

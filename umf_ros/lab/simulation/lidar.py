@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.geometry import Array, invert
+from umf_ros.core.geometry import Array, invert
 from umf_ros.lab.simulation.noise import Field
 from umf_ros.lab.simulation.shading import cast
 from umf_ros.lab.simulation.world import ROCK, World

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 
 MOONLIGHT = 2e-6
 """Of a full Moon, as a share of the sun's: 0.2 of 100,000 lux."""

@@ -8,7 +8,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.relief import Relief
 from umf_ros.lab.simulation.route import Route
 from umf_ros.lab.simulation.rover import stand
@@ -62,7 +62,7 @@ class Motion:
         """(4, 4) `world_T_body` at a time."""
         return self.poses(time_s)[0]
 
-    def travelled(self, times_s: Array | float) -> Array:
+    def path_length(self, times_s: Array | float) -> Array:
         """Metres driven along the route at times."""
         return np.asarray(np.interp(times_s, self._times, self._travelled))
 
@@ -85,10 +85,10 @@ class Motion:
 
 def _schedule(relief: Relief, route: Route, speed_m_s: float) -> tuple[Array, Array]:
     """Times and metres driven along the route."""
-    travelled = np.arange(0, route.length_m, 0.1)
-    path, _ = route.at(travelled)
+    path_length = np.arange(0, route.length_m, 0.1)
+    path, _ = route.at(path_length)
     grade = gaussian_filter1d(np.gradient(relief.height(*path.T), 0.1), 10)
     speed = speed_m_s * (1 - 0.5 * np.clip(np.abs(grade) / 0.4, 0, 1))
-    ramp = np.minimum(travelled, travelled[-1] - travelled) / (speed_m_s * _SETTLING_S)
+    ramp = np.minimum(path_length, path_length[-1] - path_length) / (speed_m_s * _SETTLING_S)
     speed *= np.clip(np.sqrt(ramp), 0.15, 1)
-    return np.concatenate([[0], np.cumsum(0.1 / speed[:-1])]), travelled
+    return np.concatenate([[0], np.cumsum(0.1 / speed[:-1])]), path_length

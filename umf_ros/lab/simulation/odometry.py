@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from umf_ros.geometry import Array, heading
+from umf_ros.core.geometry import Array, heading
 from umf_ros.lab.simulation.motion import Motion
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.lighting import Sun
 
 
@@ -90,9 +90,9 @@ def plan_passes(trail: Array, labels: tuple[str, ...], setting: Setting, step_m:
 def resample(curve: Array, step_m: float) -> tuple[Array, Array]:
     """Places every `step_m` along a closed (N, 2) curve, and the direction there, rad."""
     closed = np.vstack([curve, curve[:1]])
-    travelled = metres_along(closed)
-    wanted = np.arange(0, travelled[-1] - step_m / 2, step_m)
-    path = np.stack([np.interp(wanted, travelled, closed[:, axis]) for axis in range(2)], 1)
+    path_length = metres_along(closed)
+    wanted = np.arange(0, path_length[-1] - step_m / 2, step_m)
+    path = np.stack([np.interp(wanted, path_length, closed[:, axis]) for axis in range(2)], 1)
     return path, direction(path)
 
 

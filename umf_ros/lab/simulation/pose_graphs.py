@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from umf_ros.frames import LoopClosure
-from umf_ros.geometry import Array, expmap, gtsam_to_ros_covariance, invert, relative
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, expmap, gtsam_to_ros_covariance, invert, relative
 
 Kind = Literal["random", "groups", "near"]
 PERIOD_NS = 1_000_000_000

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from umf_ros.errors import ConfigError
-from umf_ros.geometry import Array
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation import rig
 from umf_ros.lab.simulation.odometry import Drift
 from umf_ros.lab.simulation.relief import Pan, Relief

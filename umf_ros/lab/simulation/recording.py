@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.errors import writing
+from umf_ros.core.errors import writing
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.lab.simulation import gnss, imu
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.camera import Rendering
@@ -28,7 +29,6 @@ from umf_ros.lab.simulation.messages import (
 )
 from umf_ros.lab.simulation.pool import ahead
 from umf_ros.lab.simulation.simulator import START_NS, Simulator, stamp_ns
-from umf_ros.trajectory import Trajectory, write_tum
 
 Event = tuple[int, int, str, Any]
 """Time of recording in ns, rank of its stream, topic and message."""

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from umf_ros.frames import Image, StereoCamera
-from umf_ros.geometry import Array, from_quaternion, make_pose
+from umf_ros.core.frames import Image, StereoCamera
+from umf_ros.core.geometry import Array, from_quaternion, make_pose
+from umf_ros.core.resources import find
 from umf_ros.lab.simulation.camera import Camera
 from umf_ros.lab.simulation.world import World
-from umf_ros.resources import find
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
 

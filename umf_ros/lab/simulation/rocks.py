@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.noise import Field
 from umf_ros.lab.simulation.relief import CELL_M, SIZE_M, Relief
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.noise import smooth_step
 from umf_ros.lab.simulation.passes import direction, metres_along, resample
 
@@ -31,23 +31,23 @@ class Route:
 
     path: Array
     yaw: Array
-    travelled: Array
+    path_length: Array
     labels: list[str]
 
     @property
     def length_m(self) -> float:
         """Length of the path."""
-        return float(self.travelled[-1])
+        return float(self.path_length[-1])
 
     def at(self, metres: Array) -> tuple[Array, Array]:
         """(N, 2) places and (N,) headings, rad, at metres along the route."""
-        path = np.stack([np.interp(metres, self.travelled, values) for values in self.path.T], 1)
-        return path, np.interp(metres, self.travelled, np.unwrap(self.yaw))
+        path = np.stack([np.interp(metres, self.path_length, values) for values in self.path.T], 1)
+        return path, np.interp(metres, self.path_length, np.unwrap(self.yaw))
 
     def legs(self) -> list[tuple[str, float, float]]:
         """Label, first and last metre of each part."""
         legs: list[tuple[str, float, float]] = []
-        for label, metre in zip(self.labels, self.travelled, strict=True):
+        for label, metre in zip(self.labels, self.path_length, strict=True):
             start = legs.pop()[1] if legs and legs[-1][0] == label else float(metre)
             legs.append((label, start, float(metre)))
         return legs
@@ -152,13 +152,13 @@ class Walker:
             length_m: cut here; None keeps all.
         """
         path = gaussian_filter1d(np.concatenate(self._path), 4, axis=0, mode="nearest")
-        travelled = metres_along(path)
-        keep = slice(0, int(np.searchsorted(travelled, length_m or np.inf)) + 1)
+        path_length = metres_along(path)
+        keep = slice(0, int(np.searchsorted(path_length, length_m or np.inf)) + 1)
         yaw = np.unwrap(direction(path))
-        swing = np.sin(travelled * 2 * np.pi / 37 + self._rng.uniform(0, 2 * np.pi))
-        swing += 0.5 * np.sin(travelled * 2 * np.pi / 13 + self._rng.uniform(0, 2 * np.pi))
+        swing = np.sin(path_length * 2 * np.pi / 37 + self._rng.uniform(0, 2 * np.pi))
+        swing += 0.5 * np.sin(path_length * 2 * np.pi / 13 + self._rng.uniform(0, 2 * np.pi))
         yaw += np.radians(swing_deg) * swing / 1.5
-        return Route(path[keep], yaw[keep], travelled[keep], self._labels[keep])
+        return Route(path[keep], yaw[keep], path_length[keep], self._labels[keep])
 
     def _append(self, points: Array) -> None:
         self._path.append(points)

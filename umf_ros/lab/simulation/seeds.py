@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 
 TRAINING = range(0, 10_000)
 VALIDATION = range(10_000, 20_000)

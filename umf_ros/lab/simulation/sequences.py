@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.lighting import Sun
 from umf_ros.lab.simulation.passes import SETTINGS, Pass, plan_passes
 from umf_ros.lab.simulation.presets import ETNA, Preset
@@ -56,7 +56,7 @@ def sampled(preset: Preset, route: Route, seed: int, day: int = 0) -> list[Pass]
     metres = np.linspace(0, route.length_m, preset.samples)
     path, yaw = route.at(metres)
     tilt = np.radians(preset.tilt_deg) * rng.standard_normal((len(metres), 2))
-    labels = [route.labels[int(i)] for i in np.searchsorted(route.travelled, metres - 1e-6)]
+    labels = [route.labels[int(i)] for i in np.searchsorted(route.path_length, metres - 1e-6)]
     sun = Sun.drawn(18, 40, rng)
     borders = [i for i in range(1, len(metres)) if labels[i] != labels[i - 1] or i % _CHUNK == 0]
     passes = []

@@ -9,7 +9,7 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.lighting import Sun
 from umf_ros.lab.simulation.noise import Field
 from umf_ros.lab.simulation.relief import CELL_M, SIZE_M

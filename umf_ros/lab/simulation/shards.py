@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.errors import OutputError
-from umf_ros.geometry import Array
+from umf_ros.core.errors import OutputError
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.survey import Survey, SurveyFrame, shard_plan, survey_world
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from umf_ros.errors import ConfigError
-from umf_ros.frames import Frame, Image, ScanMotion
-from umf_ros.geometry import Array, relative, transform
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.frames import Frame, Image, ScanMotion
+from umf_ros.core.geometry import Array, relative, transform
 from umf_ros.lab.simulation.camera import Rendering
 from umf_ros.lab.simulation.lidar import PERIOD_NS, Lidar, Scan
 from umf_ros.lab.simulation.lighting import Sun
@@ -107,7 +107,7 @@ class Simulator:
 
     def sun(self, stamp_ns: int) -> Sun:
         """Where the sun stands at a time; the hours pass quickly."""
-        driven = float(self.motion.travelled(_seconds(stamp_ns)))
+        driven = float(self.motion.path_length(_seconds(stamp_ns)))
         sun = self._sun.moved(driven / self.route.length_m * self.preset.sun_deg)
         return sun.set_for(driven - self._sunset_m) if driven > self._sunset_m else sun
 

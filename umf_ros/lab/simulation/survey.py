@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.frames import Image
-from umf_ros.geometry import Array, transform
+from umf_ros.core.frames import Image
+from umf_ros.core.geometry import Array, transform
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, Rendering, resized
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.lidar import Lidar

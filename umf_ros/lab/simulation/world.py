@@ -6,8 +6,8 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from umf_ros.errors import ConfigError
-from umf_ros.geometry import Array
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.families import FAMILIES, Traits, draw_traits
 from umf_ros.lab.simulation.noise import Field, detail_texture, smooth_step, spectral_noise
 from umf_ros.lab.simulation.relief import CELL_M, CELLS, SIZE_M, Pan, Relief

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.training.acceptance_examples import Example
-from umf_ros.runs.honesty import normalised_errors, share_inside
+from umf_ros.runs.consistency import normalised_errors, share_inside
 from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, refuted, scores
 from umf_ros.verification.measurement import IMAGE, SCAN
-from umf_ros.verification.registration import CovarianceModel, covariance_of
+from umf_ros.verification.scan_alignment import CovarianceModel, covariance_of
 
 RIDGE = 0.03  # measured: leaving domains out, a tenth of it accepts less at no wrong one
 SAFETY = 0.25  # by hand: log-odds between the most probable wrong pose and the threshold

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from umf_ros.frames import Keyframe
-from umf_ros.geometry import Array
-from umf_ros.runs.honesty import MEDIAN_EXPECTED, normalised_errors, pose_error, share_inside
-from umf_ros.verification.registration import Alignment, CovarianceModel, covariance_of
+from umf_ros.core.frames import Keyframe
+from umf_ros.core.geometry import Array
+from umf_ros.runs.consistency import MEDIAN_EXPECTED, normalised_errors, pose_error, share_inside
+from umf_ros.verification.scan_alignment import Alignment, CovarianceModel, covariance_of
 from umf_ros.verification.scan_motion import motion_covariance
 
 TAIL_EXPECTED = float(chi2.ppf(0.95, 6))

@@ -15,20 +15,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from umf_ros.config import Database, Settings
+from umf_ros.core.config import Database, Settings
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.embedding.inputs import read_frame
 from umf_ros.embedding.torch_runtimes import to_tensors
-from umf_ros.errors import UmfError
-from umf_ros.frames import Frame
-from umf_ros.geometry import Array
 from umf_ros.lab.datasets.labels import distances, places_of
-from umf_ros.loop_detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.networks.umf import UMF
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.pose_graph import PoseGraph
-from umf_ros.sensors.messages import OdometrySample
-from umf_ros.sensors.odometry_feed import OdometryFeed
-from umf_ros.trajectory import Trajectory
+from umf_ros.sensors.decode import OdometrySample
+from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
 
 Mask = NDArray[np.bool_]
 SAME_M, SAME_DEG = 8.0, 25.0
@@ -52,7 +52,7 @@ class Drive:
         seen, felt: (N, C) what the heads see of image and scan; cells: (N, D) pooled maps of the scene.
         image_present, cloud_present: (N,) bool.
         map_T_body: (N, 4, 4) by the pose graph.
-        travelled_m: (N,) along the drive.
+        path_length_m: (N,) along the drive.
         session: (N,) int; between sessions the odometry began anew.
         closures: (K, 2) keyframes that accepted closures join.
     """
@@ -64,7 +64,7 @@ class Drive:
     image_present: Mask
     cloud_present: Mask
     map_T_body: Array
-    travelled_m: Array
+    path_length_m: Array
     session: NDArray[np.int64]
     closures: NDArray[np.int64]
 
@@ -113,7 +113,7 @@ def label_drive(drive: Drive) -> Labels:
 
 def _along(drive: Drive) -> Array:
     """(N, N) metres between keyframes along the drive, infinite between sessions."""
-    metres = np.abs(drive.travelled_m[:, None] - drive.travelled_m[None])
+    metres = np.abs(drive.path_length_m[:, None] - drive.path_length_m[None])
     return np.where(drive.session[:, None] == drive.session[None], metres, np.inf)
 
 
@@ -135,7 +135,7 @@ class DriveReader:
         own = settings.model_copy(update={"database": Database()})  # the rover's map is not touched
         self._detector = LoopDetector(own, make_detector_embedder(settings))
         self._graph = PoseGraph(settings.pose_graph)
-        self._feed = OdometryFeed(self._graph)
+        self._feed = OdometrySessionSplitter(self._graph)
         self._stamps: list[int] = []
         self._sessions: list[int] = []
         self._travelled: list[float] = []
@@ -149,10 +149,10 @@ class DriveReader:
         detection = self._detector.process(item)
         for closure in detection.closures:
             self._graph.add_closure(closure)
-        if detection.keyframe is not None and detection.keyframe.travelled_m is not None:
+        if detection.keyframe is not None and detection.keyframe.path_length_m is not None:
             self._stamps.append(detection.keyframe.stamp_ns)
             self._sessions.append(detection.keyframe.session)
-            self._travelled.append(detection.keyframe.travelled_m)
+            self._travelled.append(detection.keyframe.path_length_m)
             self._pooled.append(pool(self._network, item))
         return detection
 
@@ -182,7 +182,7 @@ class DriveReader:
             image_present,
             cloud_present,
             map_T_body=map_T_body[kept],
-            travelled_m=np.array(self._travelled)[kept],
+            path_length_m=np.array(self._travelled)[kept],
             session=np.array(self._sessions, np.int64)[kept],
             closures=self._closures([self._stamps[row] for row in kept]),
         )

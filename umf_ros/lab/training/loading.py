@@ -9,7 +9,7 @@ import cv2
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from umf_ros.errors import UmfError
+from umf_ros.core.errors import UmfError
 
 Item = TypeVar("Item")
 

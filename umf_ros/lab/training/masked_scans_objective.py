@@ -12,8 +12,8 @@ import torch.nn.functional as F
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from umf_ros.core.geometry import Array
 from umf_ros.embedding.voxels import CELLS, ORIGIN_M, VOXEL_M
-from umf_ros.geometry import Array
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.datasets.views import View
 from umf_ros.lab.training.pretraining import Column, MaskedBatch, Pretraining, PretrainingSettings

@@ -9,9 +9,9 @@ import torch
 from pydantic import Field
 from sklearn.cluster import KMeans
 
+from umf_ros.baselines.netvlad import NetVlad
 from umf_ros.lab.training.descriptors import DescriptorObjective
 from umf_ros.lab.training.settings import DescriptorSettings
-from umf_ros.networks.netvlad import NetVlad
 
 IMAGES = 120
 """For the clusters; each has 140 local features."""

@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from umf_ros.errors import ConfigError, OutputError, WeightsError
+from umf_ros.core.errors import ConfigError, OutputError, WeightsError
 from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.image_encoder import ResidualBlock
 from umf_ros.networks.umf import UMF, channels_last

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 from umf_ros.lab import training
 from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.training.networks import Precision, make_network, save_weights

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from umf_ros.frames import Image
+from umf_ros.core.frames import Image
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,16 +20,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from umf_ros.embedding.place_inputs import EMPTY_MAPS, measured, some_points
-from umf_ros.errors import OutputError
-from umf_ros.geometry import transform
+from umf_ros.baselines.place_inputs import EMPTY_MAPS, measured, some_points
+from umf_ros.baselines.place_network import IMAGE_SIZE, MEASURED, POINTS, VOXELS, ImageTrunk, PlaceInput, Sense
+from umf_ros.core.errors import OutputError
+from umf_ros.core.geometry import transform
 from umf_ros.lab.datasets.labels import Places
 from umf_ros.lab.datasets.sample import Sample, SampleSequence
 from umf_ros.lab.datasets.views import Augmentation, View, ViewMaker
 from umf_ros.lab.training.objective import generator
 from umf_ros.lab.training.sampler import Draw, places_drawn
 from umf_ros.networks.config import NetworkConfig
-from umf_ros.networks.place_network import IMAGE_SIZE, MEASURED, POINTS, VOXELS, ImageTrunk, PlaceInput, Sense
 
 CONFIG = NetworkConfig(image_size=IMAGE_SIZE, fine_voxels=VOXELS)
 NO_CELL = np.iinfo(np.uint16).max

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from umf_ros.errors import ConfigError, writing
-from umf_ros.geometry import Array
+from umf_ros.core.errors import ConfigError, writing
+from umf_ros.core.geometry import Array
 from umf_ros.lab.datasets.sample import Sample, SampleSequence
 from umf_ros.lab.datasets.views import Augmentation, View, ViewMaker
 from umf_ros.lab.training.objective import Judgement, Objective, generator

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from umf_ros.errors import OutputError, WeightsError, writing
+from umf_ros.core.errors import OutputError, WeightsError, writing
 
 
 @dataclass

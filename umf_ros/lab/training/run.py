@@ -13,8 +13,9 @@ import torch
 from pydantic import ValidationError
 from torch import nn
 
-from umf_ros.config import problems
-from umf_ros.errors import ConfigError
+from umf_ros.core.config import problems
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.yaml_files import read_values
 from umf_ros.lab.datasets.listed import Source, open_source
 from umf_ros.lab.training.distributed import join_team
 from umf_ros.lab.training.networks import read_card
@@ -23,7 +24,6 @@ from umf_ros.lab.training.progress import Progress
 from umf_ros.lab.training.settings import RunSettings, write_settings
 from umf_ros.lab.training.trainer import Trainer
 from umf_ros.networks.umf import count_parameters
-from umf_ros.yaml_files import read_values
 
 
 def load_run(path: Path | None, **overrides: object) -> Any:

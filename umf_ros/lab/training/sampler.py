@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from umf_ros.errors import ConfigError
+from umf_ros.core.errors import ConfigError
 from umf_ros.lab.datasets.labels import Places, Rule, label, places_of
 from umf_ros.lab.datasets.sample import SampleSequence
 

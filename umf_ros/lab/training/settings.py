@@ -8,8 +8,8 @@ from typing import ClassVar, Literal, Self
 import yaml
 from pydantic import Field, model_validator
 
-from umf_ros.config import Group
-from umf_ros.errors import OutputError
+from umf_ros.core.config import Group
+from umf_ros.core.errors import OutputError
 from umf_ros.lab.training.networks import Precision
 from umf_ros.networks.umf import Branch
 

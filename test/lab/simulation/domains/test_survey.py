@@ -6,8 +6,8 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from umf_ros.errors import ConfigError
-from umf_ros.geometry import heading, transform, wrap_angle
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.geometry import heading, transform, wrap_angle
 from umf_ros.lab.simulation.domains import DOMAINS, Domain, survey
 from umf_ros.lab.simulation.domains.mounts import MOUNTS
 from umf_ros.lab.simulation.domains.places import PLACES

@@ -9,7 +9,7 @@ import open3d as o3d
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.geometry import interpolate, make_pose, transform
+from umf_ros.core.geometry import interpolate, make_pose, transform
 from umf_ros.lab.simulation.domains.scanners import SCANNERS
 from umf_ros.lab.simulation.domains.solids import Solids
 from umf_ros.lab.simulation.domains.sweeps import stamp_moment, sweep

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.domains.solids import Scene, Solids
 from umf_ros.lab.simulation.domains.trails import closed, distance_to, rounded_rectangle
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.domains.solids import Scene
 from umf_ros.lab.simulation.world import GROUND, HORIZON, ROCK, World
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from umf_ros.geometry import Array, make_pose
+from umf_ros.core.geometry import Array, make_pose
 
 
 @dataclass(frozen=True, slots=True)

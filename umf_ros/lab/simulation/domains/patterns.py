@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.lidar import PERIOD_NS, pulse_directions, pulse_times
 from umf_ros.lab.simulation.noise import Field
 

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from numpy.typing import ArrayLike
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.domains.indoors import Corridor, Rooms
 from umf_ros.lab.simulation.domains.landscape import Landscape
 from umf_ros.lab.simulation.domains.quarry import Quarry

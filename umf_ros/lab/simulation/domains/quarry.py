@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.domains.solids import Scene, Solids
 from umf_ros.lab.simulation.domains.trails import distance_to, wobbly_ring
 from umf_ros.lab.simulation.domains.undulation import Undulation

@@ -8,7 +8,7 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import ArrayLike, NDArray
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.noise import Field
 from umf_ros.lab.simulation.world import grid_triangles
 

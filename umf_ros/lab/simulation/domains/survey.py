@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from umf_ros.geometry import Array, interpolate, transform
+from umf_ros.core.geometry import Array, interpolate, transform
 from umf_ros.lab.simulation.domains.mounts import MOUNTS, Mount
 from umf_ros.lab.simulation.domains.places import PLACES, Place
 from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner

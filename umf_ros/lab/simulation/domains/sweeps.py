@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from umf_ros.geometry import Array, relative
+from umf_ros.core.geometry import Array, relative
 from umf_ros.lab.simulation.domains.scanners import Scanner
 from umf_ros.lab.simulation.domains.solids import Scene, cast_into
 from umf_ros.lab.simulation.noise import Field

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from umf_ros.geometry import Array
+from umf_ros.core.geometry import Array
 
 STEP_M = 0.1
 
@@ -31,9 +31,9 @@ def wobbly_ring(radius: float, wobble: float, rng: np.random.Generator) -> Array
 def closed(corners: Array) -> Array:
     """(N, 2) points every 0.1 m along straight lines through corners (C, 2) and back to the first."""
     ring = np.vstack([corners, corners[:1]])
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))])
-    wanted = np.arange(0, travelled[-1], STEP_M)
-    return np.stack([np.interp(wanted, travelled, ring[:, axis]) for axis in range(2)], 1)
+    path_length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))])
+    wanted = np.arange(0, path_length[-1], STEP_M)
+    return np.stack([np.interp(wanted, path_length, ring[:, axis]) for axis in range(2)], 1)
 
 
 def distance_to(trail: Array, place: Array) -> float:

@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import unit
+from fleets import IDENTITY, rover_places, settings
+from postgres import PostgresServer
+from scenes import landscape, pose_at, take
+
+from umf_ros.core.config import Settings
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.frames import Keyframe
+from umf_ros.core.geometry import Array, relative, rotation_angle
+from umf_ros.detector import LoopDetector
+from umf_ros.fleet.inter_robot_closures import UNCONFIRMED, InterRobotClosure, InterRobotMatcher
+
+GROUND = landscape(20)
+PLACES_M = (-24.0, -14.0)
+"""Two places that both rovers come by."""
+
+
+def seen(pose: Array, second: float, place: int, path_length_m: float) -> Keyframe:
+    """A keyframe whose descriptor says which place it is; its odometry is the truth."""
+    keyframe = take(GROUND, pose, second)
+    descriptor = unit(np.eye(IDENTITY[1])[place] + 0.01)
+    embedding = replace(keyframe.embedding, descriptor=descriptor)
+    return replace(keyframe, embedding=embedding, odom_T_body=pose, path_length_m=path_length_m)
+
+
+def poses_of(rover: str) -> list[Array]:
+    if rover == "bea":
+        return [pose_at(GROUND, x - 1.0, 0.0, 0.0) for x in PLACES_M]
+    return [pose_at(GROUND, x, 1.2, 6.0, 2.0) for x in PLACES_M]
+
+
+def drive(server: PostgresServer, rover: str) -> list[InterRobotClosure]:
+    """Both places by one rover, whose clock says the same as the other's; what it made of the other's places."""
+    places = rover_places(server, rover)
+    inter_robot = InterRobotMatcher(Settings(database=settings(server, rover)), places.store, IDENTITY)
+    for place, pose in enumerate(poses_of(rover)):
+        inter_robot.link.remembered(places.add(seen(pose, 10.0 * place, place, 10.0 * place)))
+    found = list(inter_robot.rest(60))
+    inter_robot.close()
+    places.close()
+    return found
+
+
+def test_two_rovers_that_come_by_two_places_learn_where_they_are(server: PostgresServer) -> None:
+    assert drive(server, "bea") == []
+    first, second = drive(server, "ada")
+    assert (first.own, first.robot) == ("ada", "bea")
+    # one place alone is not enough: it may only look like another
+    assert first.closures == [] and [v.reason for v in first.verdicts if v.closure is not None] == [UNCONFIRMED]
+    assert len(second.closures) == 2
+    for closure, ours, theirs in zip(second.closures, poses_of("ada"), poses_of("bea"), strict=True):
+        error = relative(relative(theirs, ours), closure.match_T_query)
+        assert np.linalg.norm(error[:3, 3]) < 0.1 and rotation_angle(error) < 0.01
+
+
+def test_a_fleet_needs_a_server() -> None:
+    class Nobody:
+        name, dimension = "nobody", 16
+
+    with pytest.raises(ConfigError, match=r"postgres needs database\.server"):
+        LoopDetector(Settings(database={"backend": "postgres"}), Nobody())

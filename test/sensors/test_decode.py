@@ -1,0 +1,256 @@
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from recordings import POINT, START_NS, camera_info, cloud, drive, image, odometry, scan
+
+from umf_ros.core.errors import MessageError
+from umf_ros.sensors.decode import (
+    decode_camera_info,
+    decode_cloud,
+    decode_image,
+    decode_odometry,
+    stamp_ns,
+)
+
+POINTS = np.array([[1.0, 5.0, 0.5], [-2.0, 8.0, 1.0], [0.3, 12.0, -1.0]])
+
+
+def kind_of(decode: Any, *messages: Any) -> str:
+    with pytest.raises(MessageError) as caught:
+        decode(*messages)
+    assert "\n" not in str(caught.value)
+    return caught.value.kind
+
+
+def test_stamp_keeps_every_nanosecond() -> None:
+    assert stamp_ns(image(START_NS + 123_456_789, np.zeros((2, 2), np.uint8))) == START_NS + 123_456_789
+
+
+@pytest.mark.parametrize(("sec", "nanosec"), [(2**31 - 1, 2**32 - 1), (2**31 - 1, 10**9), (-1, 0), (0, 0)])
+def test_a_stamp_that_cannot_be_sent_on_is_refused(sec: int, nanosec: int) -> None:
+    with pytest.raises(MessageError) as caught:
+        stamp_ns(SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec))))
+    assert caught.value.kind == "stamp"
+
+
+def test_message_without_a_stamp_is_refused() -> None:
+    assert kind_of(stamp_ns, image(0, np.zeros((2, 2), np.uint8))) == "stamp"
+
+
+def test_grey_image_comes_back_as_it_is(rng: np.random.Generator) -> None:
+    pixels = rng.integers(0, 255, (48, 64), np.uint8)
+    assert (decode_image(image(0, pixels)) == pixels).all()
+    assert (decode_image(image(0, pixels, "8UC1")) == pixels).all()
+
+
+def test_padding_at_the_end_of_rows_is_left_out(rng: np.random.Generator) -> None:
+    padded = rng.integers(0, 255, (48, 80), np.uint8)
+    assert (decode_image(image(0, padded, width=64)) == padded[:, :64]).all()
+
+
+@pytest.mark.parametrize(("order", "is_bigendian"), [("<u2", 0), (">u2", 1)])
+def test_mono16_keeps_the_upper_byte(order: str, is_bigendian: int) -> None:
+    pixels = np.array([[0, 255, 256, 65535]], order)
+    assert decode_image(image(0, pixels, "mono16", is_bigendian=is_bigendian)).tolist() == [[0, 0, 1, 255]]
+
+
+@pytest.mark.parametrize(("encoding", "channel"), [("rgb8", 0), ("bgr8", 2), ("rgba8", 0), ("bgra8", 2)])
+def test_red_weighs_the_same_in_every_colour_order(encoding: str, channel: int) -> None:
+    pixels = np.zeros((4, 6, 4 if "a" in encoding else 3), np.uint8)
+    pixels[..., channel] = 200
+    grey = decode_image(image(0, pixels, encoding, width=6))
+    assert grey.shape == (4, 6)
+    assert np.abs(grey.astype(int) - 0.299 * 200).max() <= 1
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize(("colour", "weight"), [("r", 0.299), ("g", 0.587), ("b", 0.114)])
+def test_bayer_patterns_start_at_the_upper_left(pattern: str, colour: str, weight: float) -> None:
+    tile = np.array([200 if cell == colour else 0 for cell in pattern], np.uint8).reshape(2, 2)
+    grey = decode_image(image(0, np.tile(tile, (10, 10)), f"bayer_{pattern}8"))
+    assert np.abs(grey[4:-4, 4:-4].astype(int) - weight * 200).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind"),
+    [
+        ({"encoding": "nv12"}, "encoding"),
+        ({"encoding": "16SC1"}, "encoding"),
+        ({"width": 0}, "size"),
+        ({"height": 0}, "size"),
+        ({"step": 63}, "step"),
+        ({"width": 65}, "step"),
+        ({"height": 49}, "truncated"),
+        ({"height": 47}, "step"),
+        ({"data": np.zeros(100, np.uint8)}, "truncated"),
+        ({"data": np.zeros(0, np.uint8)}, "truncated"),
+    ],
+)
+def test_bad_image_is_refused_by_kind(changes: dict[str, Any], kind: str) -> None:
+    assert kind_of(decode_image, image(0, np.zeros((48, 64), np.uint8), **changes)) == kind
+
+
+def test_refused_encoding_is_named() -> None:
+    with pytest.raises(MessageError, match="'nv12'"):
+        decode_image(image(0, np.zeros((4, 4), np.uint8), "nv12"))
+
+
+def test_cloud_of_the_cube_1() -> None:
+    decoded = decode_cloud(cloud(0, scan(POINTS, intensity=77, duration_ns=200_000_000)))
+    assert decoded.points.dtype == np.float32
+    assert np.allclose(decoded.points, POINTS)
+    assert decoded.intensity is not None and decoded.intensity.tolist() == [77, 77, 77]
+    assert decoded.time_offset_ns is not None and decoded.time_offset_ns.tolist() == [0, 100_000_000, 200_000_000]
+
+
+def test_pulses_without_a_return_and_points_that_are_not_finite_are_left_out() -> None:
+    angles = np.linspace(-0.5, 0.5, 200)
+    nowhere = scan(np.stack([np.sin(angles), np.cos(angles), 0 * angles], 1).astype(np.float32), intensity=0)
+    bad = scan(np.array([[np.nan, 1, 1], [1, np.inf, 1], [0, 0, 0]]))
+    records = np.concatenate([nowhere, scan(POINTS), bad])
+    records["point_time_offset"] = np.arange(len(records))
+    decoded = decode_cloud(cloud(0, records))
+    assert np.allclose(decoded.points, POINTS)
+    assert decoded.time_offset_ns is not None and decoded.time_offset_ns.tolist() == [200, 201, 202]
+    assert len(decode_cloud(cloud(0, nowhere)).points) == 0
+
+
+def test_returns_from_beyond_all_lidars_are_left_out() -> None:
+    points = np.array([[5, 0, 0], [9000, 0, 0], [2e4, 0, 0], [0, 1e18, 0], [0, 0, 3e38]], np.float32)
+    assert decode_cloud(cloud(START_NS, scan(points))).points[:, 0].tolist() == [5, 9000]
+
+
+def test_a_real_return_one_metre_away_stays() -> None:
+    assert len(decode_cloud(cloud(0, scan(np.array([[0.0, 1.0, 0.0]]), intensity=50))).points) == 1
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_fields_are_read_by_name_and_type_in_any_order(order: str, kind: str) -> None:
+    dtype = np.dtype([("ring", order + "u2"), ("z", order + kind), ("intensity", order + "f4"), ("x", order + kind)])
+    records = np.zeros(3, np.dtype([*dtype.descr, ("y", order + kind)]))
+    for axis, values in zip("xyz", POINTS.T, strict=True):
+        records[axis] = values
+    records["intensity"] = [20, 30, 40]
+    decoded = decode_cloud(cloud(0, records))
+    assert np.allclose(decoded.points, POINTS)
+    assert decoded.intensity is not None and decoded.intensity.tolist() == [20, 30, 40]
+    assert decoded.time_offset_ns is None
+
+
+def test_only_coordinates_are_enough() -> None:
+    records = np.zeros(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    records["y"] = [2, 3, 1]
+    decoded = decode_cloud(cloud(0, records))
+    # without an intensity, a range of exactly one metre is a pulse without a return
+    assert decoded.points[:, 1].tolist() == [2, 3]
+    assert decoded.intensity is None and decoded.time_offset_ns is None
+
+
+def test_organised_cloud_with_padded_rows() -> None:
+    records = np.concatenate([scan(POINTS), scan(POINTS + 1)])
+    rows = [half.tobytes() + bytes(12) for half in (records[:3], records[3:])]
+    data = np.frombuffer(b"".join(rows), np.uint8)
+    decoded = decode_cloud(cloud(0, records, height=2, width=3, row_step=len(rows[0]), data=data))
+    assert np.allclose(decoded.points, np.concatenate([POINTS, POINTS + 1]))
+
+
+def test_empty_cloud_is_no_fault() -> None:
+    assert len(decode_cloud(cloud(0, scan(np.empty((0, 3))))).points) == 0
+
+
+@pytest.mark.parametrize(
+    ("dtype", "changes", "kind"),
+    [
+        ([("x", "<f4"), ("y", "<f4")], {}, "fields"),
+        (POINT, {"data": np.zeros(27, np.uint8)}, "truncated"),
+        (POINT, {"width": 4}, "truncated"),
+        (POINT, {"point_step": 24, "row_step": 72}, "step"),
+        (POINT, {"height": 2, "width": 3, "row_step": 28}, "step"),
+    ],
+)
+def test_bad_cloud_is_refused_by_kind(dtype: Any, changes: dict[str, Any], kind: str) -> None:
+    assert kind_of(decode_cloud, cloud(0, np.ones(3, dtype), **changes)) == kind
+
+
+def test_a_point_of_many_bytes_is_refused() -> None:
+    wide = np.dtype({"names": ["x", "y", "z"], "formats": ["<f4"] * 3, "offsets": [0, 4, 8], "itemsize": 5000})
+    assert kind_of(decode_cloud, cloud(START_NS, np.zeros(2, wide))) == "step"
+
+
+def test_unknown_data_type_is_refused() -> None:
+    message = cloud(0, scan(POINTS))
+    message.fields[2].datatype = 99
+    assert kind_of(decode_cloud, message) == "datatype"
+
+
+def test_odometry_is_a_stamped_pose() -> None:
+    sample = decode_odometry(odometry(START_NS, drive(1.3)))
+    assert sample.stamp_ns == START_NS
+    assert np.allclose(sample.odom_T_body, drive(1.3))
+
+
+@pytest.mark.parametrize(
+    ("part", "field", "value"),
+    [("position", "x", np.nan), ("position", "z", np.inf), ("orientation", "w", 0.5), ("orientation", "y", np.nan)],
+)
+def test_pose_that_is_none_is_refused(part: str, field: str, value: float) -> None:
+    message = odometry(START_NS, np.eye(4))
+    setattr(getattr(message.pose.pose, part), field, value)
+    assert kind_of(decode_odometry, message) == "pose"
+
+
+def test_camera_info_gives_the_pair() -> None:
+    camera = decode_camera_info(camera_info(0, 579.5, (688, 512)), camera_info(0, 579.5, (688, 512), baseline=0.2))
+    assert (camera.width, camera.height, camera.fx, camera.fy) == (688, 512, 579.5, 579.5)
+    assert (camera.cx, camera.cy) == (344, 256)
+    assert camera.baseline == pytest.approx(0.2)
+    assert decode_camera_info(camera_info(0, 579.5, (688, 512))).baseline == 0
+
+
+def test_camera_info_without_projection_uses_the_camera_matrix() -> None:
+    camera = decode_camera_info(camera_info(0, 400.0, (640, 480), p=np.zeros(12)))
+    assert (camera.fx, camera.cx, camera.cy) == (400, 320, 240)
+
+
+@pytest.mark.parametrize("changes", [{"k": np.zeros(9), "p": np.zeros(12)}, {"width": 0}, {"p": np.full(12, np.nan)}])
+def test_uncalibrated_camera_info_is_refused(changes: dict[str, Any]) -> None:
+    assert kind_of(decode_camera_info, camera_info(0, 579.5, (688, 512), **changes)) == "camera_info"
+
+
+@pytest.mark.parametrize("baseline", [0.0, -0.2])
+def test_pair_without_a_baseline_is_refused(baseline: float) -> None:
+    left, right = camera_info(0, 579.5, (688, 512)), camera_info(0, 579.5, (688, 512), baseline=baseline)
+    assert kind_of(decode_camera_info, left, right) == "camera_info"
+
+
+def test_messages_of_rclpy_are_the_same(rng: np.random.Generator) -> None:
+    from array import array
+
+    from sensor_msgs.msg import Image, PointCloud2, PointField
+
+    pixels = rng.integers(0, 255, (8, 6), np.uint8)
+    message = Image(height=8, width=6, step=6, encoding="mono8", data=array("B", pixels.tobytes()))
+    assert (decode_image(message) == pixels).all()
+    records = scan(POINTS, duration_ns=100)
+    fields = [
+        PointField(name=field.name, offset=field.offset, datatype=field.datatype, count=1)
+        for field in cloud(0, records).fields
+    ]
+    ros_cloud = PointCloud2(
+        height=1, width=3, fields=fields, point_step=28, row_step=84, data=array("B", records.tobytes())
+    )
+    ours, theirs = decode_cloud(cloud(0, records)), decode_cloud(ros_cloud)
+    assert (ours.points == theirs.points).all()
+    assert (ours.time_offset_ns == theirs.time_offset_ns).all()
+
+
+@pytest.mark.parametrize(("encoding", "place"), [("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)])
+def test_of_colours_in_pairs_the_brightness_is_taken(encoding: str, place: int) -> None:
+    pixels = np.full((4, 6, 2), 200, np.uint8)
+    pixels[..., place] = np.arange(24).reshape(4, 6)
+    np.testing.assert_array_equal(decode_image(image(0, pixels, encoding)), np.arange(24).reshape(4, 6))

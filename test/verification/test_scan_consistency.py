@@ -1,0 +1,115 @@
+"""How two scans meet: a hall, a hall that lacks a wall, and a corridor that looks the same all along."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from umf_ros.core.geometry import Array, invert, make_pose, transform
+from umf_ros.verification import thin_scan
+from umf_ros.verification.free_space import Sight
+from umf_ros.verification.prepared_scan import PreparedScan
+from umf_ros.verification.scan_alignment import inspect
+from umf_ros.verification.scan_consistency import Meeting, meet, rivalry
+
+RNG = np.random.default_rng(5)
+UP = make_pose(np.eye(3), [0.0, 0.0, 1.5])  # the sensor on its mast
+THERE = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [2.0, 1.0, 0.0])
+
+
+def box(x: tuple[float, float], y: tuple[float, float], height: float, pillars: Array) -> Array:
+    """(N, 3) points on the floor and the walls of a room, and on pillars (P, 2) of 0.4 m that stand in it."""
+    floor = np.column_stack([RNG.uniform(*x, 30_000), RNG.uniform(*y, 30_000), np.zeros(30_000)])
+    along = np.column_stack([RNG.uniform(*x, 20_000), RNG.choice(y, 20_000), RNG.uniform(0, height, 20_000)])
+    across = np.column_stack([RNG.choice(x, 20_000), RNG.uniform(*y, 20_000), RNG.uniform(0, height, 20_000)])
+    angle = RNG.uniform(0, 2 * np.pi, (len(pillars), 800))
+    round_them = pillars[:, None] + 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=2)
+    columns = np.concatenate([round_them, RNG.uniform(0, height, (len(pillars), 800, 1))], axis=2).reshape(-1, 3)
+    return np.concatenate([floor, along, across, columns])
+
+
+def seen(world: Array, world_T_body: Array, limit_m: float = 40.0) -> PreparedScan:
+    """What a LiDAR 1.5 m above the body sees; pillars hide nothing, which is forgivable."""
+    points = transform(invert(world_T_body), world)
+    near = np.linalg.norm(points, axis=1) < limit_m
+    noisy = points[near] + RNG.normal(0, 0.01, (int(near.sum()), 3))
+    return PreparedScan(thin_scan(noisy.astype(np.float32)), UP)
+
+
+PILLARS = RNG.uniform([-9, -5], [9, 5], (5, 2))
+
+
+def hall() -> Array:
+    """Other points of the same hall at every call, as no two scans hit the same."""
+    return box((-10, 10), (-7, 7), 3.0, PILLARS)
+
+
+def corridor() -> Array:
+    return box((-60, 60), (-1.2, 1.2), 2.5, np.empty((0, 2)))
+
+
+QUERY, MATCH = seen(hall(), THERE), seen(hall(), np.eye(4))
+
+
+def test_nearly_all_of_two_scans_of_a_hall_has_a_counterpart_and_nothing_is_contradicted() -> None:
+    for one in meet(MATCH, QUERY, THERE):
+        assert one.common > 0.8 and one.contradiction < 0.03
+        assert one.counterparts > 0.85 and one.upright_counterparts > 0.85 and one.unexplained < 0.02
+
+
+@pytest.mark.parametrize("shift", [[1.5, 0, 0], [0, 1.0, 0]])
+def test_a_wrong_pose_is_contradicted_and_leaves_walls_unexplained(shift: list[float]) -> None:
+    wrong = make_pose(np.eye(3), shift) @ THERE
+    ours, theirs = meet(MATCH, QUERY, wrong)
+    assert max(ours.contradiction, theirs.contradiction) > 0.05
+    assert min(ours.upright_counterparts, theirs.upright_counterparts) < 0.7
+    assert max(ours.unexplained, theirs.unexplained) > 0.15
+
+
+def test_a_wall_that_one_scan_lacks_speaks_against_the_pose_whichever_scan_it_is() -> None:
+    world = hall()
+    without = seen(world[world[:, 0] < 9.9], np.eye(4))
+    complete = max(one.unexplained for one in meet(MATCH, QUERY, THERE))
+    for pair in (meet(without, QUERY, THERE), meet(QUERY, without, invert(THERE))):
+        assert max(one.unexplained for one in pair) > complete + 0.01
+
+
+def test_too_few_visible_points_count_against_the_pose_and_say_nothing_of_what_stands() -> None:
+    unseen = Meeting(np.full(100, Sight.UNSEEN, np.int8), np.zeros(100), np.ones(100, bool))
+    assert unseen.common == 0 and unseen.contradiction == 1 and unseen.counterparts == 0
+    assert math.isnan(unseen.upright_counterparts) and math.isnan(unseen.unexplained)
+
+
+def test_only_what_stands_counts_as_upright() -> None:
+    world = hall()
+    flat = seen(world[world[:, 2] < 0.01], np.eye(4))
+    assert math.isnan(meet(flat, flat, np.eye(4))[0].upright_counterparts)
+    assert meet(flat, flat, np.eye(4))[0].counterparts == 1
+
+
+def test_a_corridor_fits_anywhere_along_it_and_a_hall_does_not() -> None:
+    here = make_pose(np.eye(3), [1.0, 0.0, 0.0])
+    query, match = seen(corridor(), here, 15.0), seen(corridor(), np.eye(4), 15.0)
+    near, far = rivalry(match, query, here, inspect(match, query, here).information)
+    assert abs(near) < 0.1 and far < 0.1
+    near, far = rivalry(MATCH, QUERY, THERE, inspect(MATCH, QUERY, THERE).information)
+    assert near > 0.15 and far > 0.3
+
+
+def test_a_pose_beside_the_right_one_has_a_better_rival() -> None:
+    beside = make_pose(np.eye(3), [2.0, 0.0, 0.0]) @ THERE
+    information = np.diag([0.1, 100.0, 100.0, 100.0, 100.0, 100.0])  # x is known least
+    assert rivalry(MATCH, QUERY, beside, information)[1] < -0.3
+
+
+def test_pillars_that_come_again_to_any_side_are_rivals() -> None:
+    x, y = np.meshgrid(np.arange(-9, 10, 3.0), np.arange(-9, 10, 3.0))
+    lattice = np.column_stack([x.ravel() + 1.3, y.ravel() + 0.7])
+    single = RNG.uniform(-10, 10, (len(lattice), 2))
+    found = []
+    for pillars in (lattice, single):
+        query, match = (seen(box((-30, 30), (-30, 30), 3.0, pillars), np.eye(4), 9.0) for _ in range(2))
+        found.append(rivalry(match, query, np.eye(4), np.diag([100.0, 100.0, 100.0, 100.0, 100.0, 100.0]))[1])
+    assert found[0] < 0.15 < found[1] - 0.1

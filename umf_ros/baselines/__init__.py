@@ -1,0 +1,1 @@
+"""Methods of the comparison; loaded by name, never imported by the runtime."""

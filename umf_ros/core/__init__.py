@@ -1,0 +1,1 @@
+"""Records, geometry, settings and files that every package uses."""

@@ -1,0 +1,366 @@
+"""Every setting of the package: one source for node parameters, command line and documentation.
+
+Settings are nested; a node parameter's name is the path with dots, as in `keyframe.min_translation_m`.
+Numbers carry their unit in the name.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from umf_ros.core.errors import ConfigError, either
+from umf_ros.core.resources import DEFAULT_DATASET, dataset_names, find
+from umf_ros.core.yaml_files import read_values
+
+
+class Group(BaseModel):
+    """A group of settings: unknown names are refused, whole numbers pass for floats."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+
+def _known(name: str) -> str:
+    names = dataset_names()
+    if name not in names:
+        find("config/datasets")  # a broken installation lacks them all
+        raise ValueError(f"Input should be {either([repr(one) for one in names])}")
+    return name
+
+
+class SecretError(ValueError):
+    """A value that must not be repeated."""
+
+
+def without_password(address: str) -> str:
+    """The address of a server, unless it holds a password, which would be written beside the results."""
+    if "password" in address.lower() or (":" in address.partition("://")[2].partition("@")[0] and "@" in address):
+        raise SecretError("the password belongs into ~/.pgpass or PGPASSWORD, not into the address")
+    return address
+
+
+Dataset = Annotated[str, AfterValidator(_known)]
+"""Name of a data set that has a file in `config/datasets`."""
+
+
+class Topics(Group):
+    """Names of the input topics; the defaults are S3LI Etna's."""
+
+    left_image: str = Field("/stereo/left/image_rect", description="left image, sensor_msgs/Image")
+    right_image: str = Field("/stereo/right/image_rect", description="right image; empty: no stereo")
+    left_info: str = Field("/stereo/left/camera_info", description="left camera_info; empty: use the calibration file")
+    right_info: str = Field("/stereo/right/camera_info", description="right camera_info, for the baseline")
+    cloud: str = Field("/bf_lidar/points_raw", description="LiDAR scan, sensor_msgs/PointCloud2")
+    odometry: str = Field("/odom", description="odometry, nav_msgs/Odometry; empty: none")
+
+
+class DatasetPreset(Group):
+    """What is known of a data set by its name: a file in `config/datasets`."""
+
+    calibration: Path = Field(description="calibration file, relative to this one")
+    topics: Topics = Topics()
+    mark: str = Field("", description="topic that its recordings have and those of other data sets lack; empty: none")
+
+
+class Qos(Group):
+    """Quality of service of the sensor subscriptions."""
+
+    reliability: Literal["best_effort", "reliable"] = Field(
+        "best_effort", description="best_effort matches every publisher"
+    )
+    depth: int = Field(50, ge=1, le=1000, description="messages kept per subscription: bridges a busy second")
+
+
+class Sync(Group):
+    """How messages become synchronised frames."""
+
+    slop_s: float = Field(0.05, gt=0, le=1, description="largest distance of an image's stamp from the scan's, s")
+    max_wait_s: float = Field(
+        1.0, gt=0, le=10, description="stream time after which a scan stops waiting for a late input, s"
+    )
+    queue_size: int = Field(60, ge=2, le=1000, description="at most this many messages buffered per input")
+    odometry_buffer_s: float = Field(10.0, gt=0, le=600, description="odometry kept for interpolation, s")
+    max_odometry_gap_s: float = Field(1.0, gt=0, le=60, description="no pose is interpolated across a longer gap, s")
+    require_image: bool = Field(False, description="drop scans without an image, rather than use the scan alone")
+
+
+class KeyframePolicy(Group):
+    """When a frame becomes a keyframe."""
+
+    min_translation_m: float = Field(0.5, ge=0, description="a keyframe after this much motion, m")
+    min_rotation_deg: float = Field(15.0, ge=0, le=180, description="or after this much rotation, deg")
+    min_period_s: float = Field(0.4, ge=0, description="but never sooner than this, s")
+    max_period_s: float = Field(5.0, gt=0, description="and at the latest after this if the rover moved at all, s")
+    untracked_period_s: float = Field(1.0, gt=0, description="without odometry: a keyframe every so often, s")
+
+
+class EmbeddingSettings(Group):
+    """The network that turns a frame into a descriptor and local features."""
+
+    method: str = Field("umf", description="embedder by name: umf, or another of docs/benchmarks.md")
+    weights: str = Field(
+        "",
+        description="safetensors file, or umf_scene or umf_light; empty: umf_scene, or another method's own",
+    )
+    runtime: Literal["auto", "torch", "openvino"] = Field("auto", description="what runs the network")
+    device: str = Field("cpu", description="torch device")
+    threads: int = Field(0, ge=0, le=64, description="threads of the network; 0: as many as there are cores")
+
+
+class Loop(Group):
+    """Which keyframes may be candidates for a loop closure."""
+
+    min_time_gap_s: float = Field(20.0, ge=0, le=1e9, description="a match is at least this much older, s")
+    min_travel_m: float = Field(15.0, ge=0, description="and lies at least this far back along the path, m")
+    top_k: int = Field(20, ge=1, le=200, description="candidates handed to verification")
+    min_similarity: float = Field(0.0, ge=-1, le=1, description="candidates below this cosine similarity are dropped")
+
+
+class Verification(Group):
+    """Reranking, metric pose and acceptance of candidates."""
+
+    min_probability: float = Field(0.9, ge=0, le=1, description="a closure is published from this probability on")
+    seed: int = Field(0, ge=0, description="seed of every RANSAC")
+    rerank: Literal["ransac", "superfeatures"] = Field(
+        "ransac", description="how local features reorder the candidates"
+    )
+    rerank_weight: float = Field(
+        0.02,
+        ge=0,
+        le=1000,
+        description="what e times as many inliers weigh against cosine similarity; 1000: inliers alone [UMF 4.5]",
+    )
+    features: Literal["umf", "xfeat"] = Field(
+        "xfeat", description="local features of images: xfeat's, or those of the network that embeds"
+    )
+    modalities: Literal["both", "image", "cloud"] = Field("both", description="local features that reranking uses")
+    rerank_features: int = Field(
+        200, ge=20, le=2000, description="strongest features per modality that reranking matches"
+    )
+    ransac_iterations: int = Field(100, ge=10, le=5000, description="hypotheses per RANSAC")
+    refine_best: int = Field(4, ge=1, le=50, description="best candidates that get a metric pose")
+    max_closures: int = Field(1, ge=1, le=50, description="closures published per keyframe at most")
+    max_turn_deg: float = Field(
+        0.0,
+        ge=0,
+        le=180,
+        description="views further turned are not the same place, deg; 0: those that share less than 60 % of the "
+        "narrower view, so 28 deg for a LiDAR of 70 deg and any turn for one that sees all around",
+    )
+    max_shift_m: float = Field(11.5, gt=0, description="nor are positions further apart, m")
+    odometry_drift: float = Field(
+        0.05, gt=0, le=1, description="odometry error per distance driven, for the soft prior"
+    )
+    calibration: str = Field("", description="fitted acceptance model (JSON); empty: the shipped one")
+
+
+class PoseGraphSettings(Group):
+    """The GTSAM back-end."""
+
+    keyframe_period_s: float = Field(0.5, gt=0, le=60, description="odometry is sampled this often, s")
+    keyframe_spacing_m: float = Field(0.25, gt=0, description="a pose of the graph after this much way, m")
+    max_gap_s: float = Field(2.0, gt=0, description="longest gap of the odometry that is interpolated, s")
+    odometry_sigma_m: float = Field(0.05, gt=0, description="odometry noise after one metre (grows with the root), m")
+    odometry_sigma_deg: float = Field(
+        0.5, gt=0, description="odometry noise after one metre (grows with the root), deg"
+    )
+    max_closure_m: float = Field(100.0, gt=0, description="a closure longer than this is refused as absurd, m")
+    max_correction_m: float = Field(0.0, ge=0, description="a closure that moves a pose further is refused, m; 0: off")
+    gate_chi2: float = Field(
+        27.9, gt=0, description="largest squared Mahalanobis distance to the map (6 degrees of freedom)"
+    )
+    pair_chi2: float = Field(33.6, gt=0, description="the same between two closures, to be consistent")
+    alias_radius_m: float = Field(15.0, gt=0, description="wrong closures to similar places are expected this close, m")
+    max_chance: float = Field(
+        0.02, gt=0, le=1, description="a closure is accepted at once up to this false-alarm probability"
+    )
+    min_support: float = Field(
+        8.0,
+        ge=0,
+        description="evidence that makes closures of several places believed, nats; a further place gives up to 4",
+    )
+    place_m: float = Field(10.0, ge=0, description="closures this close along the path are of one place, m")
+    support_range_m: float = Field(80.0, gt=0, description="closures this close along the path are compared, m")
+    patience_m: float = Field(
+        60.0, ge=0, description="an uncertain closure nothing speaks against is believed after this way, m"
+    )
+    max_pending_s: float = Field(30.0, gt=0, description="a closure waits this long for its odometry, stream time, s")
+    reject_outliers: bool = Field(
+        True, description="find out which closures are wrong and which stated noise is; false: believe all of it"
+    )
+
+
+class FrameIds(Group):
+    """Names of the coordinate frames (REP-105)."""
+
+    map: str = Field("map", description="map frame")
+    odom: str = Field("odom", description="odometry frame, where the odometry's messages name none")
+    base: str = Field("base_link", description="body frame: what calibration, transforms and closures are about")
+    extrinsics: Literal["tf", "calibration"] = Field(
+        "tf",
+        description="where camera and LiDAR are on the body: /tf_static, as far as it says so, or the file alone; "
+        "a data set that is named keeps its own",
+    )
+    publish_tf: bool = Field(False, description="publish map -> odom on /tf when tf2_ros is installed")
+
+
+class Database(Group):
+    """Where places are kept."""
+
+    path: str = Field("", description="file to keep places in, loaded when it exists; empty: a temporary file")
+    cached_keyframes: int = Field(400, ge=20, description="keyframes whose local features stay in memory")
+    backend: Literal["sqlite", "postgres"] = Field(
+        "sqlite",
+        description="postgres: what is kept here goes to a fleet's server too, and others' places are asked for",
+    )
+    server: Annotated[str, AfterValidator(without_password)] = Field(
+        "", description="of a fleet, postgresql://ROVER@HOST/DATABASE; the password is in ~/.pgpass or PGPASSWORD"
+    )
+    fleet_candidates: int = Field(
+        5, ge=1, le=50, description="places of other rovers handed to verification, of each keyframe"
+    )
+
+
+class WorkerSettings(Group):
+    """The thread that does the work of the live node."""
+
+    queue_size: int = Field(10, ge=1, le=1000, description="frames that may wait; the oldest is dropped and counted")
+
+
+class Settings(Group):
+    """All settings."""
+
+    dataset: Dataset = Field(
+        DEFAULT_DATASET, description="preset of calibration and topics, a file in `config/datasets` by its name"
+    )
+    calibration: str = Field("", description="calibration file (YAML); empty: the data set's")
+    mode: Literal["mapping", "localization"] = Field(
+        "mapping", description="remember new places, or say where the rover is in the map that `map` names"
+    )
+    map: str = Field("", description="folder of a map that `umf map` made, for mode localization; it stays as it is")
+    topics: Topics = Topics()
+    qos: Qos = Qos()
+    sync: Sync = Sync()
+    keyframe: KeyframePolicy = KeyframePolicy()
+    embedding: EmbeddingSettings = EmbeddingSettings()
+    loop: Loop = Loop()
+    verification: Verification = Verification()
+    pose_graph: PoseGraphSettings = PoseGraphSettings()
+    frames: FrameIds = FrameIds()
+    database: Database = Database()
+    worker: WorkerSettings = WorkerSettings()
+
+    @model_validator(mode="after")
+    def _names_its_map(self) -> Settings:
+        if self.localizing and not self.map:
+            raise ValueError("mode localization needs a map: the parameter map names its folder")
+        return self
+
+    @property
+    def localizing(self) -> bool:
+        """Whether places are looked for in a map that stays as it is."""
+        return self.mode == "localization"
+
+
+def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:
+    """Settings from a YAML file, plain or a ROS parameter file (`/**: ros__parameters:`).
+
+    Args:
+        path: the file; None gives the defaults.
+        overrides: values by dotted name with `__` for the dot, as in `loop__top_k=10`; None is skipped.
+
+    Raises:
+        ConfigError: the file cannot be read, or a name, type or value is wrong.
+    """
+    values = _node_parameters(read_values(Path(path)), path) if path else {}
+    for name, value in overrides.items():
+        if value is not None:
+            _set(values, name.split("__"), value)
+    return parse_settings(values)
+
+
+def load_preset(dataset: str) -> DatasetPreset:
+    """The preset of a data set, its calibration as a path that can be opened.
+
+    Raises:
+        UmfError: there is no such data set.
+        ConfigError: its file cannot be read, or a name, type or value is wrong.
+    """
+    path = find(f"config/datasets/{dataset}.yaml")
+    try:
+        preset = DatasetPreset.model_validate(read_values(path))
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {problems(error)}") from None
+    return preset.model_copy(update={"calibration": path.parent / preset.calibration})
+
+
+def parse_settings(values: dict[str, Any]) -> Settings:
+    """Settings from a nested dictionary.
+
+    Raises:
+        ConfigError: names every wrong entry on one line.
+    """
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(problems(error)) from None
+
+
+def dump_settings(settings: Settings) -> str:
+    """The effective settings as YAML that `load_settings` and a ROS node both read."""
+    body = {"/**": {"ros__parameters": settings.model_dump()}}
+    return yaml.safe_dump(body, sort_keys=False, allow_unicode=True)
+
+
+def nest(flat: dict[str, Any]) -> dict[str, Any]:
+    """`{"a.b": 1}` as `{"a": {"b": 1}}`."""
+    nested: dict[str, Any] = {}
+    for name, value in flat.items():
+        _set(nested, name.split("."), value)
+    return nested
+
+
+def _set(values: dict[str, Any], path: list[str], value: Any) -> None:
+    for part in path[:-1]:
+        values = values.setdefault(part, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"{part}: holds settings, not a value")
+    values[path[-1]] = value
+
+
+def _node_parameters(content: dict[str, Any], path: str | Path) -> dict[str, Any]:
+    """Take the settings out of a ROS parameter file; a plain file is its own settings."""
+    blocks = [block for block in content.values() if isinstance(block, dict) and "ros__parameters" in block]
+    if not blocks:
+        return content
+    if len(blocks) != len(content):
+        raise ConfigError(f"{path}: mixes node parameters with plain settings")
+    flat: dict[str, Any] = {}
+    for block in blocks:
+        flat |= {name: value for name, value in (block["ros__parameters"] or {}).items() if name not in NODE_ONLY}
+    return nest(flat)
+
+
+NODE_ONLY = frozenset({"use_sim_time", "results_dir", "autostart"})
+
+
+def problems(error: ValidationError) -> str:
+    """Every wrong value and what is wrong with it, on one line."""
+    return "; ".join(_explain(problem) for problem in error.errors())
+
+
+def _explain(problem: Any) -> str:
+    name = ".".join(str(part) for part in problem["loc"])
+    text = str(problem["msg"]).removeprefix("Value error, ")
+    if not name:  # of several values together
+        return text
+    if problem["type"] == "extra_forbidden":
+        return f"unknown parameter {name}"
+    if problem["type"] == "missing":
+        return f"{name} is missing"
+    if isinstance(problem.get("ctx", {}).get("error"), SecretError):
+        return f"{name}: {text}"
+    return f"{name}: {text[0].lower()}{text[1:]} (got {problem['input']!r})"

@@ -1,0 +1,225 @@
+"""The nouns of the package: what flows from the sensors to a loop closure.
+
+Stamps are integer nanoseconds since the epoch. The body frame is REP-103 (x forward, y left,
+z up), the camera frame is optical (x right, y down, z forward). Poses follow `geometry`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.core.geometry import Array, invert, transform
+
+Image = NDArray[np.uint8]
+Points = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class StereoCamera:
+    """A rectified pinhole pair: pixels, and metres for the baseline (0 when there is no right camera).
+
+    Pixel (0, 0) is the centre of the upper left pixel, as in ROS and OpenCV.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    baseline: float
+
+    @property
+    def width_rad(self) -> float:
+        """Angle of view from the left to the right edge, rad."""
+        return 2 * math.atan(self.width / (2 * self.fx))
+
+    def project(self, points: Array, body_T_camera: Array) -> tuple[Array, Array]:
+        """Left pixels (N, 2) and depths (N,) of points (N, 3) of the body frame; a depth <= 0 lies behind the camera.
+
+        Args:
+            points: (N, 3) metres, body frame.
+            body_T_camera: pose of the left camera in the body frame.
+        """
+        optical = transform(invert(body_T_camera), points)
+        depth = optical[:, 2]
+        safe = np.where(depth > 0, depth, 1.0)
+        u = self.fx * optical[:, 0] / safe + self.cx
+        v = self.fy * optical[:, 1] / safe + self.cy
+        return np.column_stack([u, v]), depth
+
+
+@dataclass(frozen=True, slots=True)
+class ScanMotion:
+    """When the points of a scan were measured, and how far the motion meanwhile, which was removed, is known.
+
+    Attributes:
+        moments_s: (N,) float32, s after the frame's stamp, one for every point.
+        rates: (6,) x y z rx ry rz, m/s and rad/s about the body's axes: the motion over the scan.
+        noise: (6,) m^2/s and rad^2/s: the variance that the odometry's error gains in a second.
+    """
+
+    moments_s: Points
+    rates: Array
+    noise: Array
+
+    @classmethod
+    def none(cls, count: int) -> ScanMotion:
+        """Of a scan of so many points that was taken from one place, or whose motion is known exactly."""
+        return cls(np.zeros(count, np.float32), np.zeros(6), np.zeros(6))
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One synchronised set of measurements; either modality may be missing, never both.
+
+    Attributes:
+        stamp_ns: time of the LiDAR scan (of the image where there is no scan); the frame's key.
+        camera: intrinsics of the left image.
+        body_T_camera: pose of the left camera at its exposure in the body frame at `stamp_ns`.
+        body_T_lidar: pose of the LiDAR in the body frame.
+        left: (H, W) uint8, rectified, or None.
+        right: (H, W) uint8, rectified, or None.
+        points: (N, 3) float32, metres, body frame at `stamp_ns` (motion removed), real returns
+            only, or None.
+        intensity: (N,) float32, the sensor's unit.
+        odom_T_body: odometry at `stamp_ns`, or None.
+        image_stamp_ns: exposure of the left image, or None.
+        session: counts the resets of the clock or the odometry.
+        motion: during the scan; None where it was not removed, for want of odometry or of times per point.
+    """
+
+    stamp_ns: int
+    camera: StereoCamera
+    body_T_camera: Array
+    body_T_lidar: Array
+    left: Image | None = None
+    right: Image | None = None
+    points: Points | None = None
+    intensity: Points | None = None
+    odom_T_body: Array | None = None
+    image_stamp_ns: int | None = None
+    session: int = 0
+    motion: ScanMotion | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LocalFeatures:
+    """K salient local features of one modality [UMF 4.4], strongest first.
+
+    Attributes:
+        positions: (K, 2) float32 pixels of the left image, or (K, 3) float32 metres in the body frame.
+        descriptors: (K, D) float16, L2-normalised.
+        saliency: (K,) float32, larger is more salient.
+        points: (K, 3) float32 metres in the body frame, NaN where the depth is unknown.
+    """
+
+    positions: Points
+    descriptors: NDArray[np.float16]
+    saliency: Points
+    points: Points
+
+
+@dataclass(frozen=True, slots=True)
+class SuperFeatures:
+    """The ordered super-features of one modality [UMF 4.3]; the row is the feature's ID.
+
+    Attributes:
+        descriptors: (N, D) float16, L2-normalised.
+        strength: (N,) float32, norm before the normalisation.
+    """
+
+    descriptors: NDArray[np.float16]
+    strength: Points
+
+
+@dataclass(frozen=True, slots=True)
+class Embedding:
+    """What the network says of one frame.
+
+    Attributes:
+        descriptor: (D,) float32, L2-normalised; similarity is the dot product.
+        image: local features of the left image, or None without an image.
+        cloud: local features of the scan, or None without a scan.
+        super_image: super-features of the image, or None.
+        super_cloud: super-features of the scan, or None.
+    """
+
+    descriptor: NDArray[np.float32]
+    image: LocalFeatures | None = None
+    cloud: LocalFeatures | None = None
+    super_image: SuperFeatures | None = None
+    super_cloud: SuperFeatures | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A remembered place: all that retrieval and verification need, and no more.
+
+    Attributes:
+        stamp_ns: the frame's key.
+        embedding: descriptor and local features, lifted to 3-D where a depth is known.
+        camera: intrinsics of the left image.
+        body_T_camera: pose of the left camera in the body frame.
+        points: (M, 3) float32 metres in the body frame: the scan, thinned for registration; may be empty.
+        odom_T_body: odometry at the stamp, or None.
+        path_length_m: metres driven since the start of the session, NaN without odometry.
+        session: session of the frame.
+        body_T_lidar: pose of the LiDAR in the body frame: where the scan was seen from.
+        motion: during the scan, one moment for every thinned point; None where it was not removed.
+    """
+
+    stamp_ns: int
+    embedding: Embedding
+    camera: StereoCamera
+    body_T_camera: Array
+    points: Points
+    odom_T_body: Array | None = None
+    path_length_m: float = float("nan")
+    session: int = 0
+    body_T_lidar: Array = field(default_factory=lambda: np.eye(4))
+    motion: ScanMotion | None = None
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether any distance was measured, by a scan or a stereo pair: two keyframes without make no metric pose."""
+        image = self.embedding.image
+        return len(self.points) > 0 or (image is not None and bool(np.isfinite(image.points).any()))
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A keyframe of the database that looks like the query.
+
+    Attributes:
+        index: row in the database.
+        stamp_ns: key of the candidate keyframe.
+        similarity: cosine similarity of the global descriptors.
+    """
+
+    index: int
+    stamp_ns: int
+    similarity: float
+
+
+@dataclass(frozen=True, slots=True)
+class LoopClosure:
+    """A verified metric constraint between two keyframes: `x_query = x_match @ match_T_query`.
+
+    Attributes:
+        query_stamp_ns: key of the query keyframe, the later one.
+        match_stamp_ns: key of the matched keyframe.
+        match_T_query: pose of the query body in the match body frame.
+        covariance: (6, 6) in ROS order (x y z rx ry rz, axes of the match body), m^2 and rad^2.
+        probability: calibrated probability that the closure is right, NaN where it is unknown.
+    """
+
+    query_stamp_ns: int
+    match_stamp_ns: int
+    match_T_query: Array
+    covariance: Array
+    probability: float = float("nan")

@@ -1,0 +1,52 @@
+"""What comes with the package, in a checkout or an installed share folder, and what does not: cheap, for help asks."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+from umf_ros.core.errors import UmfError
+
+DEFAULT_DATASET = "simulated"
+LAB_PACKAGES = {"open3d": ("open3d", "0.19"), "sklearn": ("scikit-learn", "1.4")}
+"""What a rover does without: distribution and first version known to work, by module."""
+FLEET_PACKAGES = ("faiss", "pgvector", "psycopg", "ray")
+"""Modules that only a fleet's rover, a map of very many places or a cluster needs."""
+
+
+def share_folders() -> list[Path]:
+    """Folders that can hold `config/` and `models/`, the most specific first."""
+    checkout = Path(__file__).resolve().parents[2]
+    folders = [checkout] if (checkout / "package.xml").is_file() else []
+    # <prefix>/lib/python3.x/site-packages/umf_ros -> <prefix>/share/umf_ros
+    folders += [parent / "share" / "umf_ros" for parent in Path(__file__).resolve().parents]
+    return [*folders, Path(sys.prefix) / "share" / "umf_ros"]
+
+
+def find(relative: str) -> Path:
+    """Path of a shipped file, such as `config/calibration/simulated.yaml`.
+
+    Raises:
+        UmfError: no such file is installed.
+    """
+    for folder in share_folders():
+        if (folder / relative).exists():
+            return folder / relative
+    raise UmfError(f"{relative} is not installed with umf_ros; reinstall the package")
+
+
+def dataset_names() -> list[str]:
+    """Data sets that have a file in `config/datasets`, the default first."""
+    names = {path.stem for folder in share_folders() for path in (folder / "config" / "datasets").glob("*.yaml")}
+    return sorted(names, key=lambda name: (name != DEFAULT_DATASET, name))
+
+
+def check_packages() -> None:
+    """See to it that this Python is one that the package was installed for.
+
+    Raises:
+        UmfError: nothing that it needs is there, as in a workspace whose venv is not activated.
+    """
+    if not any(find_spec(name) for name in ("rosbags", "pydantic_core")):
+        raise UmfError(f"{sys.executable} has none of the packages that are needed: source venv/bin/activate first")

@@ -1,0 +1,126 @@
+"""Independent tasks spread over processes of this machine, or over a cluster by Ray."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import Any, TypeVar
+
+from umf_ros.core.errors import UmfError
+
+Task = TypeVar("Task")
+Done = Callable[[int], None]
+"""Told how many tasks are done."""
+
+ATTEMPTS = 3
+"""So often a task may take its worker with it before it is given up: once is bad luck, or somebody's kill -9."""
+LOCAL = "local"
+
+
+def spread(
+    work: Callable[[Task], None],
+    tasks: Sequence[Task],
+    workers: int = 1,
+    ray: str | None = None,
+    done: Done = lambda count: None,
+) -> None:
+    """Do all tasks, in any order. A worker that dies is replaced, and its task begun again.
+
+    Args:
+        work: a function of a module, whose results are files; a task that was begun may be done again.
+        tasks: what it is called with.
+        workers: processes; with one, all is done here. With Ray the cluster says how many there are.
+        ray: address of a cluster, whose machines see the same files and have this package; or `local`.
+        done: hears of every task that is done.
+
+    Raises:
+        UmfError: a task failed, or took its workers with it time and again; the other tasks are not waited for.
+        ModuleNotFoundError: Ray is asked for and not installed.
+    """
+    if ray is not None:
+        _by_ray(work, tasks, ray, workers, done)
+    elif workers > 1:
+        _by_processes(work, tasks, workers, done)
+    else:
+        for count, task in enumerate(tasks, 1):
+            work(task)
+            done(count)
+
+
+def _by_processes(work: Callable[[Task], None], tasks: Sequence[Task], workers: int, done: Done) -> None:
+    left = dict(enumerate(tasks))
+    for _ in range(ATTEMPTS):
+        while left:
+            before = len(left)
+            with ProcessPoolExecutor(min(workers, len(left)), get_context("spawn")) as pool:
+                running = {pool.submit(work, task): number for number, task in left.items()}
+                try:
+                    _collect(running, left, lambda: done(len(tasks) - len(left)))
+                except BaseException:
+                    pool.shutdown(wait=False, cancel_futures=True)
+                    raise
+            if len(left) == before:
+                break
+        if not left:
+            return
+    raise UmfError(f"{len(left)} tasks end the process that works at them: too little memory?")
+
+
+def _collect(running: dict[Future[None], int], left: dict[int, Any], told: Callable[[], None]) -> None:
+    """Strike out what gets done until all is, or a worker died: then all that run with it have to be begun again."""
+    pending = set(running)
+    while pending:
+        finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+        for future in finished:
+            try:
+                future.result()
+            except BrokenProcessPool:
+                continue
+            del left[running[future]]
+            told()
+
+
+def _by_ray(work: Callable[[Task], None], tasks: Sequence[Task], address: str, workers: int, done: Done) -> None:
+    import ray
+    from ray.exceptions import RayError, RayTaskError
+
+    try:
+        if address == LOCAL:
+            ray.init(
+                num_cpus=max(workers, 1), include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR
+            )
+        else:
+            _knock(address)
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    except (RayError, OSError, ValueError, RuntimeError) as error:
+        raise UmfError(f"no Ray cluster at {address}: {_line(error)}") from None
+    try:
+        remote = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(work)
+        pending = [remote.remote(task) for task in tasks]
+        while pending:
+            finished, pending = ray.wait(pending)
+            ray.get(finished)
+            done(len(tasks) - len(pending))
+    except RayTaskError as error:
+        if isinstance(error.cause, UmfError):
+            raise UmfError(str(error.cause)) from None
+        raise
+    except RayError as error:
+        raise UmfError(f"Ray gave a task up: {_line(error)}") from None
+    finally:
+        ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """Ray itself looks for a cluster that is not there for minutes."""
+    host, _, port = address.rpartition("://")[2].partition(":")
+    if port.isdigit():
+        socket.create_connection((host, int(port)), 5).close()
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]

@@ -1,0 +1,73 @@
+"""Poses over time, and their text format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.core.errors import writing
+from umf_ros.core.geometry import Array, interpolate, to_quaternion
+
+MAX_GAP_S = 2.0
+"""Nothing is interpolated across a longer gap."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses over time, in a fixed frame of its own.
+
+    Attributes:
+        stamps_ns: (N,) int64, increasing.
+        poses: (N, 4, 4) `world_T_body`; rotations are the identity where they are unknown.
+        has_orientation: whether the rotations are known.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    poses: Array
+    has_orientation: bool = True
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def at(self, stamps_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+        """Interpolated (K, 4, 4) poses at (K,) stamps, and (K,) whether each is known.
+
+        Positions are interpolated linearly, rotations along the shortest arc. A pose is known between
+        two poses no further apart than `MAX_GAP_S`; the others are the identity.
+        """
+        stamps = np.asarray(stamps_ns, np.int64)
+        poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+        if not len(self):
+            return poses, np.zeros(len(stamps), bool)
+        after = np.clip(np.searchsorted(self.stamps_ns, stamps), 0, len(self) - 1)
+        exact = self.stamps_ns[after] == stamps
+        before = np.where(exact, after, after - 1)
+        known = (before >= 0) & (stamps <= self.stamps_ns[-1])
+        known &= self.stamps_ns[after] - self.stamps_ns[before] <= MAX_GAP_S * 1e9
+        before, after = before[known], after[known]
+        steps = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
+        fractions = (stamps[known] - self.stamps_ns[before]) / steps
+        poses[known] = interpolate(self.poses[before], self.poses[after], fractions)
+        return poses, known
+
+    def of_body(self, body_T_sensor: Array) -> Trajectory:
+        """Poses of the body, where these are of a sensor on it (as SLAM systems give the IMU's or the camera's)."""
+        return Trajectory(self.stamps_ns, self.poses @ np.linalg.inv(body_T_sensor), self.has_orientation)
+
+
+def write_tum(path: str | Path, trajectory: Trajectory) -> None:
+    """Write `seconds x y z qx qy qz qw` lines, the stamps to the nanosecond.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    poses = trajectory.poses
+    numbers = np.concatenate([poses[:, :3, 3], to_quaternion(poses)], axis=1).tolist() if len(poses) else []
+    stamps = [divmod(stamp, 10**9) for stamp in trajectory.stamps_ns.tolist()]
+    form = "%d.%09d" + " %.9f" * 7 + "\n"
+    lines = [form % (*stamp, *row) for stamp, row in zip(stamps, numbers, strict=True)]
+    with writing(path):
+        Path(path).write_text("".join(lines), encoding="ascii")

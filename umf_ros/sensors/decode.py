@@ -1,0 +1,296 @@
+"""ROS messages as arrays.
+
+Messages are read by attribute, so that those of rclpy and those read from a bag without ROS are the
+same here. Every fault of a message is a `MessageError` whose `kind` groups equal causes for counting.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.core.errors import MessageError
+from umf_ros.core.frames import Image, Points, StereoCamera
+from umf_ros.core.geometry import Array, from_quaternion
+from umf_ros.sensors.rectification import LARGEST_IMAGE
+
+# encoding -> channels, bytes per channel, OpenCV's conversion to grey
+_ENCODINGS: dict[str, tuple[int, int, int | None]] = {
+    "mono8": (1, 1, None),
+    "8UC1": (1, 1, None),
+    "mono16": (1, 2, None),
+    "rgb8": (3, 1, cv2.COLOR_RGB2GRAY),
+    "bgr8": (3, 1, cv2.COLOR_BGR2GRAY),
+    "rgba8": (4, 1, cv2.COLOR_RGBA2GRAY),
+    "bgra8": (4, 1, cv2.COLOR_BGRA2GRAY),
+    # ROS names the upper left 2x2 pixels; the names of OpenCV's older constants start one pixel further
+    "bayer_rggb8": (1, 1, cv2.COLOR_BayerRGGB2GRAY),
+    "bayer_bggr8": (1, 1, cv2.COLOR_BayerBGGR2GRAY),
+    "bayer_gbrg8": (1, 1, cv2.COLOR_BayerGBRG2GRAY),
+    "bayer_grbg8": (1, 1, cv2.COLOR_BayerGRBG2GRAY),
+    "yuv422": (2, 1, cv2.COLOR_YUV2GRAY_UYVY),
+    "uyvy": (2, 1, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2GRAY_YUY2),
+    "yuyv": (2, 1, cv2.COLOR_YUV2GRAY_YUY2),
+}
+
+# sensor_msgs/PointField.datatype
+_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+LAST_STAMP_NS = 2**31 * 10**9
+"""What a stamp with seconds of 32 bits stays below."""
+FURTHEST_M = 1e7
+"""No odometry is further from its origin: a quarter of the earth."""
+NARROWEST_RAD, WIDEST_RAD = 0.02, 3.1
+"""Angles of view that a rectified camera can have."""
+LARGEST_RECORD = 4096
+"""Bytes of a point; drivers have some dozens."""
+INTENSITY_NAMES = ("intensity", "reflectivity", "reflectance", "i")
+"""Fields of the strength of a return, by whoever's driver."""
+TIME_NAMES = ("point_time_offset", "offset_time", "t", "time", "time_offset", "timestamp")
+"""Fields of the time of a point: whole numbers are ns, others s; Blickfeld, Livox, Ouster, Velodyne, Hesai."""
+FURTHEST_RETURN_M = 1e4
+"""No LiDAR of a rover sees ten kilometres (*by hand*); grids over points further apart run out of cells."""
+LONGEST_SWEEP_NS = 1_000_000_000
+NO_RETURN_RANGE_M = 1.0
+"""Range at which the Blickfeld driver puts the pulses that came back from nowhere, with intensity 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """The real returns of one scan.
+
+    Attributes:
+        points: (N, 3) float32, metres, LiDAR frame.
+        intensity: (N,) float32, or None when the driver sends none.
+        time_offset_ns: (N,) int64 after the stamp of the message, or None when the driver sends none.
+    """
+
+    points: Points
+    intensity: Points | None = None
+    time_offset_ns: NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class OdometrySample:
+    """One pose of the odometry.
+
+    Attributes:
+        stamp_ns: when.
+        odom_T_body: (4, 4) pose.
+    """
+
+    stamp_ns: int
+    odom_T_body: Array
+
+
+def stamp_ns(message: Any) -> int:
+    """Stamp of the message's header in nanoseconds.
+
+    Raises:
+        MessageError: of kind "stamp" when the driver has not set it, for it would look like a restart of the recording,
+            or when there is no such time.
+    """
+    stamp = message.header.stamp
+    nanoseconds = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    if nanoseconds <= 0:
+        raise MessageError("stamp", "message without a stamp")
+    if nanoseconds >= LAST_STAMP_NS:  # could not be sent on
+        raise MessageError("stamp", f"message with a stamp of {stamp.sec} s and {stamp.nanosec} ns")
+    return nanoseconds
+
+
+def decode_image(message: Any) -> Image:
+    """Grey image of a sensor_msgs/Image: (H, W) uint8, which may share the message's memory.
+
+    16-bit images are taken as full scale: the upper byte is kept.
+
+    Raises:
+        MessageError: of kind "encoding", "size", "step" or "truncated".
+    """
+    if message.encoding not in _ENCODINGS:
+        raise MessageError("encoding", f"image encoding {message.encoding!r} is not supported")
+    channels, size, conversion = _ENCODINGS[message.encoding]
+    rows = _image_rows(message, row_bytes=message.width * channels * size)
+    if size == 2:
+        return np.ascontiguousarray(rows[:, (0 if message.is_bigendian else 1) :: 2])
+    if channels > 1:
+        rows = rows.reshape(message.height, message.width, channels)
+    return rows if conversion is None else np.asarray(cv2.cvtColor(rows, conversion), np.uint8)
+
+
+def _image_rows(message: Any, row_bytes: int) -> Image:
+    """(H, row_bytes) bytes of an image without the padding at the end of the rows."""
+    if message.width == 0 or message.height == 0:
+        raise MessageError("size", f"image of {message.width} x {message.height} pixels")
+    if message.step < row_bytes:
+        raise MessageError("step", f"image step is {message.step} bytes, its width needs {row_bytes}")
+    data = np.frombuffer(message.data, np.uint8)
+    expected = message.step * message.height
+    if data.size < expected:
+        raise MessageError("truncated", f"image holds {data.size} bytes of {expected}")
+    if data.size > expected:
+        raise MessageError("step", f"image holds {data.size} bytes, step and height say {expected}")
+    return np.ascontiguousarray(data.reshape(message.height, message.step)[:, :row_bytes])
+
+
+def decode_cloud(message: Any) -> Cloud:
+    """Real returns of a sensor_msgs/PointCloud2; fields are found by name and read by data type.
+
+    Points that are not finite and dummies for pulses without a return are left out, so the result may
+    be empty. `intensity` and `point_time_offset` (ns) may be missing.
+
+    Raises:
+        MessageError: of kind "fields", "datatype", "step" or "truncated".
+    """
+    records = _cloud_records(message)
+    names = records.dtype.names or ()
+    points = np.stack([records[axis] for axis in "xyz"], axis=1, dtype=np.float32, casting="unsafe")
+    strength = next((name for name in INTENSITY_NAMES if name in names), None)
+    intensity = None if strength is None else records[strength].astype(np.float32)
+    real = real_returns(points, intensity)
+    offsets = _time_offsets_ns(records[real], message)
+    return Cloud(points[real], None if intensity is None else intensity[real], offsets)
+
+
+def real_returns(points: Points, intensity: Points | None) -> NDArray[np.bool_]:
+    """(N,) which of the points (N, 3), m, are echoes: away from the sensor, not too far, and no dummy of the Cube-1."""
+    x, y, z = points.T
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is too far
+        squared = x * x + y * y + z * z
+    dummy = np.abs(squared - NO_RETURN_RANGE_M**2) < 2e-5
+    if intensity is not None:
+        dummy &= intensity == 0
+    return (squared > 0) & (squared <= FURTHEST_RETURN_M**2) & ~dummy  # neither holds of what is not a number
+
+
+def _time_offsets_ns(records: NDArray[Any], message: Any) -> NDArray[np.int64] | None:
+    """(N,) ns after the message's stamp: drivers count from it, or since the epoch; None where they do not tell."""
+    name = next((name for name in TIME_NAMES if name in (records.dtype.names or ())), None)
+    if name is None:
+        return None
+    times = records[name]
+    if times.dtype.kind in "ui":
+        offsets = times.astype(np.int64)
+    elif len(times) and times[0] > 1e17:  # ns since the epoch, as Livox' driver for PCL writes them
+        offsets = (times - float(stamp_ns(message))).astype(np.int64)
+    elif len(times) and times[0] > 1e8:  # s since the epoch, as Hesai writes them
+        offsets = np.rint((times - stamp_ns(message) * 1e-9) * 1e9).astype(np.int64)
+    else:
+        offsets = np.rint(times.astype(float) * 1e9).astype(np.int64)
+    # no sweep takes a second: what says so counts from elsewhere
+    return offsets if not len(offsets) or np.abs(offsets).max() < LONGEST_SWEEP_NS else None
+
+
+def _cloud_records(message: Any) -> NDArray[Any]:
+    """(N,) structured array over the fields the package uses."""
+    wanted = {"x", "y", "z", *INTENSITY_NAMES, *TIME_NAMES}
+    fields = {field.name: field for field in message.fields if field.name in wanted}
+    missing = [axis for axis in "xyz" if axis not in fields]
+    if missing:
+        raise MessageError("fields", f"cloud has no field {', '.join(missing)}")
+    count = message.width * message.height
+    if message.point_step > LARGEST_RECORD:
+        raise MessageError("step", f"cloud point step is {message.point_step} bytes")
+    if count == 0:
+        return np.empty(0, [("x", "f4"), ("y", "f4"), ("z", "f4")])
+    dtype = _record_type(list(fields.values()), message.point_step, ">" if message.is_bigendian else "<")
+    row_bytes = message.width * message.point_step
+    row_step = message.row_step if message.height > 1 else row_bytes
+    if row_step < row_bytes:
+        raise MessageError("step", f"cloud row step is {row_step} bytes, its width needs {row_bytes}")
+    data = np.frombuffer(message.data, np.uint8)
+    if data.size < row_step * (message.height - 1) + row_bytes:
+        raise MessageError("truncated", f"cloud holds {data.size} bytes of {row_step * message.height}")
+    rows = [data[start : start + row_bytes] for start in range(0, row_step * message.height, row_step)]
+    return (rows[0] if len(rows) == 1 else np.concatenate(rows)).view(dtype)
+
+
+def _record_type(fields: list[Any], point_step: int, order: str) -> np.dtype[Any]:
+    formats = []
+    for field in fields:
+        if field.datatype not in _DATATYPES or field.count > 1:
+            raise MessageError(
+                "datatype", f"cloud field {field.name} has datatype {field.datatype} and count {field.count}"
+            )
+        formats.append(np.dtype(order + _DATATYPES[field.datatype]))
+        if field.offset + formats[-1].itemsize > point_step:
+            raise MessageError("step", f"cloud field {field.name} lies outside the point step of {point_step} bytes")
+    layout = {
+        "names": [field.name for field in fields],
+        "formats": formats,
+        "offsets": [field.offset for field in fields],
+        "itemsize": point_step,
+    }
+    return np.dtype(layout)  # type: ignore[call-overload]
+
+
+def decode_odometry(message: Any) -> OdometrySample:
+    """Pose of a nav_msgs/Odometry.
+
+    Raises:
+        MessageError: of kind "pose" when it is not finite or its quaternion is not of unit length.
+    """
+    return OdometrySample(stamp_ns(message), decode_pose(message.pose.pose))
+
+
+def decode_pose(pose: Any) -> Array:
+    """(4, 4) matrix of a geometry_msgs/Pose.
+
+    Raises:
+        MessageError: of kind "pose" when it is not finite or its quaternion is not of unit length.
+    """
+    position, turn = pose.position, pose.orientation
+    translation = np.array([position.x, position.y, position.z], dtype=float)
+    if not np.isfinite(translation).all():
+        raise MessageError("pose", "pose with a position that is not finite")
+    if np.abs(translation).max() > FURTHEST_M:
+        raise MessageError("pose", f"pose with a position {np.abs(translation).max():.3g} m from the origin")
+    try:
+        return from_quaternion(translation, (turn.x, turn.y, turn.z, turn.w))
+    except ValueError as error:
+        raise MessageError("pose", f"pose with {error}") from None
+
+
+def decode_camera_info(left: Any, right: Any | None = None) -> StereoCamera:
+    """Rectified pair of one or two sensor_msgs/CameraInfo; without the right one the baseline is 0.
+
+    Raises:
+        MessageError: of kind "camera_info" when a camera is uncalibrated or the two cannot be a pair.
+    """
+    matrix = _projection(left, "left")
+    baseline = 0.0
+    if right is not None:
+        other = _projection(right, "right")
+        baseline = -float(other[0, 3]) / float(other[0, 0])
+        if not baseline > 0:
+            raise MessageError("camera_info", f"right camera_info has a baseline of {baseline:.4g} m")
+    fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return StereoCamera(int(left.width), int(left.height), fx, fy, cx, cy, baseline)
+
+
+def _projection(info: Any, name: str) -> Array:
+    """(3, 4) projection of the rectified image; from K where the driver leaves P empty."""
+    if max(info.width, info.height) > LARGEST_IMAGE:
+        raise MessageError("camera_info", f"{name} camera_info for {info.width} x {info.height} pixels")
+    matrix = np.array(info.p, dtype=float).reshape(3, 4)
+    if not matrix.any():
+        matrix[:, :3] = np.array(info.k, dtype=float).reshape(3, 3)
+    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0 and info.width > 0 and info.height > 0):
+        raise MessageError("camera_info", f"{name} camera_info is not calibrated")
+    _check_pinhole(matrix, info, name)
+    return matrix
+
+
+def _check_pinhole(matrix: Array, info: Any, name: str) -> None:
+    """Refuse a camera that nobody can build."""
+    width, height, fx, fy = float(info.width), float(info.height), matrix[0, 0], matrix[1, 1]
+    views = [2 * np.arctan2(size / 2, focal) for size, focal in ((width, fx), (height, fy))]
+    centre = 0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height
+    if not (all(NARROWEST_RAD < view < WIDEST_RAD for view in views) and 0.5 < fx / fy < 2 and centre):
+        numbers = f"{width:.0f} x {height:.0f} pixels, fx {fx:.3g}, fy {fy:.3g}, centre {matrix[0, 2]:.3g}"
+        raise MessageError("camera_info", f"{name} camera_info of no real camera: {numbers}, {matrix[1, 2]:.3g}")

@@ -1,0 +1,140 @@
+"""The way of a message into the synchronizer: the same live and offline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from umf_ros.core.config import Topics
+from umf_ros.core.errors import MessageError
+from umf_ros.sensors.decode import (
+    OdometrySample,
+    decode_camera_info,
+    decode_odometry,
+    stamp_ns,
+)
+from umf_ros.sensors.message_kinds import decode_any_cloud, decode_any_image
+from umf_ros.sensors.sessions import ODOMETRY, Input
+from umf_ros.sensors.synchronizer import SILENCE_NS, Synchronizer
+from umf_ros.sensors.tf import OdometryFrames, TfExtrinsics
+
+_INPUTS: dict[str, Input] = {
+    "left_image": "left",
+    "right_image": "right",
+    "cloud": "cloud",
+    "odometry": ODOMETRY,
+    "left_info": "camera_info",
+    "right_info": "camera_info",
+}
+"""The input of every topic, by its name in `Topics`."""
+
+
+def wanted_inputs(topics: Topics) -> set[Input]:
+    """Inputs of the synchronizer for which there is a topic; the right camera_info alone says nothing."""
+    return {name for entry, name in _INPUTS.items() if getattr(topics, entry) and entry != "right_info"}
+
+
+class MessageRouter:
+    """Decodes the messages of the input topics and adds them to a synchronizer.
+
+    A message that cannot be used is counted by kind and skipped; the first of each kind is told.
+    """
+
+    def __init__(
+        self,
+        synchronizer: Synchronizer,
+        topics: Topics,
+        warn: Callable[[str], None],
+        hear_odometry: Callable[[OdometrySample], None] = lambda _: None,
+        mounting: TfExtrinsics | None = None,
+        odometry_frames: OdometryFrames | None = None,
+    ) -> None:
+        """Warn with one line per kind of fault and topic; `hear_odometry` gets every sample at its full rate.
+
+        `mounting` says where the sensors are on the body, and `odometry_frames` whose poses the odometry holds; None:
+        as the calibration says, and the body's.
+        """
+        self._mounting = mounting
+        self._odometry_frames = odometry_frames
+        self._synchronizer = synchronizer
+        self._hear_odometry = hear_odometry
+        self._warn = warn
+        self._warned: set[tuple[str, str]] = set()
+        self._stereo_info = bool(topics.right_info and topics.right_image)
+        self._infos: dict[str, tuple[Any, Any]] = {}
+        self._said: dict[str, Any] = {}
+        self._used: tuple[Any, Any] | None = None
+        self._entries = {getattr(topics, entry): entry for entry in _INPUTS}
+        self._entries.pop("", None)
+
+    @property
+    def topics(self) -> list[str]:
+        """Topics whose messages are taken."""
+        return list(self._entries)
+
+    def take(self, topic: str, message: Any) -> None:
+        """Add one message."""
+        entry = self._entries[topic]
+        try:
+            if entry == ODOMETRY:
+                self.take_odometry(self._of_body(message, decode_odometry(message)))
+            elif entry in ("left_info", "right_info"):
+                self._use_info(entry, message)
+            else:
+                self._mount(entry, message)
+                decode = decode_any_cloud if entry == "cloud" else decode_any_image
+                self._synchronizer.add(_INPUTS[entry], stamp_ns(message), decode(message))
+        except MessageError as error:
+            self.refuse(topic, error)
+        except Exception as error:  # whatever a message provokes, it is the message's fault
+            text = f"message provokes {type(error).__name__}: {error}"
+            self.refuse(topic, MessageError("unusable", text))
+
+    def take_odometry(self, sample: OdometrySample) -> None:
+        """Add one pose of the odometry."""
+        self._hear_odometry(sample)
+        self._synchronizer.add(ODOMETRY, sample.stamp_ns, sample.odom_T_body)
+
+    def refuse(self, topic: str, error: MessageError) -> None:
+        """Count a message that cannot be used."""
+        self._synchronizer.reject(_INPUTS[self._entries[topic]], error.kind)
+        if (topic, error.kind) not in self._warned:
+            self._warned.add((topic, error.kind))
+            self._warn(f"{topic}: {error}; such messages are skipped")
+
+    def _of_body(self, message: Any, sample: OdometrySample) -> OdometrySample:
+        if self._odometry_frames is None:
+            return sample
+        return OdometrySample(sample.stamp_ns, self._odometry_frames.to_body(message, sample.odom_T_body))
+
+    def _mount(self, entry: str, message: Any) -> None:
+        if self._mounting is None or entry == "right_image":
+            return
+        sensor = "lidar" if entry == "cloud" else "camera"
+        poses = self._mounting.update(sensor, message.header.frame_id)
+        if poses:
+            self._synchronizer.use_mounting(poses)
+
+    def _use_info(self, entry: str, message: Any) -> None:
+        """Use the camera_info of the pair, or the left one alone when the right camera stays silent.
+
+        The first is used at once. A later one that says something else replaces it when it is said twice in a row:
+        one message may be damaged, a camera that was set up anew goes on saying so.
+        """
+        content = (message.width, message.height, bytes(np.array(message.k)), bytes(np.array(message.p)))
+        repeated, self._said[entry] = self._said.get(entry) == content, content
+        known = self._infos.get(entry, (None, None))[0]
+        if content != known and (known is None or repeated):
+            decode_camera_info(message)
+            self._infos[entry] = content, message
+        left, right = (self._infos.get(name, (None, None)) for name in ("left_info", "right_info"))
+        if left[1] is None or self._used == (left[0], right[0]):
+            return
+        if right[1] is None and self._stereo_info and stamp_ns(message) - stamp_ns(left[1]) < SILENCE_NS:
+            return
+        first, self._used = not self._used, (left[0], right[0])
+        self._synchronizer.use_camera(decode_camera_info(left[1], right[1]))
+        if not first and right[1] is not None:
+            self._warn(f"{entry}: other intrinsics than before; they are used from here on")

@@ -1,0 +1,175 @@
+"""How the parts of a robot are mounted, as `/tf_static` says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from umf_ros.core.config import FrameIds
+from umf_ros.core.errors import MessageError
+from umf_ros.core.geometry import Array, from_quaternion, invert
+from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.decode import stamp_ns
+
+TOPIC = "/tf_static"
+_UP = 0.9
+PATIENCE_S = 3.0
+"""What is latched comes this soon after a node has started, as a rule much sooner."""
+
+
+class StaticTransforms:
+    """A tree of frames that do not move against each other.
+
+    Attributes:
+        version: number of changes so far.
+    """
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, Array]] = {}
+        self.version = 0
+
+    def add(self, message: Any) -> None:
+        """Take a tf2_msgs/TFMessage; what is no rigid transform in it is left out."""
+        for stamped in message.transforms:
+            shift, turn = stamped.transform.translation, stamped.transform.rotation
+            parent, child = (name.lstrip("/") for name in (stamped.header.frame_id, stamped.child_frame_id))
+            try:
+                pose = from_quaternion((shift.x, shift.y, shift.z), (turn.x, turn.y, turn.z, turn.w))
+            except ValueError:
+                continue
+            known = self._parents.get(child)
+            if parent != child and (known is None or known[0] != parent or not np.array_equal(known[1], pose)):
+                self._parents[child] = parent, pose
+                self.version += 1
+
+    def find(self, frame: str, other: str) -> Array | None:
+        """(4, 4) `frame_T_other`, or None where no static way leads from one to the other."""
+        ours, theirs = self._to_roots(frame.lstrip("/")), self._to_roots(other.lstrip("/"))
+        common = next((name for name in ours if name in theirs), None)
+        return None if common is None else invert(ours[common]) @ theirs[common]
+
+    def _to_roots(self, frame: str) -> dict[str, Array]:
+        """`ancestor_T_frame` of every ancestor, the nearest first."""
+        poses: dict[str, Array] = {frame: np.eye(4)}
+        name = frame
+        while name in self._parents:
+            parent, pose = self._parents[name]
+            if parent in poses:  # a circle: nobody's tree
+                break
+            poses[parent] = pose @ poses[name]
+            name = parent
+        return poses
+
+
+class TfExtrinsics:
+    """The calibration, with the poses of camera and LiDAR from the transforms, as soon as they say them.
+
+    Args:
+        calibration: what holds until then, and whatever the transforms do not say.
+        transforms: filled by whoever hears them.
+        base: name of the body frame.
+        warn: told in one line which pose is used, and how far it is from the calibration's.
+    """
+
+    def __init__(
+        self, calibration: Calibration, transforms: StaticTransforms, base: str, warn: Callable[[str], None]
+    ) -> None:
+        self._calibration = calibration
+        self._transforms = transforms
+        self._base = base
+        self._warn = warn
+        self._frames: dict[str, str] = {}
+        self._version = 0
+
+    def update(self, sensor: str, frame_id: str) -> dict[str, Array]:
+        """Poses that are new, `body_T_camera` and `body_T_lidar` by name, when a message of a sensor has come.
+
+        Args:
+            sensor: "camera" or "lidar".
+            frame_id: of the message's header.
+        """
+        if self._frames.get(sensor) == frame_id and self._version == self._transforms.version:
+            return {}
+        self._frames[sensor] = frame_id
+        self._version = self._transforms.version
+        found = {f"body_T_{name}": self._find(name, frame) for name, frame in self._frames.items()}
+        return {name: pose for name, pose in found.items() if pose is not None}
+
+    def _find(self, sensor: str, frame: str) -> Array | None:
+        pose = self._transforms.find(self._base, frame) if frame else None
+        if pose is None:
+            return None
+        before = getattr(self._calibration, f"body_T_{sensor}")
+        if sensor == "camera":
+            if pose[2, 2] > _UP:
+                self._warn(f"{frame} is not an optical frame (its z axis is up): the calibration's pose is kept")
+                return None
+            if self._calibration.rectifier is not None:
+                pose = pose @ self._calibration.rectifier.raw_T_rectified
+        if np.allclose(pose, before, atol=1e-6):
+            return None
+        apart_m = float(np.linalg.norm(pose[:3, 3] - before[:3, 3]))
+        self._warn(f"{sensor}: its pose is that of {frame} in {self._base} on {TOPIC}, {apart_m:.2f} m from the file's")
+        self._calibration = self._calibration.with_poses({f"body_T_{sensor}": pose})
+        return pose
+
+
+class OdometryFrames:
+    """Whose poses the odometry holds, and in which frame; another source on the same topic is refused.
+
+    Args:
+        frames: names of the frames.
+        transforms: tell where the body is, if the odometry is of another part of the robot.
+        warn: told in one line when they do not.
+        patience_s: so long the odometry of another part waits for them, by its stamps.
+
+    Attributes:
+        odom: name of the odometry's frame: that of the messages, where they name one.
+    """
+
+    def __init__(
+        self, frames: FrameIds, transforms: StaticTransforms, warn: Callable[[str], None], patience_s: float = 0.0
+    ) -> None:
+        self._patience_ns = int(patience_s * 1e9)
+        self._base = frames.base
+        self._transforms = transforms
+        self._warn = warn
+        self._names: tuple[str, str] | None = None
+        self._part_T_body: Array | None = None
+        self._first_ns = 0
+        self.odom = frames.odom
+
+    def to_body(self, message: Any, odom_T_part: Array) -> Array:
+        """(4, 4) `odom_T_body` of a nav_msgs/Odometry whose pose is `odom_T_part`.
+
+        Raises:
+            MessageError: of kind "frame" when its frames are not those of the first message; of kind "transforms" while
+                these may still come.
+        """
+        names = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
+        if self._names is None:
+            self._names = names
+            self.odom = names[0] or self.odom
+            self._first_ns = stamp_ns(message)
+        if names != self._names:
+            before, now = (" to ".join(map(repr, pair)) for pair in (self._names, names))
+            raise MessageError("frame", f"odometry from {now}, after that from {before}: two sources on one topic?")
+        if self._part_T_body is None:
+            self._part_T_body = self._look_up(names[1], stamp_ns(message) - self._first_ns)
+        if self._part_T_body is None:
+            raise MessageError("transforms", f"odometry of {names[1]} waits for {TOPIC} to say where that is")
+        found: Array = odom_T_part @ self._part_T_body
+        return found
+
+    def _look_up(self, part: str, waited_ns: int) -> Array | None:
+        """Where the body is on `part`; None while it is worth waiting."""
+        if not part or part == self._base:
+            return np.eye(4)
+        part_T_body = self._transforms.find(part, self._base)
+        if part_T_body is None and not 0 <= waited_ns < self._patience_ns:
+            text = f"and {TOPIC} does not say where {self._base} is on it: taken as the body's"
+            self._warn(f"the odometry is that of {part}, {text} (parameter frames.base)")
+            return np.eye(4)
+        return part_T_body

@@ -1,0 +1,156 @@
+"""Fine alignment of the scans of two keyframes, and what the geometry says about the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+
+from umf_ros.core.geometry import Array, transform
+from umf_ros.verification import constants as const
+from umf_ros.verification.prepared_scan import PreparedScan
+
+
+@dataclass(frozen=True, slots=True)
+class CovarianceModel:
+    """What residuals do not say about the error of a pose; fitted.
+
+    Attributes:
+        inflation: factor on the variance, for neighbouring residuals are not independent.
+        floor_m: standard deviation of every translation, m, from calibration.
+        floor_deg: of every rotation, deg.
+        disorder: logarithm of one more factor on the variance where nothing overlaps, in proportion to the share of
+            the points that have no counterpart: what grows, sways or hides each other misleads the others too.
+        motion: factor on the standard deviation of what the odometry within a scan is measured to add.
+        unknown_motion_m: like `floor_m`, added where the motion inside a scan was not removed.
+        unknown_motion_deg: like `floor_deg`, likewise.
+    """
+
+    inflation: float
+    floor_m: float
+    floor_deg: float
+    disorder: float = 0.0
+    motion: float = 1.0
+    unknown_motion_m: float = 0.0
+    unknown_motion_deg: float = 0.0
+
+    @property
+    def floor(self) -> Array:
+        """The floor as a covariance (6, 6), m^2 and rad^2."""
+        return _diagonal(self.floor_m, self.floor_deg)
+
+    @property
+    def unknown_motion(self) -> Array:
+        """What motion that was not removed adds to the covariance, (6, 6), m^2 and rad^2."""
+        return _diagonal(self.unknown_motion_m, self.unknown_motion_deg)
+
+
+def _diagonal(metres: float, degrees: float) -> Array:
+    return np.diag([metres**2] * 3 + [np.radians(degrees) ** 2] * 3)
+
+
+# information (6, 6) of the search itself: nothing is less known than that
+SEARCHED = np.diag([const.SEARCH_M**-2] * 3 + [const.SEARCH_RAD**-2] * 3)
+NOMINAL = CovarianceModel(const.NOMINAL_INFLATION, const.NOMINAL_FLOOR_M, const.NOMINAL_FLOOR_DEG)
+"""A fixed yardstick of what a pose is known to: refitting the covariance must not move the decision."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """How the scan of a query lies on that of a match.
+
+    Attributes:
+        pose: (4, 4) `match_T_query`.
+        residuals: (N,) m: point-to-plane distances of the query points that have a counterpart.
+        jacobian: (N, 6) of the residuals by (x y z rx ry rz) about the match axes at the query's origin.
+        overlap: share of the query points seen by both that have a counterpart.
+        points: (P, 3) m: the query points that have one, in the match's body frame.
+        pairs: (N, 2) index of the query's and of the match's point behind each residual; one row per residual.
+    """
+
+    pose: Array
+    residuals: Array
+    jacobian: Array
+    overlap: float
+    points: Array
+    pairs: NDArray[np.intp] = field(default_factory=lambda: np.empty((0, 2), np.intp))
+
+    @property
+    def weights(self) -> Array:
+        """Information (N,) of each residual as if they were independent, 1/m^2, with outliers weighed down."""
+        if not len(self.residuals):
+            return np.empty(0)
+        noise = max(1.4826 * float(np.median(np.abs(self.residuals))), const.MIN_RESIDUAL_NOISE_M)
+        found: Array = 1.0 / (1.0 + (self.residuals / (2 * noise)) ** 2) / noise**2
+        return found
+
+    @property
+    def information(self) -> Array:
+        """Information (6, 6) of the residuals."""
+        found: Array = (self.jacobian * self.weights[:, None]).T @ self.jacobian
+        return found
+
+
+def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Alignment:
+    """Generalised ICP (Segal, RSS 2009) from the pose `guess`, first far-sighted, then near-sighted."""
+    pose = draw(match, query.coarse_cloud, guess, const.COARSE_REACH_M, const.COARSE_STEPS)
+    pose = draw(match, query.sample_cloud, pose, const.FINE_REACH_M, const.FINE_STEPS)
+    return inspect(match, query, pose)
+
+
+def draw(match: PreparedScan, query: small_gicp.PointCloud, guess: Array, reach_m: float, steps: int) -> Array:
+    """`match_T_query` after some steps of generalised ICP from a guess; counterparts are nearer than `reach_m`."""
+    result = small_gicp.align(
+        match.cloud,
+        query,
+        match.tree,
+        guess,
+        registration_type="GICP",
+        max_correspondence_distance=reach_m,
+        num_threads=1,
+        max_iterations=steps,
+    )
+    return np.asarray(result.T_target_source)
+
+
+def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
+    """Residuals, their Jacobian and the overlap of two scans at a pose."""
+    moved = transform(pose, query.sample)
+    index, squared = match.nearest(moved)
+    normals = match.normals[index]
+    offset = moved - match.points[index]
+    residual = np.einsum("ij,ij->i", offset, normals)
+    solid = np.einsum("ij,ij->i", normals, normals) > 0.5
+    close = solid & (squared < const.FINE_REACH_M**2)
+    seen = solid & (squared < const.COARSE_REACH_M**2)
+    arm = np.cross(moved[close] - pose[:3, 3], normals[close])
+    overlap = float(close.sum()) / max(int(seen.sum()), 1)
+    pairs = np.column_stack([query.picks, index])[close]
+    return Alignment(pose, residual[close], np.hstack([normals[close], arm]), overlap, moved[close], pairs)
+
+
+def covariance_of(found: Array, model: CovarianceModel, overlap: float | Array = 1.0) -> Array:
+    """Covariance (..., 6, 6) of a pose in ROS order (x y z rx ry rz, match axes), m^2 and rad^2.
+
+    The information gives the shape: a plane leaves two shifts and a turn as wide as the search.
+
+    Args:
+        found: information (..., 6, 6) of the residuals.
+        model: what they do not say.
+        overlap: (...) of the alignment.
+    """
+    inflation = np.asarray(model.inflation * np.exp(model.disorder * (1.0 - np.asarray(overlap, float))))
+    covariance = np.linalg.inv(SEARCHED + found / inflation[..., None, None]) + model.floor
+    return (covariance + covariance.swapaxes(-1, -2)) / 2
+
+
+def nominal_deviations(found: Array) -> tuple[float, float]:
+    """Nominal standard deviations of the position along its least known direction, m, and of the heading, deg.
+
+    Args:
+        found: information (6, 6) of the residuals.
+    """
+    nominal = covariance_of(found, NOMINAL)
+    return float(np.sqrt(np.linalg.eigvalsh(nominal[:3, :3])[-1])), float(np.degrees(np.sqrt(nominal[5, 5])))
