@@ -64,9 +64,9 @@ def test_the_contracts_hold() -> None:
 
 
 def test_a_rover_on_its_own_needs_nothing_of_a_fleet() -> None:
-    missing = ["psycopg", "pgvector", "faiss", "ray", "umf_ros.fleet"]
+    missing = ["psycopg", "pgvector", "ray", "umf_ros.fleet"]
     rooms = [
-        "loop_detector",
+        "detector",
         "places.database",
         "replay",
         "commands.replay",

@@ -20,8 +20,8 @@ CONFIG = "config/calibration/simulated.yaml"
 def install(site_packages: Path) -> None:
     """The part of the package that finds files, as pip and colcon install it."""
     target = site_packages / "umf_ros"
-    target.mkdir(parents=True)
-    for name in ("__init__.py", "errors.py", "resources.py"):
+    (target / "core").mkdir(parents=True)
+    for name in ("__init__.py", "core/__init__.py", "core/errors.py", "core/resources.py"):
         shutil.copy(PACKAGE / name, target / name)
 
 

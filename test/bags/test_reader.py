@@ -21,7 +21,7 @@ from recordings import (
 )
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros import resources
+from umf_ros.core import resources
 from umf_ros.bags.presets import calibration_of, detect_dataset, settings_for, topics_of
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import load_preset, load_settings

@@ -14,7 +14,7 @@ import pytest
 from command_line import umf
 from recordings import part_of
 
-from umf_ros import spread as spread_module
+from umf_ros.core import tasks as spread_module
 from umf_ros.maps.map_folder import MapFolder
 
 

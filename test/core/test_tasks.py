@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from spread_tasks import die, refuse, square, square_after_a_death
 
-from umf_ros import spread as spread_module
+from umf_ros.core import tasks as spread_module
 from umf_ros.core.errors import UmfError
 from umf_ros.core.tasks import spread
 
