@@ -26,7 +26,7 @@ from domains import error_vector, is_wrong
 from rich.console import Console
 from rich.progress import track
 
-from umf_ros.comparison.comparer import judge
+from umf_ros.comparison import judge
 from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, from_quaternion

@@ -21,9 +21,9 @@ from recordings import (
 )
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.core import resources
 from umf_ros.bags.presets import calibration_of, detect_dataset, settings_for, topics_of
 from umf_ros.bags.reader import open_bag
+from umf_ros.core import resources
 from umf_ros.core.config import load_preset, load_settings
 from umf_ros.core.errors import BagError, ConfigError
 from umf_ros.core.resources import find, share_folders

@@ -13,8 +13,7 @@ from command_line import only_line, umf
 from recordings import CALIBRATION
 
 from umf_ros.commands import compare as command_module
-from umf_ros.comparison.comparer import Comparer
-from umf_ros.comparison.tables import RESULT_COLUMNS, VIEW_COLUMNS
+from umf_ros.comparison import RESULT_COLUMNS, VIEW_COLUMNS, Comparer
 
 NUMBERS = RESULT_COLUMNS[: RESULT_COLUMNS.index("reason")]
 
@@ -70,7 +69,7 @@ def test_a_defect_costs_one_pair_only(here: Path, monkeypatch: pytest.MonkeyPatc
     def fail(self: Comparer, match: object, query: object) -> None:
         raise np.linalg.LinAlgError("singular\nmatrix")
 
-    monkeypatch.setattr("umf_ros.comparison.comparer.Comparer.compare", fail)
+    monkeypatch.setattr("umf_ros.comparison.Comparer.compare", fail)
     Path("pairs.csv").write_text("match_scan,query_scan\none.npy,other.npy\none.npy,one.npy\n")
     ended = umf("compare", "--list", "pairs.csv", "--out", "verdicts.csv")
     assert ended.status == 1 and ended.err.splitlines() == [
@@ -78,6 +77,14 @@ def test_a_defect_costs_one_pair_only(here: Path, monkeypatch: pytest.MonkeyPatc
         "pair 2: LinAlgError: singular matrix",
     ]
     assert len(rows_of(here / "verdicts.csv")) == 2
+
+
+def test_results_of_an_earlier_list_are_not_touched(here: Path) -> None:
+    Path("pairs.csv").write_text("match_scan,query_scan\none.npy,other.npy\n")
+    Path("verdicts.csv").write_text("results of another list\n")
+    said = only_line(umf("compare", "--list", "pairs.csv", "--out", "verdicts.csv"))
+    assert "verdicts.csv exists already" in said
+    assert Path("verdicts.csv").read_text() == "results of another list\n"
 
 
 def test_images_are_named_as_views_or_beside_them(here: Path) -> None:

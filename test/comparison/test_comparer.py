@@ -12,8 +12,16 @@ from recordings import CALIBRATION
 from scenes import landscape, pose_at, take, without_image
 
 from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
-from umf_ros.comparison.comparer import NO_CALIBRATION, NO_DEPTH, Comparer, judge, similarity_of
-from umf_ros.comparison.views import KeyframeSource, PlaceView, ReadingRules
+from umf_ros.comparison import (
+    NO_CALIBRATION,
+    NO_DEPTH,
+    Comparer,
+    KeyframeSource,
+    PlaceView,
+    ReadingRules,
+    judge,
+    similarity_of,
+)
 from umf_ros.core.config import Verification
 from umf_ros.core.errors import SensorFileError
 from umf_ros.core.geometry import make_pose

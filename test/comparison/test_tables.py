@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.comparison.comparer import Comparison
-from umf_ros.comparison.tables import POSE, RESULT_COLUMNS, SIGMA, failed_row, read_pairs, result_row, view_row
-from umf_ros.comparison.views import PlaceView
+from umf_ros.comparison import (
+    POSE,
+    RESULT_COLUMNS,
+    SIGMA,
+    Comparison,
+    PlaceView,
+    failed_row,
+    read_pairs,
+    view_row,
+)
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import from_quaternion, make_pose
@@ -70,7 +77,7 @@ def test_an_accepted_pair_has_its_pose_and_sigmas() -> None:
     pose = make_pose(Rotation.from_euler("z", 20, degrees=True).as_matrix(), [1.0, -2.0, 0.5])
     covariance = np.diag(np.square([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]))
     closure = LoopClosure(2, 1, pose, covariance, 0.97)
-    row = result_row(Comparison("accepted", 0.8, 0.97, closure, 41.23))
+    row = Comparison("accepted", 0.8, 0.97, closure, 41.23).row
     assert tuple(row) == RESULT_COLUMNS
     assert (row["accepted"], row["reason"], row["probability"], row["milliseconds"]) == (1, "accepted", 0.97, 41.2)
     np.testing.assert_allclose(from_quaternion([row[n] for n in POSE[:3]], [row[n] for n in POSE[3:]]), pose, atol=1e-8)
@@ -78,7 +85,7 @@ def test_an_accepted_pair_has_its_pose_and_sigmas() -> None:
 
 
 def test_others_say_why_and_have_none() -> None:
-    rejected = result_row(Comparison("probability 0.20 is below 0.9", 0.5, 0.2))
+    rejected = Comparison("probability 0.20 is below 0.9", 0.5, 0.2).row
     failed = failed_row("query: cannot read b.npy")
     for row in (rejected, failed):
         assert row["accepted"] == 0 and row["reason"] and tuple(row) == RESULT_COLUMNS

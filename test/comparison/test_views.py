@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from recordings import CALIBRATION, traverse, write_mcap
 
+from umf_ros import comparison as views
 from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
-from umf_ros.comparison import views
-from umf_ros.comparison.views import KeyframeSource, PlaceView, ReadingRules
+from umf_ros.comparison import KeyframeSource, PlaceView, ReadingRules
 from umf_ros.core.errors import CalibrationError, SensorFileError, UmfError
 from umf_ros.core.frames import Embedding, Frame
 
@@ -72,7 +72,7 @@ def test_without_one_they_are_left_aside_and_it_says_so_once(here: Path) -> None
 
 
 def test_a_view_in_many_pairs_is_embedded_once(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(views, "KEPT", 2)
+    monkeypatch.setattr(views, "CACHED_KEYFRAMES", 2)
     embedder = CountingEmbedder()
     source = KeyframeSource(embedder, calibrated(here))
     one, two = PlaceView(str(here / "scan.npy")), PlaceView("", str(here / "left.png"))

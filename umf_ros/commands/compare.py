@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,14 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from umf_ros.commands.recordings import ConfigPath, DatasetName, EmbedderName, WeightsPath
-from umf_ros.core.errors import ConfigError, UmfError
+from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, writing
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.comparison.comparer import Comparer, Comparison
-    from umf_ros.comparison.tables import Pair, Row
-    from umf_ros.comparison.views import PlaceView
+    from umf_ros.comparison import Comparer, Comparison, Pair, PlaceView, Row
 
 Image = Annotated[Path | None, typer.Option(help="Image file; needs --calibration.", show_default=False)]
 ViewName = Annotated[
@@ -52,13 +51,13 @@ def command(
         raise ConfigError("--list PAIRS.csv needs --out VERDICTS.csv, and neither MATCH, QUERY, images nor --json")
     if pairs is None:
         _check_named(match or match_left, query or query_left, out)
+    if out is not None and out.exists():
+        raise OutputError(f"{out} exists already: name another file with --out")
 
     from rich.console import Console
 
     from umf_ros.commands.progress import WARNING
-    from umf_ros.comparison.comparer import Comparer
-    from umf_ros.comparison.tables import read_pairs
-    from umf_ros.comparison.views import KeyframeSource, ReadingRules
+    from umf_ros.comparison import Comparer, KeyframeSource, ReadingRules, read_pairs
     from umf_ros.core.config import load_settings
     from umf_ros.detector import make_detector_embedder
 
@@ -80,7 +79,7 @@ def command(
 
 
 def _check_named(match: str | Path | None, query: str | Path | None, out: Path | None) -> None:
-    """What cannot be is said before anything that takes time to import."""
+    """Refuse impossible arguments before the slow imports."""
     if out is not None:
         raise ConfigError("--out VERDICTS.csv goes with --list PAIRS.csv; one pair is printed (--json)")
     for view, name in ((match, "MATCH"), (query, "QUERY")):
@@ -89,7 +88,7 @@ def _check_named(match: str | Path | None, query: str | Path | None, out: Path |
 
 
 def _view(name: str | None, left: Path | None, right: Path | None) -> PlaceView:
-    from umf_ros.comparison.views import PlaceView
+    from umf_ros.comparison import PlaceView
     from umf_ros.sensors.snapshots import IMAGE_SUFFIXES
 
     scan, images = name or "", [str(path) if path else "" for path in (left, right)]
@@ -101,23 +100,22 @@ def _view(name: str | None, left: Path | None, right: Path | None) -> PlaceView:
 
 
 def _compare_list(comparer: Comparer, asked: list[Pair], base: Path, out: Path, errors: Console) -> None:
-    """Write one row per pair; what goes wrong with one is told, and the others go on."""
+    """Write one row per pair; a pair that cannot be compared is reported and does not stop the others."""
     from rich.progress import track
 
-    from umf_ros.comparison.tables import RESULT_COLUMNS, VIEW_COLUMNS, view_row
-    from umf_ros.runs.tables import CsvTable
+    from umf_ros.comparison import RESULT_COLUMNS, VIEW_COLUMNS, view_row
 
-    columns = [*VIEW_COLUMNS, *RESULT_COLUMNS]
-    table, accepted, failures = CsvTable(out, columns), 0, []
-    for number, pair in enumerate(
-        track(asked, "Comparing", console=errors, transient=True, disable=not errors.is_terminal), 1
-    ):
-        row, fault = _verdict(comparer, pair)
-        accepted += row["accepted"]
-        failures += [f"pair {number}: {fault}"] if fault else []
-        row |= view_row(*pair, base)
-        table.append([[row[name] for name in columns]])
-    table.close()
+    accepted, failures = 0, []
+    with writing(out), out.open("x", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, [*VIEW_COLUMNS, *RESULT_COLUMNS])
+        table.writeheader()
+        pairs = track(asked, "Comparing", console=errors, transient=True, disable=not errors.is_terminal)
+        for number, pair in enumerate(pairs, 1):
+            row, failure = _result(comparer, pair)
+            accepted += row["accepted"]
+            failures += [f"pair {number}: {failure}"] if failure else []
+            table.writerow(row | view_row(*pair, base))
+            file.flush()
     for line in failures:
         typer.echo(line, err=True)
     typer.echo(f"{out}: {len(asked)} pairs, {accepted} the same place, {len(failures)} could not be compared")
@@ -125,23 +123,23 @@ def _compare_list(comparer: Comparer, asked: list[Pair], base: Path, out: Path, 
         raise typer.Exit(1)
 
 
-def _verdict(comparer: Comparer, pair: Pair) -> tuple[Row, str]:
-    """The row of a pair, and what went wrong with it."""
-    from umf_ros.comparison.tables import failed_row, result_row
+def _result(comparer: Comparer, pair: Pair) -> tuple[Row, str]:
+    """Return the row of a pair, and the reason where it could not be compared."""
+    from umf_ros.comparison import failed_row
 
     try:
-        return result_row(comparer.compare(*pair)), ""
+        return comparer.compare(*pair).row, ""
     except UmfError as error:
-        fault = str(error)
-    except Exception as error:  # the data of strangers: one pair must not cost the others their verdicts
-        fault = f"{type(error).__name__}: {' '.join(str(error).split())}"
-    return failed_row(fault), fault
+        failure = str(error)
+    except Exception as error:  # foreign data: one pair must not cost the others their results
+        failure = f"{type(error).__name__}: {one_line(error)}"
+    return failed_row(failure), failure
 
 
 def _show(comparison: Comparison, as_json: bool) -> None:
-    from umf_ros.comparison.tables import POSE, SIGMA, result_row
+    from umf_ros.comparison import POSE, SIGMA
 
-    row = result_row(comparison)
+    row = comparison.row
     if as_json:
         typer.echo(json.dumps(row, indent=2))
         return
