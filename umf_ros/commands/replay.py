@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.reader import Bag
-    from umf_ros.commands.inputs import InputConsole
+    from umf_ros.commands.console import InputConsole
     from umf_ros.core.config import Settings
     from umf_ros.embedding.embedder import Embedder
 
@@ -78,8 +78,7 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.trajectories import read_ground_truth
-    from umf_ros.commands.inputs import InputConsole
-    from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.commands.console import FrameProgress, InputConsole, stop_on_interrupt, undisturbed
     from umf_ros.detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
     from umf_ros.runs.recorder import count_drops
@@ -146,7 +145,7 @@ def _localize(
     console: Console,
 ) -> int:
     """Find the rover of a recording in a map; 3 where it was not found."""
-    from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.commands.console import FrameProgress, stop_on_interrupt, undisturbed
     from umf_ros.detector import LoopDetector
     from umf_ros.localization import LocalizingReplay
     from umf_ros.runs.finished_run import remember_recording
