@@ -1,0 +1,144 @@
+"""Files written in one step, and SQLite files: migrated, refused, copied."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from umf_ros.core.errors import OutputError, UmfError
+from umf_ros.core.io import Schema, SqliteFile, atomic_write
+
+FIRST = Schema("log", (("CREATE TABLE line (text TEXT)",),), unversioned=lambda tables: int("line" in tables))
+SECOND = Schema("log", (*FIRST.migrations, ("ALTER TABLE line ADD COLUMN level INTEGER DEFAULT 7",)))
+BESIDE = Schema("queue", (lambda connection: connection.execute("CREATE TABLE queued (id INTEGER)"),))
+
+
+def lines(file: SqliteFile) -> list[tuple[object, ...]]:
+    with file.reading() as connection:
+        return connection.execute("SELECT * FROM line").fetchall()
+
+
+def made(path: Path, schema: Schema = FIRST) -> Path:
+    file = SqliteFile(path, schema)
+    with file.writing() as connection:
+        connection.execute("INSERT INTO line (text) VALUES ('hello')")
+    file.close()
+    return path
+
+
+def contents(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_a_file_appears_complete_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.json"
+    with atomic_write(path) as part:
+        part.write_text("one")
+        assert not path.exists()
+    with pytest.raises(ZeroDivisionError), atomic_write(path) as part:
+        part.write_text("two")
+        raise ZeroDivisionError
+    assert path.read_text() == "one" and contents(path.parent) == {"a.json"}
+
+
+def test_a_disk_error_is_one_line_and_named_kinds_too(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="cannot write .*/file/a"), atomic_write(tmp_path / "file" / "a"):
+        pass
+    with pytest.raises(OutputError, match="cannot write .*/b: no room"), atomic_write(tmp_path / "b", RuntimeError):
+        raise RuntimeError("no room")
+
+
+def test_a_file_of_an_earlier_version_is_migrated_once(tmp_path: Path) -> None:
+    path = made(tmp_path / "a.sqlite")
+    for _ in range(2):
+        file = SqliteFile(path, SECOND)
+        assert lines(file) == [("hello", 7)]
+        file.close()
+
+
+def test_a_file_from_before_versions_is_taken_up(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "a.sqlite")) as connection, connection:
+        connection.execute("CREATE TABLE line (text TEXT)")
+    file = SqliteFile(tmp_path / "a.sqlite", Schema("log", SECOND.migrations, FIRST.unversioned))
+    assert lines(file) == []
+    file.close()
+
+
+def test_a_file_holds_several_schemas(tmp_path: Path) -> None:
+    path = made(tmp_path / "a.sqlite")
+    file = SqliteFile(path, SECOND)
+    file.migrate(BESIDE)
+    file.migrate(BESIDE)
+    assert lines(file) == [("hello", 7)] and file.connection.execute("SELECT * FROM queued").fetchall() == []
+    file.close()
+
+
+def test_a_migration_that_fails_leaves_the_file_as_it_was(tmp_path: Path) -> None:
+    path = made(tmp_path / "a.sqlite")
+    broken = Schema("log", (*SECOND.migrations, ("CREATE TABLE other (id)", "no statement")))
+    with pytest.raises(UmfError, match="cannot write"):
+        SqliteFile(path, broken)
+    file = SqliteFile(path, FIRST)
+    assert lines(file) == [("hello",)]
+    file.close()
+
+
+def test_later_versions_other_files_and_two_writers_are_refused_in_one_line(tmp_path: Path) -> None:
+    path = made(tmp_path / "a.sqlite", SECOND)
+    with pytest.raises(UmfError, match="has version 2 of a log, this umf_ros reads 1"):
+        SqliteFile(path, FIRST)
+    with pytest.raises(UmfError, match="is no queue: it holds line, schema_version"):
+        SqliteFile(path, BESIDE)
+    writer = SqliteFile(path, SECOND)
+    reader = SqliteFile(path, SECOND, read_only=True)
+    assert lines(reader) == [("hello", 7)]
+    with pytest.raises(UmfError, match=rf"in use by another process \({os.getpid()}\)"):
+        SqliteFile(path, SECOND)
+    with pytest.raises(UmfError, match="there is no log"):
+        SqliteFile(tmp_path / "b.sqlite", SECOND, read_only=True)
+    reader.close()
+    writer.close()
+    assert "b.sqlite" not in contents(tmp_path)
+
+
+def test_a_reader_is_told_when_a_file_has_to_be_migrated_first(tmp_path: Path) -> None:
+    path = made(tmp_path / "a.sqlite")
+    SqliteFile(path, SECOND, read_only=True).close()
+    with pytest.raises(UmfError, match="of an earlier umf_ros"):
+        SqliteFile(path, Schema("log", SECOND.migrations, readable=2), read_only=True)
+
+
+def test_a_refusal_of_the_check_changes_nothing(tmp_path: Path) -> None:
+    path = made(tmp_path / "a.sqlite")
+    before = path.read_bytes()
+
+    def refuse(connection: sqlite3.Connection) -> None:
+        raise UmfError("of another rover")
+
+    with pytest.raises(UmfError, match="^of another rover$"):
+        SqliteFile(path, SECOND, check=refuse)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("statement", ["CREATE VIEW v AS SELECT 1", "CREATE TABLE t (a, b AS (a + 1))"])
+def test_a_file_that_computes_is_refused(tmp_path: Path, statement: str) -> None:
+    path = made(tmp_path / "a.sqlite")
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(statement)
+    with pytest.raises(UmfError, match="cannot be used as a log: it holds a"):
+        SqliteFile(path, FIRST)
+
+
+def test_a_copy_is_complete_and_a_temporary_file_is_in_no_folder(tmp_path: Path) -> None:
+    file = SqliteFile(None, FIRST)
+    with file.writing() as connection:
+        connection.execute("INSERT INTO line VALUES ('hello')")
+    file.copy(tmp_path / "copy.sqlite")
+    file.close()
+    assert contents(tmp_path) == {"copy.sqlite"}
+    assert lines(SqliteFile(tmp_path / "copy.sqlite", FIRST, read_only=True)) == [("hello",)]

@@ -1,0 +1,262 @@
+"""Files: written in one step, locked by one process, and SQLite files with versioned tables."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from umf_ros.core.errors import UmfError, one_line, shortened, writing
+
+Migration = tuple[str, ...] | Callable[[sqlite3.Connection], None]
+Check = Callable[[sqlite3.Connection], None]
+_VERSIONS = "CREATE TABLE IF NOT EXISTS schema_version (name TEXT PRIMARY KEY, version INTEGER NOT NULL)"
+
+
+@contextmanager
+def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
+    """Write a file in one step: it appears under its name complete, or not at all.
+
+    The block writes the temporary file beside `path` whose path it is given; the file replaces `path` when the block
+    ends without an error and is deleted otherwise.
+
+    Args:
+        path: the file; its folder is made where it is missing.
+        kinds: exceptions of the block, besides `OSError`, that mean that the file cannot be written.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    with writing(path, *kinds):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield part
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+class FileLock:
+    """Exclusive lock of a file against other processes, until `release` or the end of the process.
+
+    The lock lies on `<path>.lock`: SQLite uses locks of its own on `path`, and drops them when any thread of the
+    process closes that file. Readers need no lock.
+
+    Args:
+        path: the file to protect; `<path>.lock` is made beside it and stays.
+
+    Raises:
+        UmfError: another process, which is named, holds the lock.
+        OutputError: the lock file cannot be made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        lock = path.with_name(path.name + ".lock")
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.pread(self._descriptor, 20, 0).decode("ascii", "replace").strip()
+            self.release()
+            raise UmfError(f"{path} is in use by another process ({holder or 'unknown'}); only one may write") from None
+        os.ftruncate(self._descriptor, 0)
+        os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
+
+    def release(self) -> None:
+        """Let other processes write."""
+        os.close(self._descriptor)
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """The tables of one kind of SQLite file, by version.
+
+    A file may hold several schemas; the table `schema_version` has a row for each.
+
+    Attributes:
+        name: kind of the file, such as "place database"; for errors and `schema_version`.
+        migrations: the n-th leads from version n to n + 1, as statements or as a function of the connection. A released
+            one is never changed, only added to.
+        unversioned: version of a file without `schema_version`, as earlier releases wrote it, by the names of its
+            tables; 0 where it is another kind of file.
+        readable: oldest version that can be read without migration.
+    """
+
+    name: str
+    migrations: tuple[Migration, ...]
+    unversioned: Callable[[set[str]], int] = lambda tables: 0
+    readable: int = 1
+
+
+class SqliteFile:
+    """An open SQLite file: checked, migrated, written by one process, safe against its sudden end.
+
+    Writes go to a write-ahead log without a sync per row: a killed process loses nothing that was committed.
+
+    Args:
+        path: the file, made where it is missing; None: a temporary file that disappears with the process.
+        schema: its tables.
+        read_only: only read the file, which must exist; another process may write it meanwhile.
+        check: called before anything is changed in a file that has tables; raises an `UmfError` to refuse it.
+
+    Attributes:
+        connection: for any thread of the process; the caller serialises its use.
+        name: of the file, for messages.
+
+    Raises:
+        UmfError: the file is missing (`read_only`), another kind of file, damaged, of a later version, or in use.
+        OutputError: the file cannot be written.
+    """
+
+    def __init__(
+        self, path: Path | None, schema: Schema, *, read_only: bool = False, check: Check | None = None
+    ) -> None:
+        self.name = str(path or f"temporary {schema.name}")
+        self._path, self._read_only = path, read_only
+        self._lock: FileLock | None = None
+        self.connection = self._connect(schema)
+        try:
+            self._check_plain()
+            self._open(schema, check)
+        except BaseException as error:
+            self.close()
+            if isinstance(error, UmfError) or not isinstance(error, Exception):
+                raise
+            # damaged bytes raise any exception
+            raise UmfError(f"{self.name} cannot be used as a {schema.name}: {one_line(error)}") from None
+
+    def migrate(self, schema: Schema) -> None:
+        """Bring the tables of a schema up to date in one transaction; a new file gets them all.
+
+        Raises:
+            UmfError: a later release wrote them.
+            OutputError: the file cannot be written.
+        """
+        with self.writing() as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            connection.execute(_VERSIONS)
+            found = self._version(schema)
+            for migration in schema.migrations[found:]:
+                if callable(migration):
+                    migration(connection)
+                    continue
+                for statement in migration:
+                    connection.execute(statement)
+            values = schema.name, len(schema.migrations)
+            connection.execute("INSERT OR REPLACE INTO schema_version VALUES (?, ?)", values)
+
+    @contextmanager
+    def writing(self) -> Iterator[sqlite3.Connection]:
+        """One transaction: all statements of the block are kept, or none.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        with writing(self.name, sqlite3.Error), self.connection:
+            yield self.connection
+
+    @contextmanager
+    def reading(self) -> Iterator[sqlite3.Connection]:
+        """Report an error of a block that reads and parses rows as damage.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        try:
+            yield self.connection
+        except (sqlite3.Error, LookupError, TypeError, ValueError) as error:  # a damaged file holds anything anywhere
+            raise UmfError(f"{self.name} is damaged: {one_line(error)}") from None
+
+    def copy(self, path: Path) -> None:
+        """Write a complete copy in one step while the file stays in use.
+
+        Raises:
+            OutputError: the copy cannot be written.
+        """
+        with atomic_write(path, sqlite3.Error) as part:
+            target = sqlite3.connect(part)
+            try:
+                self.connection.backup(target)
+            finally:
+                target.close()
+
+    def close(self) -> None:
+        """Close the file and let other processes write it; a temporary file is deleted."""
+        self.connection.close()
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def _connect(self, schema: Schema) -> sqlite3.Connection:
+        path = self._path
+        if not self._read_only:
+            with writing(self.name, sqlite3.Error):
+                if path is not None:
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                # SQLite keeps a file without a name out of every folder
+                return sqlite3.connect(path or "", check_same_thread=False)
+        if path is None or not path.is_file():
+            raise UmfError(f"there is no {schema.name} {shortened(path)}")
+        # SQLite makes files beside one that it reads, unless the folder cannot be written
+        access = "mode=ro" if os.access(path.parent, os.W_OK) else "immutable=1"
+        return sqlite3.connect(f"{path.resolve().as_uri()}?{access}", uri=True, check_same_thread=False)
+
+    def _open(self, schema: Schema, check: Check | None) -> None:
+        found, tables = self._version(schema), self._tables()
+        if not found and (tables or self._read_only):
+            held = shortened(", ".join(sorted(tables))) or "nothing"
+            raise UmfError(f"{self.name} is no {schema.name}: it holds {held}")
+        if self._read_only and found < schema.readable:
+            raise UmfError(
+                f"{self.name} is a {schema.name} of an earlier umf_ros: convert it by opening it for writing"
+            )
+        if found and check is not None:
+            check(self.connection)
+        if not self._read_only:
+            if self._path is not None:
+                self._lock = FileLock(self._path)
+            self.connection.execute("PRAGMA journal_mode = WAL")
+            self.connection.execute("PRAGMA synchronous = NORMAL")
+            self.migrate(schema)
+
+    def _version(self, schema: Schema) -> int:
+        """Version of a schema's tables in the file, 0 where there are none.
+
+        Raises:
+            UmfError: a later release wrote them.
+        """
+        tables, versions = self._tables(), dict[str, int]()
+        if "schema_version" in tables:
+            versions = dict(self.connection.execute("SELECT name, version FROM schema_version"))
+        found = int(versions.get(schema.name) or schema.unversioned(tables))
+        if found > len(schema.migrations):
+            latest = len(schema.migrations)
+            raise UmfError(f"{self.name} has version {found} of a {schema.name}, this umf_ros reads {latest}")
+        return found
+
+    def _tables(self) -> set[str]:
+        return {name for (name,) in self.connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+
+    def _check_plain(self) -> None:
+        """Check that the file holds tables and indices only: views, triggers and computed columns run code.
+
+        Raises:
+            ValueError: it holds something else.
+        """
+        self.connection.execute("PRAGMA trusted_schema = OFF")
+        for kind, name in self.connection.execute("SELECT type, name FROM sqlite_master"):
+            if kind not in ("table", "index"):
+                raise ValueError(f"it holds a {kind}")
+            columns: Any = ()
+            if kind == "table":
+                columns = self.connection.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,))
+            if any(hidden for (hidden,) in columns):
+                raise ValueError("it holds a table with computed columns")
