@@ -13,6 +13,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
+import small_gicp
+
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import ConfigError, OutputError, UmfError
 from umf_ros.core.frames import Candidate, Frame, Keyframe, LoopClosure
@@ -87,6 +90,7 @@ class LoopDetector:
     """
 
     def __init__(self, settings: Settings, embedder: Embedder) -> None:
+        small_gicp.PointCloud(np.eye(3))  # its binding initialises itself once, before there are other threads
         self._rules = settings.loop
         self._selector = KeyframeSelector(settings.keyframe)
         self._embedder = embedder
