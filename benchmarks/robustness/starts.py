@@ -9,7 +9,6 @@ first keyframes; a node once it says that it is ready.
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -54,21 +53,21 @@ UMF = [sys.executable, "-m", "umf_ros.cli"]
 
 def start(command: list[str], interrupt: bool) -> str:
     """How one start ends: "fine", "hangs" or "failures"."""
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    deadline = time.monotonic() + LIMIT_S
-    try:
-        if interrupt:
-            os.set_blocking(process.stdout.fileno(), False)  # type: ignore[union-attr]
-            said = ""
-            while "ready" not in said and process.poll() is None and time.monotonic() < deadline:
-                said += process.stdout.read() or ""  # type: ignore[union-attr]
-                time.sleep(0.05)
-            process.send_signal(signal.SIGINT)
-        process.communicate(timeout=max(1.0, deadline - time.monotonic()))
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
-        return "hangs"
+    with tempfile.TemporaryFile("w+") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        deadline = time.monotonic() + LIMIT_S
+        try:
+            while interrupt and process.poll() is None and time.monotonic() < deadline:
+                log.seek(0)
+                if "ready" in log.read():
+                    process.send_signal(signal.SIGINT)
+                    break
+                time.sleep(0.1)
+            process.wait(max(1.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            return "hangs"
     return "fine" if process.returncode in (0, 3) else "failures"  # 3: the recording is too short for a closure
 
 
