@@ -51,9 +51,9 @@ from umf_ros.lab.simulation.seeds import TEST
 from umf_ros.lab.simulation.simulator import Simulator
 from umf_ros.lab.training.adaptation import GAINED, PARTS, Adaptation, Lesson, adapt, measure
 from umf_ros.lab.training.drives import Drive, DriveReader, label_drive, pool
+from umf_ros.networks.config import locate_weights
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
-from umf_ros.networks.weights_files import locate_weights
 from umf_ros.sensors.calibration import load_calibration
 
 

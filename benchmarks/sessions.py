@@ -50,7 +50,7 @@ from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.outputs import read_poses, write_results
 from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, absolute_trajectory_error, judge_closure
 from umf_ros.sensors.decode import OdometrySample
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
+from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 WITHIN_KEYFRAMES = 20
 WRONG_M, WRONG_DEG = 1.0, 5.0

@@ -31,10 +31,9 @@ from umf_ros.maps.tracking import track
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.upkeep import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
-from umf_ros.runs.finished_run import describe_recording, remember_recording
-from umf_ros.runs.recorder import count_drops
-from umf_ros.runs.resumption import PLACES
+from umf_ros.runs.reader import describe_recording, remember_recording
 from umf_ros.runs.tables import CLOSURES, CsvTable, closure_row
+from umf_ros.runs.writer import PLACES, count_drops
 
 Heard = Callable[[float, Detection], None]
 """Told of every frame: the part of the recording that is done, 0 to 1, and what became of it."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from umf_ros.baselines.vocabulary import InvertedIndex, Vocabulary, hamming, similarity
+from umf_ros.baselines.dbow2 import InvertedIndex, Vocabulary, hamming, similarity
 from umf_ros.core.errors import WeightsError
 from umf_ros.lab.training.vocabulary_fit import grow, k_medians
 

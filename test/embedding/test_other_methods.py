@@ -15,8 +15,8 @@ from tiny_worlds import some_scan
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
-from umf_ros.baselines.dbow2_embedder import OrbFeatures
-from umf_ros.baselines.network_table import NETWORKS
+from umf_ros.baselines.dbow2 import OrbFeatures
+from umf_ros.baselines.place_networks import NETWORKS
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import Frame
@@ -107,7 +107,7 @@ def test_solid_turns_with_the_rover_and_not_with_its_mounting() -> None:
 
 @pytest.mark.parametrize("method", ["dbow2", "netvlad"])
 def test_weights_that_are_not_there_are_one_clear_line(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("umf_ros.baselines.network_table.find", _nothing)
+    monkeypatch.setattr("umf_ros.baselines.place_networks.find", _nothing)
     with pytest.raises(ConfigError, match=f"umf train --method {method}"):
         make_embedder(EmbeddingSettings(method=method))
 

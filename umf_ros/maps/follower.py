@@ -16,8 +16,7 @@ from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.maps.localizer import Localization, Localizer
 from umf_ros.maps.outputs import read_poses
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
-from umf_ros.sensors.sessions import Reset
+from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
 
 Stamps = NDArray[np.int64]
 _SPACING_M = 0.25

@@ -14,7 +14,7 @@ from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.sensors.decode import OdometrySample
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
+from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 NAME = "odometry.npz"
 Item = TypeVar("Item")

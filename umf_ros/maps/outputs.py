@@ -21,9 +21,9 @@ from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.point_cloud import Crispness, write_cloud
 from umf_ros.maps.report import write_report
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.export import verdict_table
-from umf_ros.runs.folder import write_atomically
-from umf_ros.runs.plots import plot_trajectories
+from umf_ros.pose_graph.g2o import verdict_table
+from umf_ros.runs.report import plot_trajectories
+from umf_ros.runs.writer import write_atomically
 
 POSES = "poses.npz"
 """Every place that has a pose in the map: `stamps` (N,) on the map's clock, `poses` (N, 4, 4) `map_T_body`."""

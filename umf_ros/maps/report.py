@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from umf_ros.runs.folder import write_atomically
 from umf_ros.runs.gallery import data_address
-from umf_ros.runs.rendering import render
+from umf_ros.runs.report import render
+from umf_ros.runs.writer import write_atomically
 
 
 def write_report(folder: Path, summary: dict[str, Any]) -> None:

@@ -21,8 +21,7 @@ from umf_ros.lab.training.adaptation import Adaptation, Lesson, Recall, adapt, m
 from umf_ros.lab.training.drives import Drive
 from umf_ros.lab.training.networks import read_card, save_weights
 from umf_ros.lab.training.scene_fit import with_scene
-from umf_ros.networks.efficientnet import EfficientNetLite0
-from umf_ros.networks.scene import DEPTH
+from umf_ros.networks.efficientnet import DEPTH, EfficientNetLite0
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
 

@@ -12,8 +12,8 @@ import typer
 from tiny_worlds import write_world
 from typer.testing import CliRunner
 
-from umf_ros.baselines.network_table import NETWORKS, load_place_network
-from umf_ros.baselines.vocabulary import Vocabulary
+from umf_ros.baselines.dbow2 import Vocabulary
+from umf_ros.baselines.place_networks import NETWORKS, load_place_network
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.embedding import make_embedder

@@ -15,8 +15,7 @@ from umf_ros.core.frames import Frame
 from umf_ros.lab.training.drives import Drive, DriveReader, label_drive
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.lab.training.scene_fit import with_scene
-from umf_ros.networks.efficientnet import EfficientNetLite0
-from umf_ros.networks.scene import DEPTH
+from umf_ros.networks.efficientnet import DEPTH, EfficientNetLite0
 from umf_ros.networks.umf import UMF
 from umf_ros.sensors.decode import OdometrySample
 

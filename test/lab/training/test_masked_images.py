@@ -18,7 +18,7 @@ from umf_ros.lab.training.masked_images_objective import (
 )
 from umf_ros.lab.training.pretraining import MaskedBatch
 from umf_ros.lab.training.run import load_run
-from umf_ros.networks.image_encoder import Backbone
+from umf_ros.networks.encoders import Backbone
 from umf_ros.networks.umf import UMF
 
 SIZE = TINY.image_size

@@ -5,7 +5,7 @@ import pytest
 import torch
 from tiny_worlds import TINY
 
-from umf_ros.embedding.voxels import voxelise
+from umf_ros.embedding.inputs import voxelise
 from umf_ros.lab.training.masked_scans_objective import (
     MaskedScansObjective,
     hidden_voxels,

@@ -40,8 +40,8 @@ def command(
     from rich.console import Console
 
     from umf_ros.lab.training.adaptation import FEWEST, GAINED, Lesson, measure
+    from umf_ros.networks.config import locate_weights
     from umf_ros.networks.weights import load_weights
-    from umf_ros.networks.weights_files import locate_weights
 
     console = Console()
     path = locate_weights(weights)

@@ -18,8 +18,8 @@ from umf_ros.commands.recordings import (
     check_files,
 )
 from umf_ros.core.errors import ConfigError
-from umf_ros.core.yaml_files import is_yaml
-from umf_ros.embedding import CHOICES
+from umf_ros.core.io import is_yaml
+from umf_ros.embedding import choices
 from umf_ros.lab.commands.evaluation_inputs import RecordingOptions, choose_worlds, note_on_worlds, progress_bar
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def command(
     out: RunsFolder = Path("results"),
     config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording.")] = None,
     dataset: DatasetName = "auto",
-    embedder: Annotated[str | None, Optional(help=f"How places are embedded: {CHOICES}.")] = None,
+    embedder: Annotated[str | None, Optional(help=f"How places are embedded: {choices()}.")] = None,
     odometry: OdometryPath = None,
     odometry_frame: OdometryFrame = "",
     ground_truth: TruthPath = None,
@@ -94,7 +94,7 @@ def command(
     if json_file is not None:
         import json
 
-        from umf_ros.runs.folder import write_atomically
+        from umf_ros.runs.writer import write_atomically
 
         write_atomically(json_file, json.dumps(figures, indent=2) + "\n")
 
@@ -120,7 +120,7 @@ def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Pa
     from rich.console import Console
 
     from umf_ros.lab.evaluation.worlds_run import WorldsRun, work
-    from umf_ros.runs.folder import create_run_folder
+    from umf_ros.runs.writer import create_run_folder
 
     console = Console()
     chosen = choose_worlds(name, seed, quick, count)
@@ -146,7 +146,7 @@ def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) ->
     from umf_ros.core.frames import Frame
     from umf_ros.embedding import make_embedder
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
-    from umf_ros.runs.folder import create_run_folder
+    from umf_ros.runs.writer import create_run_folder
 
     console = Console()
     opened = options.open(console, weights)
@@ -184,9 +184,9 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     from umf_ros.lab.evaluation.protocol import RULES
     from umf_ros.lab.evaluation.results import EvaluationReport
     from umf_ros.lab.training.validation import answerable, means, table, validate
+    from umf_ros.networks.config import locate_weights
     from umf_ros.networks.weights import load_weights
-    from umf_ros.networks.weights_files import locate_weights
-    from umf_ros.runs.folder import create_run_folder
+    from umf_ros.runs.writer import create_run_folder
 
     if rule not in RULES:
         raise ConfigError(f"--rule: expected {' or '.join(RULES)}, not {rule!r}")
@@ -211,7 +211,7 @@ def _on_places(listing: Path, embedder: str | None, weights: Path | None, out: P
 
     from umf_ros.embedding import DEFAULT
     from umf_ros.lab.evaluation.places_run import evaluate_place_sets
-    from umf_ros.runs.folder import create_run_folder
+    from umf_ros.runs.writer import create_run_folder
 
     console = Console()
     with console.status("embedding") as status:

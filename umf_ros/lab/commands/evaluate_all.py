@@ -102,7 +102,7 @@ class EveryMethod:
 
     def _compare(self, console: Console, sets: Iterable[FrameSet], note: str) -> Figures:
         from umf_ros.lab.evaluation.all_methods import compare_methods
-        from umf_ros.runs.folder import create_run_folder
+        from umf_ros.runs.writer import create_run_folder
 
         with progress_bar(console) as bar:
             task = bar.add_task("reading", total=None)

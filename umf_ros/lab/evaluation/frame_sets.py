@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.core.config import Database, Loop, Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, ScanMotion

@@ -12,8 +12,7 @@ import numpy as np
 from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import Frame, Keyframe, LocalFeatures, SuperFeatures
-from umf_ros.embedding import DEFAULT, make_embedder
-from umf_ros.embedding import METHODS as EMBEDDERS
+from umf_ros.embedding import DEFAULT, find_methods, make_embedder
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.evaluation.methods import (
     MethodAnswers,
@@ -31,9 +30,9 @@ from umf_ros.lab.evaluation.protocol import RetrievalTask
 from umf_ros.lab.evaluation.results import EvaluationReport, TextTable, percent, plot_precision_recall, plot_recall
 from umf_ros.lab.evaluation.retrieval import METHODS, PlaceCollection, Ranking, rank, rerank_all
 from umf_ros.lab.evaluation.summary import ETNA_RECALL1, measure
+from umf_ros.networks.config import locate_weights
 from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import load_weights
-from umf_ros.networks.weights_files import locate_weights
 from umf_ros.places.codes import CodeTable
 from umf_ros.places.index import DescriptorIndex
 
@@ -76,7 +75,7 @@ def make_others(trained: Path | None) -> tuple[dict[str, Embedder], list[str]]:
     """
     found: dict[str, Embedder] = {}
     missing = []
-    for name in EMBEDDERS:
+    for name in find_methods():
         if name == DEFAULT:
             continue
         weights = next((path for path in _places(trained, name) if path.is_file()), None)

@@ -24,7 +24,7 @@ from umf_ros.core.config import Group, Verification, problems
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.core.frames import Frame, Image, Points, StereoCamera
 from umf_ros.core.geometry import transform
-from umf_ros.core.yaml_files import read_yaml
+from umf_ros.core.io import read_yaml
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.evaluation.protocol import RetrievalTask
 from umf_ros.lab.evaluation.results import Figures, TextTable, percent, rounded

@@ -21,7 +21,7 @@ from rich.table import Table as Grid
 
 from umf_ros.core.geometry import Array
 from umf_ros.lab.evaluation.scores import PrecisionRecall, Scores
-from umf_ros.runs.folder import write_atomically
+from umf_ros.runs.writer import write_atomically
 
 TextTable = tuple[list[str], list[list[str]]]
 """Headings and rows."""

@@ -28,8 +28,8 @@ from umf_ros.lab.evaluation.retrieval import (
 from umf_ros.lab.evaluation.scores import Scores, YawBin, recall_by_yaw, score
 from umf_ros.lab.evaluation.summary import WorldResult, WorldsSummary, at_full_size, cost_of_weights
 from umf_ros.lab.evaluation.worlds import FIRST, OPPOSITE, REVISIT, SAME_LIGHT, TestWorld, Visit
+from umf_ros.networks.config import locate_weights
 from umf_ros.networks.weights import load_weights
-from umf_ros.networks.weights_files import locate_weights
 
 ASKED = {
     # what the queries and the references are embedded with

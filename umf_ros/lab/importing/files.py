@@ -9,7 +9,7 @@ import numpy as np
 
 from umf_ros.core.errors import SensorFileError
 from umf_ros.core.geometry import Array
-from umf_ros.sensors.snapshots import read_image
+from umf_ros.sensors.scan_files import read_image
 
 
 def lines_of(path: Path) -> list[str]:

@@ -13,14 +13,13 @@ import numpy as np
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.errors import SensorFileError
 from umf_ros.core.geometry import Array, from_quaternion, invert
+from umf_ros.core.io import read_yaml
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.core.yaml_files import read_yaml
 from umf_ros.lab.importing.files import depth_of, entries_of, entry, lines_of, numbers_of, rigid, size_of
 from umf_ros.lab.importing.imported import OPTICAL, Imported, pinhole, pose_entry
 from umf_ros.lab.importing.nuscenes import nuscenes
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.scan_files import SUFFIXES, read_scan
-from umf_ros.sensors.snapshots import IMAGE_SUFFIXES
+from umf_ros.sensors.scan_files import IMAGE_SUFFIXES, SUFFIXES, read_scan
 
 KITTI_START_NS = 1_300_000_000 * 10**9
 """KITTI's odometry counts its times from 0; a message needs a stamp."""

@@ -10,14 +10,14 @@ import numpy as np
 import yaml
 
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
-from umf_ros.bags.records import message_types
+from umf_ros.bags.storages import message_types
 from umf_ros.core.config import Topics
 from umf_ros.lab.importing.imported import Imported
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.messages import image_message, pose_message
-from umf_ros.runs.folder import write_atomically
+from umf_ros.runs.writer import write_atomically
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.snapshots import read_image
+from umf_ros.sensors.scan_files import read_image
 
 _LAYOUT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 _FLOAT32 = 7

@@ -10,7 +10,7 @@ from typing import IO, Any
 
 from mcap.writer import CompressionType, Writer
 
-from umf_ros.bags.records import message_types
+from umf_ros.bags.storages import message_types
 from umf_ros.core.errors import OutputError, writing
 
 

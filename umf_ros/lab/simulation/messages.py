@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.bags.records import message_types
+from umf_ros.bags.storages import message_types
 from umf_ros.core.frames import StereoCamera
 from umf_ros.core.geometry import Array, to_quaternion
 from umf_ros.lab.simulation.lidar import Scan

@@ -11,9 +11,8 @@ from scipy.stats import chi2
 
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array
-from umf_ros.runs.consistency import MEDIAN_EXPECTED, normalised_errors, pose_error, share_inside
-from umf_ros.verification.scan_alignment import Alignment, CovarianceModel, covariance_of
-from umf_ros.verification.scan_motion import motion_covariance
+from umf_ros.runs.truth import MEDIAN_EXPECTED, normalised_errors, pose_error, share_inside
+from umf_ros.verification.scan_alignment import Alignment, CovarianceModel, covariance_of, motion_covariance
 
 TAIL_EXPECTED = float(chi2.ppf(0.95, 6))
 SHARPNESS = 0.3  # by hand: of the likelihood, against how well each group's quantiles are met

@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from umf_ros.baselines.network_table import load_place_network, make_place_network
 from umf_ros.baselines.place_network import PlaceNetwork
+from umf_ros.baselines.place_networks import load_place_network, make_place_network
 from umf_ros.lab.datasets.labels import Rule
 from umf_ros.lab.datasets.listed import open_source
 from umf_ros.lab.datasets.sample import SampleSequence
@@ -31,8 +31,8 @@ from umf_ros.lab.training.objective import Judgement, Objective, generator
 from umf_ros.lab.training.prepared_views import PlaceBatch, PreparedViews
 from umf_ros.lab.training.sampler import PairSampler
 from umf_ros.lab.training.settings import DescriptorSettings, RunSettings
+from umf_ros.networks.config import locate_weights
 from umf_ros.networks.weights import load_weights
-from umf_ros.networks.weights_files import locate_weights
 
 RULE = Rule(negative_m=20.0, negative_deg=40.0, between_passes=True)
 """A later pass looks for itself in an earlier one."""
@@ -41,7 +41,7 @@ TRUNK_FROM = "umf_scene"
 
 
 class DescriptorObjective(Objective):
-    """Trains one of `umf_ros.baselines.network_table`.
+    """Trains one of `umf_ros.baselines.place_networks`.
 
     Args:
         network: trained in place.

@@ -28,7 +28,7 @@ from umf_ros.networks.umf import UMF
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.sensors.decode import OdometrySample
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
+from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 Mask = NDArray[np.bool_]
 SAME_M, SAME_DEG = 8.0, 25.0

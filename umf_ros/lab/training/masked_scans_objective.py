@@ -13,12 +13,12 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from umf_ros.core.geometry import Array
-from umf_ros.embedding.voxels import CELLS, ORIGIN_M, VOXEL_M
+from umf_ros.embedding.inputs import CELLS, ORIGIN_M, VOXEL_M
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.datasets.views import View
 from umf_ros.lab.training.pretraining import Column, MaskedBatch, Pretraining, PretrainingSettings
+from umf_ros.networks.encoders import FEATURES
 from umf_ros.networks.umf import UMF
-from umf_ros.networks.voxel_encoder import FEATURES
 
 RARE = -4.0
 """Log-odds of a voxel being occupied before anything is learned: one in fifty."""

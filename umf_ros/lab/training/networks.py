@@ -14,9 +14,8 @@ from torch import Tensor, nn
 
 from umf_ros.core.errors import ConfigError, OutputError, WeightsError
 from umf_ros.networks.config import NetworkConfig
-from umf_ros.networks.image_encoder import ResidualBlock
+from umf_ros.networks.encoders import ResidualBlock, ResidualBlock3d
 from umf_ros.networks.umf import UMF, channels_last
-from umf_ros.networks.voxel_encoder import ResidualBlock3d
 from umf_ros.networks.weights import SCALE, load_weights
 
 Precision = Literal["half", "int8"]
@@ -26,7 +25,7 @@ SMALL = 4096
 PRESETS: dict[str, NetworkConfig] = {
     # the horizon and the rocks under a moved sun need these pixels: at 128 x 96 the image alone finds a tenth less
     "umf_light": NetworkConfig(backbone="resnet34", image_size=(160, 224), voxel_blocks=2),
-    # what it says of the scene comes from a trunk trained on photographs (`umf_ros.networks.scene`)
+    # what it says of the scene comes from a trunk trained on photographs (`umf_ros.networks.efficientnet`)
     "umf_scene": NetworkConfig(backbone="resnet34", image_size=(160, 224), voxel_blocks=2, scene=512),
     # its trunk begins with what it learned on photographs (`umf_ros.networks.efficientnet`)
     "umf_lite0": NetworkConfig(backbone="efficientnet_lite0", image_size=(160, 224), voxel_blocks=2),

@@ -15,7 +15,7 @@ from torch import nn
 
 from umf_ros.core.config import problems
 from umf_ros.core.errors import ConfigError
-from umf_ros.core.yaml_files import read_values
+from umf_ros.core.io import read_values
 from umf_ros.lab.datasets.listed import Source, open_source
 from umf_ros.lab.training.distributed import join_team
 from umf_ros.lab.training.networks import read_card

@@ -25,8 +25,7 @@ from umf_ros.lab.training.batches import stack_views
 from umf_ros.lab.training.losses import neighbourhood_components
 from umf_ros.lab.training.metric_loss import Bank, Relations, relate
 from umf_ros.lab.training.photometry import CameraLook, draw_look
-from umf_ros.networks.efficientnet import STAGES, EfficientNetLite0
-from umf_ros.networks.scene import DEPTH
+from umf_ros.networks.efficientnet import DEPTH, STAGES, EfficientNetLite0
 from umf_ros.networks.umf import UMF, channels_last
 
 RULE = Rule(negative_m=14.0, negative_deg=35.0, between_passes=True)

@@ -1,4 +1,4 @@
-"""Local features of images that survive light and view: XFeat's [Potje 2024], to a fraction of a pixel."""
+"""XFeat's local features of images [Potje 2024], refined to a fraction of a pixel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Why a keyframe found no loop closure: which gate stopped it, by how much, what would let it through, at what cost."""
+"""Explain why a keyframe closed no loop."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from umf_ros.runs.finished_run import FinishedRun
+from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.tables import TestedCandidate
-from umf_ros.runs.true_places import TruePlaces
+from umf_ros.runs.truth import TruePlaces
 from umf_ros.verification import NO_DEPTH
 from umf_ros.verification.acceptance import load_acceptance
 from umf_ros.verification.measurement import IMAGE, SCAN, SUBMAP, Measurement

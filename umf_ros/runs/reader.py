@@ -1,14 +1,16 @@
-"""What a run has left in its folder, read as one."""
+"""Read the folder of a finished run, and what its inputs lacked."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
 from umf_ros.core.config import Settings, load_settings
@@ -16,8 +18,109 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure, Points
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs import tables
-from umf_ros.runs.descriptors import read_descriptors
-from umf_ros.runs.recorder import read_summary, write_summary
+from umf_ros.runs.writer import read_descriptors, read_summary, write_summary
+from umf_ros.sensors.buffers import InputCounter
+from umf_ros.sensors.decode import TYPES
+from umf_ros.sensors.sessions import Input
+
+Severity = Literal["fault", "warning", "note"]
+_ABSENT = {
+    "left_image": ("warning", "no images on {topic}: places are told apart by scans alone"),
+    "right_image": ("note", "no right images on {topic}: depth of images comes from the scans alone"),
+    "cloud": ("warning", "no scans on {topic}: everything rests on the images"),
+    "odometry": ("warning", "no odometry on {topic}: closures only, the pose graph is skipped"),
+}
+_NAMES: dict[str, str] = {"left": "left images", "right": "right images", "cloud": "scans", "odometry": "odometry"}
+MUCH_LOST = 0.2
+"""Share of an input's messages; more of them lost than this is worth a line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """Something a person should know.
+
+    Attributes:
+        severity: a fault spoils the result, a warning may, a note is good to know.
+        what: the problem, with its number; a sentence without a full stop.
+        remedy: what helps; likewise, or empty.
+    """
+
+    severity: Severity
+    what: str
+    remedy: str = ""
+
+    @property
+    def line(self) -> str:
+        """Both on one line."""
+        return f"{self.what}; {self.remedy}" if self.remedy else self.what
+
+
+def absent_inputs(bag: Bag, settings: Settings, odometry_from_file: bool = False) -> list[Advice]:
+    """Inputs that the settings name and the recording lacks."""
+    found: list[Advice] = []
+    topics = topics_of(settings).model_dump()
+    for name, (severity, text) in _ABSENT.items():
+        topic = topics[name]
+        if (name == "odometry" and odometry_from_file) or (topic in bag.topics and bag.topics[topic].count):
+            continue
+        if topic:
+            found.append(Advice(_severity(name, severity, found), text.format(topic=topic), _remedy(name, bag)))
+        elif name == "odometry":
+            found.append(Advice("note", "no odometry: closures only, the pose graph is skipped", _remedy(name, bag)))
+    return found
+
+
+def _severity(name: str, usual: str, others: list[Advice]) -> Severity:
+    if name == "cloud" and any("right images" in other.what for other in others):
+        return "fault"  # neither a scan nor a second image: no depth at all
+    return usual  # type: ignore[return-value]
+
+
+def _remedy(name: str, bag: Bag) -> str:
+    others = sorted(topic for topic, info in bag.topics.items() if info.type in TYPES[name] and info.count)
+    if name == "odometry":
+        return f"name yours: topics.odometry ({', '.join(others)})" if others else "--odometry FILE.tum supplies it"
+    if not others:
+        return f"the recording has no {TYPES[name][0]} at all"
+    return f"name yours in a --config: topics.{name} ({', '.join(others)})"
+
+
+def input_counts(counters: Mapping[Input, InputCounter]) -> dict[str, Any]:
+    """The `inputs` entry of a summary: messages received, used and dropped, with reasons."""
+    return {
+        name: {"received": counter.received, "used": counter.used, "dropped": dict(counter.dropped)}
+        for name, counter in counters.items()
+    }
+
+
+def useless_inputs(inputs: Mapping[str, Any]) -> list[Advice]:
+    """Inputs whose messages came and could not be used, all or many of them."""
+    found = []
+    for name, count in inputs.items():
+        lost = {reason: number for reason, number in count["dropped"].items() if reason != "surplus"}
+        total = sum(lost.values())
+        if not count["received"] or total <= MUCH_LOST * count["received"]:
+            continue
+        reasons = ", ".join(f"{reason} {number}" for reason, number in sorted(lost.items(), key=lambda one: -one[1]))
+        what = f"{total} of {count['received']} messages of the {_NAMES.get(name, name)} could not be used ({reasons})"
+        found.append(Advice("warning" if count["used"] else "fault", what, _help(lost)))
+    return found
+
+
+_HELP = {
+    "size": "the calibration is for images of another size: width, height, fx, fy, cx, cy",
+    "encoding": "umf inspect names the encodings that can be read",
+    "fields": "the cloud needs fields x, y and z",
+    "stamp": "the driver must set header.stamp",
+    "pose": "the odometry must send unit quaternions",
+    "late": "sync.max_wait_s waits longer",
+    "queue full": "sync.queue_size keeps more",
+}
+
+
+def _help(lost: Mapping[str, int]) -> str:
+    return _HELP.get(max(lost, key=lambda reason: lost[reason]), "umf inspect looks closer")
+
 
 CLOCK_SLACK_NS = 5_000_000_000
 """Stamps of sensors may lie this far from the times of recording."""

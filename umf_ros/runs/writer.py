@@ -1,32 +1,234 @@
-"""Writes what a detector finds, as it finds it, for the live node and the replay alike."""
+"""Write the folder of a run while it goes."""
 
 from __future__ import annotations
 
 import json
+import os
 import resource
 import time
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from datetime import datetime
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from umf_ros import __version__
-from umf_ros.core.config import Settings, dump_settings
-from umf_ros.core.errors import UmfError
-from umf_ros.core.frames import Frame, LoopClosure
+from umf_ros.core.config import Settings, dump_settings, load_settings
+from umf_ros.core.errors import OutputError, UmfError, writing
+from umf_ros.core.frames import Frame, LoopClosure, Points
 from umf_ros.detector import Detection
 from umf_ros.runs import tables
-from umf_ros.runs.descriptors import DescriptorFile
-from umf_ros.runs.folder import write_atomically
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
 if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure
+
+
+def create_run_folder(out: Path) -> Path:
+    """Make a new folder named after the local time inside `out` and point `out/latest` at it.
+
+    Raises:
+        OutputError: `out` cannot be written.
+    """
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    with writing(f"to {out}"):
+        out.mkdir(parents=True, exist_ok=True)
+        folder = _make_unique(out, stamp)
+        # in one step, so that `latest` always leads somewhere
+        fresh = out / f".latest-{os.getpid()}"
+        fresh.symlink_to(folder.name, target_is_directory=True)
+        fresh.replace(out / "latest")
+    return folder
+
+
+def check_writable(out: Path) -> None:
+    """Find out before hours of work whether the results will have a place.
+
+    Raises:
+        OutputError: `out` cannot be written.
+    """
+    with writing(f"to {out}"):
+        out.mkdir(parents=True, exist_ok=True)
+    if not os.access(out, os.W_OK):
+        raise OutputError(f"cannot write to {out}: permission denied")
+
+
+def _make_unique(out: Path, name: str) -> Path:
+    for suffix in ["", *(f"_{i}" for i in range(2, 1000))]:
+        with suppress(FileExistsError):
+            (out / (name + suffix)).mkdir()
+            return out / (name + suffix)
+    raise OutputError(f"too many runs named {name} in {out}")
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file that is never seen half-written.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    part = path.with_name(path.name + ".part")
+    with writing(path):
+        try:
+            part.write_text(text, encoding="utf-8")
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+NAME = "descriptors.f16"
+_HEAD = np.dtype("<i4")
+
+
+def _record(dimension: int) -> np.dtype[np.void]:
+    return np.dtype([("stamp_ns", "<i8"), ("descriptor", "<f2", (dimension,))])
+
+
+class DescriptorFile:
+    """Appends stamps and descriptors in half precision behind one number, their dimension.
+
+    What an earlier process left stays, less a last record that was not finished.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / NAME
+        with writing(self._path):
+            self._file: BinaryIO = self._path.open("ab", buffering=0)
+            size = self._path.stat().st_size
+            if size >= _HEAD.itemsize:
+                step = _record(int(np.fromfile(self._path, _HEAD, 1)[0])).itemsize
+                self._file.truncate(size - (size - _HEAD.itemsize) % step)
+            self._empty = size < _HEAD.itemsize
+
+    def append(self, stamp_ns: int, descriptor: Points) -> None:
+        """Write the descriptor (D,) of one keyframe."""
+        with writing(self._path):
+            if self._empty:
+                self._file.truncate(0)
+                self._file.write(np.array(len(descriptor), _HEAD).tobytes())
+                self._empty = False
+            self._file.write(np.array((stamp_ns, descriptor), _record(len(descriptor))).tobytes())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def all_descriptors(folder: Path) -> Points:
+    """Descriptors (N, D) float32 of all keyframes of a run, in order.
+
+    Raises:
+        UmfError: it has none.
+    """
+    rows = _read(folder)
+    if rows is None or not len(rows):
+        raise UmfError(f"{folder} holds no descriptors of keyframes")
+    return rows["descriptor"].astype(np.float32)
+
+
+def read_descriptors(folder: Path, stamps_ns: Sequence[int]) -> Points | None:
+    """Descriptors (N, D) float32 of keyframes by their stamps; None where one has none, as of an older version."""
+    rows = _read(folder)
+    if rows is None or not stamps_ns:
+        return None
+    place = {int(stamp): row for row, stamp in enumerate(rows["stamp_ns"])}
+    if any(stamp not in place for stamp in stamps_ns):
+        return None
+    return rows["descriptor"][[place[stamp] for stamp in stamps_ns]].astype(np.float32)
+
+
+def _read(folder: Path) -> NDArray[np.void] | None:
+    path = folder / NAME
+    content = path.read_bytes() if path.is_file() else b""
+    if len(content) < _HEAD.itemsize:
+        return None
+    kind = _record(int(np.frombuffer(content, _HEAD, 1)[0]))
+    return np.frombuffer(content, kind, (len(content) - _HEAD.itemsize) // kind.itemsize, _HEAD.itemsize)
+
+
+PLACES = "places.sqlite"
+"""Where a replay without a store of its own keeps its places until it is finished."""
+_RUN = "run.json"
+
+
+class ReplayFolder:
+    """The folder of a replay, new or that of one that was cut off.
+
+    Args:
+        path: the folder.
+        settings: of the run.
+        resumed: whether an earlier process has begun it.
+    """
+
+    def __init__(self, path: Path, settings: Settings, resumed: bool = False) -> None:
+        self.path = path
+        self.resumed = resumed
+        self._settings = settings
+
+    @classmethod
+    def create(cls, out: Path, bag: Path, settings: Settings) -> ReplayFolder:
+        """Make a new folder inside `out` for a replay of `bag`.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        folder = cls(create_run_folder(out), settings)
+        write_atomically(folder.path / _RUN, json.dumps({"bag": str(bag.resolve()), "finished": False}) + "\n")
+        return folder
+
+    @classmethod
+    def resume(cls, out: Path, bag: Path, settings: Settings) -> ReplayFolder:
+        """The newest folder inside `out` of a replay of `bag` that was not finished; a new one where there is none.
+
+        Raises:
+            UmfError: it was begun with other settings.
+            OutputError: a new one cannot be written.
+        """
+        begun = [path.parent for path in sorted(out.glob(f"*/{_RUN}"), reverse=True) if not path.parent.is_symlink()]
+        for path in begun:
+            about = _resumption_read(path / _RUN)
+            if about.get("bag") != str(bag.resolve()) or about.get("finished") is not False:
+                continue
+            # cut off before its settings were written: nothing is in it
+            if (path / "config.yaml").exists() and load_settings(path / "config.yaml") != settings:
+                raise UmfError(f"{path} was begun with other settings; leave out --resume, or give the same options")
+            (path / "summary.json").unlink(missing_ok=True)  # of a run that was interrupted by Ctrl-C
+            return cls(path, settings, resumed=True)
+        return cls.create(out, bag, settings)
+
+    @property
+    def working_settings(self) -> Settings:
+        """The settings, with a store of places in the folder where they name none."""
+        database = self._settings.database
+        if database.path:
+            return self._settings
+        update = {"database": database.model_copy(update={"path": str(self.path / PLACES)})}
+        return self._settings.model_copy(update=update)
+
+    def finish(self) -> None:
+        """The run has come to its end: it needs no places any more.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        for path in self.path.glob(f"{PLACES}*"):
+            path.unlink(missing_ok=True)
+        about = _resumption_read(self.path / _RUN) | {"finished": True}
+        write_atomically(self.path / _RUN, json.dumps(about) + "\n")
+
+
+def _resumption_read(path: Path) -> dict[str, object]:
+    with suppress(OSError, ValueError):
+        about = json.loads(path.read_text(encoding="utf-8"))
+        return about if isinstance(about, dict) else {}
+    return {}
+
 
 COUNTS = ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected")
 STAGES = tables.STAGES

@@ -1,8 +1,4 @@
-"""What leaves the pose graph: graphs as g2o files, and verdicts as tables.
-
-An information matrix is written as GTSAM reads it: tangent space of the second vertex, translation first,
-rotation in radians.
-"""
+"""Write verdicts, vertices and edges of the pose graph."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ import numpy as np
 from umf_ros.core.errors import writing
 from umf_ros.core.geometry import Array, heading, to_quaternion
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureVerdict
-from umf_ros.pose_graph.odometry_preintegration import Edge
+from umf_ros.pose_graph.solver import Edge
 
 _ROTATION_LAST, _IN_PLANE = np.array([3, 4, 5, 0, 1, 2]), np.array([3, 4, 2])
 
