@@ -27,9 +27,9 @@ from umf_ros.core.config import Database, KeyframePolicy, Loop, Verification
 from umf_ros.core.frames import Embedding, Frame, Keyframe, StereoCamera
 from umf_ros.core.geometry import Array, make_pose, relative
 from umf_ros.core.keyframes import KeyframeSelector, is_past
+from umf_ros.lab.fit.acceptance import fit_weights
 from umf_ros.lab.simulation.presets import find_preset
 from umf_ros.lab.simulation.simulator import Simulator
-from umf_ros.lab.training.acceptance_fit import fit_weights
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.runs.truth import (
     POSE_TOLERANCE_DEG,

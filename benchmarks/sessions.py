@@ -41,8 +41,8 @@ from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.presets import SESSION
 from umf_ros.lab.simulation.recording import record
-from umf_ros.lab.simulation.seeds import TEST
 from umf_ros.lab.simulation.simulator import Simulator
+from umf_ros.lab.simulation.world import TEST
 from umf_ros.mapping import Opening, add_session, match_session, replay_session, unmatched
 from umf_ros.maps.joint_graph import JointMap, solve
 from umf_ros.maps.localizer import Localizer

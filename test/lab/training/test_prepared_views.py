@@ -18,8 +18,8 @@ from umf_ros.embedding.inputs import shrink, standardise, voxelise
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.lab.datasets.views import View, ViewMaker
+from umf_ros.lab.training.batches import Draw
 from umf_ros.lab.training.prepared_views import PreparedViews
-from umf_ros.lab.training.sampler import Draw
 
 ALL = frozenset({"image", "voxels", "points"})
 

@@ -1,10 +1,4 @@
-"""Fits the heads of a trained network to a rover's own sensors, by what its drives say of places.
-
-Encoders and fusion stay as they are, and what they say of every keyframe is pooled once: only what comes after learns
-(both heads, their weights against each other, the projection of the scene), in seconds. What few places of one drive
-cannot know is kept by a pull back to the start, and by stopping half way there [Wortsman 2022]. The last revisits of
-every drive are held out, with all views of their places, and decide whether anything was gained.
-"""
+"""Fine-tune the network's heads on a rover's own drive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fitting the covariance of scans to aligned pairs whose truth is known, through the whole pipeline."""
+"""Fit the covariance model of closures."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""Fitting the acceptance model and the covariance to closures whose truth is known."""
+"""Fit the acceptance model to examples of right and wrong hypotheses."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections import Counter
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,58 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from umf_ros.core.geometry import Array
-from umf_ros.lab.training.acceptance_examples import Example
 from umf_ros.runs.truth import normalised_errors, share_inside
 from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, refuted, scores
-from umf_ros.verification.measurement import IMAGE, SCAN
+from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
 from umf_ros.verification.scan_alignment import CovarianceModel, covariance_of
+
+NUMBERS = tuple(one.name for one in fields(Measurement) if one.name != "kind")
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """One refined pose and whether it was right.
+
+    Attributes:
+        measurement: what verification measured.
+        right: whether the pose was.
+        domain: sensor, place and mount, or another name for what resembles each other; empty: nothing in particular.
+    """
+
+    measurement: Measurement
+    right: bool
+    domain: str = ""
+
+
+def save_examples(examples: list[Example], path: Path) -> None:
+    """Write examples for `load_examples`, some forty bytes each."""
+    numbers = np.array([[getattr(one.measurement, name) for name in NUMBERS] for one in examples], np.float32)
+    np.savez_compressed(
+        path,
+        names=np.array(NUMBERS),
+        numbers=numbers,
+        kinds=np.array([one.measurement.kind for one in examples]),
+        right=np.array([one.right for one in examples]),
+        domains=np.array([one.domain for one in examples]),
+    )
+
+
+def load_examples(path: Path) -> list[Example]:
+    """Examples from a file; a number that is younger than the file is unknown.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    with np.load(path) as content:
+        names = [str(name) for name in content["names"]]
+        rows, kinds = content["numbers"].astype(float), content["kinds"]
+        right, domains = content["right"], content["domains"]
+    kept = [(column, name) for column, name in enumerate(names) if name in NUMBERS]
+    return [
+        Example(Measurement(kind=str(kind), **{name: row[column] for column, name in kept}), bool(yes), str(domain))
+        for row, kind, yes, domain in zip(rows, kinds, right, domains, strict=True)
+    ]
+
 
 RIDGE = 0.03  # measured: leaving domains out, a tenth of it accepts less at no wrong one
 SAFETY = 0.25  # by hand: log-odds between the most probable wrong pose and the threshold

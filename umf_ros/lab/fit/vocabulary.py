@@ -1,4 +1,4 @@
-"""A vocabulary of binary words from images: hierarchical k-medians [Gálvez-López 2012]."""
+"""Fit a vocabulary of binary words."""
 
 from __future__ import annotations
 

@@ -1,10 +1,4 @@
-"""Adds a scene part to a trained network and fits it, on images pooled once: minutes on one core.
-
-The trunk keeps what it learned on photographs; only the projection learns, by neighbourhood components analysis of
-whole worlds. It begins as principal components of the maps, whitened as their channels were before. It learns on its
-own, not beside the image's half as the network already has it: that half knows the worlds it was trained on too well,
-and would leave the scene nothing to do.
-"""
+"""Fit the scene descriptor on a pretrained trunk."""
 
 from __future__ import annotations
 
@@ -17,14 +11,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from umf_ros.lab.datasets.labels import Places, Rule, places_of
-from umf_ros.lab.datasets.sample import Sample, SampleSequence
+from umf_ros.lab.datasets.sample import Places, Rule, Sample, SampleSequence, places_of
 from umf_ros.lab.datasets.views import Augmentation, ViewMaker
-from umf_ros.lab.evaluation.protocol import NEAR_M
+from umf_ros.lab.evaluation.retrieval import NEAR_M
 from umf_ros.lab.training.batches import stack_views
-from umf_ros.lab.training.losses import neighbourhood_components
-from umf_ros.lab.training.metric_loss import Bank, Relations, relate
-from umf_ros.lab.training.photometry import CameraLook, draw_look
+from umf_ros.lab.training.losses import Bank, Relations, neighbourhood_components, relate
+from umf_ros.lab.training.prepared_views import CameraLook, draw_look
 from umf_ros.networks.efficientnet import DEPTH, STAGES, EfficientNetLite0
 from umf_ros.networks.umf import UMF, channels_last
 

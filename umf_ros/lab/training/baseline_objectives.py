@@ -1,4 +1,4 @@
-"""NetVLAD [Arandjelović 2016]: clusters from k-means at the start, whitening by principal components at the end."""
+"""Objectives of the other methods' networks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,73 @@ from sklearn.cluster import KMeans
 
 from umf_ros.baselines.netvlad import NetVlad
 from umf_ros.lab.training.descriptors import DescriptorObjective
-from umf_ros.lab.training.settings import DescriptorSettings
+from umf_ros.lab.training.networks import DescriptorSettings
+
+
+class AdaFusionSettings(DescriptorSettings):
+    """What it was trained with."""
+
+    method: Literal["adafusion"] = "adafusion"
+    learning_rate: float = Field(5e-4, gt=0, description="peak of the cosine schedule")
+
+
+class AdaFusionObjective(DescriptorObjective):
+    """Nothing of its own."""
+
+    settings_type = AdaFusionSettings
+
+
+class MinkLocFusionSettings(DescriptorSettings):
+    """What it was trained with."""
+
+    method: Literal["minkloc_fusion"] = "minkloc_fusion"
+    learning_rate: float = Field(5e-4, gt=0, description="peak of the cosine schedule")
+
+
+class MinkLocFusionObjective(DescriptorObjective):
+    """Nothing of its own."""
+
+    settings_type = MinkLocFusionSettings
+
+
+class MinkLocLidarSettings(DescriptorSettings):
+    """What it was trained with."""
+
+    method: Literal["minkloc_lidar"] = "minkloc_lidar"
+    learning_rate: float = Field(1e-3, gt=0, description="peak of the cosine schedule")
+
+
+class MinkLocLidarObjective(DescriptorObjective):
+    """Nothing of its own."""
+
+    settings_type = MinkLocLidarSettings
+
+
+class MinkLocVisualSettings(DescriptorSettings):
+    """What it was trained with."""
+
+    method: Literal["minkloc_visual"] = "minkloc_visual"
+    learning_rate: float = Field(3e-4, gt=0, description="peak of the cosine schedule")
+
+
+class MinkLocVisualObjective(DescriptorObjective):
+    """Nothing of its own."""
+
+    settings_type = MinkLocVisualSettings
+
+
+class PointNet2Settings(DescriptorSettings):
+    """What it was trained with."""
+
+    method: Literal["pointnet2"] = "pointnet2"
+    learning_rate: float = Field(1e-3, gt=0, description="peak of the cosine schedule")
+
+
+class PointNet2Objective(DescriptorObjective):
+    """Nothing of its own."""
+
+    settings_type = PointNet2Settings
+
 
 IMAGES = 120
 """For the clusters; each has 140 local features."""
@@ -59,6 +125,3 @@ class NetVladObjective(DescriptorObjective):
         every = [(world, row) for world in self._sequences for row in range(len(world))]
         chosen = np.random.default_rng(self._settings.seed).permutation(len(every))[:count]
         return torch.cat([self._views.plain(every[k][0], [every[k][1]]).maps for k in chosen])
-
-
-OBJECTIVE = NetVladObjective
