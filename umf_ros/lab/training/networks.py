@@ -21,6 +21,8 @@ from umf_ros.networks.encoders import ResidualBlock, ResidualBlock3d
 from umf_ros.networks.umf import UMF, Branch, channels_last
 from umf_ros.networks.weights import SCALE, load_weights
 
+Precision = Literal["half", "int8"]
+
 
 class RunSettings(Group):
     """What every run has, whatever it learns; an objective's own settings are a subclass of these."""
@@ -145,7 +147,6 @@ def write_settings(settings: RunSettings, path: Path) -> None:
         raise OutputError(f"cannot write to {path.parent}: {error.strerror}") from None
 
 
-Precision = Literal["half", "int8"]
 SMALL = 4096
 """Tensors with fewer values are kept in half precision."""
 

@@ -1,7 +1,7 @@
 """An objective: network, batches, losses and progress of one way of training.
 
-A new way of training is one file here with a subclass of `Objective`, a line in `OBJECTIVES` and, where it has settings of
-its own, a subclass of `RunSettings`; `method: NAME` in a settings file chooses it.
+A new way of training is one file here with a subclass of `Objective`, a line in `OBJECTIVES` and, where it has settings
+of its own, a subclass of `RunSettings`; `method: NAME` in a settings file chooses it.
 """
 
 from __future__ import annotations
