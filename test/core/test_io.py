@@ -47,9 +47,9 @@ def test_a_file_appears_complete_or_not_at_all(tmp_path: Path) -> None:
 
 def test_a_disk_error_is_one_line_and_named_kinds_too(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="cannot write .*/file/a"), atomic_write(tmp_path / "file" / "a"):
+    with pytest.raises(OutputError, match=r"cannot write .*/file/a"), atomic_write(tmp_path / "file" / "a"):
         pass
-    with pytest.raises(OutputError, match="cannot write .*/b: no room"), atomic_write(tmp_path / "b", RuntimeError):
+    with pytest.raises(OutputError, match=r"cannot write .*/b: no room"), atomic_write(tmp_path / "b", RuntimeError):
         raise RuntimeError("no room")
 
 
@@ -120,7 +120,7 @@ def test_a_refusal_of_the_check_changes_nothing(tmp_path: Path) -> None:
     def refuse(connection: sqlite3.Connection) -> None:
         raise UmfError("of another rover")
 
-    with pytest.raises(UmfError, match="^of another rover$"):
+    with pytest.raises(UmfError, match=r"^of another rover$"):
         SqliteFile(path, SECOND, check=refuse)
     assert path.read_bytes() == before
 
