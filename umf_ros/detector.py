@@ -6,12 +6,15 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+import small_gicp
 
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import ConfigError, OutputError, UmfError
@@ -28,6 +31,8 @@ if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatcher
 
 logger = logging.getLogger(__name__)
+Other = TypeVar("Other")
+"""Items of a stream beside frames, such as odometry."""
 NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
 
 
@@ -55,11 +60,21 @@ class Detection:
         return [verdict.closure for verdict in self.verdicts if verdict.closure is not None]
 
 
-class LoopDetector:
-    """Finds loop closures in a stream of frames; the live node, the replay and the evaluation run this same class.
+@dataclass(slots=True)
+class _Upcoming:
+    """A frame that is known before it is processed, and the embedding that was begun for it."""
 
-    `process` takes a frame through all stages: `select`, `embed`, `query`, `verify`, `look_around`,
-    `remember`. In a map that stays as it is, the last two have nothing to do.
+    frame: Frame
+    is_keyframe: bool
+    path_length_m: float
+    embedding: Future[tuple[Keyframe, float]] | None = None
+
+
+class LoopDetector:
+    """Finds loop closures in a stream of frames; the same class in the live node, the replay and the evaluation.
+
+    `process` takes a frame through all stages: `select`, `embed`, `query`, `verify`, `match_submaps`, `remember`.
+    The last two are skipped while localising in a map that stays as it is.
 
     Args:
         settings: all settings.
@@ -68,13 +83,14 @@ class LoopDetector:
     Attributes:
         database: the rover's places.
         encounters: with other rovers of a fleet; None of a rover on its own.
-        embed_ms: milliseconds that the last embedding took, whether or not it was foreseen.
+        embed_ms: milliseconds that the last embedding took, prefetched or not.
 
     Raises:
         UmfError: the place database of the settings belongs to another embedder.
     """
 
     def __init__(self, settings: Settings, embedder: Embedder) -> None:
+        small_gicp.PointCloud(np.eye(3))  # its binding initialises itself once, before there are other threads
         self._rules = settings.loop
         self._selector = KeyframeSelector(settings.keyframe)
         self._embedder = embedder
@@ -89,7 +105,8 @@ class LoopDetector:
         self._depth_told = False
         self.embed_ms = 0.0
         self._network = ThreadPoolExecutor(1, "embedding")
-        self._prefetched: deque[tuple[Frame, Future[tuple[Keyframe, float]]]] = deque()
+        self._queue: deque[_Upcoming] = deque()
+        self._current: _Upcoming | None = None
 
     def retune(self, settings: Settings) -> None:
         """Search and verify by other settings from the next frame on."""
@@ -111,7 +128,7 @@ class LoopDetector:
         latency.add("embed", self.embed_ms)
         known = self.database.find_duplicate(keyframe) if self._map is None else None
         if known is not None:
-            keyframe = self._go_on_from(frame, known)
+            keyframe = self._go_on_from(known)
         with latency.measure("query"):
             candidates = self.query(keyframe)
         with latency.measure("verify"):
@@ -126,30 +143,57 @@ class LoopDetector:
                 fault = error
         return Detection(frame.stamp_ns, keyframe, verdicts, latency.milliseconds, fault)
 
+    def prefetch(
+        self, stream: Iterable[Frame | Other], wanted: Callable[[], bool] = lambda: True
+    ) -> Iterator[Frame | Other]:
+        """Yield a recording's stream unchanged, each keyframe after the network has begun to embed the next one.
+
+        Args:
+            stream: frames and odometry of a recording, in the order in which they are processed.
+            wanted: whether keyframes are embedded at present.
+        """
+        held: list[Frame | Other] = []
+        for item in stream:
+            if isinstance(item, Frame):
+                self._queue.append(self._decide(item))
+                if self._queue[-1].is_keyframe:
+                    if wanted():
+                        self._begin(self._queue[-1])
+                    yield from held
+                    held.clear()
+            held.append(item)
+        yield from held
+
     def select(self, frame: Frame) -> bool:
         """Whether the frame becomes a keyframe; call once per frame, in order of stamps within a session."""
+        while self._queue and self._queue[0].frame is not frame:
+            self._queue.popleft()
+        self._current = self._queue.popleft() if self._queue else self._decide(frame)
         if frame.session != self._session:
             self._start_session(frame)
-        return self._selector.select(frame)
-
-    def prefetch(self, frame: Frame) -> None:
-        """Begin to embed a frame that is to come, in a thread of its own; frames that come are embedded in order."""
-        self._prefetched.append((frame, self._network.submit(self._perceive, frame)))
+        return self._current.is_keyframe
 
     def embed(self, frame: Frame) -> Keyframe:
-        """The keyframe that the frame selected last becomes, foreseen or not."""
-        while self._prefetched and self._prefetched[0][0] is not frame:
-            self._prefetched.popleft()
-        if not self._prefetched:
-            self.prefetch(frame)
-        coming = self._prefetched.popleft()[1]
+        """Return the keyframe of the frame that `select` was called with last, prefetched or not."""
+        if self._current is None or self._current.frame is not frame:
+            raise ValueError("select has to be called with this frame first")
+        coming = self._begin(self._current)
         if not coming.done() and len(self.database):
-            self._verifier.prefetch(frame)  # the network computes elsewhere
+            self._verifier.prefetch(frame)  # beside the network
         keyframe, self.embed_ms = coming.result()
-        path_length_m = self._selector.path_length_m(frame) + self._ahead_m
+        path_length_m = self._current.path_length_m + self._ahead_m
         return replace(keyframe, path_length_m=path_length_m, session=self._stored_session)
 
-    def _perceive(self, frame: Frame) -> tuple[Keyframe, float]:
+    def _decide(self, frame: Frame) -> _Upcoming:
+        is_keyframe = self._selector.select(frame)
+        return _Upcoming(frame, is_keyframe, self._selector.path_length_m(frame))
+
+    def _begin(self, upcoming: _Upcoming) -> Future[tuple[Keyframe, float]]:
+        if upcoming.embedding is None:
+            upcoming.embedding = self._network.submit(self._embed_timed, upcoming.frame)
+        return upcoming.embedding
+
+    def _embed_timed(self, frame: Frame) -> tuple[Keyframe, float]:
         start = time.perf_counter()
         keyframe = make_keyframe(frame, self._embedder)
         return keyframe, 1e3 * (time.perf_counter() - start)
@@ -196,7 +240,7 @@ class LoopDetector:
             return False
         known = self.database.newest_at(frame.stamp_ns)
         if known is not None:
-            self._submaps.remember(self._go_on_from(frame, known))
+            self._submaps.remember(self._go_on_from(known))
         return True
 
     def meet(self) -> InterRobotClosure | None:
@@ -213,6 +257,7 @@ class LoopDetector:
     def end_session(self) -> None:
         """End the session: the next frame begins a new one; every place is kept."""
         self._session = None
+        self._selector.reset()
 
     def _tell_depthless(self, verdicts: Sequence[Verdict]) -> None:
         """Say, once, why nothing becomes metric: one camera without a LiDAR recognises places, no more."""
@@ -226,15 +271,14 @@ class LoopDetector:
         self._stored_session, self._ahead_m = self.database.next_session, 0.0
         if len(self.database) and self._map is None:
             logger.warning("a new session begins; the %d places known so far are kept", len(self.database))
-        self._selector.reset()
         self._verifier.reset()
         self._submaps.reset()
 
-    def _go_on_from(self, frame: Frame, known: int) -> Keyframe:
+    def _go_on_from(self, known: int) -> Keyframe:
         """The stored keyframe that a frame became before; what follows belongs to its session, and to its way."""
         keyframe = self.database[known]
         self._stored_session = keyframe.session
-        ahead_m = keyframe.path_length_m - self._selector.path_length_m(frame)
+        ahead_m = keyframe.path_length_m - self._current.path_length_m if self._current else math.nan
         self._ahead_m = 0.0 if math.isnan(ahead_m) else ahead_m
         return keyframe
 

@@ -16,7 +16,6 @@ from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector
 from umf_ros.maps.localizer import Localization, Localizer
 from umf_ros.maps.outputs import read_poses
-from umf_ros.prefetch import one_ahead
 from umf_ros.runs.recorder import RunRecorder, read_summary, write_summary
 from umf_ros.runs.tables import POSE, SIGMA, CsvTable
 from umf_ros.sensors.decode import OdometrySample
@@ -66,7 +65,6 @@ class LocalizingReplay:
         self._detector = detector
         self._localizer = Localizer(read_poses(Path(settings.map)), settings.pose_graph)
         self._feed = OdometrySessionSplitter(self._localizer)
-        self._policy = settings.keyframe
         self._recorder = RunRecorder(folder, settings, detector.embedder_name)
         self._table = CsvTable(folder / TABLE, COLUMNS)
         self._found: list[Localization] = []
@@ -78,7 +76,7 @@ class LocalizingReplay:
         Raises:
             OutputError: the disk is full.
         """
-        for item in one_ahead(stream, self._policy, self._detector.prefetch):
+        for item in self._detector.prefetch(stream):
             if isinstance(item, OdometrySample):
                 self._feed.take(item.stamp_ns, item.odom_T_body)
                 continue

@@ -12,7 +12,6 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
 from umf_ros.detector import Detection, LoopDetector
 from umf_ros.pose_graph.pose_graph import PoseGraph
-from umf_ros.prefetch import one_ahead
 from umf_ros.runs.recorder import RunRecorder
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
@@ -45,7 +44,6 @@ class Replay:
         self._graph = PoseGraph(settings.pose_graph)
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometrySessionSplitter(self._graph)
-        self._policy = settings.keyframe
         self.faults = 0
         self._has_odometry = False
         self._done = len(self._recorder.recorded) if resume else 0
@@ -59,7 +57,7 @@ class Replay:
         Raises:
             OutputError: the disk is full.
         """
-        for item in one_ahead(stream, self._policy, self._prefetch):
+        for item in self._detector.prefetch(stream, lambda: self._done <= WARM_UP):
             if isinstance(item, OdometrySample):
                 self._has_odometry = True
                 self._feed.take(item.stamp_ns, item.odom_T_body)
@@ -90,10 +88,6 @@ class Replay:
             with (self._folder / FAULTS).open("a", encoding="utf-8") as file:
                 file.write(f"frame {frame.stamp_ns}\n{traceback.format_exc()}\n")
             return Detection(frame.stamp_ns)
-
-    def _prefetch(self, frame: Frame) -> None:
-        if self._done <= WARM_UP:
-            self._detector.prefetch(frame)
 
     def raise_if_frames_failed(self) -> None:
         """Say at the end, when everything else is written, that frames were passed over.

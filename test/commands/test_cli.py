@@ -10,7 +10,7 @@ import pytest
 from command_line import only_line, umf
 
 from umf_ros import __version__
-from umf_ros.commands import checks
+from umf_ros.commands import doctor as checks
 from umf_ros.core.errors import either
 from umf_ros.core.resources import dataset_names
 

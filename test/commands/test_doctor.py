@@ -10,7 +10,7 @@ import numpy
 import pytest
 
 from umf_ros import embedding
-from umf_ros.commands import checks
+from umf_ros.commands import doctor as checks
 from umf_ros.commands.doctor import command
 from umf_ros.core.errors import WeightsError
 

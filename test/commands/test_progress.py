@@ -13,7 +13,7 @@ import pytest
 from conftest import make_keyframe
 from rich.console import Console
 
-from umf_ros.commands.progress import WARNING, FrameProgress, stop_on_interrupt, undisturbed
+from umf_ros.commands.console import WARNING, FrameProgress, stop_on_interrupt, undisturbed
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.detector import Detection
 from umf_ros.verification import Measurement, Verdict

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -12,11 +13,12 @@ from tiny_worlds import TINY, some_scan
 from torch import Tensor, nn
 
 from umf_ros.core.config import EmbeddingSettings
-from umf_ros.core.errors import ConfigError, OutputError
+from umf_ros.core.errors import ConfigError, OutputError, WeightsError
+from umf_ros.core.resources import find
 from umf_ros.embedding.embedder import FeatureRequest
-from umf_ros.embedding.export import cached, convert, kept_or_made, openvino_core, save
+from umf_ros.embedding.export import cached, convert, import_openvino, kept_or_made, openvino_core, save
 from umf_ros.embedding.inputs import pack, prepare_scan
-from umf_ros.embedding.runtimes import OUTPUTS, SUPERS, make_runtime, outputs_of
+from umf_ros.embedding.runtimes import OUTPUTS, SUPERS, make_runtime, make_xfeat_runtime, outputs_of
 from umf_ros.embedding.torch_runtimes import TorchRuntime, to_tensors
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights_files import locate_weights
@@ -138,3 +140,56 @@ print([name for name, module in sys.modules.items() if "openvino_telemetry" in n
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "[] True\n"), done.stderr
+
+
+def test_the_first_inference_happens_where_the_runtime_is_made(monkeypatch):
+    """Two threads that initialise OpenVINO's binding at the same moment wait for each other for ever."""
+    openvino = import_openvino()
+    really, threads = openvino.CompiledModel.__call__, []
+
+    def infer(self, *arguments):
+        threads.append(threading.current_thread())
+        return really(self, *arguments)
+
+    monkeypatch.setattr(openvino.CompiledModel, "__call__", infer)
+    settings = EmbeddingSettings(runtime="openvino", threads=1)
+    make_runtime(locate_weights(None), settings, FeatureRequest())
+    make_xfeat_runtime(find("models/xfeat.safetensors"), settings)
+    assert threads == [threading.current_thread()] * 2
+
+
+BARE = """
+import sys, threading
+import numpy as np
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.core.resources import find
+from umf_ros.core.watchdog import watching
+from umf_ros.embedding.runtimes import make_xfeat_runtime
+
+runtimes = [make_xfeat_runtime(find("models/xfeat.safetensors"), EmbeddingSettings(threads=1)) for _ in range(6)]
+begin = threading.Barrier(len(runtimes))
+
+def infer(runtime):
+    begin.wait()
+    runtime.run(np.ones((64, 64), np.float32))
+
+with watching(20.0):
+    threads = [threading.Thread(target=infer, args=(runtime,)) for runtime in runtimes]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+"""
+
+
+def test_many_threads_infer_at_once_and_none_waits_for_ever():
+    """One start of six or so hung before the first inference was made in one thread."""
+    for _ in range(8):
+        done = subprocess.run([sys.executable, "-c", BARE], capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, done.stderr
+
+
+def test_weights_that_cannot_be_run_are_refused_at_the_start(monkeypatch):
+    from umf_ros.embedding import runtimes
+
+    monkeypatch.setattr(runtimes, "XFEAT_BLANK", np.zeros((384, 7), np.float32))  # no multiple of 32
+    with pytest.raises(WeightsError, match=r"xfeat.safetensors cannot be run: ."):
+        make_xfeat_runtime(find("models/xfeat.safetensors"), EmbeddingSettings(runtime="openvino", threads=1))

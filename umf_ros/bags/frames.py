@@ -9,6 +9,7 @@ from typing import Any
 from umf_ros.bags.presets import calibration_of, topics_of, uses_transforms
 from umf_ros.bags.reader import Bag, decode
 from umf_ros.bags.records import RawMessage
+from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics
 from umf_ros.core.errors import BagError, MessageError, either
 from umf_ros.core.frames import Frame, Image
@@ -86,6 +87,7 @@ class FrameReader:
         """Every message of the odometry as it comes, and the frames as they are complete."""
         odometry = _Cursor(self._odometry) if self._odometry is not None else None
         for raw in self._bag.raw_messages(self._intake.topics):
+            watchdog.feed()
             self._take(raw, odometry)
             self.progress = (raw.log_ns - self._bag.start_ns) / max(1, self._bag.end_ns - self._bag.start_ns)
             yield from self._samples

@@ -56,7 +56,7 @@ def command(
 
     from rich.console import Console
 
-    from umf_ros.commands.progress import WARNING
+    from umf_ros.commands.console import WARNING
     from umf_ros.comparison import Comparer, KeyframeSource, ReadingRules, read_pairs
     from umf_ros.core.config import load_settings
     from umf_ros.detector import make_detector_embedder

@@ -1,8 +1,60 @@
-"""`umf doctor`: whether everything that the package needs works here."""
+"""`umf doctor`: check the installation and name the remedy of every problem."""
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+
 import typer
+
+from umf_ros.core.errors import UmfError
+from umf_ros.core.resources import LAB_PACKAGES
+
+TIMEOUT_S = 60
+
+# module, distribution, first version known to work
+_PACKAGES = (
+    ("numpy", "numpy", "1.26"),
+    ("scipy", "scipy", "1.11"),
+    ("cv2", "opencv-python-headless", "4.10"),
+    ("torch", "torch", "2.4"),
+    ("safetensors", "safetensors", "0.4"),
+    ("small_gicp", "small_gicp", "1"),
+    ("gtsam", "gtsam", "4.3"),
+    ("mcap", "mcap", "1.2"),
+    ("rosbags", "rosbags", "0.10"),
+    ("pydantic", "pydantic", "2"),
+    ("matplotlib", "matplotlib", "3.8"),
+    ("jinja2", "Jinja2", "3.1"),
+    ("plotly", "plotly", "6"),
+)
+_WITHOUT_OPENVINO = "torch runs the network instead (OpenVINO asks for glibc 2.35)"
+_WITHOUT_LAB = "only the lab needs it: pip install 'umf_ros[lab]'"
+_MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "visualization_msgs", "std_srvs")
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of one check.
+
+    Attributes:
+        name: what was checked.
+        fine: whether everything works.
+        found: what is there.
+        advice: what helps, where it does not.
+    """
+
+    name: str
+    fine: bool
+    found: str
+    advice: str = ""
 
 
 def command() -> None:
@@ -11,12 +63,10 @@ def command() -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from umf_ros.commands import checks
-
     console = Console()
-    findings: list[checks.Finding] = []
+    findings: list[Finding] = []
     with console.status("") as status:
-        for name, check in checks.checks():
+        for name, check in checks():
             status.update(f"Checking {name}")
             findings.append(check())
     table = Table("", "", "found", box=None, pad_edge=False, show_header=False)
@@ -30,3 +80,137 @@ def command() -> None:
         console.print(f"[bold red]{len(problems)} of {len(findings)} checks found a problem.")
         raise typer.Exit(1)
     console.print("[green]Everything works.")
+
+
+def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
+    """All checks by name, to be run one by one."""
+    yield "Python", check_python
+    for module, distribution, minimum in _PACKAGES:
+        yield distribution, partial(check_package, module, distribution, minimum)
+    yield "openvino", partial(check_optional, "openvino", "openvino", "2025", _WITHOUT_OPENVINO)
+    for module, (distribution, minimum) in LAB_PACKAGES.items():
+        yield distribution, partial(check_optional, module, distribution, minimum, _WITHOUT_LAB)
+    yield "ROS 2 Python", check_rclpy
+    yield "ROS 2 messages", check_messages
+    yield "DDS", check_dds
+    yield "shared memory", check_shared_memory
+    yield "weights", check_weights
+    yield "processor", check_processor
+
+
+def check_python() -> Finding:
+    """Jazzy's Python is 3.12; its packages on PyPI also exist for 3.11."""
+    found = ".".join(str(part) for part in sys.version_info[:3])
+    return Finding("Python", sys.version_info[:2] in ((3, 11), (3, 12)), found, "use Python 3.11 or 3.12")
+
+
+def check_package(module: str, distribution: str, minimum: str) -> Finding:
+    """Import a package in a process of its own: a broken one may take the process with it."""
+    advice = f"pip install '{distribution}>={minimum}', or make install"
+    if importlib.util.find_spec(module) is None:
+        return Finding(distribution, False, "not installed", advice)
+    status, output = _run("-c", f"import {module}; print(getattr({module}, '__version__', ''))")
+    if status != 0:
+        if "libusb" in output:
+            advice = "sudo apt install libusb-1.0-0"
+        return Finding(distribution, False, _last_line(output) or f"import ends with status {status}", advice)
+    found = _version(distribution) or _last_line(output)
+    return Finding(distribution, _at_least(found, minimum), found, f"{minimum} or newer is needed: {advice}")
+
+
+def check_optional(module: str, distribution: str, minimum: str, without: str) -> Finding:
+    """A package that a rover can do without, as `without` says; one that is there has to work."""
+    if importlib.util.find_spec(module) is None:
+        return Finding(distribution, True, f"not installed; {without}")
+    return check_package(module, distribution, minimum)
+
+
+def check_rclpy() -> Finding:
+    """The ROS client library of Jazzy."""
+    advice = "source /opt/ros/jazzy/setup.bash, or pip install 'ros-rclpy[fastrtps]==7.1.6'"
+    status, output = _run("-c", "import rclpy; print(rclpy.get_rmw_implementation_identifier())")
+    if status != 0:
+        return Finding("ROS 2 Python", False, _last_line(output), advice)
+    found = _version("ros-rclpy") or _version("rclpy")
+    text = f"rclpy {found} with {_last_line(output)}"
+    return Finding("ROS 2 Python", found.startswith("7."), text, f"Jazzy's rclpy is 7.x: {advice}")
+
+
+def check_messages() -> Finding:
+    """The message packages of common_interfaces."""
+    missing = [name for name in _MESSAGE_PACKAGES if importlib.util.find_spec(name) is None]
+    advice = "pip install ros-common-interfaces==5.3.6, or sudo apt install ros-jazzy-common-interfaces"
+    return Finding("ROS 2 messages", not missing, f"missing: {', '.join(missing)}" if missing else "all there", advice)
+
+
+def check_dds() -> Finding:
+    """A publisher and a subscriber find each other and exchange an image."""
+    status, output = _run("-m", "umf_ros.nodes.dds_check")
+    advice = (
+        "check ROS_DOMAIN_ID, RMW_IMPLEMENTATION, and that a firewall lets UDP multicast pass on the loopback device"
+    )
+    domain = os.environ.get("ROS_DOMAIN_ID", "0")
+    return Finding("DDS", status == 0, f"{_last_line(output)} (domain {domain})", advice)
+
+
+def check_shared_memory() -> Finding:
+    """Fast DDS hands images over through /dev/shm."""
+    if not os.path.isdir("/dev/shm"):
+        return Finding("shared memory", False, "there is no /dev/shm", "mount it, or images go through the network")
+    free_mb = shutil.disk_usage("/dev/shm").free / 1e6
+    advice = "free some of /dev/shm; for a container: --shm-size=512m"
+    return Finding("shared memory", free_mb > 50, f"{free_mb:.0f} MB free in /dev/shm", advice)
+
+
+def check_weights() -> Finding:
+    """The shipped weights load into the network."""
+    advice = "reinstall the package, or name a file with the parameter embedding.weights"
+    try:
+        from umf_ros.core.config import EmbeddingSettings
+        from umf_ros.embedding import make_embedder
+
+        embedder = make_embedder(EmbeddingSettings())
+    except (UmfError, ImportError) as error:
+        return Finding("weights", False, str(error), advice)
+    return Finding("weights", True, embedder.name)
+
+
+def check_processor() -> Finding:
+    """What the network runs on."""
+    cores = len(os.sched_getaffinity(0))
+    found = f"{cores} {'core' if cores == 1 else 'cores'}"
+    status, output = _run(
+        "-c", "import torch; print(torch.cuda.get_device_name() if torch.cuda.is_available() else '')"
+    )
+    if status == 0 and _last_line(output):
+        found += f", {_last_line(output)} (parameter embedding.device: cuda)"
+    return Finding("processor", cores >= 2, found, "two cores are needed to keep up with a live rover")
+
+
+def _run(*arguments: str) -> tuple[int, str]:
+    try:
+        done = subprocess.run(
+            [sys.executable, *arguments], capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return 1, f"no answer within {TIMEOUT_S} s"
+    return done.returncode, done.stdout + (done.stderr if done.returncode else "")
+
+
+def _last_line(text: str) -> str:
+    lines = text.strip().splitlines()
+    return lines[-1].strip() if lines else ""
+
+
+def _version(distribution: str) -> str:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return ""
+
+
+def _at_least(found: str, minimum: str) -> bool:
+    def numbers(text: str) -> list[int]:
+        return [int(part) for part in text.split("+")[0].split(".") if part.isdigit()]
+
+    return numbers(found) >= numbers(minimum)

@@ -80,7 +80,7 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
 
 def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> None:
     from umf_ros.bags.frames import read_transforms
-    from umf_ros.commands import first_settings
+    from umf_ros.commands.inspection import GUESS, write_calibration, write_settings
     from umf_ros.core.errors import writing
     from umf_ros.runs.folder import write_atomically
 
@@ -90,9 +90,9 @@ def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> 
             raise OutputError(f"{path} is there already: nothing was written")
     with writing(f"to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-    text = first_settings.write_calibration(found, read_transforms(recording))
+    text = write_calibration(found, read_transforms(recording))
     write_atomically(calibration, text)
-    write_atomically(settings, first_settings.write_settings(found, str(calibration.resolve())))
-    guesses = text.count(first_settings.GUESS)
+    write_atomically(settings, write_settings(found, str(calibration.resolve())))
+    guesses = text.count(GUESS)
     then = f"; {guesses} entries of the calibration are guesses: measure them" if guesses else ""
     console.print(f"wrote {settings} and {calibration}{then}", **PLAIN)

@@ -133,7 +133,7 @@ def _with_bar(console: Console, what: str, total: int, run: Callable[[Callable[[
 def _add(target: MapFolder, recording: Path, opening: Opening, console: Console) -> None:
     """Replay a recording into the map, unless it is there."""
     from umf_ros.bags.reader import open_bag
-    from umf_ros.commands.progress import FrameProgress
+    from umf_ros.commands.console import FrameProgress
     from umf_ros.mapping import add_session, replay_session
     from umf_ros.runs.finished_run import describe_recording
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.reader import Bag
-    from umf_ros.commands.inputs import InputConsole
+    from umf_ros.commands.console import InputConsole
     from umf_ros.core.config import Settings
     from umf_ros.embedding.embedder import Embedder
 
@@ -78,8 +78,8 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.trajectories import read_ground_truth
-    from umf_ros.commands.inputs import InputConsole
-    from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.commands.console import FrameProgress, InputConsole, stop_on_interrupt, undisturbed
+    from umf_ros.core.watchdog import watching
     from umf_ros.detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
     from umf_ros.runs.recorder import count_drops
@@ -114,7 +114,7 @@ def command(
     detector = detector or LoopDetector(folder.working_settings, network)
     inputs.tell_absent(settings, odometry is not None)
     replay = Replay(folder.path, settings, detector, folder.resumed)
-    with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress:
+    with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
         stream = reader.stream()
         for detection in replay.run(viewer.watch(stream) if viewer else stream):
             progress.show(reader.progress, detection)
@@ -146,7 +146,8 @@ def _localize(
     console: Console,
 ) -> int:
     """Find the rover of a recording in a map; 3 where it was not found."""
-    from umf_ros.commands.progress import FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.commands.console import FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.core.watchdog import watching
     from umf_ros.detector import LoopDetector
     from umf_ros.localization import LocalizingReplay
     from umf_ros.runs.finished_run import remember_recording
@@ -157,7 +158,7 @@ def _localize(
     folder = create_run_folder(out)
     inputs.tell_absent(settings, odometry_from_file=False)
     replay = LocalizingReplay(folder, settings, detector)
-    with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress:
+    with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
         for detection in replay.run(reader.stream()):
             progress.show(reader.progress, detection)
             if interrupted():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
@@ -11,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.config import EmbeddingSettings
-from umf_ros.core.errors import ConfigError
+from umf_ros.core.errors import ConfigError, WeightsError, one_line
 from umf_ros.core.frames import Points
 from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.export import cached, kept_or_made, openvino_core
-from umf_ros.embedding.inputs import InputArrays
+from umf_ros.embedding.inputs import InputArrays, blank_input
+from umf_ros.networks.weights_files import read_config
 
 Outputs = dict[str, NDArray[np.float32]]
+XFEAT_BLANK = np.zeros((384, 512), np.float32)
 
 
 OUTPUTS = ("descriptor", "image", "image_saliency", "cloud", "cloud_saliency")
@@ -57,6 +60,7 @@ class OpenVinoRuntime:
 
         self._model = _compiled(kept_or_made(cached(weights, outputs), make), threads)
         self._outputs = outputs
+        warm_up(weights, lambda: self.run(blank_input(read_config(weights))))
 
     def run(self, batch: InputArrays) -> Outputs:
         """See `Runtime`."""
@@ -83,7 +87,9 @@ def make_runtime(weights: Path, settings: EmbeddingSettings, asked: FeatureReque
     from umf_ros.embedding.torch_runtimes import TorchRuntime
     from umf_ros.networks.weights import load_weights
 
-    return TorchRuntime(load_weights(weights), settings.device, count, outputs)
+    runtime = TorchRuntime(load_weights(weights), settings.device, count, outputs)
+    warm_up(weights, lambda: runtime.run(blank_input(read_config(weights))))
+    return runtime
 
 
 class XFeatOpenVinoRuntime:
@@ -96,6 +102,7 @@ class XFeatOpenVinoRuntime:
             return converted_xfeat(weights)
 
         self._model = _compiled(kept_or_made(cached(weights), make), threads)
+        warm_up(weights, lambda: self.run(XFEAT_BLANK))
 
     def run(self, image: Points) -> tuple[Points, Points, Points]:
         """See `XFeatRuntime`."""
@@ -115,7 +122,24 @@ def make_xfeat_runtime(weights: Path, settings: EmbeddingSettings) -> XFeatRunti
         return XFeatOpenVinoRuntime(weights, settings.threads or len(os.sched_getaffinity(0)))
     from umf_ros.embedding.torch_runtimes import XFeatTorchRuntime
 
-    return XFeatTorchRuntime(weights, settings.device)
+    runtime = XFeatTorchRuntime(weights, settings.device)
+    warm_up(weights, lambda: runtime.run(XFEAT_BLANK))
+    return runtime
+
+
+def warm_up(weights: Path, infer: Callable[[], object]) -> None:
+    """Run the first inference in the thread that makes the runtime, before any other thread uses the library.
+
+    OpenVINO's binding initialises itself at its first inference; two threads that do so at the same moment wait for
+    each other for ever.
+
+    Raises:
+        WeightsError: the network cannot be run.
+    """
+    try:
+        infer()
+    except Exception as error:
+        raise WeightsError(f"{weights} cannot be run: {one_line(error)}") from None
 
 
 def _wants_openvino(settings: EmbeddingSettings) -> bool:

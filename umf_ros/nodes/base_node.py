@@ -18,6 +18,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
+from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics
 from umf_ros.core.errors import MessageError, OutputError, UmfError
 from umf_ros.nodes.conversions import from_time
@@ -123,7 +124,8 @@ class BaseNode(LifecycleNode, ABC):
         self._active = False
         if self._opened:
             self._opened = False
-            self._finish()
+            with watchdog.watching(watchdog.PATIENT_S):
+                self._finish()
 
     def ready_to_close(self) -> bool:
         """Whether nothing more is to be waited for after Ctrl-C."""
@@ -150,7 +152,8 @@ class BaseNode(LifecycleNode, ABC):
             check_writable(Path(self._results))
         before, self._unwritten = self._entities(), None
         try:
-            self._open()
+            with watchdog.watching(watchdog.PATIENT_S):
+                self._open()
             self._opened = True
             # all that is there now stays: to look through it for garbage took .3 s, in which nobody was answered
             gc.collect()

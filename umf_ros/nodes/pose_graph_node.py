@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from umf_ros.bags.presets import topics_of
+from umf_ros.core import watchdog
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import Array
@@ -119,7 +120,8 @@ class PoseGraphNode(BaseNode):
 
     def _settle_left(self) -> None:
         """Finish what the process before had no time for."""
-        self._durable.write_results(Path(self._results))
+        with watchdog.task("settling the graph", watchdog.PATIENT_S):
+            self._durable.write_results(Path(self._results))
         self._announce(self._durable.graph.closures())
 
     def _retune(self, settings: Settings) -> None:
@@ -130,7 +132,8 @@ class PoseGraphNode(BaseNode):
 
         def act(answered: Future) -> None:
             try:
-                answered.set_result((True, action()))
+                with watchdog.task(name, watchdog.PATIENT_S):
+                    answered.set_result((True, action()))
             except Exception as error:
                 if not isinstance(error, UmfError):
                     self._complain(error, name)

@@ -17,6 +17,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from umf_ros.core import watchdog
 from umf_ros.core.errors import ConfigError, UmfError, one_line
 
 LONGEST_WAIT_S = 60.0
@@ -42,8 +43,9 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: asked.append(number))
     try:
-        init(arguments)
-        node = make_node()
+        with watchdog.watching(watchdog.PATIENT_S):
+            init(arguments)
+            node = make_node()
     except UmfError as error:
         complain(error)
         rclpy.try_shutdown()
@@ -52,14 +54,17 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     executor.add_node(node)
     status = 0
     try:
-        while not asked and rclpy.ok():
-            _spin_once(node, executor, 0.2)
-        _wait_until_ready(node, executor, asked)
+        with watchdog.watching():
+            while not asked and rclpy.ok():
+                _spin_once(node, executor, 0.2)
+                watchdog.feed()
+            _wait_until_ready(node, executor, asked)
     except ExternalShutdownException:
         pass
     finally:
         try:
-            getattr(node, "close", lambda: None)()  # finish the work in hand and write the results
+            with watchdog.watching(watchdog.PATIENT_S):
+                getattr(node, "close", lambda: None)()  # finish the work in hand and write the results
         except UmfError as error:
             complain(error)
             status = 1
@@ -96,6 +101,7 @@ def _wait_until_ready(node: Node, executor: SingleThreadedExecutor, asked: list[
     deadline, first = time.monotonic() + LONGEST_WAIT_S, len(asked)
     while not ready() and len(asked) == first and time.monotonic() < deadline and rclpy.ok():
         _spin_once(node, executor, 0.05)
+        watchdog.feed()
 
 
 def _spin_once(node: Node, executor: SingleThreadedExecutor, timeout_s: float) -> None:

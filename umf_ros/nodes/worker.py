@@ -1,4 +1,4 @@
-"""One thread that works through a short queue, newest first to survive."""
+"""One thread that works through a bounded queue; the oldest item gives way."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
+
+from umf_ros.core import watchdog
 
 Item = TypeVar("Item")
 
@@ -71,6 +73,7 @@ class Worker(Generic[Item]):
                 item = self._queue.popleft()
                 self._busy = True
             try:
-                self._work(item)
+                with watchdog.task(self._thread.name):
+                    self._work(item)
             except Exception as error:
                 self._on_error(error)

@@ -71,7 +71,7 @@ def _drive(
     bag: Path, network: UMF, weights: Path, config: Path | None, dataset: str, kept_in: Path, console: Console
 ) -> Drive:
     """What one recording teaches, from the folder where it is there."""
-    from umf_ros.commands.progress import WARNING, FrameProgress
+    from umf_ros.commands.console import WARNING, FrameProgress
     from umf_ros.core.errors import writing
     from umf_ros.lab.training.drives import Drive, DriveReader
 

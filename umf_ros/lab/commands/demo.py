@@ -24,7 +24,7 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
-    from umf_ros.commands.progress import undisturbed
+    from umf_ros.commands.console import undisturbed
     from umf_ros.lab.commands import simulate
     from umf_ros.lab.live.live_graph import LiveGraph
     from umf_ros.runs.finished_run import remember_recording

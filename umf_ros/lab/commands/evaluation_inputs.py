@@ -52,7 +52,7 @@ class RecordingOptions:
         frame_of_odometry = check_odometry_options(self.odometry, self.odometry_frame)
 
         from umf_ros.bags.trajectories import read_ground_truth
-        from umf_ros.commands.progress import WARNING
+        from umf_ros.commands.console import WARNING
 
         recording, settings = open_recording(self.bag, self.config, self.dataset, self.embedder, weights)
         truth = read_ground_truth(recording, self.ground_truth)

@@ -1,0 +1,85 @@
+"""A process that stands still ends with the stacks of its threads; one that makes progress goes on."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+
+import pytest
+from processes import ENVIRONMENT
+
+BUSY_LOCK = "import re; re.match('(a+)+$', 'a' * 64 + 'b')"
+"""Holds the interpreter lock for longer than any test waits."""
+
+
+def ended(code: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+@pytest.mark.parametrize("stand_still", ["time.sleep(99)", BUSY_LOCK])
+def test_a_main_thread_that_stands_still_ends_the_process(stand_still: str) -> None:
+    done = ended(f"""
+        import time
+        from umf_ros.core import watchdog
+        def stands_still(): {stand_still}
+        with watchdog.watching(1.0):
+            stands_still()
+    """)
+    assert done.returncode == 1
+    assert "Timeout" in done.stderr and "in stands_still" in done.stderr
+
+
+@pytest.mark.parametrize("stand_still", ["time.sleep(99)", BUSY_LOCK])
+def test_a_worker_that_stands_still_ends_the_process_while_the_main_thread_feeds(stand_still: str) -> None:
+    done = ended(f"""
+        import time
+        from umf_ros.core import watchdog
+        from umf_ros.nodes.worker import Worker
+        def stands_still(item): {stand_still}
+        with watchdog.watching(1.0):
+            worker = Worker(stands_still, print, 1)
+            worker.submit(1)
+            while True:
+                watchdog.feed()
+                time.sleep(0.05)
+    """)
+    assert done.returncode == 1
+    assert "in stands_still" in done.stderr
+
+
+def test_progress_keeps_the_process_alive_and_leaving_disarms_it() -> None:
+    done = ended("""
+        import time
+        from umf_ros.core import watchdog
+        with watchdog.watching(1.0):
+            for _ in range(40):
+                watchdog.feed()
+                with watchdog.task("short"):
+                    time.sleep(0.05)
+        watchdog.feed()
+        time.sleep(1.5)
+        print("done")
+    """)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "done\n", "")
+
+
+def test_long_work_may_ask_for_patience() -> None:
+    done = ended("""
+        import threading, time
+        from umf_ros.core import watchdog
+        def settle():
+            with watchdog.task("worker"), watchdog.task("settling", 30.0):
+                time.sleep(2.5)
+        with watchdog.watching(1.0):
+            thread = threading.Thread(target=settle)
+            thread.start()
+            while thread.is_alive():
+                watchdog.feed()
+                time.sleep(0.05)
+        with watchdog.watching(1.0), watchdog.watching(30.0):
+            time.sleep(1.5)
+        print("done")
+    """)
+    assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr
