@@ -22,7 +22,7 @@ from umf_ros.mapping import (
 )
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.odometry_log import OdometryLog
-from umf_ros.places.upkeep import stored_sessions
+from umf_ros.places.store import stored_sessions
 
 DAY_NS = 86_400 * 10**9
 

@@ -29,7 +29,7 @@ from umf_ros.maps.matching import Match, match_between
 from umf_ros.maps.odometry_log import OdometryLog
 from umf_ros.maps.tracking import track
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.places.upkeep import delete_sessions, stored_identity, stored_sessions
+from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
 from umf_ros.runs.tables import CLOSURES, CsvTable, closure_row

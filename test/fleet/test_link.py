@@ -15,7 +15,7 @@ from umf_ros.core.frames import Keyframe
 from umf_ros.fleet.link import Answer, FleetLink
 from umf_ros.fleet.migrations import add_rover, migrate
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.places.upkeep import delete_sessions
+from umf_ros.places.store import delete_sessions
 
 
 def link_of(places: PlaceDatabase, server: PostgresServer, rover: str, port: int | None = None) -> FleetLink:

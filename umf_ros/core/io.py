@@ -17,6 +17,8 @@ from umf_ros.core.errors import ConfigError, UmfError, one_line, shortened, writ
 
 Migration = tuple[str, ...] | Callable[[sqlite3.Connection], None]
 Check = Callable[[sqlite3.Connection], None]
+_DAMAGE = (sqlite3.Error, ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
+"""Exceptions that the values of a damaged file raise where rows are read and parsed."""
 _VERSIONS = "CREATE TABLE IF NOT EXISTS schema_version (name TEXT PRIMARY KEY, version INTEGER NOT NULL)"
 
 
@@ -174,7 +176,7 @@ class SqliteFile:
         """
         try:
             yield self.connection
-        except (sqlite3.Error, LookupError, TypeError, ValueError) as error:  # a damaged file holds anything anywhere
+        except _DAMAGE as error:
             raise UmfError(f"{self.name} is damaged: {one_line(error)}") from None
 
     def copy(self, path: Path) -> None:

@@ -17,7 +17,7 @@ from umf_ros.core.geometry import Array, invert, transform
 from umf_ros.maps.joint_graph import JointMap
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.places.upkeep import stored_identity
+from umf_ros.places.store import stored_identity
 from umf_ros.runs.gallery import HeightMap
 
 VOXEL_M = 0.1

@@ -39,8 +39,7 @@ from umf_ros.lab.evaluation.summary import ETNA_RECALL1, measure
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import load_weights
-from umf_ros.places.codes import CodeTable
-from umf_ros.places.index import DescriptorIndex
+from umf_ros.places.index import PlaceIndex
 
 RERANKED = {"umf_superfeatures": "superfeatures both", "umf_ransac": "ransac both"}
 """UMF's rerankers that stand beside the other methods."""
@@ -257,14 +256,13 @@ def search_ms(dimension: int, repeats: int = 30) -> float:
     """Median milliseconds to find the best of 858 places by descriptors of so many numbers."""
     places = np.random.default_rng(0).standard_normal((PLACES, dimension)).astype(np.float32)
     places /= np.linalg.norm(places, axis=1, keepdims=True)
-    table = CodeTable(dimension)
-    table.extend(places)
-    index = DescriptorIndex(table, lambda rows: places[rows])
-    query, everywhere = places[0], np.ones(PLACES, bool)
+    index = PlaceIndex(dimension)
+    index.add(places)
+    everywhere = np.ones(PLACES, bool)
     took = []
     for _ in range(repeats):
         started = time.perf_counter()
-        index.search(query, 20, everywhere)
+        index.search(places[0], 20, everywhere.__getitem__)
         took.append(time.perf_counter() - started)
     return 1e3 * float(np.median(took))
 
