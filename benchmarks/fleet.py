@@ -49,8 +49,7 @@ from umf_ros.fleet.server import FleetServer, OutgoingPlace
 from umf_ros.lab.evaluation.places_bench import made_up_drives
 from umf_ros.mapping import open_places
 from umf_ros.maps.map_folder import MapFolder
-from umf_ros.places.store import KeyframeStore
-from umf_ros.places.store import stored_identity
+from umf_ros.places.store import KeyframeStore, stored_identity
 from umf_ros.runs.truth import judge_closure
 
 ROVERS = 4
