@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 
 from umf_ros.core.errors import OutputError, writing
+from umf_ros.core.io import atomic_write
 
 
 def create_run_folder(out: Path) -> Path:
@@ -53,10 +54,5 @@ def write_atomically(path: Path, text: str) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    part = path.with_name(path.name + ".part")
-    with writing(path):
-        try:
-            part.write_text(text, encoding="utf-8")
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+    with atomic_write(path) as part:
+        part.write_text(text, encoding="utf-8")

@@ -12,7 +12,8 @@ from typing import Any
 
 import torch
 
-from umf_ros.core.errors import OutputError, WeightsError, writing
+from umf_ros.core.errors import WeightsError, writing
+from umf_ros.core.io import atomic_write
 
 
 @dataclass
@@ -59,12 +60,8 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    unfinished = path.with_suffix(".part")
-    try:
-        torch.save(state, unfinished)
-        unfinished.replace(path)
-    except (OSError, RuntimeError) as error:
-        raise OutputError(f"cannot write {path}: {_one_line(error)}") from None
+    with atomic_write(path, RuntimeError) as part:
+        torch.save(state, part)
 
 
 @contextmanager
