@@ -36,24 +36,23 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.frames import Frame, Image, ScanMotion
 from umf_ros.core.geometry import Array
-from umf_ros.lab.datasets.labels import label, places_of
-from umf_ros.lab.evaluation.protocol import THESIS_RULE, place_recognition
-from umf_ros.lab.evaluation.retrieval import rank
-from umf_ros.lab.evaluation.scores import score
+from umf_ros.lab.datasets.sample import label, places_of
+from umf_ros.lab.evaluation.results import score
+from umf_ros.lab.evaluation.retrieval import THESIS_RULE, place_recognition, rank
 from umf_ros.lab.evaluation.worlds import FIRST, FULL, QUICK, REVISIT, Sampling, TestWorld
+from umf_ros.lab.fit.adaptation import GAINED, PARTS, Adaptation, Lesson, adapt, measure
 from umf_ros.lab.simulation.bag_writer import BagWriter
+from umf_ros.lab.simulation.lidar import ETNA
 from umf_ros.lab.simulation.presets import Preset, gentle_loop
 from umf_ros.lab.simulation.recording import record
 from umf_ros.lab.simulation.relief import Relief
-from umf_ros.lab.simulation.rig import ETNA
 from umf_ros.lab.simulation.route import Walker
-from umf_ros.lab.simulation.seeds import TEST
 from umf_ros.lab.simulation.simulator import Simulator
-from umf_ros.lab.training.adaptation import GAINED, PARTS, Adaptation, Lesson, adapt, measure
+from umf_ros.lab.simulation.world import TEST
 from umf_ros.lab.training.drives import Drive, DriveReader, label_drive, pool
+from umf_ros.networks.config import locate_weights
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
-from umf_ros.networks.weights_files import locate_weights
 from umf_ros.sensors.calibration import load_calibration
 
 

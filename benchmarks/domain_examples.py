@@ -15,8 +15,8 @@ from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, invert, make_pose, relative, rotation_angle, transform
 from umf_ros.embedding.embedder import Embedder
+from umf_ros.lab.fit.acceptance import Example
 from umf_ros.lab.simulation.domains import Domain
-from umf_ros.lab.training.acceptance_examples import Example
 from umf_ros.verification import Verifier
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory
 from umf_ros.verification.measurement import SCAN, AlignedHypothesis, Measurement, beside, measure

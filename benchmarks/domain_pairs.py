@@ -17,7 +17,7 @@ from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
 from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, SAME_WAY
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.snapshots import make_snapshot
+from umf_ros.sensors.scan_files import make_snapshot
 
 SAME_M, ELSEWHERE_M = 4.0, 12.0
 SAME_WAY_DEG, OTHER_WAY_DEG = 25.0, 155.0

@@ -30,10 +30,9 @@ from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.embedding import make_embedder
+from umf_ros.lab.fit.acceptance import bounds_of, fit_decision, inside_ellipsoid, load_examples, save_acceptance
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
-from umf_ros.lab.simulation.seeds import TEST
-from umf_ros.lab.training.acceptance_examples import load_examples
-from umf_ros.lab.training.acceptance_fit import bounds_of, fit_decision, inside_ellipsoid, save_acceptance
+from umf_ros.lab.simulation.world import TEST
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
 from umf_ros.verification.measurement import SCAN

@@ -38,8 +38,8 @@ from umf_ros.core.errors import UmfError
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.sensors.decode import OdometrySample
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
+from umf_ros.sensors.sessions import OdometrySessionSplitter
 from umf_ros.sensors.synchronizer import Synchronizer
 
 MEMORY = 2 * 2**30

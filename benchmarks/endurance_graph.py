@@ -17,8 +17,7 @@ from std_srvs.srv import Trigger
 from umf_ros.core.config import load_settings
 from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops
-from umf_ros.nodes.conversions import closure_to_message, to_pose, to_time
-from umf_ros.nodes.qos import CLOSURES_QOS
+from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, to_pose, to_time
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.journal import JOURNAL, GraphJournal
 from umf_ros.pose_graph.pose_graph import PoseGraph

@@ -28,8 +28,7 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import load_settings
 from umf_ros.lab.live.live_graph import LiveGraph
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
-from umf_ros.nodes.conversions import closure_to_message, from_time, to_pose, to_time
-from umf_ros.nodes.qos import CLOSURES_QOS
+from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, from_time, to_pose, to_time
 from umf_ros.pose_graph.journal import JOURNAL, GraphJournal
 
 Figures = dict[str, Any]

@@ -18,8 +18,7 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from umf_ros.nodes.conversions import from_time
-from umf_ros.nodes.qos import CLOSURES_QOS
+from umf_ros.nodes.conversions import CLOSURES_QOS, from_time
 
 FRONT_END, BACK_END = "loop_closure_node", "pose_graph_node"
 PLAYER = "umf_ros.lab.live.bag_player_node"

@@ -32,9 +32,9 @@ from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.embedding import make_embedder
+from umf_ros.lab.fit.covariance import PoseSample, fit_scan_covariance, honesty, sample_of
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
-from umf_ros.lab.simulation.seeds import VALIDATION
-from umf_ros.lab.training.covariance_fit import PoseSample, fit_scan_covariance, honesty, sample_of
+from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.verification.measurement import SCAN
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import align_scans

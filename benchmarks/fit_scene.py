@@ -17,16 +17,14 @@ import torch
 
 from umf_ros.core.frames import Image
 from umf_ros.core.io import atomic_write
-from umf_ros.lab.datasets.labels import Places
-from umf_ros.lab.datasets.sample import Sample
+from umf_ros.lab.datasets.sample import Places, Sample
+from umf_ros.lab.fit.scene import PooledWorld, SceneFit, fit_scene, pool_world, with_scene
 from umf_ros.lab.simulation.survey import shard_plan, survey_world
 from umf_ros.lab.training.networks import read_card, save_weights
-from umf_ros.lab.training.scene_fit import PooledWorld, SceneFit, fit_scene, pool_world, with_scene
-from umf_ros.networks.efficientnet import pretrained_trunk
-from umf_ros.networks.scene import DEPTH
+from umf_ros.networks.config import locate_weights
+from umf_ros.networks.efficientnet import DEPTH, pretrained_trunk
 from umf_ros.networks.umf import UMF, count_parameters
 from umf_ros.networks.weights import load_weights
-from umf_ros.networks.weights_files import locate_weights
 
 VIEWS = ("plain", "mirrored")
 ORIGIN = {

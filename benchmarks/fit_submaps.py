@@ -27,20 +27,25 @@ from umf_ros.core.config import Database, KeyframePolicy, Loop, Verification
 from umf_ros.core.frames import Embedding, Frame, Keyframe, StereoCamera
 from umf_ros.core.geometry import Array, make_pose, relative
 from umf_ros.core.keyframes import KeyframeSelector, is_past
+from umf_ros.lab.fit.acceptance import fit_weights
 from umf_ros.lab.simulation.presets import find_preset
 from umf_ros.lab.simulation.simulator import Simulator
-from umf_ros.lab.training.acceptance_fit import fit_weights
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.runs.consistency import normalised_errors, pose_error, share_inside
-from umf_ros.runs.truth import POSE_TOLERANCE_DEG, POSE_TOLERANCE_M, find_revisits
+from umf_ros.runs.truth import (
+    POSE_TOLERANCE_DEG,
+    POSE_TOLERANCE_M,
+    find_revisits,
+    normalised_errors,
+    pose_error,
+    share_inside,
+)
 from umf_ros.submaps import SubmapFinder
-from umf_ros.submaps.finder import Tested
-from umf_ros.submaps.judgement import OdometryError, SubmapAcceptance, scores
-from umf_ros.submaps.proposals import Proposal
+from umf_ros.submaps.finder import OdometryError, SubmapAcceptance, Tested, scores
+from umf_ros.submaps.submap_index import Proposal
 from umf_ros.verification import Measurement
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import Logistic
-from umf_ros.verification.thinning import thin_scan
+from umf_ros.verification.prepared_scan import thin_scan
 
 Truth = dict[int, Array]
 NO_CAMERA = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)

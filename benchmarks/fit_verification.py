@@ -31,14 +31,15 @@ from umf_ros.core.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array
 from umf_ros.embedding import make_embedder
-from umf_ros.lab.simulation.domains import DOMAINS, Domain
-from umf_ros.lab.simulation.seeds import VALIDATION
-from umf_ros.lab.training.acceptance_examples import Example, save_examples
-from umf_ros.lab.training.acceptance_fit import (
+from umf_ros.lab.fit.acceptance import (
+    Example,
     bounds_of,
     fit_decision,
     save_acceptance,
+    save_examples,
 )
+from umf_ros.lab.simulation.domains import DOMAINS, Domain
+from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance, refuted

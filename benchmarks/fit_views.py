@@ -32,7 +32,7 @@ from umf_ros.core.frames import Candidate, Frame, Keyframe
 from umf_ros.core.geometry import Array, heading, relative, wrap_angle
 from umf_ros.core.keyframes import Mask, is_past
 from umf_ros.detector import LoopDetector, make_detector_embedder
-from umf_ros.lab.training.acceptance_fit import (
+from umf_ros.lab.fit.acceptance import (
     Example,
     fit_covariance,
     fit_logistic,

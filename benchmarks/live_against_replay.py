@@ -26,7 +26,7 @@ from umf_ros.core.config import Settings, dump_settings
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.live.live_graph import LiveGraph
 from umf_ros.replay import Replay
-from umf_ros.runs.recorder import count_drops, read_summary
+from umf_ros.runs.writer import count_drops, read_summary
 
 OUT = Path("results/live_against_replay")
 TABLES = ("closures.csv", "graph_verdicts.csv")

@@ -37,8 +37,8 @@ from umf_ros.lab.simulation.pose_graphs import (
     with_wrong_closures,
 )
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.odometry_preintegration import Edge, between
 from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.pose_graph.solver import Edge, between
 
 FIRST_SEED = 20_000
 MOST_CLOSURES_OF_A_FILE = 1500

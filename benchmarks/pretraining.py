@@ -22,8 +22,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from umf_ros.lab.commands import simulate
 from umf_ros.lab.datasets.simulated import WorldFolder
 from umf_ros.lab.evaluation.results import print_table
-from umf_ros.lab.simulation.seeds import TRAINING, VALIDATION
-from umf_ros.lab.training.run import load_run, train
+from umf_ros.lab.simulation.world import TRAINING, VALIDATION
+from umf_ros.lab.training.trainer import load_run, train
 from umf_ros.lab.training.validation import MODES, Results, mean_of, validate
 from umf_ros.networks.weights import load_weights
 

@@ -32,10 +32,9 @@ from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, from_quaternion
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding import make_embedder
-from umf_ros.lab.training.acceptance_fit import inside_ellipsoid
+from umf_ros.lab.fit.acceptance import inside_ellipsoid
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.scan_files import read_scan
-from umf_ros.sensors.snapshots import make_snapshot
+from umf_ros.sensors.scan_files import make_snapshot, read_scan
 from umf_ros.verification import Verdict, Verifier
 
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")

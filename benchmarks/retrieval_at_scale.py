@@ -41,7 +41,7 @@ from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.evaluation.worlds import FULL, QUICK, TestWorld
-from umf_ros.lab.simulation.seeds import VALIDATION
+from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.runs.truth import find_revisits, judge_closure
 
 PLACES = (0, 1_000, 10_000, 100_000)

@@ -41,8 +41,8 @@ from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.presets import SESSION
 from umf_ros.lab.simulation.recording import record
-from umf_ros.lab.simulation.seeds import TEST
 from umf_ros.lab.simulation.simulator import Simulator
+from umf_ros.lab.simulation.world import TEST
 from umf_ros.localizer import Localizer, read_poses
 from umf_ros.maps.joint_graph import JointMap, solve
 from umf_ros.maps.map_folder import MapFolder
@@ -50,7 +50,7 @@ from umf_ros.maps.mapping import Opening, add_session, match_session, replay_ses
 from umf_ros.maps.outputs import write_results
 from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, absolute_trajectory_error, judge_closure
 from umf_ros.sensors.decode import OdometrySample
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
+from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 WITHIN_KEYFRAMES = 20
 WRONG_M, WRONG_DEG = 1.0, 5.0

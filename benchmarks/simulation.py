@@ -21,13 +21,11 @@ from umf_ros.core.geometry import Array, heading, invert, relative, transform, w
 from umf_ros.lab.simulation.camera import Rendering
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.lidar import PERIOD_NS, Lidar
-from umf_ros.lab.simulation.passes import SETTINGS, plan_passes
-from umf_ros.lab.simulation.presets import DEMO, ETNA
-from umf_ros.lab.simulation.seeds import TEST
-from umf_ros.lab.simulation.sequences import etna_surveys
+from umf_ros.lab.simulation.presets import DEMO, ETNA, etna_surveys
+from umf_ros.lab.simulation.route import SETTINGS, plan_passes
 from umf_ros.lab.simulation.simulator import Simulator
 from umf_ros.lab.simulation.survey import Survey
-from umf_ros.lab.simulation.world import World, ground
+from umf_ros.lab.simulation.world import TEST, World, ground
 
 WORLDS = 4
 NEAR_M, NEAR_DEG = 12.0, 30.0

@@ -32,8 +32,8 @@ from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading, wrap_angle
 from umf_ros.core.keyframes import is_past
 from umf_ros.embedding import make_embedder
-from umf_ros.lab.simulation.seeds import TEST
-from umf_ros.lab.training.acceptance_fit import inside_ellipsoid
+from umf_ros.lab.fit.acceptance import inside_ellipsoid
+from umf_ros.lab.simulation.world import TEST
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
 

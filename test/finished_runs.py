@@ -11,13 +11,12 @@ from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.runs.diagnosis import GateDiagnosis
 from umf_ros.runs.findings import ExaminedRun
-from umf_ros.runs.finished_run import FinishedRun
+from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.sensor_check import SensorReport
 from umf_ros.runs.tables import GraphVerdict, KeyframeRow, TestedCandidate
-from umf_ros.runs.true_places import TruePlaces
-from umf_ros.runs.truth import JudgedRun, judge_closure
-from umf_ros.runs.why import GateDiagnosis
+from umf_ros.runs.truth import JudgedRun, TruePlaces, judge_closure
 
 START_NS = 1_600_000_000 * 10**9
 LAP_S = 40

@@ -15,8 +15,8 @@ from umf_ros.lab.datasets.g2o import drive as drive_recording
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, WorldClosure
 from umf_ros.pose_graph.closures import ClosureVerdict, State, TrackedClosure
 from umf_ros.pose_graph.odometry import OdometryChain
-from umf_ros.pose_graph.odometry_preintegration import Edge, between
 from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.pose_graph.solver import Edge, between
 
 SETTINGS = PoseGraphSettings(keyframe_spacing_m=1e-6, max_gap_s=1.5)
 LAP = 100

@@ -116,8 +116,8 @@ def test_help_imports_nothing_heavy() -> None:
 
 def test_a_rover_with_openvino_carries_no_torch() -> None:
     """Two hundred megabytes of the live front-end were a library that computed nothing."""
-    statement = "import umf_ros.nodes.loop_closure_node, umf_ros.commands.replay, umf_ros.embedding.umf_embedder"
-    statement += ", umf_ros.embedding.image_features, openvino"
+    statement = "import umf_ros.nodes.loop_closure_node, umf_ros.commands.replay, umf_ros.embedding.umf"
+    statement += ", umf_ros.embedding.local_features, openvino"
     assert imported_after(statement, ["torch", "matplotlib", "open3d", "gtsam"]) == []
 
 

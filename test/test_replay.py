@@ -15,7 +15,7 @@ from recordings import small_settings, traverse, write_mcap
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_tum
-from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.core.config import Database, Settings, load_settings
 from umf_ros.core.errors import OutputError
 from umf_ros.core.frames import Frame

@@ -14,8 +14,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from umf_ros.bags.reader import open_bag
-from umf_ros.runs.finished_run import FinishedRun, read_run
-from umf_ros.runs.plots import ODOMETRY, OPTIMISED, RIGHT, TRUTH
+from umf_ros.runs.reader import FinishedRun, read_run
+from umf_ros.runs.report import ODOMETRY, OPTIMISED, RIGHT, TRUTH
 from umf_ros.runs.scene import error_curves
 from umf_ros.runs.truth import endpoints, positions_in_truth
 

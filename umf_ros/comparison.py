@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.moments import Moment, nearest_frames, parse_moment, split_reference
+from umf_ros.bags.frames import FrameReader, Moment, nearest_frames, parse_moment, split_reference
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import Verification
@@ -22,8 +21,7 @@ from umf_ros.core.geometry import to_quaternion
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.sensors.scan_files import OUT_OF_REACH, read_scan
-from umf_ros.sensors.snapshots import UNCALIBRATED, fit_image, make_snapshot, read_image
+from umf_ros.sensors.scan_files import OUT_OF_REACH, UNCALIBRATED, fit_image, make_snapshot, read_image, read_scan
 from umf_ros.verification import Verdict, Verifier
 
 NO_CALIBRATION = "no calibration: images alone give no pose without one"

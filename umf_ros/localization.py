@@ -15,10 +15,10 @@ from umf_ros.core.geometry import to_quaternion
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector
 from umf_ros.localizer import Localization, Localizer, read_poses
-from umf_ros.runs.recorder import RunRecorder, read_summary, write_summary
 from umf_ros.runs.tables import POSE, SIGMA, CsvTable
+from umf_ros.runs.writer import RunRecorder, read_summary, write_summary
 from umf_ros.sensors.decode import OdometrySample
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
+from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 COLUMNS = ["stamp_ns", *POSE, *SIGMA, "probability"]
 TABLE = "localization.csv"

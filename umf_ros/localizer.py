@@ -27,8 +27,7 @@ from umf_ros.core.geometry import (
 )
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.pose_graph.closures import ClosureVerdict, State, check_closure, check_pose
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
-from umf_ros.sensors.sessions import Reset
+from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
 
 ACCEPTED_ODDS = log(0.999 / 0.001)
 """A pose is reported from these odds on, nats (*by hand*: one wrong in a thousand)."""

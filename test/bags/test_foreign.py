@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import decode, open_bag
-from umf_ros.bags.records import RawMessage
+from umf_ros.bags.storages import RawMessage
 from umf_ros.core.errors import BagError, MessageError
 
 ENTRIES = traverse(1.0)

@@ -25,7 +25,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.unpacking import unpack_bz2, unpack_lz4
+from umf_ros.bags.storages import unpack_bz2, unpack_lz4
 from umf_ros.core.errors import BagError
 
 ENTRIES = traverse(0.4)
@@ -93,7 +93,7 @@ def test_a_chunk_that_claims_gigabytes_is_not_unpacked(tmp_path: Path) -> None:
 
 def test_a_bzip2_chunk_is_unpacked_to_a_limit_only(monkeypatch: pytest.MonkeyPatch) -> None:
     assert unpack_bz2(bz2.compress(b"abc" * 1000)) == b"abc" * 1000
-    monkeypatch.setattr("umf_ros.bags.unpacking.LARGEST_CHUNK", 2**16)
+    monkeypatch.setattr("umf_ros.bags.storages.LARGEST_CHUNK", 2**16)
     with pytest.raises(ValueError, match="more than"):
         unpack_bz2(bz2.compress(bytes(2**20)))
 
@@ -106,7 +106,7 @@ def zeros_in_lz4(count: int) -> bytes:
 
 def test_an_lz4_chunk_is_unpacked_to_a_limit_only(monkeypatch: pytest.MonkeyPatch) -> None:
     assert unpack_lz4(lz4.frame.compress(b"abc" * 1000)) == b"abc" * 1000
-    monkeypatch.setattr("umf_ros.bags.unpacking.LARGEST_CHUNK", 2**16)
+    monkeypatch.setattr("umf_ros.bags.storages.LARGEST_CHUNK", 2**16)
     with pytest.raises(ValueError, match="more than"):
         unpack_lz4(zeros_in_lz4(2**25))
 
@@ -133,7 +133,7 @@ def test_chunks_across_each_other_come_in_order_as_far_as_there_is_memory(
     with (tmp_path / "a.mcap").open("rb") as file:
         expected = [(message.log_time, message.data) for _, _, message in make_reader(file).iter_messages(["/a", "/c"])]
     assert [(raw.log_ns, raw.data) for raw in bag.raw_messages(["/a", "/c"])] == expected
-    monkeypatch.setattr("umf_ros.bags.mcap_storage.MOST_WAITING", 2000)
+    monkeypatch.setattr("umf_ros.bags.storages.MOST_WAITING", 2000)
     held = [(raw.log_ns, raw.data) for raw in bag.raw_messages(["/a", "/c"])]
     assert sorted(held) == sorted(expected) and held != expected
 
@@ -146,11 +146,11 @@ def test_no_packing_hides_how_large_a_chunk_is(broken: bool, tmp_path: Path, mon
             path.write_bytes(path.read_bytes()[:-100])
         assert len(list(open_bag(path).raw_messages())) == 200
     with monkeypatch.context() as limited:
-        limited.setattr("umf_ros.bags.mcap_storage.LARGEST_CHUNK", 2500)
+        limited.setattr("umf_ros.bags.storages.LARGEST_CHUNK", 2500)
         for packing in CompressionType:  # what they claim is looked at before
             with pytest.raises(BagError, match="holds no message"):
                 open_bag(tmp_path / f"{packing}.mcap")
-    monkeypatch.setattr("umf_ros.bags.unpacking.LARGEST_CHUNK", 2500)
+    monkeypatch.setattr("umf_ros.bags.storages.LARGEST_CHUNK", 2500)
     path = tmp_path / f"{CompressionType.LZ4}.mcap"
     with pytest.raises(BagError, match="holds no message" if broken else "holds more than"):
         list(open_bag(path).raw_messages())
@@ -167,7 +167,7 @@ def test_a_chunk_of_ros_1_in_lz4_is_unpacked_to_a_limit_only(tmp_path: Path, mon
         for log_ns in range(1, 50):
             writer.write(connection, log_ns, store.serialize_ros1(message, message.__msgtype__))
     assert len(list(open_bag(path).raw_messages())) == 49
-    monkeypatch.setattr("umf_ros.bags.unpacking.LARGEST_CHUNK", 2**12)
+    monkeypatch.setattr("umf_ros.bags.storages.LARGEST_CHUNK", 2**12)
     with pytest.raises(BagError, match="holds more than"):
         list(open_bag(path).raw_messages())
 

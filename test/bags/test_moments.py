@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from conftest import make_frame
 
-from umf_ros.bags.moments import nearest_frames, parse_moment, split_reference
+from umf_ros.bags.frames import nearest_frames, parse_moment, split_reference
 from umf_ros.core.errors import BagError
 
 FRAMES = [make_frame(1_625_680_800 + 0.25 * number) for number in range(40)]

@@ -10,17 +10,17 @@ import torch
 from tiny_worlds import some_scan
 
 from umf_ros.baselines.netvlad import NetVlad
-from umf_ros.baselines.network_table import (
+from umf_ros.baselines.place_inputs import PreparedView, some_points, stack
+from umf_ros.baselines.place_network import EARLY, VOXELS, PlaceInput
+from umf_ros.baselines.place_networks import (
     NETWORKS,
     load_place_network,
     locate_place_weights,
     make_place_network,
 )
-from umf_ros.baselines.place_inputs import PreparedView, some_points, stack
-from umf_ros.baselines.place_network import EARLY, VOXELS, PlaceInput
 from umf_ros.baselines.pointnet2 import ball_query, farthest_points
 from umf_ros.core.errors import ConfigError, WeightsError
-from umf_ros.embedding.voxels import voxelise
+from umf_ros.embedding.inputs import voxelise
 from umf_ros.lab.training.networks import save_tensors
 from umf_ros.networks.umf import count_parameters
 

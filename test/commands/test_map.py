@@ -17,8 +17,7 @@ from umf_ros.bags.trajectories import read_ground_truth, read_tum
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.runs.tables import read_closures
 from umf_ros.runs.truth import trajectory_error
-from umf_ros.sensors.pcd import parse_pcd
-from umf_ros.sensors.ply import parse_ply
+from umf_ros.sensors.scan_files import parse_pcd, parse_ply
 
 
 @pytest.fixture(scope="module")

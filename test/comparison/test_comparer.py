@@ -11,7 +11,7 @@ import pytest
 from recordings import CALIBRATION
 from scenes import landscape, pose_at, take, without_image
 
-from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.comparison import (
     NO_CALIBRATION,
     NO_DEPTH,

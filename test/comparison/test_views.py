@@ -11,7 +11,7 @@ import pytest
 from recordings import CALIBRATION, traverse, write_mcap
 
 from umf_ros import comparison as views
-from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.comparison import KeyframeSource, PlaceView, ReadingRules
 from umf_ros.core.errors import CalibrationError, SensorFileError, UmfError
 from umf_ros.core.frames import Embedding, Frame

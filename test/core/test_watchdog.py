@@ -36,7 +36,7 @@ def test_a_worker_that_stands_still_ends_the_process_while_the_main_thread_feeds
     done = ended(f"""
         import time
         from umf_ros.core import watchdog
-        from umf_ros.nodes.worker import Worker
+        from umf_ros.nodes.process import Worker
         def stands_still(item): {stand_still}
         with watchdog.watching(1.0):
             worker = Worker(stands_still, print, 1)

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,16 +15,14 @@ from scipy.spatial.transform import Rotation
 from tiny_worlds import TINY, some_scan
 
 from umf_ros import embedding
-from umf_ros.baselines.gradients_embedder import GradientsEmbedder
-from umf_ros.baselines.scan_context_embedder import ScanContextEmbedder
-from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.baselines.handcrafted import GradientsEmbedder, ScanContextEmbedder, ThumbnailEmbedder
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, WeightsError, either
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import transform
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import FeatureRequest
-from umf_ros.embedding.umf_embedder import UmfEmbedder
+from umf_ros.embedding.umf import UmfEmbedder
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
 
@@ -174,7 +174,7 @@ def test_baselines_know_a_place_again(embedder):
 def test_baselines_by_name():
     for name in ("thumbnail", "scan_context"):
         assert make_embedder(EmbeddingSettings(method=name)).name == name
-    assert embedding.METHODS[0] == "umf" and {"scan_context", "thumbnail"} < set(embedding.METHODS)
+    assert embedding.find_methods()[0] == "umf" and {"scan_context", "thumbnail"} < set(embedding.find_methods())
 
 
 NEW = """
@@ -189,14 +189,27 @@ def make(settings, asked):
 """
 
 
-def test_a_new_method_is_one_file(tmp_path, monkeypatch):
-    (tmp_path / "nowhere_embedder.py").write_text(NEW)
-    monkeypatch.setattr(embedding, "__path__", [*embedding.__path__, str(tmp_path)])
-    methods = ("umf", *sorted(["nowhere", *embedding.METHODS[1:]]))
-    assert embedding.find_methods() == methods
-    monkeypatch.setattr(embedding, "METHODS", methods)
-    assert make_embedder(EmbeddingSettings(method="nowhere")).dimension == 3
-    with pytest.raises(ConfigError, match=f"unknown method 'magic'; known: {', '.join(methods)}"):
+def test_a_package_of_a_user_adds_a_method_by_an_entry_point(tmp_path):
+    (tmp_path / "my_rover.py").write_text(NEW)
+    about = tmp_path / "my_rover-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: my_rover\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[umf_ros.embedders]\nnowhere = my_rover:make\nbroken = my_rover:missing\n")
+    code = (
+        "from umf_ros.core.config import EmbeddingSettings as S; from umf_ros.core.errors import ConfigError\n"
+        "from umf_ros.embedding import find_methods, make_embedder\n"
+        "print(find_methods()[0], 'nowhere' in find_methods(), make_embedder(S(method='nowhere')).dimension)\n"
+        "try:\n    make_embedder(S(method='broken'))\nexcept ConfigError as error:\n    print(error)"
+    )
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{Path(embedding.__file__).parents[2]}"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    first, second = done.stdout.splitlines()
+    assert first == "umf True 3"
+    assert second.startswith("embedding.method broken: its entry point cannot be loaded:")
+
+
+def test_an_unknown_method_is_one_line():
+    with pytest.raises(ConfigError, match=f"unknown method 'magic'; known: {', '.join(embedding.find_methods())}"):
         make_embedder(EmbeddingSettings(method="magic"))
 
 
@@ -205,7 +218,7 @@ def test_every_command_names_the_methods():
     show = "from umf_ros.cli import main; import sys; sys.argv = ['umf', sys.argv[1], '--help']; main()"
     for command in ("replay", "explain", "evaluate"):
         said = subprocess.run([sys.executable, "-c", show, command], capture_output=True, text=True, check=True)
-        assert f" {either(embedding.METHODS)}." in " ".join(said.stdout.replace("\u2502", " ").split())
+        assert f" {either(embedding.find_methods())}." in " ".join(said.stdout.replace("\u2502", " ").split())
     listed = "import sys, umf_ros.embedding; print([name for name in ('torch', 'cv2') if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", listed], capture_output=True, text=True).stdout.strip() == "[]"
 

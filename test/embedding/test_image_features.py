@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from conftest import CAMERA
 
-from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.core.config import EmbeddingSettings, Settings, Verification
 from umf_ros.core.frames import Frame, Image, LocalFeatures
 from umf_ros.detector import make_detector_embedder
 from umf_ros.embedding import make_embedder
-from umf_ros.embedding.image_features import LIMIT, WithXFeat, key_points, network_size, sample, with_xfeat
+from umf_ros.embedding.local_features import LIMIT, WithXFeat, key_points, network_size, sample, with_xfeat
 from umf_ros.verification.rerank import mutual_neighbours, similarities
 
 

@@ -7,9 +7,21 @@ import numpy as np
 import pytest
 from tiny_worlds import TINY, some_scan
 
-from umf_ros.embedding.inputs import blank_input, is_blank, pack, prepare_image, prepare_scan, shrink, standardise
-from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_salient
-from umf_ros.embedding.voxels import CELLS, MIN_POINTS, ORIGIN_M, VOXEL_M, voxelise
+from umf_ros.embedding.inputs import (
+    CELLS,
+    MIN_POINTS,
+    ORIGIN_M,
+    VOXEL_M,
+    blank_input,
+    is_blank,
+    pack,
+    prepare_image,
+    prepare_scan,
+    shrink,
+    standardise,
+    voxelise,
+)
+from umf_ros.embedding.umf import cell_regions, ground_regions, select_salient
 
 
 def voxels_of(points: np.ndarray) -> dict[tuple[int, int, int], list[int]]:

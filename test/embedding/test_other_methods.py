@@ -15,18 +15,17 @@ from tiny_worlds import some_scan
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
-from umf_ros.baselines.dbow2_embedder import OrbFeatures
-from umf_ros.baselines.network_table import NETWORKS
+from umf_ros.baselines.dbow2 import OrbFeatures
+from umf_ros.baselines.place_networks import NETWORKS
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import make_pose
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.embedding import make_embedder
+from umf_ros.lab.fit.vocabulary import grow
 from umf_ros.lab.training.descriptors import DescriptorObjective
-from umf_ros.lab.training.networks import save_tensors
-from umf_ros.lab.training.settings import DescriptorSettings
-from umf_ros.lab.training.vocabulary_fit import grow
+from umf_ros.lab.training.networks import DescriptorSettings, save_tensors
 from umf_ros.replay import Replay
 
 SEEN = ("dbow2", "netvlad", "minkloc_visual", "lite0_gem")
@@ -107,7 +106,7 @@ def test_solid_turns_with_the_rover_and_not_with_its_mounting() -> None:
 
 @pytest.mark.parametrize("method", ["dbow2", "netvlad"])
 def test_weights_that_are_not_there_are_one_clear_line(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("umf_ros.baselines.network_table.find", _nothing)
+    monkeypatch.setattr("umf_ros.baselines.place_networks.find", _nothing)
     with pytest.raises(ConfigError, match=f"umf train --method {method}"):
         make_embedder(EmbeddingSettings(method=method))
 

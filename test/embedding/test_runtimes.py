@@ -20,8 +20,8 @@ from umf_ros.embedding.export import cached, convert, import_openvino, kept_or_m
 from umf_ros.embedding.inputs import pack, prepare_scan
 from umf_ros.embedding.runtimes import OUTPUTS, SUPERS, make_runtime, make_xfeat_runtime, outputs_of
 from umf_ros.embedding.torch_runtimes import TorchRuntime, to_tensors
+from umf_ros.networks.config import locate_weights
 from umf_ros.networks.umf import UMF
-from umf_ros.networks.weights_files import locate_weights
 
 
 class Scale(nn.Module):

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from tiny_worlds import some_scan
 
-from umf_ros.embedding.inputs import is_blank, shrink, standardise
-from umf_ros.embedding.keypoints import cell_regions, ground_regions, select_salient
-from umf_ros.embedding.voxels import CELLS, ORIGIN_M, VOXEL_M, _brightness, voxelise
+from umf_ros.embedding.inputs import CELLS, ORIGIN_M, VOXEL_M, _brightness, is_blank, shrink, standardise, voxelise
+from umf_ros.embedding.umf import cell_regions, ground_regions, select_salient
 
 
 def cluster(x: float, y: float, z: float, count: int = 30) -> np.ndarray:

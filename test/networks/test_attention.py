@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from umf_ros.networks.attention import Attention, Block, received
+from umf_ros.networks.fusion import Attention, Block, received
 
 
 @pytest.fixture(autouse=True)

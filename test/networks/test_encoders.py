@@ -8,9 +8,8 @@ import pytest
 import torch
 from tiny_worlds import TINY, some_input
 
-from umf_ros.networks.image_encoder import Backbone, FeaturePyramid, ImageEncoder, ResidualBlock
+from umf_ros.networks.encoders import Backbone, FeaturePyramid, ImageEncoder, ResidualBlock, VoxelEncoder
 from umf_ros.networks.umf import count_parameters
-from umf_ros.networks.voxel_encoder import VoxelEncoder
 
 NAMES = ("resnet18", "resnet34", "resnet50")
 

@@ -7,7 +7,7 @@ import torch
 from tiny_worlds import TINY
 from torch import nn
 
-from umf_ros.networks.attention import Block
+from umf_ros.networks.fusion import Block
 from umf_ros.networks.local_features import WINDOW, CloudLocal, ImageLocal, IterativeAttention
 
 ROWS, COLUMNS = TINY.image_size[0] // 4, TINY.image_size[1] // 4

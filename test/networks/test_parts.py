@@ -3,10 +3,9 @@ from __future__ import annotations
 import torch
 from tiny_worlds import TINY
 
-from umf_ros.networks.attention import Attention, cell_positions, received, sine_encoding
-from umf_ros.networks.fusion import GeneralisedMean, Tokens
+from umf_ros.networks.encoders import parent_and_child, take
+from umf_ros.networks.fusion import Attention, GeneralisedMean, Tokens, cell_positions, received, sine_encoding
 from umf_ros.networks.local_features import ImageLocal, IterativeAttention
-from umf_ros.networks.voxel_encoder import parent_and_child, take
 
 
 def test_every_cell_has_its_own_code():

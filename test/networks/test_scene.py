@@ -8,7 +8,7 @@ import pytest
 import torch
 from tiny_worlds import TINY, some_input
 
-from umf_ros.networks.scene import SceneDescriptor
+from umf_ros.networks.efficientnet import SceneDescriptor
 from umf_ros.networks.umf import UMF
 
 SCENE = replace(TINY, scene=16)

@@ -11,10 +11,9 @@ from tiny_worlds import TINY, some_input
 
 from umf_ros.core.errors import WeightsError
 from umf_ros.lab.training.networks import PRESETS, read_card, save_weights
-from umf_ros.networks.config import NetworkConfig
+from umf_ros.networks.config import SHIPPED, NetworkConfig, locate_weights
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
-from umf_ros.networks.weights_files import SHIPPED, locate_weights
 
 
 @pytest.fixture

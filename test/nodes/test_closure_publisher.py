@@ -24,9 +24,15 @@ from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, make_pose
 from umf_ros.detector import Detection
 from umf_ros.fleet.inter_robot_closures import InterRobotClosure
-from umf_ros.nodes.closure_publisher import MAX_LINES, ClosurePublisher
-from umf_ros.nodes.conversions import closure_to_message, from_time, is_between_rovers
-from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS
+from umf_ros.nodes.conversions import (
+    CLOSURES_QOS,
+    LATCHED_QOS,
+    MAX_LINES,
+    ClosurePublisher,
+    closure_to_message,
+    from_time,
+    is_between_rovers,
+)
 from umf_ros.verification import Measurement, Verdict
 
 TOPICS: dict[str, tuple[type, Any]] = {

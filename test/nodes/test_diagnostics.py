@@ -15,8 +15,8 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from umf_ros.core.config import Qos
 from umf_ros.nodes import diagnostics
+from umf_ros.nodes.conversions import sensor_qos
 from umf_ros.nodes.diagnostics import Heartbeat, InputWatch, Throttle, memory_mb, status
-from umf_ros.nodes.qos import sensor_qos
 
 TOPIC = "/watched/image"
 

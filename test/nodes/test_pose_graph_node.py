@@ -27,8 +27,7 @@ from visualization_msgs.msg import MarkerArray
 from umf_ros.core.geometry import Array
 from umf_ros.lab.datasets.g2o import read_g2o
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
-from umf_ros.nodes.closure_publisher import CLOSURES_QOS, LATCHED_QOS
-from umf_ros.nodes.conversions import closure_to_message, from_time, to_pose, to_time
+from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, closure_to_message, from_time, to_pose, to_time
 from umf_ros.sensors.decode import decode_pose
 
 MODULE = "umf_ros.nodes.pose_graph_node"

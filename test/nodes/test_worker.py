@@ -3,7 +3,7 @@ from __future__ import annotations
 import threading
 import time
 
-from umf_ros.nodes.worker import Worker
+from umf_ros.nodes.process import Worker
 
 
 class HeldUp:

@@ -10,9 +10,8 @@ import pytest
 from umf_ros.core.errors import GraphError
 from umf_ros.core.geometry import Array, expmap, invert
 from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops
-from umf_ros.pose_graph import incremental
-from umf_ros.pose_graph.incremental import IncrementalOptimizer
-from umf_ros.pose_graph.odometry_preintegration import Edges, Graph, Optimizer
+from umf_ros.pose_graph import solver as incremental
+from umf_ros.pose_graph.solver import Edges, Graph, IncrementalOptimizer, Optimizer
 
 WORLD = rover_loops(400, 10002)
 

@@ -201,7 +201,7 @@ def test_the_newest_pose_has_the_marginal_of_the_full_graph() -> None:
     import gtsam
 
     from umf_ros.core.geometry import ros_to_gtsam_covariance
-    from umf_ros.pose_graph.odometry_preintegration import Edge, between
+    from umf_ros.pose_graph.solver import Edge, between
 
     world = rover_loops(300, 12)
     graph = drive(world)

@@ -10,8 +10,8 @@ from graph_worlds import closing, drive, lap_pairs, two_laps
 from umf_ros.core.geometry import invert
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.pose_graph.closures import PoseSamples
-from umf_ros.pose_graph.odometry_preintegration import Edge, between
 from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.pose_graph.solver import Edge, between
 
 
 def stop(graph: PoseGraph, *poses: int) -> PoseSamples:

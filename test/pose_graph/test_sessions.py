@@ -23,9 +23,9 @@ from graph_worlds import (
 from umf_ros.core.geometry import Array, expmap, invert
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.odometry_preintegration import Edge, between
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.sessions import CorrectedPath
+from umf_ros.pose_graph.solver import Edge, between
 
 GAUGE = expmap(np.array([[0.05, -0.1, 2.5, 40, -25, 3]]))[0]
 

@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 from finished_runs import BELOW, accepted, candidate, closure, examined, trajectory
 
-from umf_ros.runs.findings import look_first
+from umf_ros.runs.findings import conclude, look_first
 from umf_ros.runs.gallery import Gallery, photograph
-from umf_ros.runs.page import write_page
-from umf_ros.runs.scene import build_scene
-from umf_ros.runs.scene_pairs import pairs_of
-from umf_ros.runs.verdict import conclude
+from umf_ros.runs.report import write_page
+from umf_ros.runs.scene import build_scene, pairs_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")

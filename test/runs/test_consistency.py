@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import make_pose, relative
-from umf_ros.runs.consistency import MEDIAN_EXPECTED, in_words, normalised_errors, pose_error, share_inside
+from umf_ros.runs.truth import MEDIAN_EXPECTED, in_words, normalised_errors, pose_error, share_inside
 
 
 def pose(seed: int) -> np.ndarray:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from umf_ros.runs.descriptors import NAME, DescriptorFile, read_descriptors
+from umf_ros.runs.writer import NAME, DescriptorFile, read_descriptors
 
 
 def write(folder: Path, rows: dict[int, np.ndarray]) -> None:

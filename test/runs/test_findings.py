@@ -14,11 +14,9 @@ from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, traverse, write_mcap
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import load_settings
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.runs.findings import ExaminedRun, look_first
-from umf_ros.runs.inputs import Advice, useless_inputs
-from umf_ros.runs.sensor_check import SensorReport
-from umf_ros.runs.sensor_motion import Disagreement
-from umf_ros.runs.verdict import USELESS, conclude
+from umf_ros.runs.findings import USELESS, ExaminedRun, conclude, look_first
+from umf_ros.runs.reader import Advice, useless_inputs
+from umf_ros.runs.sensor_check import Disagreement, SensorReport
 
 
 def verdict(about: ExaminedRun) -> tuple[str, int, str]:

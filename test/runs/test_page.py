@@ -13,14 +13,12 @@ import pytest
 from finished_runs import accepted, candidate, closure, examined, trajectory
 from rich.console import Console
 
-from umf_ros.runs.findings import ExaminedRun, look_first
+from umf_ros.runs.findings import ExaminedRun, conclude, look_first
 from umf_ros.runs.gallery import Gallery
-from umf_ros.runs.inputs import Advice
-from umf_ros.runs.page import closure_rows, describe, final_verdicts, print_summary, write_page
-from umf_ros.runs.scene import build_scene
-from umf_ros.runs.scene_pairs import pairs_of
+from umf_ros.runs.reader import Advice
+from umf_ros.runs.report import closure_rows, describe, final_verdicts, print_summary, write_page
+from umf_ros.runs.scene import build_scene, pairs_of
 from umf_ros.runs.truth import JudgedClosure
-from umf_ros.runs.verdict import conclude
 
 NASTY = "</script><script>alert('x')</script> & \"quotes\" [red]"
 TRUTH = {"closures_true": 4, "closures_false": 0, "revisits": 3, "ate_odometry_m": 1.5, "ate_optimized_m": 0.25}

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from umf_ros.runs.plots import (
+from umf_ros.runs.report import (
     MAX_LINES,
     ODOMETRY,
     OPTIMISED,

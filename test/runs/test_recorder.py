@@ -17,9 +17,9 @@ from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.detector import Detection
-from umf_ros.runs import recorder as recorder_module
-from umf_ros.runs.recorder import RunRecorder, count_drops, read_summary
+from umf_ros.runs import writer as recorder_module
 from umf_ros.runs.tables import read_closures
+from umf_ros.runs.writer import RunRecorder, count_drops, read_summary
 from umf_ros.sensors.buffers import SURPLUS, InputCounter
 from umf_ros.sensors.synchronizer import INPUTS
 from umf_ros.verification import Measurement, Verdict

@@ -6,7 +6,7 @@ import pytest
 
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError
-from umf_ros.runs.resumption import PLACES, ReplayFolder
+from umf_ros.runs.writer import PLACES, ReplayFolder
 
 BAG = Path("some.mcap")
 

@@ -16,8 +16,7 @@ from umf_ros.core.config import load_settings
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import make_pose, transform
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.runs.sensor_check import SensorCheck, SensorReport
-from umf_ros.runs.sensor_motion import MIN_PAIRS, Step, compare_motion
+from umf_ros.runs.sensor_check import MIN_PAIRS, SensorCheck, SensorReport, Step, compare_motion
 from umf_ros.sensors.decode import OdometrySample
 
 Drive = tuple[list[Frame], Trajectory]

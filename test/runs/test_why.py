@@ -8,9 +8,9 @@ import numpy as np
 from finished_runs import BELOW, candidate, closure, examined, stamp, trajectory
 
 from umf_ros.core.config import load_settings
-from umf_ros.runs.descriptors import DescriptorFile
+from umf_ros.runs.diagnosis import ClosureDiagnosis
 from umf_ros.runs.findings import ExaminedRun
-from umf_ros.runs.why import ClosureDiagnosis
+from umf_ros.runs.writer import DescriptorFile
 from umf_ros.verification.verifier import NO_POSE, UNTESTED
 
 

@@ -10,9 +10,8 @@ from recordings import CALIBRATION, camera_info
 
 from umf_ros.core.errors import CalibrationError
 from umf_ros.core.geometry import make_pose, transform
-from umf_ros.sensors.calibration import load_calibration
+from umf_ros.sensors.calibration import RawCamera, StereoRectifier, load_calibration
 from umf_ros.sensors.decode import decode_camera_info
-from umf_ros.sensors.rectification import RawCamera, StereoRectifier
 
 DATASETS = ("simulated", "s3li-etna", "s3li-vulcano")
 

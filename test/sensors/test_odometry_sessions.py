@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from umf_ros.core.geometry import Array, make_pose
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
+from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 S = 1_000_000_000
 START = 1_700_000_000 * S

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, make_pose
+from umf_ros.sensors.assembly import UNKNOWN_NOISE, odometry_noise, scan_motion, twists
 from umf_ros.sensors.buffers import OdometryBuffer
-from umf_ros.sensors.scan_motion import UNKNOWN_NOISE, odometry_noise, scan_motion, twists
 
 SCAN_NS = 200_000_000
 

@@ -7,8 +7,7 @@ import pytest
 from recordings import drive
 
 from umf_ros.core.geometry import Array, make_pose
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
-from umf_ros.sensors.sessions import Input, SessionClock, StampedInput
+from umf_ros.sensors.sessions import Input, OdometrySessionSplitter, SessionClock, StampedInput
 
 S = 10**9
 T0 = 1_625_680_800 * S

@@ -11,7 +11,7 @@ from umf_ros.core.config import Database, Loop, Verification
 from umf_ros.core.geometry import invert, relative, rotation_angle
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
-from umf_ros.submaps.proposals import Proposal
+from umf_ros.submaps.submap_index import Proposal
 from umf_ros.verification import Verdict
 from umf_ros.verification.constants import SUBMAP_NEAR_M
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from umf_ros.submaps.judgement import CRITERIA, OdometryError, SubmapAcceptance, load_submap_acceptance, scores
+from umf_ros.submaps.finder import CRITERIA, OdometryError, SubmapAcceptance, load_submap_acceptance, scores
 from umf_ros.verification import Measurement
 from umf_ros.verification.acceptance import Logistic
 

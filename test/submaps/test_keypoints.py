@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from umf_ros.submaps.index import KeypointIndex
-from umf_ros.submaps.keypoints import find_keypoints, planar_motion
+from umf_ros.submaps.submap_index import KeypointIndex, find_keypoints, planar_motion
 from umf_ros.verification import constants as const
 
 

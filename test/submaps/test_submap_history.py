@@ -7,9 +7,8 @@ from submaps_drives import Drive
 from umf_ros.core.config import Loop
 from umf_ros.core.geometry import invert, transform
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.submaps.proposals import Expectation, Found
-from umf_ros.submaps.submap import merge
-from umf_ros.submaps.submap_history import SubmapHistory
+from umf_ros.submaps.submap_history import SubmapHistory, merge
+from umf_ros.submaps.submap_index import Expectation, Found
 from umf_ros.verification import constants as const
 
 

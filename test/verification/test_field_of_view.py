@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from umf_ros.core.geometry import Array
-from umf_ros.verification.field_of_view import FieldOfView
+from umf_ros.verification.surroundings import FieldOfView
 
 
 def fan(width_deg: float, towards_deg: float = 0.0) -> FieldOfView:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from umf_ros.core.geometry import invert, make_pose, transform
-from umf_ros.verification.free_space import RangeImage, Sight, visible
+from umf_ros.verification.surroundings import RangeImage, Sight, visible
 
 RNG = np.random.default_rng(3)
 TURN = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [2.0, 1.0, 0.0])

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import make_pose, transform
-from umf_ros.verification.ransac import fit_homography, fit_rigid, kabsch
+from umf_ros.verification.rerank import fit_homography, fit_rigid, kabsch
 
 HOMOGRAPHY = np.array([[0.95, 0.08, 12.0], [-0.05, 1.04, -7.0], [1e-4, -5e-5, 1.0]])
 MOTION = make_pose(Rotation.from_euler("ZYX", [25, 4, -3], degrees=True).as_matrix(), [1.5, -2.0, 0.3])

@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, invert, make_pose, relative, rotation_angle, transform
 from umf_ros.verification.constants import SEARCH_M
-from umf_ros.verification.prepared_scan import PreparedScan
+from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import Alignment, CovarianceModel, align_scans, covariance_of, inspect
-from umf_ros.verification.thinning import thin_scan
 
 GROUND = landscape(8)
 PLANE = replace(GROUND, bumps=np.empty((0, 4)))

@@ -9,10 +9,10 @@ import pytest
 
 from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.verification import thin_scan
-from umf_ros.verification.free_space import Sight
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import inspect
 from umf_ros.verification.scan_consistency import Meeting, meet, rivalry
+from umf_ros.verification.surroundings import Sight
 
 RNG = np.random.default_rng(5)
 UP = make_pose(np.eye(3), [0.0, 0.0, 1.5])  # the sensor on its mast

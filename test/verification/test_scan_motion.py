@@ -10,9 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Embedding, Keyframe, ScanMotion, StereoCamera
 from umf_ros.core.geometry import Array, make_pose
-from umf_ros.runs.consistency import normalised_errors, pose_error
-from umf_ros.verification.scan_alignment import Alignment, CovarianceModel, covariance_of
-from umf_ros.verification.scan_motion import closure_covariance, motion_covariance
+from umf_ros.runs.truth import normalised_errors, pose_error
+from umf_ros.verification.scan_alignment import (
+    Alignment,
+    CovarianceModel,
+    closure_covariance,
+    covariance_of,
+    motion_covariance,
+)
 
 MODEL = CovarianceModel(4.0, 0.001, 0.005, unknown_motion_m=0.04, unknown_motion_deg=0.1)
 COUNT = 600

@@ -12,8 +12,7 @@ from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate
 from umf_ros.verification import Verifier
 from umf_ros.verification.prepared_scan import PreparedScan
-from umf_ros.verification.ransac import fit_homography
-from umf_ros.verification.rerank import mutual_neighbours, similarities
+from umf_ros.verification.rerank import fit_homography, mutual_neighbours, similarities
 from umf_ros.verification.yaw_search import RotatedElevationMap, search
 
 

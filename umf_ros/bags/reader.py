@@ -7,8 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from umf_ros.bags.records import RawMessage, Storage, message_types
-from umf_ros.bags.storages import open_storage
+from umf_ros.bags.storages import RawMessage, Storage, message_types, open_storage
 from umf_ros.core.errors import BagError, MessageError, one_line, shortened
 
 

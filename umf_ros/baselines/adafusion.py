@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from umf_ros.baselines.minkloc import LENGTH, VoxelPyramid, frame_means
 from umf_ros.baselines.place_network import EARLY, LATE, Gem, ImageTrunk, PlaceInput, PlaceNetwork, Sense
-from umf_ros.networks.sparse import Level, SparseGem
+from umf_ros.networks.encoders import Level, SparseGem
 
 SUMMARY = 64
 """Numbers that say of one scale how much it is worth."""

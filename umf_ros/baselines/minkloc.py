@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from umf_ros.baselines.place_network import LATE, MEASURED, Gem, ImageTrunk, PlaceInput, PlaceNetwork, Sense
-from umf_ros.networks.sparse import Around, Down, Level, SparseGem, Up
+from umf_ros.networks.encoders import Around, Down, Level, SparseGem, Up
 
 CELLS = 40
 LENGTH = 128

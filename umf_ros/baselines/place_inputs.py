@@ -14,9 +14,8 @@ from umf_ros.baselines.place_network import EARLY, IMAGE_SIZE, MEASURED, POINTS,
 from umf_ros.core.frames import Frame, Points
 from umf_ros.core.geometry import transform
 from umf_ros.core.levelling import level
-from umf_ros.embedding.inputs import is_blank, shrink, standardise
-from umf_ros.embedding.voxels import VoxelScan, voxelise
-from umf_ros.networks.voxel_encoder import parent_and_child
+from umf_ros.embedding.inputs import VoxelScan, is_blank, shrink, standardise, voxelise
+from umf_ros.networks.encoders import parent_and_child
 
 EMPTY_MAPS = (EARLY, IMAGE_SIZE[0] // 16, IMAGE_SIZE[1] // 16)
 

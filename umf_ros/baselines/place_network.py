@@ -25,7 +25,7 @@ EARLY, LATE = STAGES[DEPTH - 2].channels, STAGES[DEPTH - 1].channels
 VOXELS = 1024
 """Occupied voxels of a scan at most, of a grid of 40 to each side."""
 MEASURED = 6
-"""Features of a voxel (`umf_ros.embedding.voxels.VoxelScan`)."""
+"""Features of a voxel (`umf_ros.embedding.inputs.VoxelScan`)."""
 POINTS = 1024
 
 

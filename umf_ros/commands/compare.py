@@ -89,7 +89,7 @@ def _check_named(match: str | Path | None, query: str | Path | None, out: Path |
 
 def _view(name: str | None, left: Path | None, right: Path | None) -> PlaceView:
     from umf_ros.comparison import PlaceView
-    from umf_ros.sensors.snapshots import IMAGE_SUFFIXES
+    from umf_ros.sensors.scan_files import IMAGE_SUFFIXES
 
     scan, images = name or "", [str(path) if path else "" for path in (left, right)]
     if Path(scan).suffix.lower() in IMAGE_SUFFIXES:

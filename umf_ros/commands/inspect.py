@@ -39,7 +39,7 @@ def command(
 
     from umf_ros.bags.reader import open_bag
     from umf_ros.commands.inspection import inspect
-    from umf_ros.runs.verdict import USELESS
+    from umf_ros.runs.findings import USELESS
 
     console, recording = Console(), open_bag(bag)
     found = inspect(recording)
@@ -82,7 +82,7 @@ def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> 
     from umf_ros.bags.frames import read_transforms
     from umf_ros.commands.inspection import GUESS, write_calibration, write_settings
     from umf_ros.core.errors import writing
-    from umf_ros.runs.folder import write_atomically
+    from umf_ros.runs.writer import write_atomically
 
     settings, calibration = folder / "my_rover.yaml", folder / "my_calibration.yaml"
     for path in (settings, calibration):

@@ -14,9 +14,17 @@ from umf_ros.bags.reader import Bag, decode
 from umf_ros.core.config import Settings, Topics
 from umf_ros.core.errors import MessageError, UmfError
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
-from umf_ros.runs.inputs import Advice
-from umf_ros.sensors.decode import decode_camera_info, decode_odometry
-from umf_ros.sensors.message_kinds import CLOUD, COMPRESSED, IMAGE, LIVOX, decode_any_cloud, decode_any_image
+from umf_ros.runs.reader import Advice
+from umf_ros.sensors.decode import (
+    CLOUD,
+    COMPRESSED,
+    IMAGE,
+    LIVOX,
+    decode_any_cloud,
+    decode_any_image,
+    decode_camera_info,
+    decode_odometry,
+)
 from umf_ros.sensors.tf import TOPIC, StaticTransforms
 
 SAMPLES = 20

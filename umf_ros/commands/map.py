@@ -63,7 +63,7 @@ def command(
     from umf_ros.maps.joint_graph import solve
     from umf_ros.maps.mapping import Opening, find_recordings, unmatched
     from umf_ros.maps.outputs import write_results
-    from umf_ros.runs.folder import check_writable
+    from umf_ros.runs.writer import check_writable
 
     console = Console()
     check_writable(out)
@@ -107,7 +107,7 @@ def _add_all(
 def _new_ones(target: MapFolder, recordings: list[Path], console: Console) -> dict[str, Path]:
     """The recordings that are not in the map yet, by the names of their sessions to be."""
     from umf_ros.bags.reader import open_bag
-    from umf_ros.runs.finished_run import describe_recording
+    from umf_ros.runs.reader import describe_recording
 
     new: dict[str, Path] = {}
     described = []
@@ -135,7 +135,7 @@ def _add(target: MapFolder, recording: Path, opening: Opening, console: Console)
     from umf_ros.bags.reader import open_bag
     from umf_ros.commands.console import FrameProgress
     from umf_ros.maps.mapping import add_session, replay_session
-    from umf_ros.runs.finished_run import describe_recording
+    from umf_ros.runs.reader import describe_recording
 
     known = target.knows(describe_recording(open_bag(recording)))
     if known is not None:

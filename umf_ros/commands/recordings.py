@@ -9,7 +9,7 @@ import typer
 
 from umf_ros.core.errors import BagError, ConfigError, UmfError, either
 from umf_ros.core.resources import dataset_names
-from umf_ros.embedding import CHOICES
+from umf_ros.embedding import choices
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 BagPath = Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")]
 ConfigPath = Annotated[Path | None, typer.Option("--config", help="Parameter file (YAML).")]
 DatasetName = Annotated[str, typer.Option("--dataset", help=f"{either(['auto', *dataset_names()])}.")]
-EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"How places are embedded: {CHOICES}.")]
+EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"How places are embedded: {choices()}.")]
 WeightsPath = Annotated[Path | None, typer.Option("--weights", help="Weights file, or umf_light; default: umf_scene.")]
 OdometryPath = Annotated[
     Path | None, typer.Option("--odometry", help="Odometry as a TUM file, where the recording has none.")

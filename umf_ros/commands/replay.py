@@ -82,10 +82,9 @@ def command(
     from umf_ros.core.watchdog import watching
     from umf_ros.detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
-    from umf_ros.runs.recorder import count_drops
     from umf_ros.runs.report import finish_run
     from umf_ros.runs.rerun_log import RerunLog
-    from umf_ros.runs.resumption import ReplayFolder
+    from umf_ros.runs.writer import ReplayFolder, count_drops
 
     console = Console()
     recording, settings = open_recording(
@@ -150,9 +149,8 @@ def _localize(
     from umf_ros.core.watchdog import watching
     from umf_ros.detector import LoopDetector
     from umf_ros.localization import LocalizingReplay
-    from umf_ros.runs.finished_run import remember_recording
-    from umf_ros.runs.folder import create_run_folder
-    from umf_ros.runs.recorder import count_drops
+    from umf_ros.runs.reader import remember_recording
+    from umf_ros.runs.writer import count_drops, create_run_folder
 
     detector = LoopDetector(settings, network)  # a map that cannot be used is told before there is a folder
     folder = create_run_folder(out)

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from umf_ros.bags.reader import Bag
+    from umf_ros.runs.diagnosis import ClosureDiagnosis
     from umf_ros.runs.findings import ExaminedRun
-    from umf_ros.runs.why import ClosureDiagnosis
 
 SHOWN = 8
 """Candidates and criteria in the terminal."""
@@ -38,9 +38,9 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
-    from umf_ros.runs.finished_run import read_run
-    from umf_ros.runs.recorder import read_summary
+    from umf_ros.runs.reader import read_run
     from umf_ros.runs.report import judge
+    from umf_ros.runs.writer import read_summary
 
     summary = read_summary(folder)
     known = bag or Path(summary.get("recording", {}).get("path", ""))
@@ -53,7 +53,7 @@ def command(
 
 
 def _stamp(text: str, start_ns: int) -> int:
-    from umf_ros.bags.moments import parse_moment
+    from umf_ros.bags.frames import parse_moment
 
     try:
         moment = parse_moment(text)

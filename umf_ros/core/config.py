@@ -13,8 +13,8 @@ import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from umf_ros.core.errors import ConfigError, either
+from umf_ros.core.io import read_values
 from umf_ros.core.resources import DEFAULT_DATASET, dataset_names, find
-from umf_ros.core.yaml_files import read_values
 
 
 class Group(BaseModel):

@@ -1,14 +1,14 @@
-"""From a frame to a descriptor and local features.
+"""Embedders: from a frame to a descriptor and local features.
 
-A new method is one file here, `NAME_embedder.py`, with a function `make` that gives an `Embedder`; it is then known
-to `embedding.method`, to `--embedder` and to the evaluation. Its imports wait until it is asked for.
+Methods are found by name, those of other packages through the entry point group `umf_ros.embedders`. An entry point
+names a function `make(settings, asked)` that returns an `Embedder`; it is imported only when its method is used.
 """
 
 from __future__ import annotations
 
-import pkgutil
+from functools import cache
 from importlib import import_module
-from pathlib import Path
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
 from umf_ros.core.errors import ConfigError, either
@@ -17,44 +17,60 @@ if TYPE_CHECKING:
     from umf_ros.core.config import EmbeddingSettings
     from umf_ros.embedding.embedder import Embedder
 
-SUFFIX = "_embedder"
+GROUP = "umf_ros.embedders"
 DEFAULT = "umf"
 OWN_FEATURES = "umf"
+_MODULES = {
+    DEFAULT: "umf_ros.embedding.umf",
+    **dict.fromkeys(("thumbnail", "gradients", "solid", "scan_context"), "umf_ros.baselines.handcrafted"),
+    "dbow2": "umf_ros.baselines.dbow2",
+    **dict.fromkeys(("lite0", "lite0_mean", "lite0_gem"), "umf_ros.baselines.lite0"),
+    **dict.fromkeys(("netvlad", "pointnet2", "adafusion"), "umf_ros.baselines.place_networks"),
+    **dict.fromkeys(("minkloc_visual", "minkloc_lidar", "minkloc_fusion"), "umf_ros.baselines.place_networks"),
+}
+"""Modules of the methods that come with the package, each with a function `make`."""
 
 
+@cache
 def find_methods() -> tuple[str, ...]:
-    """Names of the methods that have a file here, the default first."""
-    folders = [*__path__, str(Path(__file__).parents[1] / "baselines")]
-    names = (module.name for module in pkgutil.iter_modules(folders) if module.name.endswith(SUFFIX))
-    return tuple(sorted((name.removesuffix(SUFFIX) for name in names), key=lambda name: (name != DEFAULT, name)))
+    """Return the names of all methods, the default first."""
+    others = {*_MODULES, *entry_points(group=GROUP).names} - {DEFAULT}
+    return DEFAULT, *sorted(others)
 
 
-METHODS = find_methods()
-CHOICES = either(METHODS)
-"""For help texts."""
+def choices() -> str:
+    """Return the names of all methods as a choice, for help texts."""
+    return either(find_methods())
 
 
 def make_embedder(settings: EmbeddingSettings, super_features: bool = False, features: str = OWN_FEATURES) -> Embedder:
-    """The embedder that the settings name.
+    """Return the embedder that the settings name.
 
     Args:
         settings: method, weights, runtime, device and threads.
         super_features: whether the network's super-features are wanted too.
-        features: local features of images: "umf", what the embedder gives itself, or "xfeat".
+        features: local features of images: "umf", those of the embedder itself, or "xfeat".
 
     Raises:
-        ConfigError: unknown method or device.
+        ConfigError: unknown method or device, or an entry point that cannot be loaded.
         WeightsError: the weights cannot be used.
     """
-    if settings.method not in METHODS:
-        raise ConfigError(f"embedding.method: unknown method {settings.method!r}; known: {', '.join(METHODS)}")
+    method = settings.method
+    if method not in find_methods():
+        raise ConfigError(f"embedding.method: unknown method {method!r}; known: {', '.join(find_methods())}")
     from umf_ros.embedding.embedder import FeatureRequest
 
     asked = FeatureRequest(image=features == OWN_FEATURES, supers=super_features)
-    package = __name__ if settings.method == DEFAULT else "umf_ros.baselines"
-    embedder: Embedder = import_module(f"{package}.{settings.method}{SUFFIX}").make(settings, asked)
+    if method in _MODULES:
+        make = import_module(_MODULES[method]).make
+    else:
+        try:
+            make = entry_points(group=GROUP)[method].load()
+        except (ImportError, AttributeError) as error:
+            raise ConfigError(f"embedding.method {method}: its entry point cannot be loaded: {error}") from None
+    embedder: Embedder = make(settings, asked)
     if asked.image:
         return embedder
-    from umf_ros.embedding.image_features import with_xfeat
+    from umf_ros.embedding.local_features import with_xfeat
 
     return with_xfeat(embedder, settings)

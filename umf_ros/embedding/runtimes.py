@@ -17,7 +17,7 @@ from umf_ros.core.frames import Points
 from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.export import cached, kept_or_made, openvino_core
 from umf_ros.embedding.inputs import InputArrays, blank_input
-from umf_ros.networks.weights_files import read_config
+from umf_ros.networks.config import read_config
 
 Outputs = dict[str, NDArray[np.float32]]
 XFEAT_BLANK = np.zeros((384, 512), np.float32)

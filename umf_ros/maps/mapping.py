@@ -30,10 +30,9 @@ from umf_ros.maps.odometry_log import OdometryLog, track
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
-from umf_ros.runs.finished_run import describe_recording, remember_recording
-from umf_ros.runs.recorder import count_drops
-from umf_ros.runs.resumption import PLACES
+from umf_ros.runs.reader import describe_recording, remember_recording
 from umf_ros.runs.tables import CLOSURES, CsvTable, closure_row
+from umf_ros.runs.writer import PLACES, count_drops
 from umf_ros.verification import Verdict, Verifier
 
 OnFrame = Callable[[float, Detection], None]

@@ -20,11 +20,10 @@ from umf_ros.maps.joint_graph import JointMap, JointSession
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.point_cloud import write_cloud
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.export import verdict_table
-from umf_ros.runs.folder import write_atomically
+from umf_ros.pose_graph.g2o import verdict_table
 from umf_ros.runs.gallery import data_address
-from umf_ros.runs.plots import plot_trajectories
-from umf_ros.runs.rendering import render
+from umf_ros.runs.report import plot_trajectories, render
+from umf_ros.runs.writer import write_atomically
 
 
 def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:

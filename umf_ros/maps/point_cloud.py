@@ -18,7 +18,7 @@ from umf_ros.maps.joint_graph import JointMap
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import stored_identity
-from umf_ros.runs.height_map import HeightMap
+from umf_ros.runs.gallery import HeightMap
 
 VOXEL_M = 0.1
 REACH_M = 25.0  # by hand: beyond, points are too sparse to show an alignment

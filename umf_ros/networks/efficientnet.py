@@ -1,8 +1,4 @@
-"""EfficientNet-Lite0 ([Tan 2019], and its "lite" release of 2020), an image trunk that has seen photographs.
-
-The lite networks leave out squeeze-and-excitation and clip their activations at six. Batch normalisation is
-folded into the convolutions: what was learned on millions of photographs is not to drift with a batch of one world.
-"""
+"""EfficientNet-Lite0 [Tan 2019] and the scene descriptor that rests on it."""
 
 from __future__ import annotations
 
@@ -166,3 +162,34 @@ def _fold(published: Mapping[str, Tensor], conv: str, norm: str) -> tuple[Tensor
     gain = published[f"{norm}.weight"] / (published[f"{norm}.running_var"] + EPSILON).sqrt()
     weight = published[f"{conv}.weight"] * gain[:, None, None, None]
     return weight, published[f"{norm}.bias"] - published[f"{norm}.running_mean"] * gain
+
+
+GRID = (3, 5)
+"""Rows and columns: finer, and a turned head is another place."""
+DEPTH = 5
+"""Stages of the trunk; the later ones know what a thing is rather than how it looks."""
+
+
+class SceneDescriptor(nn.Module):
+    """EfficientNet-Lite0 up to stride 16, pooled, centred and projected; its trunk is not trained with the rest."""
+
+    def __init__(self, length: int) -> None:
+        super().__init__()
+        self.trunk = EfficientNetLite0(DEPTH)
+        self.trunk.requires_grad_(False)
+        channels = STAGES[DEPTH - 1].channels
+        self.projection = nn.Linear(GRID[0] * GRID[1] * channels, length, bias=False)
+
+    def pool(self, image: Tensor) -> Tensor:
+        """Maps (B, C, 3, 5) of a standardised image (B, 1, H, W), without what the cells share."""
+        cells = F.adaptive_avg_pool2d(self.trunk(image)[-1], GRID)
+        return cells - cells.mean(dim=(2, 3), keepdim=True)
+
+    def project(self, cells: Tensor) -> Tensor:
+        """(B, C * 15) pooled maps to (B, length)."""
+        scene: Tensor = self.projection(cells)
+        return scene * scene.norm(dim=1, keepdim=True)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, 1, H, W) to (B, length), short where the view resembles those it was fitted to."""
+        return self.project(self.pool(image).flatten(1))

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from umf_ros.networks.attention import Block, cell_positions, received, sine_encoding
 from umf_ros.networks.config import NetworkConfig
+from umf_ros.networks.fusion import Block, cell_positions, received, sine_encoding
 
 WINDOW = 8
 HEADS = 4

@@ -8,13 +8,11 @@ from typing import Literal, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from umf_ros.networks.attention import cell_positions, sine_encoding
 from umf_ros.networks.config import NetworkConfig
-from umf_ros.networks.fusion import AbsentToken, Fused, Fusion, Tokens
-from umf_ros.networks.image_encoder import ImageEncoder
+from umf_ros.networks.efficientnet import SceneDescriptor
+from umf_ros.networks.encoders import CELLS, ImageEncoder, VoxelEncoder
+from umf_ros.networks.fusion import AbsentToken, Fused, Fusion, Tokens, cell_positions, sine_encoding
 from umf_ros.networks.local_features import CloudLocal, ImageLocal, IterativeAttention, LocalMap, SuperMap
-from umf_ros.networks.scene import SceneDescriptor
-from umf_ros.networks.voxel_encoder import CELLS, VoxelEncoder
 
 Branch = Literal["both", "image", "cloud"]
 

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from umf_ros.core.errors import WeightsError
-from umf_ros.networks.config import NetworkConfig
+from umf_ros.networks.config import NetworkConfig, open_weights, parse_architecture
 from umf_ros.networks.umf import UMF, channels_last
-from umf_ros.networks.weights_files import open_weights, parse_architecture
 
 SCALE = ".scale"
 """End of the name of what the eight bits of another tensor are to be multiplied with."""

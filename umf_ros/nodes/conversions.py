@@ -1,22 +1,55 @@
-"""The nouns of the package as ROS messages, and back."""
+"""Conversions between records of the core and ROS messages, and the QoS profiles."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections import deque
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
-from nav_msgs.msg import Odometry
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Point, Pose, PoseStamped, PoseWithCovarianceStamped, Quaternion, TransformStamped, Vector3
+from nav_msgs.msg import Odometry, Path
+from numpy.typing import NDArray
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from std_msgs.msg import ColorRGBA, Header
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray
 
+from umf_ros.core.config import FrameIds, Qos
 from umf_ros.core.errors import MessageError
-from umf_ros.core.frames import LoopClosure
+from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, to_quaternion
+from umf_ros.detector import Detection
+from umf_ros.nodes.diagnostics import OK, WARN, status
+from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose
+from umf_ros.verification import Verdict
+
+if TYPE_CHECKING:
+    from umf_ros.fleet.inter_robot_closures import InterRobotClosure
+
+
+# with their history: a SLAM system that joins late gets every closure and verdict of the run
+CLOSURES_QOS = QoSProfile(
+    depth=5000, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+)
+# maps and markers: whoever joins late gets the last one (REP-2003)
+LATCHED_QOS = QoSProfile(
+    depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+)
+
+
+def sensor_qos(settings: Qos, min_depth: int = 1) -> QoSProfile:
+    """Profile of a sensor subscription: best effort unless the settings say otherwise."""
+    reliable = settings.reliability == "reliable"
+    policy = QoSReliabilityPolicy.RELIABLE if reliable else QoSReliabilityPolicy.BEST_EFFORT
+    return QoSProfile(depth=max(settings.depth, min_depth), reliability=policy)
+
 
 GREEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.5)
@@ -149,3 +182,126 @@ def _keyframe_stamp(frame: str) -> int:
     if stamp_ns is None:
         raise MessageError("closure_frame", f"loop closure with frame {frame[:80]!r}, expected keyframe/<stamp in ns>")
     return stamp_ns
+
+
+# RViz draws no more of a path than this, and messages stay small on long drives
+MAX_POSES = 2000
+MAX_LINES = 500
+
+
+def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: FrameIds) -> Path:
+    """The trajectory as a path, evenly thinned to at most `MAX_POSES` poses."""
+    if not len(stamps_ns):
+        return Path(header=Header(frame_id=frames.map))
+    rows = np.unique(np.linspace(0, len(stamps_ns) - 1, MAX_POSES).astype(int))
+    poses = to_poses_stamped(stamps_ns[rows].tolist(), frames.map, map_T_body[rows])
+    return Path(header=to_header(int(stamps_ns[-1]), frames.map), poses=poses)
+
+
+def pose(stamp_ns: int, map_T_body: Array, covariance: Array, frames: FrameIds) -> PoseWithCovarianceStamped:
+    """A pose in the map with its (6, 6) covariance in ROS order."""
+    message = PoseWithCovarianceStamped(header=to_header(stamp_ns, frames.map))
+    message.pose.pose = to_pose(map_T_body)
+    message.pose.covariance = covariance.ravel()
+    return message
+
+
+def transform(stamp_ns: int, map_T_odom: Array, frames: FrameIds) -> TransformStamped:
+    """`map_T_odom` as a transform."""
+    message = TransformStamped(header=to_header(stamp_ns, frames.map), child_frame_id=frames.odom)
+    rigid = to_pose(map_T_odom)
+    message.transform.translation = Vector3(x=rigid.position.x, y=rigid.position.y, z=rigid.position.z)
+    message.transform.rotation = rigid.orientation
+    return message
+
+
+def markers(verdicts: list[ClosureVerdict], lines: Array, stamp_ns: int, frames: FrameIds) -> MarkerArray:
+    """Closures as lines from match to query: accepted green, the others red."""
+    accepted = np.array([verdict.state is State.ACCEPTED for verdict in verdicts], bool)
+    header = to_header(stamp_ns, frames.map)
+    chosen = {"accepted": lines[accepted], "rejected": lines[~accepted]}
+    points = {name: [map(to_point, line) for line in some[-MAX_LINES:]] for name, some in chosen.items()}
+    return MarkerArray(markers=[to_lines(name, some, header) for name, some in points.items()])
+
+
+# RViz redraws every line it is sent: a rover that runs for days shows its latest ones
+
+
+class ClosurePublisher:
+    """Loop closures, keyframes, tested candidates and markers of one node.
+
+    `loop_closures` carries verified closures only; `~/candidates` everything that was tested.
+
+    Attributes:
+        odom: name of the odometry's frame.
+    """
+
+    def __init__(self, node: Node, frames: FrameIds) -> None:
+        self._node = node
+        self.odom = frames.odom
+        self._closures = node.create_publisher(Odometry, "loop_closures", CLOSURES_QOS)
+        self._keyframes = node.create_publisher(PoseStamped, "~/keyframes", CLOSURES_QOS)
+        self._candidates = node.create_publisher(DiagnosticArray, "~/candidates", 10)
+        self._markers = node.create_publisher(MarkerArray, "~/markers", LATCHED_QOS)
+        self._accepted: deque[list] = deque(maxlen=MAX_LINES)
+        self._rejected: deque[list] = deque(maxlen=MAX_LINES)
+
+    def announce(self, detection: Detection, matches: dict[int, Keyframe]) -> None:
+        """Publish one detection.
+
+        Args:
+            detection: what became of a frame.
+            matches: the matched keyframes by stamp, for the markers.
+        """
+        keyframe = detection.keyframe
+        if keyframe is None:
+            return
+        for closure in detection.closures:
+            self._closures.publish(closure_to_message(closure))
+        self._keyframes.publish(self._pose_of(keyframe))
+        if detection.verdicts:
+            report = DiagnosticArray(status=[_describe(keyframe, verdict) for verdict in detection.verdicts])
+            report.header.stamp = to_time(keyframe.stamp_ns)
+            self._candidates.publish(report)
+            self._draw(keyframe, detection.verdicts, matches)
+
+    def announce_encounter(self, inter_closure: InterRobotClosure) -> None:
+        """Publish what was found of another rover's places: closures like any other, with the names of both rovers."""
+        for closure in inter_closure.closures:
+            self._closures.publish(closure_to_message(closure, inter_closure.own, inter_closure.robot))
+        report = DiagnosticArray(
+            status=[_describe(inter_closure.keyframe, one, inter_closure.robot) for one in inter_closure.verdicts]
+        )
+        report.header.stamp = to_time(inter_closure.keyframe.stamp_ns)
+        self._candidates.publish(report)
+
+    def wait_until_heard(self) -> None:
+        """Wait until whoever listens has the last closures, as far as they answer soon."""
+        self._closures.wait_for_all_acked(Duration(seconds=1))
+
+    def _pose_of(self, keyframe: Keyframe) -> PoseStamped:
+        """The keyframe's odometry; without one it is where it is: at the origin of its own frame."""
+        if keyframe.odom_T_body is not None:
+            return to_pose_stamped(keyframe.stamp_ns, self.odom, keyframe.odom_T_body)
+        return to_pose_stamped(keyframe.stamp_ns, keyframe_frame(keyframe.stamp_ns), np.eye(4))
+
+    def _draw(self, keyframe: Keyframe, verdicts: list[Verdict], matches: dict[int, Keyframe]) -> None:
+        if keyframe.odom_T_body is None:
+            return
+        here = to_point(keyframe.odom_T_body[:3, 3])
+        for verdict in verdicts:
+            match = matches.get(verdict.candidate.stamp_ns)
+            if match is None or match.odom_T_body is None or match.session != keyframe.session:
+                continue
+            lines = self._rejected if verdict.closure is None else self._accepted
+            lines.append([to_point(match.odom_T_body[:3, 3]), here])
+        header = to_header(keyframe.stamp_ns, self.odom)
+        chosen = {"accepted": self._accepted, "rejected": self._rejected}
+        self._markers.publish(MarkerArray(markers=[to_lines(*item, header) for item in chosen.items()]))
+
+
+def _describe(keyframe: Keyframe, verdict: Verdict, robot: str = "") -> DiagnosticStatus:
+    accepted = verdict.closure is not None
+    name = f"{keyframe_frame(verdict.candidate.stamp_ns, robot)} -> {keyframe.stamp_ns}"
+    numbers = {"similarity": verdict.candidate.similarity, **verdict.numbers}
+    return status(OK if accepted else WARN, name, verdict.reason, numbers)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from umf_ros.core.errors import ConfigError
-from umf_ros.core.yaml_files import read_yaml
+from umf_ros.core.io import read_yaml
 
 PARAMETERS = "ros__parameters"
 

@@ -19,13 +19,11 @@ from umf_ros.core.frames import Frame, LoopClosure
 from umf_ros.core.geometry import rotation_angle
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.nodes.base_node import BaseNode
-from umf_ros.nodes.closure_publisher import ClosurePublisher
+from umf_ros.nodes.conversions import ClosurePublisher, sensor_qos
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
-from umf_ros.nodes.process import leave, run
-from umf_ros.nodes.qos import sensor_qos
+from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.nodes.transforms import hear_static_transforms
-from umf_ros.nodes.worker import Worker
-from umf_ros.runs.recorder import RunRecorder, count_drops
+from umf_ros.runs.writer import RunRecorder, count_drops
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms, TfExtrinsics

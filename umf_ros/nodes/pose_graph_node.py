@@ -27,14 +27,19 @@ from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import Array
 from umf_ros.localizer import MapFollower
-from umf_ros.nodes import pose_graph_messages as messages
+from umf_ros.nodes import conversions as messages
 from umf_ros.nodes.base_node import BaseNode
-from umf_ros.nodes.conversions import closure_from_message, is_between_rovers, parse_pair
+from umf_ros.nodes.conversions import (
+    CLOSURES_QOS,
+    LATCHED_QOS,
+    closure_from_message,
+    is_between_rovers,
+    parse_pair,
+    sensor_qos,
+)
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
-from umf_ros.nodes.process import leave, run
-from umf_ros.nodes.qos import CLOSURES_QOS, LATCHED_QOS, sensor_qos
+from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.nodes.transforms import hear_static_transforms
-from umf_ros.nodes.worker import Worker
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.journal import JOURNAL
 from umf_ros.sensors.decode import OdometrySample, decode_odometry

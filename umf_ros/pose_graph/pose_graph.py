@@ -25,7 +25,7 @@ from umf_ros.pose_graph.closures import (
     check_covariance,
     check_pose,
 )
-from umf_ros.pose_graph.export import verdict_table, write_g2o, write_vertex_table
+from umf_ros.pose_graph.g2o import verdict_table, write_g2o, write_vertex_table
 from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.odometry import OdometryChain, Stamps
 from umf_ros.pose_graph.rejection import OutlierRejection

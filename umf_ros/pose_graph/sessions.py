@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, adjoint, invert, propagate
 from umf_ros.pose_graph.closures import ChosenClosures, ClosureColumns, TrackedClosure
-from umf_ros.pose_graph.corrected_path import CorrectedPath
-from umf_ros.pose_graph.incremental import IncrementalOptimizer
 from umf_ros.pose_graph.noise_scale import NoiseScale
-from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Stamps
-from umf_ros.pose_graph.odometry_preintegration import Edges, Graph, Optimizer, odometry_edges
+from umf_ros.pose_graph.odometry import CorrectedPath, OdometryChain, PathPoints, Stamps
+from umf_ros.pose_graph.solver import Edges, Graph, IncrementalOptimizer, Optimizer, odometry_edges
 
 # where every keyframe is a vertex, one so close to a closure's endpoint adds nothing but rounding errors
 _TOO_CLOSE_NS = 10_000_000

@@ -1,23 +1,140 @@
-"""What to look at first: everything about a run that a person should know, the worst first, each with what helps."""
+"""Findings about a run, worst first, and the verdict that they add up to."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from umf_ros.bags.reader import Bag
+from umf_ros.core.config import Settings
 from umf_ros.pose_graph.closures import State
-from umf_ros.runs import sensor_findings
-from umf_ros.runs.consistency import in_words
-from umf_ros.runs.finished_run import FinishedRun
-from umf_ros.runs.inputs import Advice, absent_inputs, useless_inputs
-from umf_ros.runs.sensor_check import SensorReport
-from umf_ros.runs.true_places import TruePlaces
-from umf_ros.runs.truth import JudgedRun
-from umf_ros.runs.why import ClosureDiagnosis, GateDiagnosis
+from umf_ros.runs.diagnosis import ClosureDiagnosis, GateDiagnosis
+from umf_ros.runs.reader import Advice, FinishedRun, absent_inputs, useless_inputs
+from umf_ros.runs.sensor_check import Disagreement, SensorReport
+from umf_ros.runs.truth import JudgedRun, TruePlaces, in_words
+
+BLANK, DIM = 3.0, 8.0
+"""Grey values, by hand: standard deviations of an image that shows nothing, and next to nothing."""
+FEW_RETURNS = 500
+"""Of a scan, by hand: a place takes more to be told by."""
+LAG_S = 0.1
+"""By hand: twice the step that lags are tried in."""
+MOUNTING_DEG = 6.0
+"""Measured on simulated drives: right mountings come out within 3.3 deg, the worst about the vertical."""
+SCALE = 0.08
+"""Measured on simulated drives: a right baseline comes out within 1 %."""
+SAME_DEG = 5.0
+"""By hand: two sensors that differ from the odometry alike: it is the odometry."""
+ACROSS = 0.5
+"""Of the way, by hand: a body drives along its x, or its y where it can."""
+
+
+def about_sensors(seen: SensorReport, settings: Settings) -> Iterator[Advice]:
+    """Findings about light, returns, baseline, clocks and mountings."""
+    yield from _images(seen)
+    yield from _scans(seen)
+    yield from _odometry_frame(seen)
+    yield from _clocks(seen)
+    yield from _mountings(seen)
+    yield from _baseline(seen)
+
+
+def _images(seen: SensorReport) -> Iterator[Advice]:
+    for name, contrast in (("left", seen.left_contrast), ("right", seen.right_contrast)):
+        if contrast < BLANK:
+            yield Advice(
+                "fault",
+                f"the {name} images are empty: their grey values vary by {contrast:.1f} in the median",
+                "is the camera covered, or the topic another one's? topics." + name + "_image",
+            )
+        elif contrast < DIM:
+            yield Advice(
+                "warning",
+                f"the {name} images show little: their grey values vary by {contrast:.1f} in the median",
+                "exposure and gain of the camera",
+            )
+
+
+def _scans(seen: SensorReport) -> Iterator[Advice]:
+    if seen.returns < FEW_RETURNS:
+        yield Advice(
+            "warning",
+            f"scans have {seen.returns:.0f} returns in the median",
+            "places take a few thousand: merge scans, or see min_intensity and max_height_m of the calibration",
+        )
+    if seen.intensity_max == 0:
+        yield Advice("warning", "all intensities are 0: the descriptor does without them", "a field named intensity")
+
+
+def _odometry_frame(seen: SensorReport) -> Iterator[Advice]:
+    if seen.forward is None or abs(seen.forward[2]) < ACROSS or abs(seen.forward[2]) < np.abs(seen.forward[:2]).max():
+        return
+    yield Advice(
+        "fault",
+        "the odometry is not of the body: by its poses the way goes along the body's z axis, and z is up",
+        "--odometry-frame camera, imu or lidar says whose poses the file holds (of the camera z looks ahead)",
+    )
+
+
+def _clocks(seen: SensorReport) -> Iterator[Advice]:
+    lags = {name: one.lag_s for name, one in _known(seen).items()}
+    if not lags or max(map(abs, lags.values())) < LAG_S:
+        return
+    if len(lags) == 2 and abs(lags["lidar"] - lags["camera"]) < LAG_S:
+        what = f"the odometry's clock is about {lags['lidar']:+.1f} s off those of camera and LiDAR"
+        yield Advice("fault", what, "correct its stamps: closures and scans are placed by it")
+        return
+    for name, lag in lags.items():
+        if abs(lag) >= LAG_S:
+            sensor = {"lidar": "LiDAR", "camera": "camera"}[name]
+            cure = "the stamps of its driver (PTP, or a constant): no parameter corrects them"
+            yield Advice(
+                "fault", f"the {sensor}'s clock is about {-lag:+.1f} s off the odometry's, by its motion", cure
+            )
+
+
+def _mountings(seen: SensorReport) -> Iterator[Advice]:
+    known = {name: one.mounting_deg for name, one in _known(seen).items() if one.mounting_deg is not None}
+    off = {name: turn for name, turn in known.items() if np.linalg.norm(turn) > MOUNTING_DEG}
+    if len(off) == 2 and np.linalg.norm(off["lidar"] - off["camera"]) < SAME_DEG:
+        yield Advice(
+            "fault",
+            f"the odometry is not of the body frame: camera and LiDAR both say it is turned by {_turn(off['lidar'])}",
+            "--odometry-frame camera, imu or lidar says whose poses the file holds; a topic must be of the body",
+        )
+        return
+    for name, turn in off.items():
+        sensor = {"lidar": "LiDAR", "camera": "camera"}[name]
+        yield Advice(
+            "fault",
+            f"the {sensor}'s mounting is off by {_turn(turn)}: so its motion says, held against the odometry's",
+            f"body_T_{name} of the calibration",
+        )
+
+
+def _baseline(seen: SensorReport) -> Iterator[Advice]:
+    if abs(seen.stereo_scale - 1) > SCALE:
+        yield Advice(
+            "fault",
+            f"stereo sees everything {seen.stereo_scale:.2f} times as far as the LiDAR: the baseline is wrong by that "
+            "factor",
+            f"baseline of the calibration, or P[3] of the right camera_info: divide by {seen.stereo_scale:.3f}",
+        )
+
+
+def _known(seen: SensorReport) -> dict[str, Disagreement]:
+    return {name: one for name, one in (("lidar", seen.lidar), ("camera", seen.camera)) if one is not None}
+
+
+def _turn(mounting_deg: np.ndarray) -> str:
+    """As "10 deg about y"."""
+    axis = int(np.abs(mounting_deg).argmax())
+    return f"{np.linalg.norm(mounting_deg):.0f} deg, mostly about {'xyz'[axis]} ({mounting_deg[axis]:+.0f} deg)"
+
 
 PENDING = (State.UNDECIDED, State.WAITING)
 MUCH_MISSED, MUCH_REJECTED, WELL_COVERED = 0.3, 0.2, 0.5
@@ -83,7 +200,7 @@ def _inputs(about: ExaminedRun) -> Iterator[Advice]:
 
 
 def _sensors(about: ExaminedRun) -> Iterator[Advice]:
-    yield from sensor_findings.about_sensors(about.sensors, about.run.settings)
+    yield from about_sensors(about.sensors, about.run.settings)
 
 
 def _truth(about: ExaminedRun) -> Iterator[Advice]:
@@ -246,3 +363,68 @@ def _end(about: ExaminedRun) -> Iterator[Advice]:
 Rule = Callable[[ExaminedRun], Iterator[Advice]]
 _CAUSES: tuple[Rule, ...] = (_truth, _gaps, _sensors, _pairs, _inputs)
 _EFFECTS: tuple[Rule, ...] = (_graph, _closures, _untrue, _map, _honest, _speed, _end)
+
+
+Mark = Literal["good", "warn", "bad"]
+USELESS = 3
+"""Exit status of a run that ended well on inputs that could not give anything."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunVerdict:
+    """Attributes: sentence: for a person; mark: its class in the style sheet; exit_code: of the command."""
+
+    sentence: str
+    mark: Mark
+    exit_code: int = 0
+
+
+def conclude(about: ExaminedRun, findings: list[Advice]) -> RunVerdict:
+    """Green only when something was found, or when there was nothing to find."""
+    sentence = ", ".join(filter(None, (_found(about), _used(about)))) + _errors(about) + "."
+    warnings = [finding for finding in findings if finding.severity != "note"]
+    if any(finding.severity == "fault" for finding in warnings):
+        return RunVerdict(f"{_capital(warnings[0].what)}. {sentence}", "bad", 0 if about.run.closures else USELESS)
+    if about.run.closures and not warnings:
+        return RunVerdict(sentence, "good")
+    nothing_to_find = about.judged.covered[0] and not about.judged.revisits
+    if not about.run.closures and nothing_to_find:
+        return RunVerdict(f"No place was seen twice. {sentence}", "good" if not warnings else "warn")
+    if warnings:
+        return RunVerdict(f"{_capital(warnings[0].what)}. {sentence}", "warn")
+    return RunVerdict(sentence, "warn")
+
+
+def _found(about: ExaminedRun) -> str:
+    judged, count = about.judged, len(about.run.closures)
+    if about.run.truth is None or (judged.covered[1] and not judged.covered[0]):
+        reason = "there is no ground truth" if about.run.truth is None else "no ground truth of this time"
+        return f"{count} loop closures; {reason} to judge them by"
+    true = sum(one.is_true for one in judged.closures)
+    return f"{true} true and {len(judged.closures) - true} false loop closures at {judged.revisits} revisits"
+
+
+def _used(about: ExaminedRun) -> str:
+    """What the graph made of them: pending is not rejected."""
+    states = about.states()
+    total = sum(states.values())
+    if not total:
+        return ""
+    accepted, pending = states[State.ACCEPTED], sum(states[state] for state in PENDING)
+    rejected = total - accepted - pending
+    rest = [f"{number} {word}" for number, word in ((pending, "pending"), (rejected, "rejected")) if number]
+    used = "all of them" if accepted == total else f"{accepted or 'none'} of them"
+    return f"the graph used {used}" + (f" ({', '.join(rest)})" if rest else "")
+
+
+def _errors(about: ExaminedRun) -> str:
+    before, after = about.judged.ate_odometry_m, about.judged.ate_optimized_m
+    if before is None or after is None:
+        return ""
+    return f"; trajectory error {before:.2f} m by odometry, {after:.2f} m optimised"
+
+
+def _capital(text: str) -> str:
+    if "_" in text.split(" ", 1)[0]:  # the name of a parameter
+        return text
+    return text[:1].upper() + text[1:]

@@ -1,34 +1,302 @@
-"""What becomes of a finished run: it is judged by the truth, drawn, and written up."""
+"""Write report.html, plots and matches of a finished run."""
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as Grid
 
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.errors import UmfError
-from umf_ros.core.frames import LoopClosure
-from umf_ros.core.geometry import Array
+from umf_ros.core.frames import Image, LoopClosure
+from umf_ros.core.geometry import Array, rotation_angle
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.runs.findings import ExaminedRun, look_first
-from umf_ros.runs.finished_run import FinishedRun, read_run
+from umf_ros.pose_graph.closures import State
+from umf_ros.runs.diagnosis import GateDiagnosis
+from umf_ros.runs.findings import ExaminedRun, RunVerdict, conclude, look_first
 from umf_ros.runs.gallery import Gallery, walk
-from umf_ros.runs.page import MAX_PICTURES, describe, print_summary, write_page
-from umf_ros.runs.plots import ODOMETRY, OPTIMISED, TRUTH, draw_match, plot_trajectories
-from umf_ros.runs.recorder import write_summary
-from umf_ros.runs.scene import build_scene, drawn_trajectory
-from umf_ros.runs.scene_pairs import by_need, pairs_of
+from umf_ros.runs.reader import Advice, FinishedRun, read_run
+from umf_ros.runs.scene import build_scene, by_need, drawn_trajectory, pairs_of
 from umf_ros.runs.tables import INLIERS, Endpoints, read_table
-from umf_ros.runs.true_places import TruePlaces
-from umf_ros.runs.truth import JudgedRun, endpoints, judge_run, positions_in_truth
-from umf_ros.runs.verdict import RunVerdict, conclude
-from umf_ros.runs.why import GateDiagnosis
+from umf_ros.runs.truth import (
+    MEDIAN_EXPECTED,
+    JudgedClosure,
+    JudgedRun,
+    TruePlaces,
+    endpoints,
+    in_words,
+    judge_run,
+    positions_in_truth,
+)
+from umf_ros.runs.writer import write_atomically, write_summary
+
+
+def render(template: str, **values: Any) -> str:
+    """A page from one of `runs/templates`; a value that it names and nobody gave is an error, so that it says all."""
+    environment = Environment(
+        loader=PackageLoader("umf_ros.runs"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template(template).render(**values)
+
+
+TRUTH, ODOMETRY, OPTIMISED = "#222222", "#e07b00", "#1f6fb4"
+RIGHT, WRONG, UNJUDGED = "#2ca02c", "#d62728", "#64748b"
+MAX_LINES = 60
+
+
+def plot_trajectories(
+    path: Path,
+    curves: list[tuple[str, str, Array]],
+    closures: Array,
+    verdicts: list[bool | None],
+) -> None:
+    """Draw trajectories from above, and the closures between keyframes of the last one.
+
+    Args:
+        path: PNG to write.
+        curves: name, colour and (N, 3) positions in metres, all in one frame; drawn in this order.
+        closures: (K, 2, 3) positions of both ends of every closure.
+        verdicts: K times true, false, or None when there is no truth.
+    """
+    figure = Figure(figsize=(9, 7), layout="constrained")
+    axes = figure.subplots()
+    for name, colour, positions in curves:
+        axes.plot(positions[:, 0], positions[:, 1], color=colour, linewidth=1.6, label=name)
+    if curves:
+        start = curves[0][2][0]
+        axes.plot(start[0], start[1], "o", color=TRUTH, markersize=6, label="start")
+    handles, _ = axes.get_legend_handles_labels()
+    for verdict, colour, name in ((True, RIGHT, "true"), (False, WRONG, "false"), (None, UNJUDGED, "found")):
+        chosen = [i for i, found in enumerate(verdicts) if found is verdict]
+        if chosen:
+            # lines as wide as closures are short would hide the trajectories
+            axes.add_collection(
+                LineCollection(closures[chosen, :, :2].tolist(), colors=colour, linewidths=1.0, alpha=0.8)
+            )
+            ends = closures[chosen].reshape(-1, 3)
+            axes.plot(ends[:, 0], ends[:, 1], ".", color=colour, markersize=4)
+            handles.append(Line2D([], [], color=colour, label=f"closures {name}: {len(chosen)}"))
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.grid(alpha=0.3)
+    axes.legend(handles=handles, loc="best", fontsize=9)
+    figure.savefig(path, dpi=120)
+
+
+def draw_match(query: Image, match: Image, inliers: Array, caption: str) -> Image:
+    """Query (left) and match (right) side by side with a line for every inlier.
+
+    Args:
+        query: (H, W) uint8.
+        match: (H, W) uint8.
+        inliers: (K, 4) pixels u, v in the query and u, v in the match; a spread subset is drawn.
+        caption: written above the pictures.
+
+    Returns:
+        (H + margin, 2 W + gap, 3) uint8 BGR.
+    """
+    margin, gap = 34, 6
+    height, width = query.shape
+    canvas = np.full((height + margin, 2 * width + gap, 3), 255, np.uint8)
+    canvas[margin:, :width] = query[..., None]
+    canvas[margin:, width + gap :] = cv2.resize(match, (width, height))[..., None]
+    cv2.putText(canvas, caption, (8, 23), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (30, 30, 30), 1, cv2.LINE_AA)
+    chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), MAX_LINES)).astype(int)] if len(inliers) else []
+    hues = np.linspace(0, 179, max(len(chosen), 1)).astype(np.uint8)
+    colours = cv2.cvtColor(np.stack([hues, hues * 0 + 220, hues * 0 + 255], -1)[None], cv2.COLOR_HSV2BGR)[0]
+    for (u0, v0, u1, v1), colour in zip(chosen, colours.tolist(), strict=False):
+        start, end = (round(u0), round(v0) + margin), (round(u1) + width + gap, round(v1) + margin)
+        cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
+        cv2.circle(canvas, start, 3, colour, 1, cv2.LINE_AA)
+        cv2.circle(canvas, end, 3, colour, 1, cv2.LINE_AA)
+    return canvas
+
+
+MAX_PICTURES = 40
+MOST_LINES = 8
+"""Of closures and of findings in the terminal; the page has all."""
+COLOURS = {"good": "green", "warn": "yellow", "bad": "red", "fault": "red", "warning": "yellow", "note": "dim"}
+
+Summary = Mapping[str, Any]
+"""What `summary.json` holds."""
+
+
+class ClosureRow(NamedTuple):
+    """A row of the page's table: its cells, and the last one, which says whether the closure is true."""
+
+    cells: list[str]
+    word: str
+    mark: str
+
+
+def write_page(about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advice], scene: Mapping[str, Any]) -> None:
+    """Write report.html.
+
+    Raises:
+        OutputError: the page cannot be written.
+    """
+    run = about.run
+    page = render(
+        "report.html",
+        name=run.folder.resolve().name,
+        verdict=verdict,
+        findings=findings,
+        facts=_facts(run.summary),
+        closures=closure_rows(about),
+        scene=_inside_a_script(scene),
+        plotly=_plotly(),
+        version=run.summary["version"],
+        weights=run.summary["weights"],
+        seed=run.summary["seed"],
+    )
+    write_atomically(run.folder / "report.html", page)
+
+
+def print_summary(
+    console: Console, about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advice], told: frozenset[str]
+) -> None:
+    """Print what a person wants to know first: figures, what became of the closures, and the verdict.
+
+    Args:
+        console: where.
+        about: the run.
+        verdict: about it.
+        findings: likewise.
+        told: lines that were printed before, and are not again.
+    """
+    plain: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
+    grid = Grid(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for name, value in _facts(about.run.summary):
+        grid.add_row(name, escape(value))
+    console.print(grid)
+    for line in final_verdicts(about):
+        console.print(line, **plain)
+    shown = [finding for finding in findings if finding.line not in told and finding.severity != "note"]
+    for finding in shown[:MOST_LINES]:
+        console.print(f"{finding.severity}: {finding.line}", style=COLOURS[finding.severity], **plain)
+    console.print(verdict.sentence, style=COLOURS[verdict.mark], markup=False, highlight=False)
+    console.print(f"Report: {about.run.folder / 'report.html'}", **plain)
+
+
+def final_verdicts(about: ExaminedRun) -> list[str]:
+    """A line for each closure, by its number, that the graph did not accept in the end."""
+    lines = []
+    for number, closure in enumerate(about.run.closures, 1):
+        verdict = about.run.verdicts.get(endpoints(closure))
+        if verdict is None or verdict.state == State.ACCEPTED:
+            continue
+        seconds = (closure.query_stamp_ns - closure.match_stamp_ns) * 1e-9
+        figures = f" ({verdict.sigma:.1f} sigma, {verdict.misfit_m:.2f} m)" if isfinite(verdict.sigma) else ""
+        lines.append(f"closure {number}, {seconds:.1f} s back: {verdict.state}, {verdict.reason}{figures}")
+    more = len(lines) - MOST_LINES
+    return lines if more <= 0 else [*lines[:MOST_LINES], f"... and {more} more in graph_verdicts.csv"]
+
+
+def describe(closure: LoopClosure, inliers: int, judged: JudgedClosure | None) -> str:
+    """One line for the picture of a closure."""
+    shift_m, turn_deg = _size(closure)
+    text = f"{shift_m:.2f} m, {turn_deg:.1f} deg apart   p {closure.probability:.3f}   {inliers} image inliers"
+    if judged is None:
+        return text
+    return f"{text}   {'true' if judged.is_true else 'FALSE'}, {judged.translation_error_m:.2f} m off"
+
+
+def closure_rows(about: ExaminedRun) -> list[ClosureRow]:
+    """The page's table: seconds since the first keyframe, figures, the graph's verdict and the truth's."""
+    known = about.judged.by_endpoints()
+    start = int(about.run.stamps[0]) if len(about.run.stamps) else 0
+    rows = []
+    for number, closure in enumerate(about.run.closures, 1):
+        at_s, back_s = ((closure.query_stamp_ns - other) * 1e-9 for other in (start, closure.match_stamp_ns))
+        shift_m, turn_deg = _size(closure)
+        verdict, judged = about.run.verdicts.get(endpoints(closure)), known.get(endpoints(closure))
+        figures = [f"{at_s:.1f}", f"{back_s:.1f}", f"{shift_m:.2f}", f"{turn_deg:.1f}", f"{closure.probability:.4f}"]
+        cells = [str(number), *figures, verdict.state if verdict else ""]
+        if judged is None:
+            rows.append(ClosureRow([*cells, "", "", ""], "", ""))
+            continue
+        errors = [f"{value:.3g}" for value in (judged.translation_error_m, judged.rotation_error_deg, judged.nees)]
+        rows.append(ClosureRow([*cells, *errors], *(("yes", "good") if judged.is_true else ("NO", "bad"))))
+    return rows
+
+
+def _inside_a_script(scene: Mapping[str, Any]) -> str:
+    """The scene as JSON that no parser of HTML takes for the end of its script."""
+    text = json.dumps(scene, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+def _plotly() -> str:
+    """The drawing library, as its package brings it."""
+    from plotly.offline import get_plotlyjs
+
+    return str(get_plotlyjs())
+
+
+def _facts(summary: Summary) -> list[tuple[str, str]]:
+    truth, latency = summary["ground_truth"], summary["latency_ms"]
+    facts = {
+        "frames": f"{summary['frames']}, {summary['pairs']} with image and scan",
+        "keyframes": f"{summary['keyframes']}, {summary['queries']} of them with candidates",
+        "closures": f"{summary['closures_published']} published, {summary['closures_rejected']} candidates rejected",
+    }
+    if truth:
+        facts["revisits"] = _revisits(truth)
+        facts["stated errors"] = _honesty(truth)
+    if latency["total"]["p50"] is not None:
+        medians = {stage: times["p50"] for stage, times in latency.items() if stage != "total"}
+        stages = ", ".join(f"{stage} {median:.0f}" for stage, median in medians.items() if median is not None)
+        facts["latency"] = f"{latency['total']['p50']:.0f} ms per keyframe, median ({stages})"
+    facts["dropped"] = ", ".join(f"{name} {count}" for name, count in summary["drops"].items())
+    facts["memory"] = f"{summary['peak_rss_mb']:.0f} MB at most"
+    return list(facts.items())
+
+
+def _revisits(truth: Summary) -> str:
+    """How often a place was seen again, and how many of those times found it; older runs do not say the latter."""
+    again, closed = truth.get("revisits_any_heading"), truth.get("closed_any_heading")
+    if not again or closed is None:
+        return str(truth["revisits"])
+    return f"{truth['revisits']} in the same direction; {again} from any side, {closed} of them closed"
+
+
+def _honesty(truth: Summary) -> str:
+    """How the covariances of the closures compare with their errors; older runs do not say."""
+    median, inside = truth.get("nees_median"), truth.get("inside_95")
+    if median is None or inside is None:
+        return "not judged: no closure, or a truth without orientations"
+    return (
+        f"{in_words(median, inside)}; {inside:.0%} of the closures inside their 95 % ellipsoid, "
+        f"normalised error squared {median:.1f} in the median ({MEDIAN_EXPECTED:.1f} expected)"
+    )
+
+
+def _size(closure: LoopClosure) -> tuple[float, float]:
+    """Metres and degrees between the endpoints."""
+    pose = closure.match_T_query
+    return float(np.linalg.norm(pose[:3, 3])), float(np.degrees(rotation_angle(pose)))
+
 
 MAX_SHOWN = 400
 """Keyframes that are photographed; the page shows as many as find room."""

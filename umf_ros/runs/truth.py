@@ -1,4 +1,4 @@
-"""A run held against the ground truth."""
+"""Judge closures, their covariances and trajectories by ground truth."""
 
 from __future__ import annotations
 
@@ -9,14 +9,55 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
 from umf_ros.core.config import Loop
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, align, heading, invert, relative, rotation_angle, transform, wrap_angle
 from umf_ros.core.keyframes import is_past
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.runs.consistency import normalised_errors, pose_error, share_inside
+from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.tables import Endpoints, read_keyframes
+
+CONFIDENCE = 0.95
+MEDIAN_EXPECTED = float(chdtri(6, 0.5))
+"""Half of honest normalised errors squared are less than this, 5.35: chi square with six degrees of freedom."""
+HONEST_MEDIAN = (3.0, 8.0)
+HONEST_INSIDE = 0.9
+
+
+def pose_error(estimated: Array, true: Array) -> Array:
+    """Error (..., 6) of poses (..., 4, 4) `match_T_query` in ROS order, about the axes of the match.
+
+    The estimate is the truth, turned by the last three about the query's origin and shifted by the first three.
+    """
+    turn = Rotation.from_matrix(estimated[..., :3, :3] @ np.swapaxes(true[..., :3, :3], -1, -2)).as_rotvec()
+    return np.concatenate([estimated[..., :3, 3] - true[..., :3, 3], turn], axis=-1)
+
+
+def normalised_errors(errors: Array, covariances: Array) -> Array:
+    """Normalised errors squared (...) of errors (..., 6) under their covariances (..., 6, 6), both in ROS order."""
+    weighed = np.linalg.solve(covariances, errors[..., None])[..., 0]
+    found: Array = np.einsum("...i,...i->...", errors, weighed)
+    return found
+
+
+def share_inside(squared: Array, confidence: float = CONFIDENCE) -> float:
+    """Share of normalised errors squared that lie inside the confidence ellipsoid; NaN without any."""
+    return float(np.mean(np.asarray(squared) < chdtri(6, 1 - confidence))) if len(squared) else nan
+
+
+def in_words(nees_median: float, inside_95: float) -> str:
+    """What a person wants to know of the stated errors."""
+    low, high = HONEST_MEDIAN
+    factor = (nees_median / MEDIAN_EXPECTED) ** 0.5
+    if nees_median > high:
+        return f"too small by a factor of {factor:.2g}"
+    if nees_median < low:
+        return f"too large by a factor of {1 / max(factor, 1e-9):.2g}"
+    return "honest" if inside_95 >= HONEST_INSIDE else "honest for most, too small for the worst"
+
 
 PLACE_RADIUS_M = 12.0
 PLACE_ANGLE_DEG = 30.0
@@ -227,3 +268,63 @@ def _judge_closures(closures: list[LoopClosure], truth: Trajectory) -> list[Judg
 
 def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 4)
+
+
+class TruePlaces:
+    """The keyframes of a run, where they truly were and which of them may be matched with which.
+
+    Without a truth nothing is known to be the same place; what the gap rules allow is known all the same.
+    """
+
+    def __init__(self, run: FinishedRun) -> None:
+        self._rules = run.settings.loop
+        self.stamps = run.stamps
+        self._travelled: Array = np.array([row.path_length_m for row in run.keyframes], float)
+        self._sessions = np.array([row.session for row in run.keyframes], int)
+        self._has_orientation = run.truth is not None and run.truth.has_orientation
+        self.poses: Array
+        if run.truth is None:
+            self.poses, self.known = np.tile(np.eye(4), (len(self.stamps), 1, 1)), np.zeros(len(self.stamps), bool)
+        else:
+            self.poses, self.known = run.truth.at(self.stamps)
+        self._headings = heading(self.poses) if len(self.poses) else np.empty(0)
+        self._row = {int(stamp): row for row, stamp in enumerate(self.stamps)}
+
+    def row(self, stamp_ns: int) -> int | None:
+        """Place of a keyframe among all; None where there is none of this stamp."""
+        return self._row.get(int(stamp_ns))
+
+    def nearest_row(self, stamp_ns: int) -> int:
+        """Place of the keyframe nearest to a stamp."""
+        return int(np.abs(self.stamps - stamp_ns).argmin())
+
+    def admissible(self, row: int) -> NDArray[np.bool_]:
+        """(row,) which earlier keyframes the gap rules allow."""
+        return is_past(
+            self.stamps[row] - self.stamps[:row],
+            self._travelled[row] - self._travelled[:row],
+            self._rules,
+            self._sessions[:row] == self._sessions[row],
+        )
+
+    def distances(self, row: int) -> NDArray[np.float64]:
+        """(N,) metres in truth to every keyframe, infinite where it is unknown."""
+        apart = np.linalg.norm(self.poses[:, :3, 3] - self.poses[row, :3, 3], axis=1)
+        return np.where(self.known & self.known[row], apart, np.inf)
+
+    def same_places(self, row: int) -> NDArray[np.int64]:
+        """Earlier keyframes that are the same place and may be matched, the nearest first."""
+        apart = self.distances(row)[:row]
+        near = self.admissible(row) & (apart <= PLACE_RADIUS_M)
+        if self._has_orientation:
+            turned = np.abs(wrap_angle(self._headings[:row] - self._headings[row]))
+            near &= turned <= radians(PLACE_ANGLE_DEG)
+        rows = np.flatnonzero(near)
+        return rows[np.argsort(apart[rows])]
+
+    def is_same_place(self, query_ns: int, match_ns: int) -> bool | None:
+        """Whether the two are within 12 m in truth, whatever their headings; None where that is unknown."""
+        query, match = self.row(query_ns), self.row(match_ns)
+        if query is None or match is None or not (self.known[query] and self.known[match]):
+            return None
+        return bool(np.linalg.norm(self.poses[query, :3, 3] - self.poses[match, :3, 3]) <= PLACE_RADIUS_M)

@@ -1,7 +1,8 @@
-"""The parts of a frame, put together in one body frame at one time."""
+"""Assemble a frame from its messages: rectified images, a scan within its limits and without motion distortion."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -14,7 +15,163 @@ from umf_ros.core.geometry import Array, invert, relative, transform
 from umf_ros.sensors.buffers import OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.scan_motion import scan_motion
+
+Path = tuple[NDArray[np.int64], list[Array]]
+"""Stamps and poses `odom_T_body`."""
+
+HISTORY_NS = 5_000_000_000
+"""Over so long the noise of the odometry is measured; by hand: some twenty scans, on the same ground at one speed."""
+FINEST = 6
+"""Poses looked at per scan, at most: odometry may come much faster than is needed."""
+BINOMIALS = (-1.0, 3.0, -3.0, 1.0)
+"""Third differences of the steps over a scan leave out whatever motion bends evenly."""
+STEPS = sum(binomial**2 for binomial in BINOMIALS)
+"""The variance of a third difference of independent steps, in variances of one."""
+UNKNOWN_NOISE = np.array([1e-4] * 3 + [2e-5] * 3)
+"""Taken where the history is too short to tell: 1 cm and .25 deg per root of a second; by hand."""
+
+
+def scan_motion(moments_s: Array, span_ns: tuple[int, int], path: Path, odometry: OdometryBuffer) -> ScanMotion:
+    """The motion during a scan.
+
+    Args:
+        moments_s: (N,) when each point was measured, s after the frame's stamp.
+        span_ns: when the first and the last of them was.
+        path: the odometry over the scan, at least one pose.
+        odometry: its latest poses.
+    """
+    stamps, poses = path
+    lasted_s = float(stamps[-1] - stamps[0]) * 1e-9
+    rates = twists(np.stack([poses[0], poses[-1]]))[0] / lasted_s if lasted_s > 0 else np.zeros(6)
+    history = odometry.samples(span_ns[1] - HISTORY_NS, span_ns[1])
+    return ScanMotion(moments_s.astype(np.float32), rates, odometry_noise(history, span_ns[1] - span_ns[0]))
+
+
+def odometry_noise(history: Path, duration_ns: int) -> Array:
+    """Variance (6,) that the odometry's error gains in a second: x y z rx ry rz about the body's axes, m^2/s, rad^2/s.
+
+    A rover moves smoothly, and its odometry walks beside it at random or jitters about it. What third differences leave
+    of the steps over the duration of a scan is that noise, as much of it as bends a scan of this duration, whichever
+    of the two it is. Rougher motion counts as noise too: the odometry may not have followed it.
+
+    Args:
+        history: poses before the end of the scan, at about equal distances in time.
+        duration_ns: of the scan.
+    """
+    stamps, poses = history
+    if len(stamps) < 2 or duration_ns <= 0:
+        return UNKNOWN_NOISE
+    spacing_ns = float(np.median(np.diff(stamps)))
+    stride = max(1, int(duration_ns / spacing_ns / FINEST))
+    lag = max(1, round(duration_ns / spacing_ns / stride))
+    used = poses[::-1][::stride][::-1]
+    if len(used) < 2 * len(BINOMIALS) * lag:
+        return UNKNOWN_NOISE
+    steps = twists(np.stack(used), lag)
+    count = len(steps) - (len(BINOMIALS) - 1) * lag
+    left = np.sum([binomial * steps[i * lag : i * lag + count] for i, binomial in enumerate(BINOMIALS)], axis=0)
+    return np.asarray(np.mean(left**2, axis=0) / STEPS / (lag * stride * spacing_ns * 1e-9))
+
+
+def twists(poses: Array, lag: int = 1) -> Array:
+    """Steps (N - lag, 6) x y z rx ry rz between poses (N, 4, 4), about the axes of the first of each two."""
+    moved = invert(poses[:-lag]) @ poses[lag:]
+    return np.hstack([moved[:, :3, 3], Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()])
+
+
+MOST = 0.8
+"""A limit that would drop more than this share of all returns so far was written for another sensor (*by hand*: the
+Cube-1's drops a quarter of a scan at most, one written for 0 to 4095 drops all of 0 to 1)."""
+
+
+@dataclass(slots=True)
+class _Tally:
+    """How many returns a limit would have dropped so far."""
+
+    dropped: int = 0
+    seen: int = 0
+
+    def add(self, dropped: NDArray[np.bool_]) -> None:
+        """Count the returns of one scan that the limit is there for."""
+        self.dropped += int(np.count_nonzero(dropped))
+        self.seen += len(dropped)
+
+    @property
+    def fits(self) -> bool:
+        """Whether the limit can be meant for this sensor."""
+        return self.dropped < MOST * self.seen
+
+    @property
+    def share(self) -> str:
+        return f"{100 * self.dropped / max(1, self.seen):.0f} %"
+
+
+class ScanLimits:
+    """Drops weak returns and those far above or below the LiDAR.
+
+    A limit of the calibration is applied only as long as it spares enough of what the sensor has seen so far: no
+    scan is lost because its intensities go from 0 to 1, or because its z axis is not the vertical. What was seen is
+    counted from scan to scan, so that one poor scan of the right sensor is filtered like the others. The same scans
+    in the same order are filtered alike.
+
+    Args:
+        calibration: holds the limits.
+        warn: told once, in one line, when a limit is not applied, and when a scan is empty.
+    """
+
+    def __init__(self, calibration: Calibration, warn: Callable[[str], None]) -> None:
+        self._min_intensity = calibration.min_intensity
+        self._max_height_m = calibration.max_height_m
+        self._warn = warn
+        self._told: set[str] = set()
+        self._weak, self._high = _Tally(), _Tally()
+        self._strongest = 0.0
+
+    def apply(self, cloud: Cloud) -> Cloud:
+        """The returns to use; those of the next scan in time."""
+        keep = self._within_height(cloud) & self._strong_enough(cloud)
+        if not keep.any():
+            self._tell("empty", f"a scan of {len(keep)} returns, none of which can be used; such scans are skipped")
+        return Cloud(
+            cloud.points[keep],
+            None if cloud.intensity is None else cloud.intensity[keep],
+            None if cloud.time_offset_ns is None else cloud.time_offset_ns[keep],
+        )
+
+    def _within_height(self, cloud: Cloud) -> NDArray[np.bool_]:
+        near: NDArray[np.bool_] = np.abs(cloud.points[:, 2]) <= self._max_height_m
+        self._high.add(~near)
+        if self._high.fits or math.isinf(self._max_height_m) or not len(near):
+            return near
+        self._tell(
+            "max_height_m",
+            f"max_height_m {self._max_height_m:g} of the calibration would drop {self._high.share} of the returns"
+            " so far: it is not applied; is the LiDAR's z axis up?",
+        )
+        return np.ones_like(near)
+
+    def _strong_enough(self, cloud: Cloud) -> NDArray[np.bool_]:
+        everything = np.ones(len(cloud.points), bool)
+        if cloud.intensity is None or not self._min_intensity or not len(everything):
+            return everything
+        strong = cloud.intensity > self._min_intensity
+        # where there is no intensity at all, drivers send 0: neither for nor against the limit
+        self._weak.add(~strong[cloud.intensity > 0])
+        self._strongest = max(self._strongest, float(np.nanmax(cloud.intensity, initial=0.0)))
+        if self._weak.fits:
+            return strong
+        if self._strongest > 0:
+            self._tell(
+                "min_intensity",
+                f"min_intensity {self._min_intensity:g} of the calibration would drop {self._weak.share} of the returns"
+                f" so far, whose intensities reach {self._strongest:.3g}: it is not applied",
+            )
+        return everything
+
+    def _tell(self, what: str, text: str) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            self._warn(text)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,7 @@ from umf_ros.pose_graph import journal
 from umf_ros.pose_graph.closures import ClosureVerdict, Decision
 from umf_ros.pose_graph.journal import Event, GraphJournal
 from umf_ros.pose_graph.pose_graph import PoseGraph
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
-from umf_ros.sensors.sessions import Reset
+from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
 
 MANY = 300
 """From so many closures on the verdicts are taken up as they were written, rather than found again (*by hand*)."""

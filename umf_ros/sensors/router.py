@@ -11,11 +11,12 @@ from umf_ros.core.config import Topics
 from umf_ros.core.errors import MessageError
 from umf_ros.sensors.decode import (
     OdometrySample,
+    decode_any_cloud,
+    decode_any_image,
     decode_camera_info,
     decode_odometry,
     stamp_ns,
 )
-from umf_ros.sensors.message_kinds import decode_any_cloud, decode_any_image
 from umf_ros.sensors.sessions import ODOMETRY, Input
 from umf_ros.sensors.synchronizer import SILENCE_NS, Synchronizer
 from umf_ros.sensors.tf import OdometryFrames, TfExtrinsics

@@ -11,11 +11,10 @@ from umf_ros.core.config import Sync
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import Frame, Image, StereoCamera
 from umf_ros.core.geometry import Array
-from umf_ros.sensors.assembly import Anchor, assemble
+from umf_ros.sensors.assembly import Anchor, ScanLimits, assemble
 from umf_ros.sensors.buffers import ImageBuffer, InputCounter, OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.limits import ScanLimits
 from umf_ros.sensors.sessions import ODOMETRY, Input, Reset, SessionClock, StampedInput
 
 _log = logging.getLogger(__name__)

@@ -16,8 +16,7 @@ from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan, views_tell
-from umf_ros.verification.ransac import fit_rigid
-from umf_ros.verification.rerank import RankedCandidate
+from umf_ros.verification.rerank import RankedCandidate, fit_rigid
 from umf_ros.verification.view_alignment import PairedViews
 from umf_ros.verification.yaw_search import Fit, RotatedElevationMap, scout, search
 

@@ -22,9 +22,14 @@ from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, near, prior_sigmas
 from umf_ros.verification.prepared_scan import PreparedScan, joint_blur, levelled
 from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
-from umf_ros.verification.scan_alignment import Alignment, CovarianceModel, covariance_of, nominal_deviations
+from umf_ros.verification.scan_alignment import (
+    Alignment,
+    CovarianceModel,
+    closure_covariance,
+    covariance_of,
+    nominal_deviations,
+)
 from umf_ros.verification.scan_consistency import meet, rivalry
-from umf_ros.verification.scan_motion import closure_covariance
 from umf_ros.verification.view_alignment import ViewAlignment
 
 SCAN, IMAGE, SUBMAP = "scan", "image", "submap"

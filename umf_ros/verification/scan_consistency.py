@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from umf_ros.core.geometry import Array, invert, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.free_space import Sight, visible
 from umf_ros.verification.prepared_scan import PreparedScan, joint_blur
 from umf_ros.verification.scan_alignment import SEARCHED
+from umf_ros.verification.surroundings import Sight, visible
 from umf_ros.verification.yaw_search import alternatives
 
 Mask = NDArray[np.bool_]

@@ -1,24 +1,114 @@
-"""Bird's-eye maps of everything around a scan that was set upright, for the search over all headings.
-
-Two quantities stand in every cell. *Relief*, the height above a plane fitted to the neighbourhood, tells terrain from
-terrain. *Height of structure*, in how many layers a cell has points, tells walls, trunks and boxes from the floor they
-stand on, also where a ceiling hides every height. The cells are as large as the place asks for: a room is some
-metres wide, a field some ten.
-"""
+"""Visible space of a scan: field of view, free space and the surroundings of the sensor."""
 
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from functools import cached_property
 
 import cv2
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
-from umf_ros.verification.relief import Grid, relief_of
+from umf_ros.verification.elevation_map import Grid, relief_of
+
+
+class FieldOfView:
+    """The bearings into which a scan has points, found from the points themselves.
+
+    A spinning LiDAR and a submap look all around; a solid-state LiDAR into a fan.
+    """
+
+    def __init__(self, points: Array) -> None:
+        """Args: points (M, >= 2) m, upright, about the sensor."""
+        bearing = np.arctan2(points[:, 1], points[:, 0])
+        sector = np.floor((bearing + np.pi) * (const.SECTORS / (2 * np.pi))).astype(int) % const.SECTORS
+        count = np.bincount(sector, minlength=const.SECTORS)
+        self.seen: Array = (count > const.MIN_SECTOR_SHARE * max(len(points), 1)).astype(float)
+
+    @property
+    def width_deg(self) -> float:
+        """Of all directions seen, together, deg."""
+        return float(self.seen.sum()) * 360.0 / const.SECTORS
+
+    def overlap(self, other: FieldOfView, headings: Array) -> Array:
+        """Share (H,) of the narrower view that both see, were `other` turned by the headings (H,), rad."""
+        spectrum = np.fft.rfft(self.seen) * np.fft.rfft(other.seen).conj()
+        shared = np.append(both := np.fft.irfft(spectrum, const.SECTORS), both[0])
+        steps = np.mod(np.asarray(headings) * (const.SECTORS / (2 * np.pi)), const.SECTORS)
+        narrower = min(self.seen.sum(), other.seen.sum())
+        share: Array = np.interp(steps, np.arange(const.SECTORS + 1), shared) / max(narrower, 1.0)
+        return share
+
+
+class Sight(IntEnum):
+    """What a scan's rays say of a point of another scan."""
+
+    MET = 0
+    """It lies where rays end."""
+    PASSED = 1
+    """Rays passed it by: it stands in free space."""
+    HIDDEN = 2
+    """It lies behind what the rays met."""
+    UNSEEN = 3
+    """There are no rays in its direction, or it is too near to be seen."""
+
+
+class RangeImage:
+    """How far a scan sees in every direction from where its sensor is."""
+
+    def __init__(self, points: Array) -> None:
+        """Args: points (N, 3) m, thinned, sensor at the origin."""
+        row, column, reach = _polar(_filled(points))
+        shape = (const.SIGHT_ROWS, const.SIGHT_COLUMNS)
+        nearest, farthest = np.full(shape, np.inf), np.zeros(shape)
+        np.minimum.at(nearest, (row, column), reach)
+        np.maximum.at(farthest, (row, column), reach)
+        around = ("nearest", "wrap")
+        self._nearest = minimum_filter(nearest, 3, mode=around)
+        self._farthest = maximum_filter(farthest, 3, mode=around)
+        self._known = uniform_filter(np.isfinite(nearest).astype(float), 3, mode=around) > const.SIGHT_KNOWN
+
+    def look_at(self, points: Array) -> NDArray[np.int8]:
+        """(N,) a `Sight` for each of the points (N, 3), given in this image's sensor frame."""
+        row, column, reach = _polar(points)
+        margin = const.SIGHT_MARGIN_M + const.SIGHT_MARGIN * reach
+        sight = np.full(len(points), Sight.MET, np.int8)
+        sight[reach < self._nearest[row, column] - margin] = Sight.PASSED
+        sight[reach > self._farthest[row, column] + margin] = Sight.HIDDEN
+        sight[~self._known[row, column] | (reach < const.SIGHT_FROM_M)] = Sight.UNSEEN
+        return sight
+
+
+def visible(sight: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """(N,) whether the rays should have met or did meet the points."""
+    return (sight == Sight.MET) | (sight == Sight.PASSED)
+
+
+def _filled(points: Array) -> Array:
+    """The points and, near the sensor, some around each: a thinned point stands for a cube that is wider than rays."""
+    reach = np.linalg.norm(points, axis=1, keepdims=True)
+    near = (reach < const.SIGHT_FILLED_M).ravel() & (reach > const.SIGHT_FROM_M).ravel()
+    ray = points[near] / reach[near]
+    across = np.column_stack([ray[:, 1], -ray[:, 0], np.zeros(len(ray))])
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-6)
+    aside = [side * way for way in (across, np.cross(ray, across)) for side in (-1, 1)]
+    return np.concatenate([points, *(points[near] + const.THIN_CELL_M / 3 * way for way in aside)])
+
+
+def _polar(points: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Row, column and range of points."""
+    reach = np.sqrt(np.einsum("ij,ij->i", points, points))
+    elevation = np.arcsin(np.clip(points[:, 2] / np.maximum(reach, 1e-6), -1, 1)) / np.pi + 0.5
+    azimuth = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
+    row = np.clip((elevation * const.SIGHT_ROWS).astype(np.intp), 0, const.SIGHT_ROWS - 1)
+    column = (azimuth * const.SIGHT_COLUMNS).astype(np.intp) % const.SIGHT_COLUMNS
+    return row, column, reach
+
 
 Spectra = NDArray[np.complex64]
 SIDE = const.AROUND_CELLS

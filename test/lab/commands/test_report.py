@@ -23,8 +23,8 @@ from umf_ros.core.frames import Candidate, Frame, LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection
-from umf_ros.runs.finished_run import remember_recording
-from umf_ros.runs.recorder import RunRecorder
+from umf_ros.runs.reader import remember_recording
+from umf_ros.runs.writer import RunRecorder
 from umf_ros.verification import Measurement, Verdict
 
 LATENCY = {"embed": 30.0, "query": 1.0, "verify": 9.0, "total": 40.0}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from landmarks import PLACES, LandmarkEmbedder, frame_of
 
-from umf_ros.baselines.thumbnail_embedder import ThumbnailEmbedder
+from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame

@@ -33,8 +33,7 @@ def places(
     from rich.console import Console
 
     from umf_ros.lab.evaluation.places_bench import measure_places
-    from umf_ros.runs.descriptors import all_descriptors
-    from umf_ros.runs.folder import write_atomically
+    from umf_ros.runs.writer import all_descriptors, write_atomically
 
     console = Console(stderr=True)
     largest = 150_000 if quick else 1_000_000

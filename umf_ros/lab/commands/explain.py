@@ -10,7 +10,7 @@ import typer
 from umf_ros.commands.recordings import BagPath, ConfigPath, DatasetName, EmbedderName, WeightsPath, open_recording
 
 if TYPE_CHECKING:
-    from umf_ros.bags.moments import Moment
+    from umf_ros.bags.frames import Moment
 
 Optional = typer.Option
 
@@ -28,8 +28,7 @@ def command(
     """Show both images with their matching features, both scans aligned, and the decision's numbers."""
     from rich.console import Console
 
-    from umf_ros.bags.frames import FrameReader
-    from umf_ros.bags.moments import nearest_frames
+    from umf_ros.bags.frames import FrameReader, nearest_frames
     from umf_ros.detector import make_detector_embedder, make_keyframe
     from umf_ros.lab.evaluation.explanation import draw, explain
 
@@ -51,7 +50,7 @@ def command(
 
 
 def _moment(text: str) -> Moment:
-    from umf_ros.bags.moments import parse_moment
+    from umf_ros.bags.frames import parse_moment
 
     try:
         return parse_moment(text)

@@ -21,8 +21,8 @@ def command(
     from umf_ros.embedding.export import save
     from umf_ros.embedding.runtimes import outputs_of
     from umf_ros.embedding.torch_runtimes import converted
-    from umf_ros.networks.weights_files import locate_weights
-    from umf_ros.runs.folder import check_writable
+    from umf_ros.networks.config import locate_weights
+    from umf_ros.runs.writer import check_writable
 
     if out.suffix != ".xml":
         raise ConfigError(f"{out}: OpenVINO's files end in .xml")

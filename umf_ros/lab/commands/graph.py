@@ -40,7 +40,7 @@ def optimize(
 
     from umf_ros.core.config import PoseGraphSettings
     from umf_ros.lab.datasets.g2o import as_recording, drive, read_g2o
-    from umf_ros.pose_graph.export import verdict_table
+    from umf_ros.pose_graph.g2o import verdict_table
     from umf_ros.pose_graph.pose_graph import PoseGraph
 
     console, content = Console(), read_g2o(file)

@@ -29,8 +29,8 @@ from umf_ros.core.geometry import (
     propagate,
 )
 from umf_ros.pose_graph.closures import check_covariance
-from umf_ros.pose_graph.odometry_preintegration import Edge
 from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.pose_graph.solver import Edge
 
 PERIOD_NS = 1_000_000_000
 LARGEST_ID = 2**63 - 1

@@ -25,7 +25,7 @@ from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.inputs import prepare_scan, read_frame
 from umf_ros.embedding.torch_runtimes import to_tensors
 from umf_ros.lab.evaluation.retrieval import Indices
-from umf_ros.networks.attention import received
+from umf_ros.networks.fusion import received
 from umf_ros.networks.umf import UMF, NetworkOutput
 from umf_ros.verification.rerank import eligible_superfeatures
 

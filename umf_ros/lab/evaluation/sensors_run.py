@@ -22,9 +22,9 @@ from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.evaluation.results import TextTable
 from umf_ros.replay import Replay
 from umf_ros.runs.findings import ExaminedRun
-from umf_ros.runs.finished_run import read_run, remember_recording
-from umf_ros.runs.recorder import count_drops
+from umf_ros.runs.reader import read_run, remember_recording
 from umf_ros.runs.report import finish_run, judge
+from umf_ros.runs.writer import count_drops
 
 _NOTHING = "/none"
 SENSORS: dict[str, dict[str, Any]] = {

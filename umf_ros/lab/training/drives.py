@@ -24,12 +24,12 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.embedding.inputs import read_frame
 from umf_ros.embedding.torch_runtimes import to_tensors
-from umf_ros.lab.datasets.labels import distances, places_of
+from umf_ros.lab.datasets.sample import distances, places_of
 from umf_ros.networks.umf import UMF
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.sensors.decode import OdometrySample
-from umf_ros.sensors.odometry_sessions import OdometrySessionSplitter
+from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 Mask = NDArray[np.bool_]
 SAME_M, SAME_DEG = 8.0, 25.0

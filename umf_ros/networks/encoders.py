@@ -1,0 +1,349 @@
+"""Encoders of images and of sparse voxels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from umf_ros.networks.config import NetworkConfig
+from umf_ros.networks.efficientnet import EfficientNetLite0
+
+MARGIN = 2
+"""Empty voxels around the grid: how far the widest convolution reaches."""
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """The occupied voxels of a batch at one resolution.
+
+    Attributes:
+        cells: (N, 4) int64 frame, x, y, z; every cell once.
+        size: voxels along each side of the grid.
+        batch: frames.
+    """
+
+    cells: Tensor
+    size: int
+    batch: int
+
+    def rows(self, cells: Tensor) -> Tensor:
+        """Rows of some cells (M, 4) within the grid, N for those that are empty."""
+        return self._table[self._padded(cells)]
+
+    def neighbours(self, kernel: int) -> Tensor:
+        """Rows (N, kernel^3) of the cells around each cell, itself in the middle; N for those that are empty.
+
+        The table is wider than the grid, so that nobody has to ask whether a neighbour is outside.
+        """
+        reach = torch.arange(kernel, device=self.cells.device) - kernel // 2
+        around = torch.cartesian_prod(reach, reach, reach) @ reach.new_tensor([self._wide**2, self._wide, 1])
+        return self._table[self._padded(self.cells)[:, None] + around]
+
+    @cached_property
+    def half(self) -> Level:
+        """The same at half the resolution."""
+        flat = self._flat(self._parents, self.size // 2).unique()
+        return Level(_unflatten(flat, self.size // 2), self.size // 2, self.batch)
+
+    @cached_property
+    def parent(self) -> Tensor:
+        """(N,) rows of `half`, and (N,) which of its eight children each cell is, as a pair (2, N)."""
+        child = self.cells[:, 1:] % 2 @ self.cells.new_tensor([4, 2, 1])
+        return torch.stack([self.half.rows(self._parents), child])
+
+    @property
+    def _parents(self) -> Tensor:
+        return torch.cat([self.cells[:, :1], self.cells[:, 1:] // 2], 1)
+
+    @property
+    def _wide(self) -> int:
+        return self.size + 2 * MARGIN
+
+    @cached_property
+    def _table(self) -> Tensor:
+        table = self.cells.new_full((self.batch * self._wide**3,), len(self.cells))
+        table[self._padded(self.cells)] = torch.arange(len(self.cells), device=table.device)
+        return table
+
+    def _padded(self, cells: Tensor) -> Tensor:
+        """Places of cells (..., 4) in the table."""
+        frame, x, y, z = cells.unbind(-1)
+        return ((frame * self._wide + x + MARGIN) * self._wide + y + MARGIN) * self._wide + z + MARGIN
+
+    def _flat(self, cells: Tensor, size: int) -> Tensor:
+        frame, x, y, z = cells.unbind(-1)
+        return ((frame * size + x) * size + y) * size + z
+
+
+def _unflatten(flat: Tensor, size: int) -> Tensor:
+    return torch.stack([flat // size**3, flat // size**2 % size, flat // size % size, flat % size], 1)
+
+
+class Around(nn.Module):
+    """Convolution of odd kernel over the occupied cells (N, C) of a level, to (N, C')."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int = 3) -> None:
+        super().__init__()
+        self._kernel = kernel
+        self.linear = _linear(inputs * kernel**3, outputs)
+
+    def forward(self, features: Tensor, level: Level) -> Tensor:
+        """Features (N, C') of the same cells."""
+        padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
+        found: Tensor = self.linear(padded[level.neighbours(self._kernel)].flatten(1))
+        return found
+
+
+class Down(nn.Module):
+    """Convolution of kernel and stride two, to the level of half the resolution."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.linear = _linear(inputs * 8, outputs)
+
+    def forward(self, features: Tensor, level: Level) -> Tensor:
+        """Features (M, C') of the cells of `level.half` from (N, C)."""
+        row, child = level.parent
+        family = features.new_zeros(len(level.half.cells), 8, features.shape[1])
+        found: Tensor = self.linear(family.index_put((row, child), features).flatten(1))
+        return found
+
+
+class Up(nn.Module):
+    """Transposed convolution of kernel and stride two, from the level of half the resolution."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self._outputs = outputs
+        self.linear = _linear(inputs, outputs * 8)
+
+    def forward(self, features: Tensor, level: Level) -> Tensor:
+        """Features (N, C') of the cells of `level` from (M, C) of `level.half`."""
+        row, child = level.parent
+        return self.linear(features).unflatten(1, (8, self._outputs))[row, child]
+
+
+def _linear(inputs: int, outputs: int) -> nn.Linear:
+    """Without bias, for a normalisation follows."""
+    made = nn.Linear(inputs, outputs, bias=False)
+    nn.init.kaiming_normal_(made.weight, nonlinearity="relu")
+    return made
+
+
+class SparseGem(nn.Module):
+    """Generalised mean [Radenović 2019] over the cells of each frame.
+
+    Args:
+        power: at the start; it is learned.
+    """
+
+    def __init__(self, power: float = 3.0) -> None:
+        super().__init__()
+        self.power = nn.Parameter(torch.tensor(power))
+
+    def forward(self, features: Tensor, level: Level) -> Tensor:
+        """(N, C) to (B, C); zeros for a frame without cells."""
+        raised = features.float().clamp(min=1e-6) ** self.power
+        total = raised.new_zeros(level.batch, features.shape[1]).index_add(0, level.cells[:, 0], raised)
+        count = torch.bincount(level.cells[:, 0], minlength=level.batch)[:, None]
+        mean = total / count.clamp(min=1)
+        return torch.where(count > 0, mean.clamp(min=1e-18) ** (1 / self.power), torch.zeros_like(mean))
+
+
+RESNET_DEPTHS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3), "resnet50": (3, 4, 6, 3)}
+
+
+def conv_norm(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
+    """Convolution without bias, and batch normalisation."""
+    conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
+    return nn.Sequential(conv, nn.BatchNorm2d(outputs))
+
+
+class ResidualBlock(nn.Module):
+    """Residual block [He 2016]: basic (two 3x3), or a bottleneck (1x1, 3x3, 1x1 with four times the width)."""
+
+    def __init__(self, inputs: int, width: int, stride: int, bottleneck: bool) -> None:
+        super().__init__()
+        outputs = 4 * width if bottleneck else width
+        if bottleneck:
+            layers = [conv_norm(inputs, width, 1), conv_norm(width, width, 3, stride), conv_norm(width, outputs, 1)]
+        else:
+            layers = [conv_norm(inputs, width, 3, stride), conv_norm(width, width, 3)]
+        self.layers = nn.ModuleList(layers)
+        same = stride == 1 and inputs == outputs
+        self.shortcut = nn.Identity() if same else conv_norm(inputs, outputs, 1, stride)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, C', H / stride, W / stride)."""
+        y = x
+        for number, layer in enumerate(self.layers):
+            y = layer(y)
+            if number < len(self.layers) - 1:
+                y = F.relu(y)
+        return F.relu(y + self.shortcut(x))
+
+
+class Backbone(nn.Module):
+    """A stem and four stages at strides 4, 8, 16 and 32."""
+
+    def __init__(self, name: str, width: int) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(conv_norm(1, width, 7, 2), nn.ReLU(), nn.MaxPool2d(3, 2, 1))
+        self.channels: list[int] = []
+        stages = []
+        inputs = width
+        for level in range(4):
+            stage, inputs = _stage(name, inputs, width * 2**level, level)
+            stages.append(stage)
+            self.channels.append(inputs)
+        self.stages = nn.ModuleList(stages)
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """(B, 1, H, W) to the maps of the four stages, finest first."""
+        x = self.stem(image)
+        maps = []
+        for stage in self.stages:
+            x = stage(x)
+            maps.append(x)
+        return maps
+
+
+def _stage(name: str, inputs: int, width: int, level: int) -> tuple[nn.Sequential, int]:
+    stride = 1 if level == 0 else 2
+    blocks: list[nn.Module] = []
+    bottleneck = name == "resnet50"
+    for number in range(RESNET_DEPTHS[name][level]):
+        blocks.append(ResidualBlock(inputs, width, stride if number == 0 else 1, bottleneck))
+        inputs = 4 * width if bottleneck else width
+    return nn.Sequential(*blocks), inputs
+
+
+class FeaturePyramid(nn.Module):
+    """Top-down pyramid over a backbone's stages: a coarse map for fusion, a fine one for local features."""
+
+    def __init__(self, channels: Sequence[int], pyramid: int, coarse: int, fine: int) -> None:
+        super().__init__()
+        self.laterals = nn.ModuleList(nn.Conv2d(count, pyramid, 1) for count in channels)
+        self.coarse = nn.Conv2d(pyramid, coarse, 3, padding=1)
+        self.fine = nn.Conv2d(pyramid, fine, 3, padding=1)
+
+    def forward(self, maps: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Coarse map (B, coarse, H/16, W/16) and fine map (B, fine, H/4, W/4)."""
+        top = self.laterals[3](maps[3])
+        merged = []
+        for level in (2, 1, 0):
+            up = F.interpolate(top, scale_factor=2.0, mode="bilinear", align_corners=False)
+            top = self.laterals[level](maps[level]) + up
+            merged.append(top)
+        return self.coarse(merged[0]), self.fine(merged[2])
+
+
+class ImageEncoder(nn.Module):
+    """Backbone and pyramid."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        lite = config.backbone == "efficientnet_lite0"
+        self.backbone = EfficientNetLite0() if lite else Backbone(config.backbone, config.width)
+        self.pyramid = FeaturePyramid(self.backbone.channels, config.pyramid, config.tokens, config.local)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Coarse (B, tokens, H/16, W/16) and fine (B, local, H/4, W/4) maps of an image (B, 1, H, W)."""
+        return self.pyramid(self.backbone(image))
+
+
+CELLS = 40
+FEATURES = 6
+
+
+def parent_and_child(voxels: Tensor) -> tuple[Tensor, Tensor]:
+    """Flat index in the 20^3 grid, and which of its eight children, of flat indices in the 40^3 grid."""
+    x, y, z = voxels // (CELLS * CELLS), voxels // CELLS % CELLS, voxels % CELLS
+    half = CELLS // 2
+    return (x // 2 * half + y // 2) * half + z // 2, x % 2 * 4 + y % 2 * 2 + z % 2
+
+
+def take(cells: Tensor, index: Tensor) -> Tensor:
+    """Features (B, N, C) of the cells of a dense map (B, C, X, Y, Z) at flat indices (B, N)."""
+    wanted = index.unsqueeze(1).expand(-1, cells.shape[1], -1)
+    return cells.flatten(2).gather(2, wanted).transpose(1, 2)
+
+
+def conv_block(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    """3-D convolution, batch normalisation, ReLU."""
+    conv = nn.Conv3d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
+    return nn.Sequential(conv, nn.BatchNorm3d(outputs), nn.ReLU())
+
+
+class ResidualBlock3d(nn.Module):
+    """Two convolutions beside a shortcut."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        second = nn.Conv3d(channels, channels, 3, padding=1, bias=False)
+        self.layers = nn.Sequential(conv_block(channels, channels), second, nn.BatchNorm3d(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, X, Y, Z) to the same shape; `x` is not negative."""
+        return F.relu(x + self.layers(x))
+
+
+class VoxelEncoder(nn.Module):
+    """Encoder at 20^3, 10^3 and 5^3 cells with a top-down decoder."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        fine, middle, deep = config.voxel_channels
+        self.stem = nn.Sequential(conv_block(FEATURES * 8, fine, 1), conv_block(fine, fine))
+        self.down = _voxel_encoder_stage(fine, middle, config.voxel_blocks)
+        self.bottom = _voxel_encoder_stage(middle, deep, config.voxel_blocks)
+        self.up_middle = nn.Conv3d(deep, middle, 1)
+        self.up_fine = nn.Conv3d(middle, fine, 1)
+        self.coarse = nn.Conv3d(middle, config.tokens, 1)
+        # a voxel's feature: its parent cell's, its own measurements, and which child it is
+        self.fine = nn.Sequential(
+            nn.Linear(fine + FEATURES + 8, config.local), nn.GELU(), nn.Linear(config.local, config.local)
+        )
+
+    def forward(self, grid: Tensor, coarse_index: Tensor, fine_index: Tensor) -> tuple[Tensor, Tensor]:
+        """Encode a grid and read it at the occupied voxels.
+
+        Args:
+            grid: (B, 20, 20, 20, 48) folded features of the voxels, x y z.
+            coarse_index: (B, T) flat indices in the 10^3 grid.
+            fine_index: (B, V) flat indices in the 40^3 grid.
+
+        Returns:
+            Coarse tokens (B, T, tokens) and fine features (B, V, local).
+        """
+        folded = grid.permute(0, 4, 1, 2, 3)  # channels last in memory
+        fine = self.stem(folded)
+        middle = self.down(fine)
+        deep = self.bottom(middle)
+        middle = middle + _double(self.up_middle(deep))
+        coarse = take(self.coarse(middle), coarse_index)
+        fine = fine + _double(self.up_fine(middle))
+        return coarse, self._fine_features(fine, folded, fine_index)
+
+    def _fine_features(self, cells: Tensor, folded: Tensor, index: Tensor) -> Tensor:
+        parent, child = parent_and_child(index)
+        context = take(cells, parent)
+        family = take(folded, parent).unflatten(-1, (FEATURES, 8))
+        own = family.gather(3, child[..., None, None].expand(-1, -1, FEATURES, 1)).squeeze(3).to(context.dtype)
+        place = F.one_hot(child, 8).to(context.dtype)
+        return self.fine(torch.cat([context, own, place], dim=-1))
+
+
+def _voxel_encoder_stage(inputs: int, outputs: int, blocks: int) -> nn.Sequential:
+    """Half the resolution."""
+    further = (ResidualBlock3d(outputs) for _ in range(blocks))
+    return nn.Sequential(conv_block(inputs, outputs, stride=2), conv_block(outputs, outputs), *further)
+
+
+def _double(cells: Tensor) -> Tensor:
+    return F.interpolate(cells, scale_factor=2.0, mode="nearest")
