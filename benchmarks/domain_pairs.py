@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ import numpy as np
 
 from umf_ros.core.frames import Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, relative, rotation_angle
+from umf_ros.core.io import atomic_write
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
@@ -82,9 +82,8 @@ def surveyed(domain: Domain, seed: int, extent: Extent, folder: Path | None) -> 
     path = folder / f"{domain.name}_{seed}_{extent.step_m:g}_{extent.longest_m:g}.pkl"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_suffix(f".{os.getpid()}")
-        unfinished.write_bytes(pickle.dumps(survey(domain, seed, extent.step_m, extent.longest_m)))
-        unfinished.replace(path)
+        with atomic_write(path) as part:
+            part.write_bytes(pickle.dumps(survey(domain, seed, extent.step_m, extent.longest_m)))
     scans: list[DomainScan] = pickle.loads(path.read_bytes())
     return scans
 

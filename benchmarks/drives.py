@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Frame, Image, Keyframe, ScanMotion, StereoCamera
 from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle, transform
+from umf_ros.core.io import atomic_write
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, resized
@@ -86,9 +86,8 @@ def kept(folder: Path | None, seed: int, family: str, aliasing: float, step_m: f
     path = folder / f"{seed}_{family}_{aliasing:g}_{step_m:g}.pkl"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_suffix(f".{os.getpid()}")
-        unfinished.write_bytes(pickle.dumps(simulate(seed, family, aliasing, step_m)))
-        unfinished.replace(path)
+        with atomic_write(path) as part:
+            part.write_bytes(pickle.dumps(simulate(seed, family, aliasing, step_m)))
     drive: Drive = pickle.loads(path.read_bytes())
     return drive
 

@@ -34,6 +34,7 @@ from rich.table import Table
 
 from umf_ros.core.config import Database, Loop
 from umf_ros.core.frames import Embedding
+from umf_ros.core.io import atomic_write
 from umf_ros.places.database import PlaceDatabase
 
 Figures = dict[str, Any]
@@ -202,8 +203,8 @@ def run_part(name: str, wanted: int, task: Task, seed: int, console: Console) ->
         start = time.monotonic()
         found = PARTS[name].step(task, count, np.random.default_rng([seed, state["done"], len(name)]))
         state = {"done": state["done"] + count, "figures": together(state["figures"], found)}
-        kept.with_suffix(".part").write_text(json.dumps(state))
-        kept.with_suffix(".part").replace(kept)
+        with atomic_write(kept) as part:
+            part.write_text(json.dumps(state))
         console.print(f"{name}: {state['done']} of {wanted} ({time.monotonic() - start:.0f} s): {found}", markup=False)
     return dict(state["figures"])
 

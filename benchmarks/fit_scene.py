@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from umf_ros.core.frames import Image
+from umf_ros.core.io import atomic_write
 from umf_ros.lab.datasets.sample import Places, Sample
 from umf_ros.lab.fit.scene import PooledWorld, SceneFit, fit_scene, pool_world, with_scene
 from umf_ros.lab.simulation.survey import shard_plan, survey_world
@@ -69,11 +70,9 @@ def pooled(network: UMF, seed: int, view: str, stride: int, folder: Path) -> Poo
     if not kept.exists():
         rng = None if view == "plain" else np.random.default_rng([seed, VIEWS.index(view)])
         found = pool_world(network, rendered(seed, stride), rng, view == "mirrored")
-        unfinished = kept.with_suffix(".part")
         arrays = {f.name: getattr(found.places, f.name) for f in fields(Places)}
-        with unfinished.open("wb") as stream:
+        with atomic_write(kept) as part, part.open("wb") as stream:
             np.savez(stream, allow_pickle=False, cells=found.cells.half().numpy(), **arrays)
-        unfinished.replace(kept)
     with np.load(kept) as stored:
         places = Places(*(stored[f.name] for f in fields(Places)))
         return PooledWorld(torch.from_numpy(stored["cells"]).float(), places)

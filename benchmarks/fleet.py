@@ -47,8 +47,8 @@ from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatc
 from umf_ros.fleet.migrations import add_rover, migrate
 from umf_ros.fleet.server import FleetServer, OutgoingPlace
 from umf_ros.lab.evaluation.places_bench import made_up_drives
-from umf_ros.mapping import open_places
 from umf_ros.maps.map_folder import MapFolder
+from umf_ros.maps.mapping import open_places
 from umf_ros.places.store import KeyframeStore, stored_identity
 from umf_ros.runs.truth import judge_closure
 

@@ -43,11 +43,11 @@ from umf_ros.lab.simulation.presets import SESSION
 from umf_ros.lab.simulation.recording import record
 from umf_ros.lab.simulation.simulator import Simulator
 from umf_ros.lab.simulation.world import TEST
-from umf_ros.mapping import Opening, add_session, match_session, replay_session, unmatched
+from umf_ros.localizer import Localizer, read_poses
 from umf_ros.maps.joint_graph import JointMap, solve
-from umf_ros.maps.localizer import Localizer
 from umf_ros.maps.map_folder import MapFolder
-from umf_ros.maps.outputs import read_poses, write_results
+from umf_ros.maps.mapping import Opening, add_session, match_session, replay_session, unmatched
+from umf_ros.maps.outputs import write_results
 from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, absolute_trajectory_error, judge_closure
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter

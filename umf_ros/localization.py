@@ -14,8 +14,7 @@ from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import to_quaternion
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector
-from umf_ros.maps.localizer import Localization, Localizer
-from umf_ros.maps.outputs import read_poses
+from umf_ros.localizer import Localization, Localizer, read_poses
 from umf_ros.runs.tables import POSE, SIGMA, CsvTable
 from umf_ros.runs.writer import RunRecorder, read_summary, write_summary
 from umf_ros.sensors.decode import OdometrySample

@@ -8,8 +8,9 @@ import pytest
 from maps_made import MadeSession, made_map, on_circle, tie
 
 from umf_ros.core.geometry import transform
+from umf_ros.localizer import read_poses
 from umf_ros.maps.joint_graph import JointMap, solve
-from umf_ros.maps.outputs import read_poses, write_results
+from umf_ros.maps.outputs import write_results
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.truth import absolute_trajectory_error
 

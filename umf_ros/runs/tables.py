@@ -15,6 +15,7 @@ import numpy as np
 from umf_ros.core.errors import UmfError, writing
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
+from umf_ros.core.io import atomic_write
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS
 
 if TYPE_CHECKING:
@@ -142,9 +143,8 @@ def _taken_up(path: Path, columns: list[str], keep: Callable[[dict[str, str]], b
     table = [(line, dict(zip(columns, row, strict=False))) for line, row in zip(whole, csv.reader(whole), strict=True)]
     kept = table[:1] + [(line, row) for line, row in table[1:] if len(row) == len(columns) and (not keep or keep(row))]
     if len(kept) != len(lines):
-        part = path.with_name(path.name + ".part")
-        part.write_text("".join(line for line, _ in kept), encoding="utf-8", newline="")
-        part.replace(path)
+        with atomic_write(path) as part:
+            part.write_text("".join(line for line, _ in kept), encoding="utf-8", newline="")
     return [row for _, row in kept[1:]]
 
 

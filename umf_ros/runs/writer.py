@@ -21,6 +21,7 @@ from umf_ros import __version__
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import OutputError, UmfError, writing
 from umf_ros.core.frames import Frame, LoopClosure, Points
+from umf_ros.core.io import atomic_write
 from umf_ros.detector import Detection
 from umf_ros.runs import tables
 from umf_ros.sensors.buffers import InputCounter
@@ -73,13 +74,8 @@ def write_atomically(path: Path, text: str) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    part = path.with_name(path.name + ".part")
-    with writing(path):
-        try:
-            part.write_text(text, encoding="utf-8")
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+    with atomic_write(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 NAME = "descriptors.f16"

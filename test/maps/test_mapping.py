@@ -11,7 +11,8 @@ from recordings import CALIBRATION, ODOMETRY, START_NS, drive, traverse, write_m
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.errors import BagError, UmfError
 from umf_ros.core.trajectory import Trajectory, write_tum
-from umf_ros.mapping import (
+from umf_ros.maps.map_folder import MapFolder
+from umf_ros.maps.mapping import (
     Opening,
     add_session,
     find_recordings,
@@ -20,7 +21,6 @@ from umf_ros.mapping import (
     replay_session,
     unmatched,
 )
-from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.odometry_log import OdometryLog
 from umf_ros.places.store import stored_sessions
 
@@ -90,7 +90,7 @@ def test_a_second_session_is_stored_behind_the_first_on_the_maps_clock(
     for session in unmatched(target):
         matches = list(match_session(target, session))
         assert len(matches) == session.places
-        assert all(v.candidate.index < session.first_place for match in matches for v in match.verdicts)
+        assert all(v.candidate.index < session.first_place for verdicts in matches for v in verdicts)
     assert unmatched(target) == []
 
 

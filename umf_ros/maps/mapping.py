@@ -1,10 +1,10 @@
-"""Makes a map of many recordings: replays each, compares it with those before, and solves all of them together.
+"""Map many recordings: replay each, match it against the earlier ones, and solve one joint pose graph.
 
-Three steps, each a function of files alone, so that the first two can run anywhere:
+Three steps, each a function of files alone, so that the first two can run on any machine:
 
-1. `replay_session`: one recording becomes a run folder with its own places;
-2. `match_session`: what it saw of the places of the recordings before it;
-3. `umf_ros.maps.joint_graph.solve`: one graph of all.
+1. `replay_session`: one recording becomes a run folder with its own place database;
+2. `match_session`: closures between a recording and the earlier ones;
+3. `umf_ros.maps.joint_graph.solve`: one graph of all sessions.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.config import Database, Settings
 from umf_ros.core.errors import BagError, writing
 from umf_ros.core.frames import Keyframe
+from umf_ros.core.io import atomic_write
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
-from umf_ros.maps.matching import Match, match_between
-from umf_ros.maps.odometry_log import OdometryLog
-from umf_ros.maps.tracking import track
+from umf_ros.maps.odometry_log import OdometryLog, track
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
 from umf_ros.runs.tables import CLOSURES, CsvTable, closure_row
 from umf_ros.runs.writer import PLACES, count_drops
+from umf_ros.verification import Verdict, Verifier
 
-Heard = Callable[[float, Detection], None]
-"""Told of every frame: the part of the recording that is done, 0 to 1, and what became of it."""
+OnFrame = Callable[[float, Detection], None]
+"""Called for every frame with the share of the recording that is done, 0 to 1, and the detection."""
 RECORDINGS = (".mcap", ".db3", ".bag")
 
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """How recordings are opened, as by the options of `umf replay`.
+    """Options of `umf replay` that recordings are opened with.
 
     Attributes:
         odometry: folder of TUM files named like the recordings, `NAME.tum` or `NAME.odometry.tum`; None: none.
-        odometry_frame: whose poses they hold.
+        odometry_frame: frame whose poses the files hold.
     """
 
     config: Path | None = None
@@ -57,19 +57,19 @@ class Opening:
     odometry_frame: str = "body"
 
     def settings(self, bag: Bag) -> Settings:
-        """The settings to read a recording with.
+        """Settings for a recording.
 
         Raises:
-            UmfError: they are wrong, or the recording's data set is not known.
+            UmfError: they are wrong, or the recording's data set is unknown.
         """
         overrides = {"embedding__method": self.embedder, "embedding__weights": self.weights}
         return settings_for(bag, self.config, self.dataset, mode="mapping", **overrides)
 
     def odometry_of(self, recording: Path, settings: Settings) -> Trajectory | None:
-        """The odometry of a recording from its file; None where there is no such file.
+        """The odometry of a recording from its TUM file; None where there is none.
 
         Raises:
-            BagError: the file is damaged, or its frame is not known.
+            BagError: the file is damaged, or its frame is unknown.
         """
         folder = self.odometry
         paths = [folder / f"{recording.stem}{ending}" for ending in (".tum", ".odometry.tum")] if folder else []
@@ -78,10 +78,10 @@ class Opening:
 
 
 def find_recordings(paths: list[Path]) -> list[Path]:
-    """The recordings among files and folders, each folder's in the order of their names.
+    """The recordings among files and folders, those of a folder sorted by name.
 
     Raises:
-        BagError: a path is not there, or a folder has no recording in it.
+        BagError: a path is missing, or a folder holds no recording.
     """
     found = []
     for path in paths:
@@ -98,17 +98,17 @@ def _is_recording(path: Path) -> bool:
     return path.suffix in RECORDINGS if path.is_file() else (path / "metadata.yaml").is_file()
 
 
-def replay_session(recording: Path, opening: Opening, folder: Path, heard: Heard = lambda *_: None) -> None:
-    """Find the places of one recording and the closures among them; what lies in the folder is made anew.
+def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: OnFrame = lambda *_: None) -> None:
+    """Replay one recording into a run folder, which replaces an earlier one.
 
     Args:
         recording: any that `umf replay` can read.
-        opening: how.
+        opening: options.
         folder: becomes a run folder with `places.sqlite` and `odometry.npz`, stamped by the recording's own clock.
-        heard: is told of every frame.
+        on_frame: called for every frame.
 
     Raises:
-        UmfError: the recording cannot be read, or the folder not be written.
+        UmfError: the recording cannot be read, or the folder cannot be written.
     """
     bag = open_bag(recording)
     settings = opening.settings(bag)
@@ -121,7 +121,7 @@ def replay_session(recording: Path, opening: Opening, folder: Path, heard: Heard
     reader, log = FrameReader(bag, settings, opening.odometry_of(recording, settings)), OdometryLog()
     replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
     for detection in replay.run(log.following(reader.stream())):
-        heard(reader.progress, detection)
+        on_frame(reader.progress, detection)
     replay.finish(count_drops(reader.counters))
     remember_recording(folder, bag)
     if not len(log):
@@ -131,7 +131,7 @@ def replay_session(recording: Path, opening: Opening, folder: Path, heard: Heard
 
 
 def _track(folder: Path, settings: Settings) -> OdometryLog:
-    """Follow a recording without odometry through its own keyframes, which take that as odometry from now on."""
+    """Track a recording without odometry, and store its keyframes with the tracked poses as odometry."""
     old, new = folder / PLACES, folder / f"tracked_{PLACES}"
     with closing(open_places(old)) as places:
         log, tracked = track((places[row] for row in range(len(places))), settings.verification)
@@ -144,12 +144,12 @@ def _track(folder: Path, settings: Settings) -> OdometryLog:
 
 
 def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
-    """Take the run folder of a recording into the map: its places go to the map's store, on the map's clock.
+    """Add the run folder of a recording to the map: its places move to the map's store, on the map's clock.
 
-    Where a process was killed meanwhile, what it left behind is taken out first.
+    Places that a killed process left behind are removed first.
 
     Raises:
-        UmfError: the recording was embedded by another network than those before it.
+        UmfError: the recording was embedded by another network than the earlier ones.
         OutputError: the map cannot be written.
     """
     run = target.folder_of(name)
@@ -184,36 +184,42 @@ def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
     return session
 
 
-def match_session(target: MapFolder, session: MapSession) -> Iterator[Match]:
-    """Look for a recording's places among those of the recordings before it; writes `closures_between.csv`.
+def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Verdict]]:
+    """Match a recording against the earlier ones; yields the verdicts of every keyframe, accepted ones first.
 
-    The map's store is only read: several sessions may be matched at once.
+    Writes `closures_between.csv`, complete or not at all. The map's store is only read: several sessions may be
+    matched at once.
 
     Raises:
         UmfError: the map's store cannot be read.
         OutputError: the table cannot be written.
     """
-    path = target.folder_of(session.name) / BETWEEN
-    part = path.with_name(path.name + ".part")
-    part.unlink(missing_ok=True)
-    table = CsvTable(part, CLOSURES)
+    settings = target.settings
     rows = range(session.first_place, session.first_place + session.places)
-    with closing(open_places(target.places)) as places, closing(table):
-        for match in match_between(places, rows, range(session.first_number), target.settings):
-            found = [one for one in match.verdicts if one.closure is not None]
-            table.append([closure_row(one.closure, one.candidate.similarity) for one in found if one.closure])
-            yield match
-    with writing(path):
-        part.replace(path)  # it is there when it is whole
+    verifier, number = Verifier(settings.verification), -1
+    with (
+        atomic_write(target.folder_of(session.name) / BETWEEN) as part,
+        closing(CsvTable(part, CLOSURES)) as table,
+        closing(open_places(target.places)) as places,
+    ):
+        for row in rows:
+            keyframe = places[row]
+            if keyframe.session != number:
+                verifier.reset()
+                number = keyframe.session
+            candidates = places.query(keyframe, settings.loop, range(session.first_number))
+            verdicts = verifier.verify(keyframe, [(found, places[found.index]) for found in candidates])
+            table.append([closure_row(v.closure, v.candidate.similarity) for v in verdicts if v.closure])
+            yield verdicts
 
 
 def replay_task(task: tuple[Path, Opening, Path]) -> None:
-    """`replay_session` where nobody listens."""
+    """`replay_session` as a task of another process."""
     replay_session(*task)
 
 
 def match_task(task: tuple[Path, str]) -> None:
-    """`match_session` of a map's folder and the name of one of its sessions, where nobody listens."""
+    """`match_session` as a task of another process, given the folder of the map and the name of the session."""
     target = MapFolder.open(task[0])
     session = next(one for one in target.sessions if one.name == task[1])
     for _ in match_session(target, session):
@@ -221,12 +227,12 @@ def match_task(task: tuple[Path, str]) -> None:
 
 
 def unmatched(target: MapFolder) -> list[MapSession]:
-    """Sessions that were added, but not compared with those before them to the end."""
+    """Sessions that were added and are not matched completely against the earlier ones."""
     return [session for session in target.sessions if not (target.folder_of(session.name) / BETWEEN).is_file()]
 
 
 def _discard_unfinished(target: MapFolder) -> None:
-    """Take out of the store what a process that was killed had begun to add."""
+    """Delete the places of a recording that a killed process had not added completely."""
     if not target.places.is_file():
         return
     known = max((session.first_number + session.numbers for session in target.sessions), default=0)
@@ -236,7 +242,7 @@ def _discard_unfinished(target: MapFolder) -> None:
 
 
 def open_places(path: Path) -> PlaceDatabase:
-    """A store of places to read, by whichever network it was made.
+    """Open a place database of any embedder for reading.
 
     Raises:
         UmfError: it cannot be read.

@@ -8,7 +8,7 @@ from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, expmap, invert, make_pose, relative, rotation_angle
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.maps.localizer import BELIEVED, Localizer
+from umf_ros.localizer import ACCEPTED_ODDS, Localizer
 
 SECOND_NS = 10**9
 LATER_NS = START_NS + 5000 * SECOND_NS
@@ -189,7 +189,7 @@ def test_less_probable_closures_take_longer() -> None:
             count += 1
         needed.append(count)
     assert needed[0] < needed[1] == needed[2] < 12
-    assert BELIEVED > 6
+    assert ACCEPTED_ODDS > 6
 
 
 def test_origin_of_the_odometry_does_not_matter() -> None:
