@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from conftest import unit
 from fleets import IDENTITY, rover_places, settings
-from postgres import PostgresServer
-from scenes import landscape, pose_at, take
 
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import ConfigError
@@ -15,6 +13,8 @@ from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.detector import LoopDetector
 from umf_ros.fleet.inter_robot_closures import UNCONFIRMED, InterRobotClosure, InterRobotMatcher
+from umf_ros.lab.live.postgres import PostgresServer
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 
 GROUND = landscape(20)
 PLACES_M = (-24.0, -14.0)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from scenes import landscape, pose_at, take
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, relative
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 from umf_ros.maps.odometry_log import track
 
 GROUND = landscape(20)

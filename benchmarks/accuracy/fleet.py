@@ -1,7 +1,7 @@
 """Four rovers and a real PostgreSQL, with links that are cut and a server that is killed.
 
-    python benchmarks/fleet.py --json fleet.json                 # simulates four drives first: an hour
-    python benchmarks/fleet.py --quick --map MAP --json F        # with the recordings of a map that umf map made
+    python benchmarks/accuracy/fleet.py --json fleet.json                 # simulates four drives first: an hour
+    python benchmarks/accuracy/fleet.py --quick --map MAP --json F  # with the recordings of a map that umf map made
 
 Rovers are the sessions of a map: their keyframes are stored, pushed and asked about one after the other, all four at
 once, each through a link of its own, while links are cut and the server is killed and started again. The clocks of all
@@ -37,7 +37,6 @@ import numpy as np
 import psycopg
 from pgvector import HalfVector
 from pgvector.psycopg import register_vector
-from postgres import PASSWORD, CuttableLink, PostgresServer
 from sessions import QUICK, Size, mapped, simulated, truth_of
 
 from umf_ros.core.config import Database, Settings
@@ -47,6 +46,7 @@ from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatc
 from umf_ros.fleet.migrations import add_rover, migrate
 from umf_ros.fleet.server import FleetServer, OutgoingPlace
 from umf_ros.lab.evaluation.places_bench import made_up_drives
+from umf_ros.lab.live.postgres import PASSWORD, CuttableLink, PostgresServer
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import open_places
 from umf_ros.places.store import KeyframeStore, stored_identity
