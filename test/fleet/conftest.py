@@ -8,7 +8,7 @@ import pytest
 from fleets import IDENTITY, ROVERS, administrator
 from postgres import PASSWORD, PostgresServer
 
-from umf_ros.fleet.migrations import add_rover, migrate
+from umf_ros.fleet.server import add_rover, migrate
 
 
 @pytest.fixture(scope="package")

@@ -10,17 +10,15 @@ from fleets import IDENTITY, administrator, stored
 from postgres import PASSWORD, PostgresServer, free_port
 
 from umf_ros.core.errors import UmfError
-from umf_ros.fleet.migrations import MIGRATIONS, add_rover, migrate
-from umf_ros.fleet.server import FleetServer, LinkError, OutgoingPlace
-from umf_ros.places.packing import pack, unpack
+from umf_ros.core.frames import Keyframe
+from umf_ros.fleet.server import MIGRATIONS, FleetServer, LinkError, add_rover, migrate
+from umf_ros.places.packing import unpack
 
 STORE = uuid4()
 
 
-def place(second: int, session: int = 0) -> OutgoingPlace:
-    keyframe = make_keyframe(second, seed=second, session=session)
-    descriptor = keyframe.embedding.descriptor
-    return OutgoingPlace(session, keyframe.stamp_ns, keyframe.path_length_m, descriptor, pack(keyframe))
+def place(second: int, session: int = 0) -> Keyframe:
+    return make_keyframe(second, seed=second, session=session)
 
 
 def connect(server: PostgresServer, rover: str, store: UUID = STORE) -> FleetServer:
@@ -30,13 +28,13 @@ def connect(server: PostgresServer, rover: str, store: UUID = STORE) -> FleetSer
 def test_what_one_rover_pushes_the_other_finds_and_reads(server: PostgresServer) -> None:
     ada, bea = connect(server, "ada"), connect(server, "bea")
     ada.push([place(second) for second in range(20)])
-    found = bea.nearest(place(7).descriptor, 3)
+    found = bea.nearest(place(7).embedding.descriptor, 3)
     key, similarity = found[0]
     assert (key.robot, key.stamp_ns, key.store) == ("ada", 7 * 10**9, STORE) and len(found) == 3
     assert similarity == pytest.approx(1, abs=2e-3)
     data = bea.data(key)
     assert data is not None and unpack(data).stamp_ns == 7 * 10**9
-    assert ada.nearest(place(7).descriptor, 3) == []  # nobody else has been there
+    assert ada.nearest(place(7).embedding.descriptor, 3) == []  # nobody else has been there
     assert ada.robot == "ada"
 
 
@@ -107,8 +105,8 @@ def test_the_graph_finds_what_an_exhaustive_search_finds(server: PostgresServer,
     rows = rng.standard_normal((2000, 16)).astype(np.float32)
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     ada, bea = connect(server, "ada"), connect(server, "bea")
-    ada.push([OutgoingPlace(0, i, float("nan"), row, b"") for i, row in enumerate(rows[:1000])])
-    bea.push([OutgoingPlace(0, i, 1.0, row, b"") for i, row in enumerate(rows[1000:])])
+    for rover, part in ((ada, rows[:1000]), (bea, rows[1000:])):
+        rover.push([make_keyframe(i * 1e-9, descriptor=row) for i, row in enumerate(part)])
     hits = 0
     for query in rows[:20]:
         true = set(np.argsort(-(rows[1000:] @ query))[:10].tolist())
