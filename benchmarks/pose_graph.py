@@ -7,6 +7,11 @@ closures: far at random, in groups that agree with each other, and as such group
 close by. Some have odometry that is wrong in one direction all the time, or but one closure at the end of a long
 way (figures named hard). Times are CPU time of this process, which is wall time on a quiet core and does not depend
 on what else the machine does.
+
+Two standard methods run on the same worlds, as a batch over the whole graph: graduated non-convexity (`gnc`, GTSAM's
+GncLMOptimizer with truncated least squares, odometry as known inliers) [Yang 2020] and pairwise consistency maximisation
+(`pcm`, the largest set of pairwise consistent closures, then Levenberg-Marquardt) [Mangelson 2018]. `gnc_scaled` and
+`pcm_scaled` multiply the stated covariances by the noise scale that the back-end estimated in the same world.
 """
 
 from __future__ import annotations
@@ -15,6 +20,7 @@ import argparse
 import json
 import os
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,9 +28,10 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from umf_ros.core.config import PoseGraphSettings
-from umf_ros.core.geometry import Array, invert
+from umf_ros.core.geometry import Array, adjoint, invert, logmap, propagate
 from umf_ros.lab.datasets.g2o import PERIOD_NS, as_recording, read_g2o
 from umf_ros.lab.simulation.pose_graphs import (
     WORLDS,
@@ -37,6 +44,7 @@ from umf_ros.lab.simulation.pose_graphs import (
     with_wrong_closures,
 )
 from umf_ros.pose_graph.closures import State
+from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.solver import Edge, between
 
@@ -59,6 +67,7 @@ class Outcome:
     error_m: float
     transient_wrong: float
     seconds: Array
+    scale: NoiseScale = NoiseScale()
 
 
 def drive(
@@ -86,6 +95,7 @@ def drive(
         float(np.sqrt((error**2).sum(axis=1).mean())),
         wrong_events / max(len(seconds), 1),
         np.array(seconds),
+        graph.scale,
     )
 
 
@@ -104,22 +114,147 @@ def judged(graph: PoseGraph, right: dict[tuple[int, int], bool]) -> list[bool]:
     return [right[c.match_stamp_ns, c.query_stamp_ns] for c in accepted]
 
 
+def odometry_graph(world: GraphWorld, scale: NoiseScale = NoiseScale()) -> gtsam.NonlinearFactorGraph:
+    """The world's odometry as a chain with an anchored first pose; N factors, the anchor last."""
+    graph = gtsam.NonlinearFactorGraph()
+    steps = invert(world.odometry[:-1]) @ world.odometry[1:]
+    for k in range(len(world.odometry)):
+        if k not in world.chains:
+            graph.add(between(Edge(k - 1, k, steps[k - 1], scale.odometry**2 * world.step_covariances[k])))
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(world.odometry[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    return graph
+
+
+def closure_factor(closure: WorldClosure, scale: NoiseScale = NoiseScale()) -> gtsam.BetweenFactorPose3:
+    return between(Edge(closure.first, closure.second, closure.pose, scale.closures**2 * closure.covariance))
+
+
+def as_values(poses: Array) -> gtsam.Values:
+    values = gtsam.Values()
+    for k, pose in enumerate(poses):
+        values.insert(k, gtsam.Pose3(pose))
+    return values
+
+
+def as_poses(values: gtsam.Values) -> Array:
+    return np.stack([values.atPose3(k).matrix() for k in range(values.size())])
+
+
 def batch_optimum(world: GraphWorld, initial: Array) -> tuple[Array, float]:
     """(N, 4, 4) Levenberg-Marquardt optimum of odometry and right closures, and its seconds of CPU."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    steps = invert(world.odometry[:-1]) @ world.odometry[1:]
-    for k, pose in enumerate(initial):
-        values.insert(k, gtsam.Pose3(pose))
-        if k not in world.chains:
-            graph.add(between(Edge(k - 1, k, steps[k - 1], world.step_covariances[k])))
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(world.odometry[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    graph, values = odometry_graph(world), as_values(initial)
     for closure in world.closures:
         if closure.right:
-            graph.add(between(Edge(closure.first, closure.second, closure.pose, closure.covariance)))
+            graph.add(closure_factor(closure))
     before = time.process_time()
     result = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
     seconds = time.process_time() - before
-    return np.stack([result.atPose3(k).matrix() for k in range(len(initial))]), seconds
+    return as_poses(result), seconds
+
+
+def solve_gnc(world: GraphWorld, scale: NoiseScale) -> tuple[NDArray[np.bool_], Array]:
+    """(M,) closures that graduated non-convexity accepts, and its (N, 4, 4) poses."""
+    graph = odometry_graph(world, scale)
+    known = list(range(graph.size()))
+    for closure in world.closures:
+        graph.add(closure_factor(closure, scale))
+    parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
+    parameters.setLossType(gtsam.GncLossType.TLS)
+    parameters.setKnownInliers(known)
+    optimizer = gtsam.GncLMOptimizer(graph, as_values(world.odometry), parameters)
+    optimizer.setInlierCostThresholdsAtProbability(0.99)
+    poses = as_poses(optimizer.optimize())
+    return np.asarray(optimizer.getWeights())[len(known) :] > 0.5, poses
+
+
+def solve_pcm(world: GraphWorld, scale: NoiseScale) -> tuple[NDArray[np.bool_], Array]:
+    """(M,) closures of the largest pairwise consistent set, and the (N, 4, 4) optimum with them."""
+    chosen = largest_clique(pairwise_consistent(world, scale))
+    graph = odometry_graph(world, scale)
+    for row in np.flatnonzero(chosen):
+        graph.add(closure_factor(world.closures[row], scale))
+    values, parameters = as_values(world.odometry), gtsam.LevenbergMarquardtParams()
+    return chosen, as_poses(gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize())
+
+
+def pairwise_consistent(world: GraphWorld, scale: NoiseScale) -> NDArray[np.bool_]:
+    """(M, M) whether the loop through two closures and the odometry between their endpoints closes."""
+    steps = propagate(adjoint(world.odometry), scale.odometry**2 * world.step_covariances)
+    steps[list(world.chains)] = 0
+    noise = np.cumsum(steps, axis=0)
+    first = np.array([closure.first for closure in world.closures], int)
+    second = np.array([closure.second for closure in world.closures], int)
+    poses = np.array([closure.pose for closure in world.closures]).reshape(-1, 4, 4)
+    own = scale.closures**2 * np.array([closure.covariance for closure in world.closures]).reshape(-1, 6, 6)
+    consistent = np.zeros((len(first), len(first)), bool)
+    for row in range(len(first)):
+        # from the match of `row` through its query, the query and the match of each other closure, and back
+        last = invert(world.odometry[first]) @ world.odometry[first[row]]
+        before = invert(poses) @ last
+        after = invert(world.odometry[second[row]]) @ world.odometry[second] @ before
+        walks = [(second[row], second, second), (first, np.full(len(first), first[row]), first[row])]
+        covariance = propagate(adjoint(invert(after)), own[row]) + propagate(
+            adjoint(invert(last)) @ adjoint(poses), own
+        )
+        for (start, end, at), back in zip(walks, (invert(before), np.eye(4)), strict=True):
+            sign = np.where(np.asarray(start) <= np.asarray(end), 1.0, -1.0)[:, None, None]
+            walked = propagate(adjoint(invert(world.odometry[at])), sign * (noise[end] - noise[start]))
+            covariance = covariance + (walked if back.ndim == 2 else propagate(adjoint(back), walked))
+        residuals = logmap(poses[row] @ after)
+        distances = np.einsum("ni,ni->n", residuals, np.linalg.solve(covariance, residuals[..., None])[..., 0])
+        consistent[row] = distances <= SETTINGS.pair_chi2
+    return consistent & consistent.T
+
+
+def largest_clique(consistent: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(M,) members of a large clique: from each vertex on, the neighbour with most candidates left comes next."""
+    best = np.zeros(len(consistent), bool)
+    joined = consistent & ~np.eye(len(consistent), dtype=bool)
+    for row in np.argsort(-joined.sum(axis=0), kind="stable"):
+        if joined[row].sum() < best.sum():
+            break
+        clique, candidates = np.zeros(len(consistent), bool), joined[row].copy()
+        clique[row] = True
+        while candidates.any() and clique.sum() + candidates.sum() > best.sum():
+            rows = np.flatnonzero(candidates)
+            chosen = rows[np.argmax(joined[np.ix_(rows, rows)].sum(axis=0))]
+            clique[chosen] = True
+            candidates &= joined[chosen]
+        if not candidates.any() and clique.sum() > best.sum():
+            best = clique
+    return best
+
+
+PEERS: dict[str, Callable[[GraphWorld, NoiseScale], tuple[NDArray[np.bool_], Array]]] = {
+    "gnc": solve_gnc,
+    "pcm": solve_pcm,
+}
+
+
+def run_peers(world: GraphWorld, reference: Array, stated: float, scale: NoiseScale) -> dict[str, Outcome]:
+    """The standard methods in one cell, with the stated covariances and with those that `scale` corrects."""
+    if len(world.chains) > 1:  # both start from one chain of odometry
+        return {}
+    world = replace(world, step_covariances=stated**2 * world.step_covariances)
+    right = np.array([closure.right for closure in world.closures])
+    outcomes = {}
+    for name, solve in PEERS.items():
+        for suffix, factors in (("", NoiseScale()), ("_scaled", scale)):
+            if suffix and scale == NoiseScale():
+                outcomes[name + suffix] = outcomes[name]
+                continue
+            before = time.process_time()
+            accepted, poses = solve(world, factors)
+            seconds = time.process_time() - before
+            error = poses[:, :3, 3] - reference[:, :3, 3]
+            outcomes[name + suffix] = Outcome(
+                float(right[accepted].mean()) if accepted.any() else 1.0,
+                float(accepted[right].mean()) if right.any() else 1.0,
+                float(np.sqrt((error**2).sum(axis=1).mean())),
+                0.0,
+                np.array([seconds]),
+            )
+    return outcomes
 
 
 def optimum_near_truth(world: GraphWorld) -> Array:
@@ -201,33 +336,45 @@ def cells(quick: bool, misscaled: bool) -> list[Cell]:
     return chosen + [Cell(shares[-1], kind, stated) for kind in KINDS for stated in (1 / 3, 3.0) if misscaled]
 
 
-def try_world(trial: Trial) -> list[tuple[Cell, Outcome]]:
-    """Drive a world through its cells."""
+def try_world(trial: Trial) -> list[tuple[Cell, dict[str, Outcome]]]:
+    """Drive a world through its cells; outcomes by method, the back-end's under an empty name."""
     reference = optimum_near_truth(trial.world)
     outcomes = []
     for cell in trial.cells:
         world = with_wrong_closures(trial.world, cell.share, cell.kind, 1) if cell.share else trial.world
-        outcomes.append((cell, drive(world, reference, cell.stated, batch=trial.batch)))
+        ours = drive(world, reference, cell.stated, batch=trial.batch)
+        outcomes.append((cell, {"": ours} | run_peers(world, reference, cell.stated, ours.scale)))
     return outcomes
 
 
 def resist(trials: list[Trial], jobs: int) -> dict[str, float]:
     """Every cell of every trial; prints them as they are done."""
-    columns = f"{'graph':26s} {'wrong':>10s} {'stated':>7s} {'precision':>9s} {'recall':>7s} {'error m':>8s}"
-    print(f"{columns} {'transient':>9s}")
-    plain: list[Outcome] = []
-    misscaled: list[Outcome] = []
-    hardest: list[Outcome] = []
+    columns = f"{'graph':26s} {'wrong':>10s} {'stated':>7s} {'method':>10s} {'precision':>9s} {'recall':>7s}"
+    print(f"{columns} {'error m':>8s} {'transient':>9s}")
+    found: dict[str, list[tuple[str, Outcome]]] = {}
     with ProcessPoolExecutor(jobs) as pool:
         tried = {pool.submit(try_world, trial): trial for trial in trials}
         for done in as_completed(tried):
             trial = tried[done]
-            for cell, outcome in done.result():
-                (hardest if trial.hard else plain if cell.stated == 1 else misscaled).append(outcome)
+            for cell, outcomes in done.result():
+                group = "hard" if trial.hard else "plain" if cell.stated == 1 else "misscaled"
                 label = f"{cell.share:.0%} {cell.kind}" if cell.share else "none"
-                head = f"{trial.name:26s} {label:>10s} {f'x {cell.stated:.2f}':>7s}"
-                numbers = f"{outcome.precision:9.3f} {outcome.recall:7.3f} {outcome.error_m:8.4f}"
-                print(f"{head} {numbers} {outcome.transient_wrong:9.3f}", flush=True)
+                for method, outcome in outcomes.items():
+                    found.setdefault(method, []).append((group, outcome))
+                    head = f"{trial.name:26s} {label:>10s} {f'x {cell.stated:.2f}':>7s} {method or 'umf_ros':>10s}"
+                    numbers = f"{outcome.precision:9.3f} {outcome.recall:7.3f} {outcome.error_m:8.4f}"
+                    print(f"{head} {numbers} {outcome.transient_wrong:9.3f}", flush=True)
+    figures: dict[str, float] = {}
+    for method, outcomes in found.items():
+        figures |= {f"{method}_{name}".lstrip("_"): value for name, value in worst(outcomes).items()}
+    return figures
+
+
+def worst(outcomes: list[tuple[str, Outcome]]) -> dict[str, float]:
+    """The worst figures of one method by group of cells."""
+    plain, misscaled, hardest = (
+        [outcome for group, outcome in outcomes if group == name] for name in ("plain", "misscaled", "hard")
+    )
     return {
         "precision_worst": min(outcome.precision for outcome in plain),
         "recall_worst": min(outcome.recall for outcome in plain),
@@ -235,6 +382,7 @@ def resist(trials: list[Trial], jobs: int) -> dict[str, float]:
         "transient_wrong_share_worst": max(outcome.transient_wrong for outcome in plain),
         "misscaled_error_worst_m": max(outcome.error_m for outcome in misscaled),
         "misscaled_precision_worst": min(outcome.precision for outcome in misscaled),
+        "misscaled_recall_worst": min(outcome.recall for outcome in misscaled),
         "hard_precision_worst": min(outcome.precision for outcome in hardest),
         "hard_recall_worst": min(outcome.recall for outcome in hardest),
         "hard_error_worst_m": max(outcome.error_m for outcome in hardest),
