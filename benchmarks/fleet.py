@@ -93,7 +93,7 @@ class Rover:
     def drive(self) -> Iterator[None]:
         """Store one keyframe after the other, and verify what comes back meanwhile."""
         for keyframe in self.keyframes:
-            self.inter_robot.link.remembered(self.store.add(keyframe))
+            self.inter_robot.link.enqueue(self.store.add(keyframe))
             inter_closure = self.inter_robot.next()
             if inter_closure is not None:
                 self._note(inter_closure)

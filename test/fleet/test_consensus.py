@@ -39,7 +39,7 @@ def test_closures_of_one_place_confirm_nothing() -> None:
     assert [consensus.confirm(pair(metres)) for metres in (0, 2, 4, 6)] == [[]] * 4
 
 
-def test_a_wrong_one_waits_for_ever_and_does_no_harm() -> None:
+def test_a_wrong_closure_stays_pending() -> None:
     consensus = FleetConsensus(DRIFT)
     wrong, *right = pair(0, off_m=9), pair(10), pair(20)
     assert consensus.confirm(wrong) == []
@@ -47,7 +47,7 @@ def test_a_wrong_one_waits_for_ever_and_does_no_harm() -> None:
     assert consensus.confirm(pair(30, off_m=-8)) == []
 
 
-def test_neither_another_session_nor_a_long_way_nor_missing_odometry_confirms() -> None:
+def test_another_session_a_long_path_or_missing_odometry_confirms_nothing() -> None:
     consensus = FleetConsensus(DRIFT)
     assert not consensus.agree(pair(0), pair(12, session=-2))
     assert not consensus.agree(pair(0), pair(300))

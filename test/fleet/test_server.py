@@ -25,7 +25,7 @@ def connect(server: PostgresServer, rover: str, store: UUID = STORE) -> FleetSer
     return FleetServer(server.address(rover), store, IDENTITY)
 
 
-def test_what_one_rover_pushes_the_other_finds_and_reads(server: PostgresServer) -> None:
+def test_one_rover_finds_and_reads_keyframes_of_another(server: PostgresServer) -> None:
     ada, bea = connect(server, "ada"), connect(server, "bea")
     ada.push([place(second) for second in range(20)])
     found = bea.nearest(place(7).embedding.descriptor, 3)
@@ -61,7 +61,7 @@ def test_pushing_twice_stores_once_and_two_stores_of_one_rover_are_kept_apart(se
         "UPDATE fleet SET embedder = 'mine'",
     ],
 )
-def test_a_rover_changes_nothing_of_anybody(server: PostgresServer, statement: str) -> None:
+def test_a_rover_cannot_change_rows_of_others(server: PostgresServer, statement: str) -> None:
     connect(server, "ada").push([place(1)])
     with psycopg.connect(server.address("bea")) as connection, pytest.raises(psycopg.errors.InsufficientPrivilege):
         connection.execute(statement)
@@ -79,7 +79,7 @@ def test_passwords_reach_neither_log_nor_message(server: PostgresServer, monkeyp
     assert "wrong, and secret" not in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_server_that_is_not_there_is_one_line() -> None:
+def test_an_unreachable_server_is_one_line() -> None:
     with pytest.raises(LinkError, match="cannot be reached") as caught:
         FleetServer(f"postgresql://ada@127.0.0.1:{free_port()}/postgres", STORE, IDENTITY)
     assert "\n" not in str(caught.value)

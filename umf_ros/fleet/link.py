@@ -73,7 +73,7 @@ class FleetLink:
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
         self._thread.start()
 
-    def remembered(self, row: int) -> None:
+    def enqueue(self, row: int) -> None:
         """Push and query a keyframe that was stored."""
         self._asks.append(row)
         self._work.set()
