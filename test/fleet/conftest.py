@@ -7,7 +7,7 @@ import psycopg
 import pytest
 from fleets import IDENTITY, ROVERS, administrator
 
-from umf_ros.fleet.migrations import add_rover, migrate
+from umf_ros.fleet.server import add_rover, migrate
 from umf_ros.lab.live.postgres import PASSWORD, PostgresServer
 
 

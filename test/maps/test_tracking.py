@@ -19,7 +19,7 @@ def drive(count: int) -> tuple[list[Keyframe], list[Array]]:
     return [take(GROUND, pose, 10.0 + step) for step, pose in enumerate(poses)], poses
 
 
-def test_neighbours_are_chained_to_a_way() -> None:
+def test_consecutive_keyframes_are_tracked() -> None:
     keyframes, poses = drive(4)
     log, tracked = track(keyframes, Verification())
     assert [one.session for one in tracked] == [0, 0, 0, 0]
@@ -30,7 +30,7 @@ def test_neighbours_are_chained_to_a_way() -> None:
     assert len(log.trajectory) == 4
 
 
-def test_where_the_chain_breaks_another_way_begins() -> None:
+def test_a_gap_begins_a_session() -> None:
     keyframes, _ = drive(2)
     elsewhere = take(landscape(99), pose_at(landscape(99), -10.0, 5.0, 40.0), 12.0)
     _, tracked = track([*keyframes, elsewhere], Verification())
