@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from umf_ros.baselines.lite0 import pretrained_trunk
 from umf_ros.core.frames import Image
 from umf_ros.core.io import atomic_write
 from umf_ros.lab.datasets.sample import Places, Sample
@@ -22,7 +23,7 @@ from umf_ros.lab.fit.scene import PooledWorld, SceneFit, fit_scene, pool_world, 
 from umf_ros.lab.simulation.survey import shard_plan, survey_world
 from umf_ros.lab.training.networks import read_card, save_weights
 from umf_ros.networks.config import locate_weights
-from umf_ros.networks.efficientnet import DEPTH, pretrained_trunk
+from umf_ros.networks.efficientnet import DEPTH
 from umf_ros.networks.umf import UMF, count_parameters
 from umf_ros.networks.weights import load_weights
 
