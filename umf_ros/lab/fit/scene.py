@@ -27,7 +27,7 @@ from umf_ros.lab.training.losses import Bank, Relations, neighbourhood_component
 from umf_ros.lab.training.networks import read_card, save_weights
 from umf_ros.lab.training.prepared_views import CameraLook, draw_look
 from umf_ros.networks.config import locate_weights
-from umf_ros.networks.efficientnet import DEPTH, STAGES, EfficientNetLite0, pretrained_trunk
+from umf_ros.networks.efficientnet import DEPTH, STAGES, EfficientNetLite0
 from umf_ros.networks.umf import UMF, channels_last, count_parameters
 from umf_ros.networks.weights import load_weights
 
