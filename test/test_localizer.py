@@ -58,7 +58,7 @@ class Drive:
         return float(np.linalg.norm(found.map_T_body[:3, 3] - self.true[:3, 3]))
 
 
-def test_a_rover_that_wakes_up_knows_where_it_is_after_some_metres_of_closures() -> None:
+def test_a_cold_start_is_localised_within_some_metres_of_closures() -> None:
     rover = Drive(37)
     assert rover.localizer.add_closure(rover.closure()) is None  # one alone is not believed
     told = [rover.drive(1).localizer.add_closure(rover.closure()) for _ in range(6)]
@@ -72,7 +72,7 @@ def test_a_rover_that_wakes_up_knows_where_it_is_after_some_metres_of_closures()
     assert np.allclose(rover.localizer.map_T_odom(), on_circle(np.array([37]))[0], atol=0.15)
 
 
-def test_closures_of_one_spot_prove_nothing_however_many() -> None:
+def test_many_closures_of_one_place_do_not_localise() -> None:
     rover = Drive(37)
     rover.drive(1)
     for _ in range(30):
@@ -80,7 +80,7 @@ def test_closures_of_one_spot_prove_nothing_however_many() -> None:
     assert rover.localizer.estimate() is None and rover.localizer.map_T_odom() is None
 
 
-def test_places_that_look_alike_here_and_there_are_not_believed() -> None:
+def test_inconsistent_closures_do_not_localise() -> None:
     rover = Drive(37)
     for row in range(10):
         wrong = 70 + 3 * (row % 4)  # every time another one
@@ -88,7 +88,7 @@ def test_places_that_look_alike_here_and_there_are_not_believed() -> None:
     assert rover.localizer.estimate() is None
 
 
-def test_single_wrong_closures_do_not_move_a_pose_that_is_known() -> None:
+def test_a_single_wrong_closure_does_not_move_the_pose() -> None:
     rover = Drive(10)
     for row in range(12):
         rover.drive(1).localizer.add_closure(rover.closure(at_m=80 if row == 8 else None))
@@ -96,7 +96,7 @@ def test_single_wrong_closures_do_not_move_a_pose_that_is_known() -> None:
     assert rover.localizer.counts["contradicted"] == 1
 
 
-def test_a_rover_that_was_carried_away_finds_itself_again() -> None:
+def test_a_moved_rover_is_relocalised() -> None:
     rover = Drive(10)
     for _ in range(8):
         rover.drive(1).localizer.add_closure(rover.closure())
@@ -108,7 +108,7 @@ def test_a_rover_that_was_carried_away_finds_itself_again() -> None:
     assert rover.localizer.relocalised == 2 and rover.error_m() < 0.3
 
 
-def test_odometry_that_begins_anew_is_anywhere() -> None:
+def test_a_new_session_forgets_the_pose() -> None:
     rover = Drive(10)
     for _ in range(8):
         rover.drive(1).localizer.add_closure(rover.closure())
@@ -117,7 +117,7 @@ def test_odometry_that_begins_anew_is_anywhere() -> None:
     assert rover.localizer.relocalised == 1
 
 
-def test_without_closures_the_pose_goes_on_and_gets_less_sure() -> None:
+def test_without_closures_the_covariance_grows() -> None:
     rover = Drive(10, drift=0.02)
     for _ in range(8):
         rover.drive(1).localizer.add_closure(rover.closure())
@@ -142,7 +142,7 @@ def test_covariance_is_about_the_maps_axes() -> None:
     assert heading_sigma > np.deg2rad(1) and across > along  # heading that is unsure shows across the way
 
 
-def test_a_closure_that_comes_before_its_odometry_waits() -> None:
+def test_a_closure_before_its_odometry_is_pending() -> None:
     rover = Drive(50)
     for _ in range(6):
         rover.drive(1).localizer.add_closure(rover.closure())
@@ -160,7 +160,7 @@ def test_a_closure_that_comes_before_its_odometry_waits() -> None:
 
 
 @pytest.mark.parametrize("kind", ["unknown match", "before all odometry", "broken pose"])
-def test_what_cannot_be_used_is_counted(kind: str) -> None:
+def test_unusable_closures_are_counted(kind: str) -> None:
     rover = Drive(50).drive(1)
     closure = rover.closure()
     match, stamp, pose = closure.match_stamp_ns, closure.query_stamp_ns, closure.match_T_query
@@ -173,7 +173,7 @@ def test_what_cannot_be_used_is_counted(kind: str) -> None:
     assert rover.localizer.counts["unusable"] == 1
 
 
-def test_wrong_odometry_is_refused() -> None:
+def test_invalid_odometry_is_refused() -> None:
     localizer = Localizer(MAP, PoseGraphSettings())
     assert localizer.add_odometry(5, np.eye(4))
     assert not localizer.add_odometry(5, np.eye(4))  # the same stamp again

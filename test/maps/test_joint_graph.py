@@ -48,7 +48,7 @@ def test_without_closures_only_one_of_them_is_in_the_map(tmp_path: Path) -> None
     assert len(joint.sessions[0].stamps) == 0
 
 
-def test_a_session_without_odometry_is_tied_in_by_closures(tmp_path: Path) -> None:
+def test_closures_join_a_session_without_odometry(tmp_path: Path) -> None:
     made = two(odometry=False)
     joint = solve(made_map(tmp_path / "map", list(made)))
     assert joint.sessions[1].joined and not joint.sessions[1].session.odometry
@@ -56,7 +56,7 @@ def test_a_session_without_odometry_is_tied_in_by_closures(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("wrong", [(20,), (20, 23, 26, 29)])
-def test_wrong_closures_between_sessions_are_not_believed(tmp_path: Path, wrong: tuple[int, ...]) -> None:
+def test_wrong_closures_between_sessions_are_rejected(tmp_path: Path, wrong: tuple[int, ...]) -> None:
     """One, or many of one place that repeats: the place is 25 m further on in truth."""
     first, second = two()
     second.between += [tie((0, DAY_NS), first, second, metre + 25, metre) for metre in wrong]
@@ -88,7 +88,7 @@ def test_closures_within_are_moved_to_the_maps_clock(tmp_path: Path) -> None:
     assert len(joint.within) == 4 and {v.state for v in joint.within} == {State.ACCEPTED}
 
 
-def test_results_say_whose_everything_is(tmp_path: Path) -> None:
+def test_results_are_listed_by_session(tmp_path: Path) -> None:
     made = two()
     folder = made_map(tmp_path / "map", list(made))
     joint = solve(folder)

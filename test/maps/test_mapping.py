@@ -94,7 +94,7 @@ def test_a_second_session_is_stored_behind_the_first_on_the_maps_clock(
     assert unmatched(target) == []
 
 
-def test_what_a_process_that_died_had_added_goes(tmp_path: Path, opening: Opening, bag: Path) -> None:
+def test_places_of_a_killed_process_are_removed(tmp_path: Path, opening: Opening, bag: Path) -> None:
     target = new_map(tmp_path / "map", opening, bag)
     replay_session(bag, opening, target.folder_of("one"))
     add_session(target, "one", bag)
@@ -105,7 +105,7 @@ def test_what_a_process_that_died_had_added_goes(tmp_path: Path, opening: Openin
     assert [(one.number, one.keyframes) for one in stored_sessions(again.places)] == [(0, again.sessions[0].places)]
 
 
-def test_a_comparison_that_was_cut_off_is_not_taken_for_whole(tmp_path: Path, opening: Opening, bag: Path) -> None:
+def test_an_interrupted_match_counts_as_unmatched(tmp_path: Path, opening: Opening, bag: Path) -> None:
     target = new_map(tmp_path / "map", opening, bag)
     replay_session(bag, opening, target.folder_of("one"))
     session = add_session(target, "one", bag)

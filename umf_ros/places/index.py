@@ -17,7 +17,7 @@ from umf_ros.core.io import atomic_write
 logger = logging.getLogger(__name__)
 
 EXACT_UP_TO = 50_000
-"""Up to so many places every descriptor is compared (*measured*: 4 ms with 768 numbers each, `umf bench places`)."""
+"""Up to so many places every descriptor is compared (*measured*: 4 ms with 768 numbers each)."""
 SHORTLIST = 3000
 """Descriptors whose half-precision products decide in a larger database (*measured*, as above: recall)."""
 DIRECTIONS = 96

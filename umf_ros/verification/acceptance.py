@@ -2,7 +2,7 @@
 
 A logistic regression on a handful of clipped, monotone criteria: each can only speak for a closure
 the way a person would read it, and none can shout. The weights are fitted on validation worlds by
-`benchmarks/fit_verification.py` and `benchmarks/fit_views.py`, and shipped as JSON.
+`umf_ros/lab/fit/scan_acceptance.py` and `umf_ros/lab/fit/view_acceptance.py`, and shipped as JSON.
 """
 
 from __future__ import annotations

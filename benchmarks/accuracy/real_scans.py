@@ -1,6 +1,6 @@
 """Verification on real scans in a plain folder, LiDAR alone: how many true and how many false pairs are accepted.
 
-python benchmarks/real_scans.py FOLDER [--sample N] [--apart N] [--crop DEG] [--json FILE]
+python benchmarks/accuracy/real_scans.py FOLDER [--sample N] [--apart N] [--crop DEG] [--json FILE]
 
 The folder holds scans as `umf compare` reads them, and `pairs.csv` with the columns match_scan, query_scan (paths
 relative to the folder) and same_place (1 or 0), and where it is known the true pose of the query in the match: x, y,
@@ -22,7 +22,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from domains import error_vector, is_wrong
 from rich.console import Console
 from rich.progress import track
 
@@ -33,6 +32,7 @@ from umf_ros.core.geometry import Array, from_quaternion
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.fit.acceptance import inside_ellipsoid
+from umf_ros.lab.simulation.domains.pairs import error_vector, is_wrong
 from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.scan_files import make_snapshot, read_scan
 from umf_ros.verification import Verdict, Verifier

@@ -1,6 +1,6 @@
 """Whether pretraining helps: random against pretrained encoders at equal fine-tuning [UMF 5.5.1, table 5.6].
 
-`python benchmarks/pretraining.py [--quick] [--seed N] [--json FILE] [--folder FOLDER]`
+`python benchmarks/accuracy/pretraining.py [--quick] [--seed N] [--json FILE] [--folder FOLDER]`
 
 Simulates training and validation worlds (those in the folder are kept), pretrains both encoders
 without labels, then trains two networks alike but for where they start, with several seeds. Only the

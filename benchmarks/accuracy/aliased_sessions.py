@@ -1,6 +1,6 @@
 """Sessions that share one graph, and as many wrong closures as right ones: what the joint graph believes.
 
-    python benchmarks/aliased_sessions.py --json F       # seconds each: five sessions, four kinds, of ten test worlds
+    python benchmarks/accuracy/aliased_sessions.py --json F  # seconds each: five sessions, four kinds, ten worlds
 
 A drive of 750 m is cut into five sessions, each with an origin of its own; wrong closures come in groups that agree
 with each other, as where a world repeats itself: between places far apart (`groups`) or 3 to 15 m apart (`near`). They

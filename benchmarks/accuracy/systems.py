@@ -1,6 +1,6 @@
 """Whole systems on the same recordings: this package, KISS-SLAM, map-closures, KISS-Matcher with small_gicp.
 
-    python benchmarks/systems.py BAG... [--systems fused,lidar,camera,map_closures,...] [--json FILE]
+    python benchmarks/accuracy/systems.py BAG... [--systems fused,lidar,camera,map_closures,...] [--json FILE]
 
 Peers are installed into an environment of their own (`--peers`, made if it is not there), as their authors publish
 them. Each runs at its defaults and at its best setting of those that `--systems grid` tries on validation drives. Bags
@@ -45,7 +45,7 @@ WINDOW_M = 25.0
 TRUE_M, TRUE_DEG = 3.0, 15.0
 PAIRED = 4
 """Every so many-th keyframe is a query of KISS-Matcher, which takes half a second for each."""
-PINNED = Path(__file__).parents[1] / "requirements-peers.txt"
+PINNED = Path(__file__).parents[2] / "requirements-peers.txt"
 OURS: dict[str, dict[str, Any]] = {
     "fused": {},
     "lidar": {"topics": {"left_image": "/none/left", "right_image": ""}},

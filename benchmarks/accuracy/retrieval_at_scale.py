@@ -1,6 +1,6 @@
 """Whether a rover still finds its places when the database holds those of many other worlds.
 
-python benchmarks/retrieval_at_scale.py BAG... [--quick] [--only METHOD] [--json FILE]
+python benchmarks/accuracy/retrieval_at_scale.py BAG... [--quick] [--only METHOD] [--json FILE]
 
 Every recording (`umf simulate --preset mapping` and `loops`; with a ground truth) is run through the detector with 0,
 1,000, 10,000 and 100,000 places of other worlds beside its own. These compete for the candidates as all others do; as

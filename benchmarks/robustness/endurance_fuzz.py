@@ -1,7 +1,7 @@
 """Inputs that were damaged, for `endurance.py`: messages, recordings, and files of every kind that is read.
 
 Each part runs in a process of its own with 2 GB of memory, which prints what became of every input as JSON:
-    python benchmarks/endurance_fuzz.py messages|bags|files COUNT SEED FOLDER [BAG]
+    python benchmarks/robustness/endurance_fuzz.py messages|bags|files COUNT SEED FOLDER [BAG]
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How other methods learned: `python benchmarks/training_curves.py runs --picture curves.png`.
+"""How other methods learned: `python benchmarks/accuracy/training_curves.py runs --picture curves.png`.
 
 Reads `log.csv` of every run below a folder, draws recall@1 on its validation worlds against steps, and prints what each
 found before and after.

@@ -1,8 +1,8 @@
 """Plants ten faults in recordings or their settings, and prints the first sentence of each report.
 
-    python benchmarks/planted_faults.py data/demo_seed1.mcap --out /tmp/planted
-    python benchmarks/planted_faults.py data/demo_seed1.mcap --offsets      # what clocks are measured to be off
-    python benchmarks/planted_faults.py *.mcap --good                       # what is said of recordings as they are
+    python benchmarks/accuracy/planted_faults.py data/demo_seed1.mcap --out /tmp/planted
+    python benchmarks/accuracy/planted_faults.py data/demo_seed1.mcap --offsets  # what clocks are measured to be off
+    python benchmarks/accuracy/planted_faults.py *.mcap --good  # what is said of recordings as they are
 
 Each run must name its own fault, and the run without a fault none.
 """

@@ -1,6 +1,6 @@
 """How well the pose graph resists wrong closures, and what it costs.
 
-`python benchmarks/pose_graph.py [--quick] [--seed N] [--jobs N] [--json FILE] [FILES.g2o ...]`
+`python benchmarks/accuracy/pose_graph.py [--quick] [--seed N] [--jobs N] [--json FILE] [FILES.g2o ...]`
 
 Generated graphs and, if given, g2o files (their closures count as right) get 0 to 50 % wrong
 closures: far at random, in groups that agree with each other, and as such groups to similar places
@@ -9,9 +9,10 @@ way (figures named hard). Times are CPU time of this process, which is wall time
 on what else the machine does.
 
 Two standard methods run on the same worlds, as a batch over the whole graph: graduated non-convexity (`gnc`, GTSAM's
-GncLMOptimizer with truncated least squares, odometry as known inliers) [Yang 2020] and pairwise consistency maximisation
-(`pcm`, the largest set of pairwise consistent closures, then Levenberg-Marquardt) [Mangelson 2018]. `gnc_scaled` and
-`pcm_scaled` multiply the stated covariances by the noise scale that the back-end estimated in the same world.
+GncLMOptimizer with truncated least squares, odometry as known inliers) [Yang 2020] and pairwise consistency
+maximisation (`pcm`, the largest set of pairwise consistent closures, then Levenberg-Marquardt) [Mangelson 2018].
+`gnc_scaled` and `pcm_scaled` multiply the stated covariances by the noise scale that the back-end estimated in the
+same world.
 """
 
 from __future__ import annotations
@@ -58,6 +59,10 @@ KINDS: tuple[Kind, ...] = ("random", "groups", "near")
 BIAS = np.array([0, 0, np.deg2rad(0.1), 0.01, 0, 0])
 
 
+STATED = NoiseScale()
+"""Covariances as they are stated."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """One run: shares of closures, RMS position error in metres, seconds of CPU per event."""
@@ -67,7 +72,7 @@ class Outcome:
     error_m: float
     transient_wrong: float
     seconds: Array
-    scale: NoiseScale = NoiseScale()
+    scale: NoiseScale = STATED
 
 
 def drive(
@@ -114,7 +119,7 @@ def judged(graph: PoseGraph, right: dict[tuple[int, int], bool]) -> list[bool]:
     return [right[c.match_stamp_ns, c.query_stamp_ns] for c in accepted]
 
 
-def odometry_graph(world: GraphWorld, scale: NoiseScale = NoiseScale()) -> gtsam.NonlinearFactorGraph:
+def odometry_graph(world: GraphWorld, scale: NoiseScale = STATED) -> gtsam.NonlinearFactorGraph:
     """The world's odometry as a chain with an anchored first pose; N factors, the anchor last."""
     graph = gtsam.NonlinearFactorGraph()
     steps = invert(world.odometry[:-1]) @ world.odometry[1:]
@@ -125,7 +130,7 @@ def odometry_graph(world: GraphWorld, scale: NoiseScale = NoiseScale()) -> gtsam
     return graph
 
 
-def closure_factor(closure: WorldClosure, scale: NoiseScale = NoiseScale()) -> gtsam.BetweenFactorPose3:
+def closure_factor(closure: WorldClosure, scale: NoiseScale = STATED) -> gtsam.BetweenFactorPose3:
     return between(Edge(closure.first, closure.second, closure.pose, scale.closures**2 * closure.covariance))
 
 
@@ -237,7 +242,7 @@ def run_peers(world: GraphWorld, reference: Array, stated: float, scale: NoiseSc
         return {}
     world = replace(world, step_covariances=stated**2 * world.step_covariances)
     right = np.array([closure.right for closure in world.closures])
-    outcomes = {}
+    outcomes: dict[str, Outcome] = {}
     for name, solve in PEERS.items():
         for suffix, factors in (("", NoiseScale()), ("_scaled", scale)):
             if suffix and scale == NoiseScale():
@@ -365,8 +370,8 @@ def resist(trials: list[Trial], jobs: int) -> dict[str, float]:
                     numbers = f"{outcome.precision:9.3f} {outcome.recall:7.3f} {outcome.error_m:8.4f}"
                     print(f"{head} {numbers} {outcome.transient_wrong:9.3f}", flush=True)
     figures: dict[str, float] = {}
-    for method, outcomes in found.items():
-        figures |= {f"{method}_{name}".lstrip("_"): value for name, value in worst(outcomes).items()}
+    for method, grouped in found.items():
+        figures |= {f"{method}_{name}".lstrip("_"): value for name, value in worst(grouped).items()}
     return figures
 
 

@@ -1,6 +1,6 @@
 """Verification on unseen worlds: is every published closure right, how exact, how honest, how fast.
 
-python benchmarks/verification.py [--quick] [--seed N] [--drives FOLDER] [--json FILE]
+python benchmarks/accuracy/verification.py [--quick] [--seed N] [--drives FOLDER] [--json FILE]
 
 A world takes about a minute and a half of one core: half a minute to simulate, the rest to embed and verify.
 With `--drives` the simulated drives are kept and used again.
@@ -21,11 +21,9 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from drives import Drive, embedded, kept, worlds
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
-from traps import TRAPS, spring
 
 from umf_ros.core.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
@@ -33,6 +31,8 @@ from umf_ros.core.geometry import Array, heading, wrap_angle
 from umf_ros.core.keyframes import is_past
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.fit.acceptance import inside_ellipsoid
+from umf_ros.lab.simulation.drives import Drive, embedded, kept, worlds
+from umf_ros.lab.simulation.scenes import TRAPS, spring
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier

@@ -1,7 +1,7 @@
 """Four rovers and a real PostgreSQL, with links that are cut and a server that is killed.
 
-    python benchmarks/fleet.py --json fleet.json                 # simulates four drives first: an hour
-    python benchmarks/fleet.py --quick --map MAP --json F        # with the recordings of a map that umf map made
+    python benchmarks/accuracy/fleet.py --json fleet.json                 # simulates four drives first: an hour
+    python benchmarks/accuracy/fleet.py --quick --map MAP --json F  # with the recordings of a map that umf map made
 
 Rovers are the sessions of a map: their keyframes are stored, pushed and asked about one after the other, all four at
 once, each through a link of its own, while links are cut and the server is killed and started again. The clocks of all
@@ -37,16 +37,15 @@ import numpy as np
 import psycopg
 from pgvector import HalfVector
 from pgvector.psycopg import register_vector
-from postgres import PASSWORD, CuttableLink, PostgresServer
 from sessions import QUICK, Size, mapped, simulated, truth_of
 
 from umf_ros.core.config import Database, Settings
 from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatcher
-from umf_ros.fleet.migrations import add_rover, migrate
-from umf_ros.fleet.server import FleetServer, OutgoingPlace
-from umf_ros.lab.evaluation.places_bench import made_up_drives
+from umf_ros.fleet.server import FleetServer, add_rover, migrate
+from umf_ros.lab.evaluation.places_bench import bare_keyframe, made_up_drives
+from umf_ros.lab.live.postgres import PASSWORD, CuttableLink, PostgresServer
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import open_places
 from umf_ros.places.store import KeyframeStore, stored_identity
@@ -94,7 +93,7 @@ class Rover:
     def drive(self) -> Iterator[None]:
         """Store one keyframe after the other, and verify what comes back meanwhile."""
         for keyframe in self.keyframes:
-            self.inter_robot.link.remembered(self.store.add(keyframe))
+            self.inter_robot.link.enqueue(self.store.add(keyframe))
             inter_closure = self.inter_robot.next()
             if inter_closure is not None:
                 self._note(inter_closure)
@@ -157,11 +156,11 @@ def pushes_per_s(server: PostgresServer, identity: tuple[str, int], seed: int) -
     """Places a second of one rover, each with as many bytes as a real one."""
     archive = FleetServer(server.address("archive"), uuid4(), identity)
     (descriptors,) = made_up_drives(PUSHED, np.random.default_rng(seed + 1))
-    data = np.random.default_rng(seed).bytes(120_000)
+    scan = np.random.default_rng(seed).random((10_000, 3), np.float32)
     start = time.perf_counter()
     for first in range(0, PUSHED, 16):
         part = descriptors[first : first + 16]
-        archive.push([OutgoingPlace(1, first + i, 0.0, row, data) for i, row in enumerate(part)])
+        archive.push([bare_keyframe(first + i, 1, 0.0, row, scan) for i, row in enumerate(part)])
     archive.close()
     return PUSHED / (time.perf_counter() - start)
 

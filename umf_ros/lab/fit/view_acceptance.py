@@ -1,6 +1,6 @@
 """Fit the acceptance model and the covariance of views, what a camera alone decides by, to simulated recordings.
 
-python benchmarks/fit_views.py BAG... [--keyframes FOLDER] [--out FILE]
+python -m umf_ros.lab.fit.view_acceptance BAG... [--keyframes FOLDER] [--out FILE]
 
 The recordings (`umf simulate`, validation seeds) are read without their scans, as a rover without a LiDAR sees them.
 Right and wrong examples are hypotheses about what retrieval offers, about nearer places that it missed, and about
@@ -46,7 +46,7 @@ from umf_ros.verification.measurement import IMAGE
 from umf_ros.verification.scan_alignment import covariance_of
 from umf_ros.verification.verifier import JudgedHypothesis
 
-DEFAULT_OUT = Path(__file__).parent.parent / "config" / "verification" / "calibration.json"
+DEFAULT_OUT = Path("config/verification/calibration.json")
 RIGHT_M, RIGHT_DEG = 0.3, 2.0  # examples between right and wrong are left out
 RIDGE = 0.03  # measured: with a tenth of it the wrong ones nearest to the threshold come nearer
 MARGIN = 0.5  # log-odds that the worst wrong example of a recording left out stays below the threshold
@@ -129,7 +129,7 @@ def main(
     shipped = load_acceptance(str(out))
     models, covariances = shipped.models | model.models, shipped.covariances | model.covariances
     whole = replace(shipped, models=models, covariances=covariances)
-    told = f"python benchmarks/fit_views.py on {len(bags)} recordings without scans"
+    told = f"python -m umf_ros.lab.fit.view_acceptance on {len(bags)} recordings without scans"
     save_acceptance(whole, out, {IMAGE: told}, results)
     console.print(f"wrote {out}")
 

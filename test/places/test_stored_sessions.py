@@ -56,7 +56,7 @@ def test_the_command_asks_first(path: Path) -> None:
     assert [session.number for session in stored_sessions(path)] == [0, 2]
 
 
-def test_what_is_no_store_is_told_in_one_line(tmp_path: Path) -> None:
+def test_other_files_are_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "text").write_text("nothing of the kind")
     for name in ("text", "missing"):
         with pytest.raises(UmfError) as caught:
@@ -68,7 +68,7 @@ LIES = ["[]", "null", "5", "[" * 100_000, "9" * 5000, '{"schema": "3", "embedder
 
 
 @pytest.mark.parametrize("lie", LIES, ids=lambda lie: lie[:10])
-def test_a_store_that_lies_about_itself_is_told_in_one_line(path: Path, lie: str) -> None:
+def test_a_damaged_identity_is_refused_in_one_line(path: Path, lie: str) -> None:
     with sqlite3.connect(path) as connection:
         connection.execute("UPDATE about SET content = ?", (lie,))
     for use in (stored_identity, database):
@@ -86,7 +86,7 @@ TRAPS = {
 
 
 @pytest.mark.parametrize("trap", TRAPS)
-def test_a_store_that_would_run_something_is_not_used(path: Path, trap: str) -> None:
+def test_views_triggers_and_computed_columns_are_refused(path: Path, trap: str) -> None:
     with sqlite3.connect(path) as connection:
         for statement in TRAPS[trap]:
             connection.execute(statement)

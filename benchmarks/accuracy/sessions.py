@@ -1,7 +1,7 @@
 """Five sessions on one hard world in one map, and ten cold starts in it.
 
-    python benchmarks/sessions.py --json sessions.json               # five test worlds, some hours
-    python benchmarks/sessions.py --quick --seed 20001 --json F      # three short sessions, four cold starts
+    python benchmarks/accuracy/sessions.py --json sessions.json               # five test worlds, some hours
+    python benchmarks/accuracy/sessions.py --quick --seed 20001 --json F      # three short sessions, four cold starts
 
 Every session drives a part of one way of 100 m by a route, light and noise of its own; the world repeats itself
 (aliasing 1.0), and all clocks start at the same second. Recordings and maps stay in `--work` and are taken up again.

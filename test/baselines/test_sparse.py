@@ -6,7 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from umf_ros.networks.encoders import Around, Down, Level, SparseGem, Up
+from umf_ros.baselines.minkloc import Around, Down, Level, SparseGem, Up
 
 SIZE, CHANNELS = 8, 3
 

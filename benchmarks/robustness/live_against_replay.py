@@ -1,6 +1,6 @@
 """One recording through the live nodes and through the replay: both must find the same.
 
-    python benchmarks/live_against_replay.py BAG --rate 1
+    python benchmarks/robustness/live_against_replay.py BAG --rate 1
 
 The live graph runs as processes over DDS (bag player, loop_closure_node, pose_graph_node) with queues in which
 nothing is lost, so that what is compared is what was found, not what a busy machine dropped. Prints how many rows of

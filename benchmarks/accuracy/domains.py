@@ -1,6 +1,6 @@
 """Verification in other domains: other LiDARs, other places, other mounts, LiDAR alone.
 
-python benchmarks/domains.py [--quick] [--seed N] [--jobs N] [--folder FOLDER] [--json FILE]
+python benchmarks/accuracy/domains.py [--quick] [--seed N] [--jobs N] [--folder FOLDER] [--json FILE]
 
 With `--folder` the simulated scans are kept and used again. Descriptors and local features are those of the shipped
 network; there is no odometry, and every pair is verified on its own, so that no other pair supports it.
@@ -21,24 +21,39 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from domain_pairs import ELSEWHERE, FULL, QUICK, SAME, TURNED, Extent, Pair, pairs_of, places_of
 from rich.console import Console
 from rich.table import Table
-from scipy.spatial.transform import Rotation
 
 from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Candidate, LoopClosure
-from umf_ros.core.geometry import Array, relative, rotation_angle
+from umf_ros.core.geometry import Array
 from umf_ros.embedding import make_embedder
-from umf_ros.lab.fit.acceptance import bounds_of, fit_decision, inside_ellipsoid, load_examples, save_acceptance
+from umf_ros.lab.fit.acceptance import (
+    EXAMPLES,
+    bounds_of,
+    fit_decision,
+    inside_ellipsoid,
+    load_examples,
+    save_acceptance,
+)
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
+from umf_ros.lab.simulation.domains.pairs import (
+    ELSEWHERE,
+    FULL,
+    QUICK,
+    SAME,
+    TURNED,
+    Extent,
+    Pair,
+    error_vector,
+    is_wrong,
+    pairs_of,
+    places_of,
+)
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
 from umf_ros.verification.measurement import SCAN
-
-WRONG_M, WRONG_DEG = 1.0, 5.0
-EXAMPLES = Path(__file__).parent / "acceptance_examples.npz"
 
 
 @dataclass
@@ -168,18 +183,6 @@ def _closure(verifier: Verifier, pair: Pair) -> LoopClosure | None:
     verifier.reset()
     candidate = Candidate(0, pair.match.keyframe.stamp_ns, pair.similarity)
     return verifier.verify(pair.query.keyframe, [(candidate, pair.match.keyframe)])[0].closure
-
-
-def is_wrong(estimated: Array, true: Array) -> bool:
-    """Whether a pose is more than 1 m or 5 deg from the truth."""
-    gap = relative(true, estimated)
-    return bool(np.linalg.norm(gap[:3, 3]) > WRONG_M or np.degrees(rotation_angle(gap)) > WRONG_DEG)
-
-
-def error_vector(estimated: Array, true: Array) -> Array:
-    """Error (6,) in ROS order, axes of the match."""
-    turn = Rotation.from_matrix(estimated[:3, :3] @ true[:3, :3].T).as_rotvec()
-    return np.concatenate([estimated[:3, 3] - true[:3, 3], turn])
 
 
 def _table(outcomes: list[Outcome]) -> Table:

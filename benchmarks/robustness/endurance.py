@@ -1,7 +1,7 @@
 """What the package survives: kill -9, damaged input, long drives. Prints a table and writes it as JSON.
 
-    python benchmarks/endurance.py --json endurance.json --quick              (a quarter of an hour)
-    python benchmarks/endurance.py --json endurance.json --folder endurance   (hours)
+    python benchmarks/robustness/endurance.py --json endurance.json --quick              (a quarter of an hour)
+    python benchmarks/robustness/endurance.py --json endurance.json --folder endurance   (hours)
 
 Replays and both live nodes are killed at random moments and go on; two robots live at once; inputs are damaged in a
 process of their own with 2 GB of memory. Each part is done in steps, and what a step found is kept in the folder: a

@@ -1,6 +1,6 @@
 """Fit the decision about submaps, and what odometry adds to their covariance, to simulated validation drives.
 
-python benchmarks/fit_submaps.py [--drives FOLDER] [--out FILE]
+python -m umf_ros.lab.fit.submap_acceptance [--drives FOLDER] [--out FILE]
 
 Only LiDAR and odometry are simulated: a drive takes about a minute of one core. What a single scan would have found
 (revisits in the same direction) is taken from the truth.
@@ -64,7 +64,7 @@ DRIVES = [
 ]
 ANYWHERE, BESIDE_M = 3, 4.0  # wrong answers per keyframe at any stop, and how far beside the right ones
 EVERY = 10  # keyframes, for wrong answers
-DEFAULT_OUT = Path(__file__).parent.parent / "config" / "verification" / "submaps.json"
+DEFAULT_OUT = Path("config/verification/submaps.json")
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ def main(
     found = results(examples, model, threshold)
     console.print("all:", found, model)
     content = {
-        "fitted_with": "benchmarks/fit_submaps.py",
+        "fitted_with": "umf_ros/lab/fit/submap_acceptance.py",
         "results": found,
         "bias": model.model.bias,
         "weights": model.model.weights,

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, relative, rotation_angle
@@ -22,6 +23,8 @@ from umf_ros.sensors.scan_files import make_snapshot
 SAME_M, ELSEWHERE_M = 4.0, 12.0
 SAME_WAY_DEG, OTHER_WAY_DEG = 25.0, 155.0
 SAME, TURNED, ELSEWHERE = "same way", "other way", "elsewhere"
+
+WRONG_M, WRONG_DEG = 1.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -142,3 +145,15 @@ def _distance(query: Place, match: Place) -> float:
 
 def _turn_deg(query: Place, match: Place) -> float:
     return float(np.degrees(rotation_angle(relative(match.scan.world_T_lidar, query.scan.world_T_lidar))))
+
+
+def is_wrong(estimated: Array, true: Array) -> bool:
+    """Whether a pose is more than 1 m or 5 deg from the truth."""
+    gap = relative(true, estimated)
+    return bool(np.linalg.norm(gap[:3, 3]) > WRONG_M or np.degrees(rotation_angle(gap)) > WRONG_DEG)
+
+
+def error_vector(estimated: Array, true: Array) -> Array:
+    """Error (6,) in ROS order, axes of the match."""
+    turn = Rotation.from_matrix(estimated[:3, :3] @ true[:3, :3].T).as_rotvec()
+    return np.concatenate([estimated[:3, 3] - true[:3, 3], turn])

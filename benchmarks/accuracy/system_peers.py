@@ -1,4 +1,4 @@
-"""Other systems on the scans of a recording, in their own environment: `benchmarks/systems.py` calls it.
+"""Other systems on the scans of a recording, in their own environment: `benchmarks/accuracy/systems.py` calls it.
 
     python system_peers.py PEER SCANS.npz SETTINGS.json OUT.json
 

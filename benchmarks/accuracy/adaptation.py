@@ -1,7 +1,7 @@
 """What `umf adapt` gains on rovers of kinds the network has never seen, in another world.
 
-    python benchmarks/adaptation.py --json adaptation.json               # three rovers, about an hour on one core
-    python benchmarks/adaptation.py --quick --seed 10101 --json F        # one rover, shorter drives
+    python benchmarks/accuracy/adaptation.py --json adaptation.json  # three rovers, about an hour on one core
+    python benchmarks/accuracy/adaptation.py --quick --seed 10101 --json F        # one rover, shorter drives
 
 Each rover has a camera of another height, tilt, angle of view and response, and a LiDAR that keeps a part of the
 Cube-1's pulses and speaks of intensity in another unit. It learns from one drive of a recording with odometry that
@@ -149,7 +149,7 @@ class StrangeSensors:
 
 def calibration_of(rover: Rover, path: Path) -> Path:
     """The simulated rig's calibration with the rover's camera in it, written to a file."""
-    content = yaml.safe_load(Path(__file__).parents[1].joinpath(ETNA.calibration).read_text(encoding="utf-8"))
+    content = yaml.safe_load(Path(__file__).parents[2].joinpath(ETNA.calibration).read_text(encoding="utf-8"))
     content["camera"] |= {"fx": rover.focal_px, "fy": rover.focal_px}
     mount = content["body_T_camera"]
     lower = rover.height_m - mount["translation"][2]
