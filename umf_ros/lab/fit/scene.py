@@ -16,6 +16,7 @@ import torch.nn.functional as F
 import typer
 from torch import Tensor
 
+from umf_ros.baselines.lite0 import pretrained_trunk
 from umf_ros.core.frames import Image
 from umf_ros.core.io import atomic_write
 from umf_ros.lab.datasets.sample import Places, Rule, Sample, SampleSequence, places_of
