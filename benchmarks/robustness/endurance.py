@@ -19,7 +19,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,9 +33,11 @@ from rich.console import Console
 from rich.table import Table
 
 from umf_ros.core.config import Database, Loop
+from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Embedding
 from umf_ros.core.io import atomic_write
 from umf_ros.places.database import PlaceDatabase
+from umf_ros.runs.run_file import NAME, RunFile
 
 Figures = dict[str, Any]
 KEYS = "kills lost_keyframes duplicate_closures backend_kills lost_verdicts fuzz_messages fuzz_bags fuzz_files"
@@ -125,8 +127,10 @@ def kill_replays(task: Task, kills: int, rng: np.random.Generator) -> Figures:
 
 def _keyframes(out: Path) -> int:
     """How many keyframes the newest run has written."""
-    tables = sorted(out.glob("2*/keyframes.csv"))
-    return max(tables[-1].read_bytes().count(b"\n") - 1, 0) if tables else 0
+    runs = sorted(path.parent for path in out.glob(f"2*/{NAME}"))
+    with suppress(UmfError, IndexError), closing(RunFile(runs[-1], read_only=True)) as file:
+        return len(file.rows("keyframes"))
+    return 0
 
 
 def fuzz(part: str, task: Task, count: int, rng: np.random.Generator) -> Figures:

@@ -74,19 +74,16 @@ def test_wrong_closures_alone_join_nothing(tmp_path: Path) -> None:
 
 
 def test_closures_within_are_moved_to_the_maps_clock(tmp_path: Path) -> None:
-    from umf_ros.runs.tables import CLOSURES, CsvTable, closure_row
+    from umf_ros.runs.tables import CLOSURES, closure_row, write_table
 
     made = [MadeSession("first", 0, 60), MadeSession("round", 0, 160)]
     folder = made_map(tmp_path / "map", made)
-    table = CsvTable(folder.folder_of("round") / "closures.csv", CLOSURES)
     own = [tie((0, 0), made[1], replace(made[1], first_m=-100), metre) for metre in (5, 20, 35, 50)]
-    table.append(
-        [
-            closure_row(replace(c, query_stamp_ns=made[1].stamp(m + 100)), 0.9)
-            for c, m in zip(own, (5, 20, 35, 50), strict=True)
-        ]
-    )
-    table.close()
+    rows = [
+        closure_row(replace(c, query_stamp_ns=made[1].stamp(m + 100)), 0.9)
+        for c, m in zip(own, (5, 20, 35, 50), strict=True)
+    ]
+    write_table(folder.folder_of("round") / "closures.csv", CLOSURES, rows)
     joint = solve(folder)
     assert len(joint.within) == 4 and {v.state for v in joint.within} == {State.ACCEPTED}
 

@@ -14,6 +14,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import rmtree
+from typing import Any
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
@@ -22,7 +23,6 @@ from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.config import Database, Settings
 from umf_ros.core.errors import BagError, writing
 from umf_ros.core.frames import Keyframe
-from umf_ros.core.io import atomic_write
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
@@ -31,7 +31,7 @@ from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
-from umf_ros.runs.tables import CLOSURES, CsvTable, closure_row
+from umf_ros.runs.tables import CLOSURES, closure_row, write_table
 from umf_ros.runs.writer import PLACES, count_drops
 from umf_ros.verification import Verdict, Verifier
 
@@ -197,11 +197,8 @@ def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Verdi
     settings = target.settings
     rows = range(session.first_place, session.first_place + session.places)
     verifier, number = Verifier(settings.verification), -1
-    with (
-        atomic_write(target.folder_of(session.name) / BETWEEN) as part,
-        closing(CsvTable(part, CLOSURES)) as table,
-        closing(open_places(target.places)) as places,
-    ):
+    found_rows: list[list[Any]] = []
+    with closing(open_places(target.places)) as places:
         for row in rows:
             keyframe = places[row]
             if keyframe.session != number:
@@ -209,8 +206,9 @@ def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Verdi
                 number = keyframe.session
             candidates = places.query(keyframe, settings.loop, range(session.first_number))
             verdicts = verifier.verify(keyframe, [(found, places[found.index]) for found in candidates])
-            table.append([closure_row(v.closure, v.candidate.similarity) for v in verdicts if v.closure])
+            found_rows += [closure_row(v.closure, v.candidate.similarity) for v in verdicts if v.closure]
             yield verdicts
+    write_table(target.folder_of(session.name) / BETWEEN, CLOSURES, found_rows)
 
 
 def replay_task(task: tuple[Path, Opening, Path]) -> None:
