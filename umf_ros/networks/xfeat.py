@@ -20,7 +20,8 @@ class XFeat(nn.Module):
     """Descriptors, key points and reliability of a grey image [Potje 2024, fig. 3].
 
     A convolutional pyramid with its three deepest levels fused at an eighth of the resolution gives descriptors. A
-    separate branch on squares of eight by eight pixels gives key points. Batch normalisation is folded into the convolutions.
+    separate branch on squares of eight by eight pixels gives key points. Batch normalisation is folded into the
+    convolutions.
     """
 
     def __init__(self) -> None:
