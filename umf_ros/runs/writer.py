@@ -32,8 +32,12 @@ if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure
 
 
-def create_run_folder(out: Path) -> Path:
-    """Make a new folder named after the local time inside `out` and point `out/latest` at it.
+def create_run_folder(out: Path, latest: bool = True) -> Path:
+    """Make a new folder named after the local time inside `out`.
+
+    Args:
+        out: the folder of all runs.
+        latest: whether `out/latest` leads to it from now on, as it should for runs, whose report it shows.
 
     Raises:
         OutputError: `out` cannot be written.
@@ -42,10 +46,10 @@ def create_run_folder(out: Path) -> Path:
     with writing(f"to {out}"):
         out.mkdir(parents=True, exist_ok=True)
         folder = _make_unique(out, stamp)
-        # in one step, so that `latest` always leads somewhere
-        fresh = out / f".latest-{os.getpid()}"
-        fresh.symlink_to(folder.name, target_is_directory=True)
-        fresh.replace(out / "latest")
+        if latest:  # in one step, so that it always leads to a folder
+            fresh = out / f".latest-{os.getpid()}"
+            fresh.symlink_to(folder.name, target_is_directory=True)
+            fresh.replace(out / "latest")
     return folder
 
 
