@@ -120,6 +120,8 @@ def refuted(measurement: Measurement) -> str:
     """Why a hypothesis is no closure however probable, or nothing."""
     if measurement.misfit > const.MAX_MISFIT:
         return f"surfaces are {measurement.misfit:.0f} times their noise apart"
+    if measurement.passage_rival < 1.0:
+        return "surfaces fit as well elsewhere along the passage"
     return "another pose fits as well" if measurement.runner_up < const.MIN_RUNNER_UP else ""
 
 

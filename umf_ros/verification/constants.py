@@ -113,6 +113,22 @@ RIVAL_FAR_M = np.concatenate([np.arange(-6.0, -0.9, 0.5), np.arange(1.0, 6.1, 0.
 RIVAL_EVERY = 10  # of the sample: bounds the time
 RIVAL_MISFIT = 3.0  # by hand: how bad a misfit can be, in counterparts' reach
 
+# passages: corridors, tunnels, aisles, canyons, where a scan looks the same all along
+BAND_DEG = 2.0  # geometry: elevations about one ring of sixteen
+PLANE_NEIGHBOURS, PLANE_REACH_M = 8, 0.8  # measured: 12 neighbours leave next to no planes of sixteen rings
+PLANE_WIDTH_M, PLANE_ROUNDNESS = 0.1, 0.45  # by hand: narrower neighbourhoods lie on a single ring
+PLANE_THICKNESS_M = 0.04  # by hand: twice the noise of a range
+PLANE_SIGMA_M, PLANE_MISFIT_FLOOR = 0.1, 0.05  # measured: .05 and .2 m tell right poses from wrong ones less well
+PASSAGE_RATIO = 0.2  # measured: of surfaces along to surfaces across; passages have up to .17
+PASSAGE_SURFACE = 0.1  # measured: share of points on planes; woods and orchards have less, passages from .2
+PASSAGE_COMMON = 0.25  # by hand: of the compared points that a rival needs
+PASSAGE_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: as RIVAL_NEAR_M
+PASSAGE_FAR_M = np.concatenate([np.arange(-15.0, -0.9, 0.5), np.arange(1.0, 15.1, 0.5)])  # geometry: scans overlap
+PASSAGE_SAMPLE, PASSAGE_SCOUTS, PASSAGE_KEPT = 750, 100, 6  # by hand: points of a half, first of all, of few rivals
+FAN = 0.5  # geometry: length of the mean bearing; .94 of a view of 70 deg, .5 of one of 217 deg
+# measured on benchmarks/corridors.py, seeds from 10000 on: of wrong closures 1 in 700 has more, none with a narrow view
+PASSAGE_RIVAL, NARROW_PASSAGE_RIVAL = 0.3, 0.12
+
 HOPELESS = 0.5  # by definition: what is wrong more likely than right, whatever its rivals, is held against none
 RUNNER_UP_ROOM = 0.02  # by hand: shares nearer to nothing than this are alike
 MAX_MISFIT = 2.5  # measured: of 2,400 right poses one in 100 has more than 1.5, of wrong ones half have more than this
