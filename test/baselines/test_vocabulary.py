@@ -9,7 +9,7 @@ import pytest
 
 from umf_ros.baselines.dbow2 import InvertedIndex, Vocabulary, hamming, similarity
 from umf_ros.core.errors import WeightsError
-from umf_ros.lab.training.vocabulary_fit import grow, k_medians
+from umf_ros.lab.fit.vocabulary import grow, k_medians
 
 
 def noisy(centres: np.ndarray, each: int, rng: np.random.Generator, flips: float = 0.05) -> np.ndarray:

@@ -137,7 +137,7 @@ def test_camera_info_and_transforms_become_the_calibration(tmp_path: Path, monke
 
 
 def test_an_imu_is_no_odometry_and_what_to_run_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from umf_ros.lab.simulation.messages import imu_message
+    from umf_ros.lab.simulation.bag_writer import imu_message
 
     entries = [entry for entry in traverse(3.0) if entry[0] != ODOMETRY]
     entries += [("/imu", START_NS + i, imu_message(np.zeros(3), np.zeros(3), START_NS + i)) for i in range(3)]

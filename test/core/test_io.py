@@ -35,7 +35,7 @@ def contents(folder: Path) -> set[str]:
 
 
 def test_a_file_appears_complete_or_not_at_all(tmp_path: Path) -> None:
-    path = tmp_path / "new" / "a.json"
+    path = tmp_path / "a.json"
     with atomic_write(path) as part:
         part.write_text("one")
         assert not path.exists()
@@ -47,9 +47,9 @@ def test_a_file_appears_complete_or_not_at_all(tmp_path: Path) -> None:
 
 def test_a_disk_error_is_one_line_and_named_kinds_too(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="cannot write .*/file/a"), atomic_write(tmp_path / "file" / "a"):
+    with pytest.raises(OutputError, match=r"cannot write .*/file/a"), atomic_write(tmp_path / "file" / "a"):
         pass
-    with pytest.raises(OutputError, match="cannot write .*/b: no room"), atomic_write(tmp_path / "b", RuntimeError):
+    with pytest.raises(OutputError, match=r"cannot write .*/b: no room"), atomic_write(tmp_path / "b", RuntimeError):
         raise RuntimeError("no room")
 
 
@@ -81,7 +81,7 @@ def test_a_file_holds_several_schemas(tmp_path: Path) -> None:
 def test_a_migration_that_fails_leaves_the_file_as_it_was(tmp_path: Path) -> None:
     path = made(tmp_path / "a.sqlite")
     broken = Schema("log", (*SECOND.migrations, ("CREATE TABLE other (id)", "no statement")))
-    with pytest.raises(UmfError, match="cannot write"):
+    with pytest.raises(UmfError, match=r"cannot write"):
         SqliteFile(path, broken)
     file = SqliteFile(path, FIRST)
     assert lines(file) == [("hello",)]
@@ -90,16 +90,16 @@ def test_a_migration_that_fails_leaves_the_file_as_it_was(tmp_path: Path) -> Non
 
 def test_later_versions_other_files_and_two_writers_are_refused_in_one_line(tmp_path: Path) -> None:
     path = made(tmp_path / "a.sqlite", SECOND)
-    with pytest.raises(UmfError, match="has version 2 of a log, this umf_ros reads 1"):
+    with pytest.raises(UmfError, match=r"has version 2 of a log, this umf_ros reads 1"):
         SqliteFile(path, FIRST)
-    with pytest.raises(UmfError, match="is no queue: it holds line, schema_version"):
+    with pytest.raises(UmfError, match=r"is no queue: it holds line, schema_version"):
         SqliteFile(path, BESIDE)
     writer = SqliteFile(path, SECOND)
     reader = SqliteFile(path, SECOND, read_only=True)
     assert lines(reader) == [("hello", 7)]
     with pytest.raises(UmfError, match=rf"in use by another process \({os.getpid()}\)"):
         SqliteFile(path, SECOND)
-    with pytest.raises(UmfError, match="there is no log"):
+    with pytest.raises(UmfError, match=r"there is no log"):
         SqliteFile(tmp_path / "b.sqlite", SECOND, read_only=True)
     reader.close()
     writer.close()
@@ -109,7 +109,7 @@ def test_later_versions_other_files_and_two_writers_are_refused_in_one_line(tmp_
 def test_a_reader_is_told_when_a_file_has_to_be_migrated_first(tmp_path: Path) -> None:
     path = made(tmp_path / "a.sqlite")
     SqliteFile(path, SECOND, read_only=True).close()
-    with pytest.raises(UmfError, match="of an earlier umf_ros"):
+    with pytest.raises(UmfError, match=r"of an earlier umf_ros"):
         SqliteFile(path, Schema("log", SECOND.migrations, readable=2), read_only=True)
 
 
@@ -120,7 +120,7 @@ def test_a_refusal_of_the_check_changes_nothing(tmp_path: Path) -> None:
     def refuse(connection: sqlite3.Connection) -> None:
         raise UmfError("of another rover")
 
-    with pytest.raises(UmfError, match="^of another rover$"):
+    with pytest.raises(UmfError, match=r"^of another rover$"):
         SqliteFile(path, SECOND, check=refuse)
     assert path.read_bytes() == before
 
@@ -130,7 +130,7 @@ def test_a_file_that_computes_is_refused(tmp_path: Path, statement: str) -> None
     path = made(tmp_path / "a.sqlite")
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute(statement)
-    with pytest.raises(UmfError, match="cannot be used as a log: it holds a"):
+    with pytest.raises(UmfError, match=r"cannot be used as a log: it holds a"):
         SqliteFile(path, FIRST)
 
 

@@ -9,7 +9,7 @@ import pytest
 from measurements import BAD, GOOD
 
 from umf_ros.core.errors import ConfigError
-from umf_ros.lab.training.acceptance_fit import save_acceptance
+from umf_ros.lab.fit.acceptance import save_acceptance
 from umf_ros.verification import Measurement
 from umf_ros.verification.acceptance import (
     KINDS,

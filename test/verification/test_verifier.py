@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
 from umf_ros.verification import NO_DEPTH, Verdict, Verifier
 from umf_ros.verification.constants import SAME_M, SAME_RAD
 from umf_ros.verification.hypotheses import near
 from umf_ros.verification.measurement import SCAN
-from umf_ros.verification.verifier import FOUND_BEFORE
+from umf_ros.verification.verifier import FOUND_BEFORE, LESS_SURE
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
@@ -59,6 +59,19 @@ def test_every_verdict_has_numbers_and_a_reason(verifier: Verifier) -> None:
     assert {"residual_m", "overlap", "probability", "inliers_image", "support"} <= set(verdicts[0].numbers)
     pixels = verdicts[0].inlier_pixels
     assert pixels.shape[1] == 4 and len(pixels) > 10
+
+
+def test_the_most_probable_closures_are_published_and_no_more_than_asked_for() -> None:
+    """Several candidates of one place: their closures share the query's scan, so their errors are correlated."""
+    matches = [take(GROUND, pose_at(GROUND, -15.0 + 1.0 * n, 0.0, 0.0), 10.0 + n) for n in range(4)]
+    places = [candidate(match, n) for n, match in enumerate(matches)]
+    query = take(GROUND, HERE, 100.0)
+    for most in (1, 2):
+        found = Verifier(Verification(max_closures=most, refine_best=4)).verify(query, places)
+        assert sum(verdict.closure is not None for verdict in found) == most
+        left = [verdict for verdict in found if verdict.reason == LESS_SURE]
+        least = min(verdict.closure.probability for verdict in found if verdict.closure is not None)
+        assert left and all(verdict.probability is not None and verdict.probability <= least for verdict in left)
 
 
 def test_rejected_candidate_says_how_far_it_fell_short(verifier: Verifier) -> None:
@@ -164,7 +177,7 @@ def test_expected_place_is_tested_before_better_looking_ones() -> None:
 
 PROBE = """
 import sys; sys.path[:0] = [{benchmarks!r}]
-from scenes import *; from umf_ros.core.config import Verification
+from umf_ros.lab.simulation.scenes import *; from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate; from umf_ros.verification import Verifier
 ground = landscape(20); verifier = Verifier(Verification())
 for step in range(2):

@@ -17,7 +17,7 @@ def list_sessions(store: StorePath) -> None:
     """List the sessions of a store: number, keyframes, and when."""
     from datetime import UTC, datetime
 
-    from umf_ros.places.upkeep import stored_sessions
+    from umf_ros.places.store import stored_sessions
 
     for session in stored_sessions(store):
         first, last = (datetime.fromtimestamp(ns // 10**9, UTC) for ns in (session.first_ns, session.last_ns))
@@ -32,7 +32,7 @@ def delete(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Delete sessions of a store for good, after a confirmation."""
-    from umf_ros.places.upkeep import check_sessions, delete_sessions
+    from umf_ros.places.store import check_sessions, delete_sessions
 
     check_sessions(store, session)
     if not yes:

@@ -17,6 +17,8 @@ from umf_ros.core.errors import ConfigError, UmfError, one_line, shortened, writ
 
 Migration = tuple[str, ...] | Callable[[sqlite3.Connection], None]
 Check = Callable[[sqlite3.Connection], None]
+_DAMAGE = (sqlite3.Error, ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
+"""Exceptions that the values of a damaged file raise where rows are read and parsed."""
 _VERSIONS = "CREATE TABLE IF NOT EXISTS schema_version (name TEXT PRIMARY KEY, version INTEGER NOT NULL)"
 
 
@@ -28,7 +30,7 @@ def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
     ends without an error and is deleted otherwise.
 
     Args:
-        path: the file; its folder is made where it is missing.
+        path: the file, in a folder that exists.
         kinds: exceptions of the block, besides `OSError`, that mean that the file cannot be written.
 
     Raises:
@@ -36,7 +38,6 @@ def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     with writing(path, *kinds):
-        path.parent.mkdir(parents=True, exist_ok=True)
         try:
             yield part
             part.replace(path)
@@ -174,7 +175,7 @@ class SqliteFile:
         """
         try:
             yield self.connection
-        except (sqlite3.Error, LookupError, TypeError, ValueError) as error:  # a damaged file holds anything anywhere
+        except _DAMAGE as error:
             raise UmfError(f"{self.name} is damaged: {one_line(error)}") from None
 
     def copy(self, path: Path) -> None:
@@ -183,6 +184,8 @@ class SqliteFile:
         Raises:
             OutputError: the copy cannot be written.
         """
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path, sqlite3.Error) as part:
             target = sqlite3.connect(part)
             try:

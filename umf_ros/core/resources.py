@@ -11,8 +11,8 @@ from umf_ros.core.errors import UmfError
 DEFAULT_DATASET = "simulated"
 LAB_PACKAGES = {"open3d": ("open3d", "0.19"), "sklearn": ("scikit-learn", "1.4")}
 """What a rover does without: distribution and first version known to work, by module."""
-FLEET_PACKAGES = ("faiss", "pgvector", "psycopg", "ray")
-"""Modules that only a fleet's rover, a map of very many places or a cluster needs."""
+FLEET_PACKAGES = ("pgvector", "psycopg", "ray")
+"""Modules that only a rover of a fleet or a cluster needs."""
 
 
 def share_folders() -> list[Path]:

@@ -1,1 +1,1 @@
-"""The growing database of places seen."""
+"""The place database: keyframes on disk, and the index that finds similar ones."""

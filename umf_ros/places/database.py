@@ -1,47 +1,54 @@
-"""The growing memory of places."""
+"""The place database: every keyframe on disk, a half-precision descriptor of each in memory."""
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
 
 from umf_ros.core.config import Database, Loop
-from umf_ros.core.errors import UmfError
+from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.core.frames import Candidate, Keyframe
+from umf_ros.core.geometry import Array
 from umf_ros.core.keyframes import is_past
-from umf_ros.places.codes import Rows
-from umf_ros.places.index import Mask
-from umf_ros.places.search import PlaceSearch
-from umf_ros.places.store import KeyframeStore
+from umf_ros.places.index import SAME_NUMBER, Admissible, Mask, PlaceIndex, Rows
+from umf_ros.places.store import KeyframeStore, index_path
+
+logger = logging.getLogger(__name__)
 
 SAME_KEYFRAME = 0.98
-"""Two keyframes of one stamp whose descriptors are this similar are one measurement read twice (*by hand*: runtimes of
-the network differ by less than 0.001; clocks that begin at 0 give the same stamps to scans of anything)."""
+"""Least similarity of two keyframes of one stamp that are one measurement read twice (*by hand*: runtimes of the
+network differ by less than 0.001; clocks that begin at 0 give the same stamps to different scans)."""
 VISITS = 4
-"""A place is handed on from at most so many sessions (*by hand*): as many as get a metric pose."""
+"""Most sessions of which one place is returned (*by hand*): as many as get a metric pose."""
 WIDER = 10
-"""So many times the candidates asked for are looked through for diverse ones (*by hand*)."""
-
-
+"""Multiple of the candidates asked for that is searched for diverse ones (*by hand*)."""
+MARGIN = 24
+"""Rows found in half precision beyond those asked for: full precision orders them (*by hand*)."""
+BATCH = 8192
+"""Descriptors read from the store at once; with so many new ones the file of the index is written again."""
+SPOT_CHECKS = 64
+"""Descriptors of the index that are compared with the store's when its file is opened."""
 PLACES_OF_MAP = "places.sqlite"
-"""The store of places in the folder of a map."""
+"""Name of the place database in the folder of a map."""
 
 
 class PlaceDatabase:
-    """Keyframes by index: a kilobyte of each in memory to search among them, everything on disk.
+    """Keyframes of all sessions by index, and the search among their descriptors.
 
-    Nothing is ever deleted here: sessions end and new ones begin.
+    Keyframes are only added. Beside a large file lies `<path>.faiss`, the index; it is built again where it is missing
+    or does not match the store.
 
     Args:
         settings: where to keep the keyframes.
         embedder: name of the embedder; a stored database of another one is refused.
         dimension: numbers per descriptor.
-        read_only: leave the file as it is, and to whoever else reads it.
+        read_only: only read the file; another process may write it.
 
     Attributes:
         store: the keyframes.
-        search: finds descriptors.
+        index: of their descriptors.
 
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use.
@@ -52,11 +59,16 @@ class PlaceDatabase:
         identity = {"embedder": embedder, "dimension": str(dimension)}
         outgoing = settings.backend == "postgres" and not read_only
         self.store = KeyframeStore(path, identity, settings.cached_keyframes, read_only, outgoing)
-        self.search = PlaceSearch(self.store, dimension)
+        self._index_path = index_path(path) if path is not None else None
+        try:
+            self.index = self._open_index(dimension)
+        except BaseException:
+            self.store.close()
+            raise
 
     @classmethod
     def of_map(cls, folder: Path, embedder: str, dimension: int) -> PlaceDatabase:
-        """The places of a map, to be read only.
+        """Open the places of a map for reading.
 
         Raises:
             UmfError: there is no map, or it was made with another embedder.
@@ -96,9 +108,12 @@ class PlaceDatabase:
         return int(self.store.keys["session"].max(initial=-1)) + 1
 
     def add(self, keyframe: Keyframe) -> int:
-        """Remember a keyframe and return its index."""
+        """Store a keyframe and return its index."""
         row = self.store.add(keyframe)
-        self.search.add(keyframe.embedding.descriptor)
+        self.index.add(keyframe.embedding.descriptor[None])
+        self.index.compress()
+        if len(self.index) - self._saved >= max(BATCH, self._saved // 4):
+            self._save_index()
         return row
 
     def query(self, keyframe: Keyframe, rules: Loop, sessions: range | None = None) -> list[Candidate]:
@@ -106,61 +121,97 @@ class PlaceDatabase:
 
         Keyframes must be older than `min_time_gap_s`, and those of the same session further back along
         the path than `min_travel_m`; where either path length is unknown, time alone decides. A place that was
-        visited in many sessions does not crowd out the others.
+        visited in many sessions does not displace the others.
 
         Args:
-            keyframe: what is looked for.
-            rules: which places may be candidates.
-            sessions: look among the places of these sessions, whatever their age.
+            keyframe: the query.
+            rules: the places that may be candidates.
+            sessions: search the places of these sessions, whatever their age.
         """
-        descriptor, stamps = keyframe.embedding.descriptor, self.store.keys["stamp_ns"]
 
         def admissible(rows: Rows | slice) -> Mask:
-            return self._admissible(keyframe, rules, rows) if sessions is None else self._of_sessions(sessions, rows)
+            keys = self.store.keys[rows]
+            if sessions is not None:
+                return np.asarray((keys["session"] >= sessions.start) & (keys["session"] < sessions.stop))
+            age_ns, path_m = keyframe.stamp_ns - keys["stamp_ns"], keyframe.path_length_m - keys["travelled_m"]
+            return is_past(age_ns, path_m, rules, keys["session"] == keyframe.session)
 
         for wanted in (2 * rules.top_k, WIDER * rules.top_k):
-            found = self.search(descriptor, wanted, admissible)
+            found = self._most_similar(keyframe.embedding.descriptor, wanted, admissible)
             similar = [(row, similarity) for row, similarity in found if similarity >= rules.min_similarity]
             chosen = self._diverse(similar, rules.top_k)
             if len(chosen) == rules.top_k or len(similar) < wanted:
                 break
+        stamps = self.store.keys["stamp_ns"]
         return [Candidate(row, int(stamps[row]), similarity) for row, similarity in chosen]
 
     def save(self, path: Path) -> None:
-        """Write a copy of the database to `path`."""
+        """Write a copy of the keyframes to `path`.
+
+        Raises:
+            OutputError: the copy cannot be written.
+        """
         self.store.save(path)
 
     def close(self) -> None:
-        """Release the file."""
-        self.search.close()
+        """Close the files."""
+        if len(self.index) - self._saved >= BATCH:
+            self._save_index()
         self.store.close()
 
-    def _diverse(self, found: list[tuple[int, float]], count: int) -> list[tuple[int, float]]:
-        """The best `count`, but of one place those of `VISITS` sessions only.
+    def _open_index(self, dimension: int) -> PlaceIndex:
+        """The index from its file where that matches the store, and completed from the store."""
+        path, size = self._index_path, len(self.store)
+        index = PlaceIndex.load(path, dimension) if path is not None else None
+        if index is None or not self._matches(index):
+            if path is not None and not self.store.read_only:
+                path.unlink(missing_ok=True)
+                path.with_suffix(".codes").unlink(missing_ok=True)  # what earlier versions kept
+            index = PlaceIndex(dimension)
+        self._saved = len(index)
+        for first in range(len(index), size, BATCH):
+            index.add(self.store.descriptors(np.arange(first, min(first + BATCH, size))))
+        index.compress()
+        return index
 
-        Two keyframes of different sessions show one place when they are more like each other than like the query.
+    def _matches(self, index: PlaceIndex) -> bool:
+        if not 0 < len(index) <= len(self.store):
+            return False
+        rows = np.unique(np.linspace(0, len(index) - 1, SPOT_CHECKS).astype(np.intp))
+        return bool(np.abs(index.descriptors(rows) - self.store.descriptors(rows)).max() < SAME_NUMBER)
+
+    def _save_index(self) -> None:
+        self._saved = len(self.index)
+        if self._index_path is None or self.store.read_only:
+            return
+        try:
+            self.index.save(self._index_path)
+        except OutputError as error:
+            logger.warning("%s; the index is built again at the next start", error)
+
+    def _most_similar(self, descriptor: Array, wanted: int, admissible: Admissible) -> list[tuple[int, float]]:
+        """Rows and cosine similarities of the most similar places, best first; equal ones in order of row."""
+        rows = np.sort(self.index.search(descriptor, wanted + MARGIN, admissible))
+        similarity = self.store.descriptors(rows) @ descriptor
+        order = np.argsort(-similarity, kind="stable")[:wanted]
+        return [(int(rows[i]), float(similarity[i])) for i in order]
+
+    def _diverse(self, found: list[tuple[int, float]], count: int) -> list[tuple[int, float]]:
+        """The best `count`, of one place those of `VISITS` sessions at most.
+
+        Two keyframes of different sessions show one place when they are more similar to each other than to the query.
         """
         sessions = self.store.keys["session"]
         if len(found) <= count or len({int(sessions[row]) for row, _ in found}) <= VISITS:
             return found[:count]
         descriptors = self.store.descriptors(np.array([row for row, _ in found]))
-        likeness = descriptors @ descriptors.T
+        similarities = descriptors @ descriptors.T
         chosen: list[int] = []
         for position, (row, similarity) in enumerate(found):
-            alike = [one for one in chosen if likeness[one, position] > similarity]
+            alike = [one for one in chosen if similarities[one, position] > similarity]
             visits = {int(sessions[found[one][0]]) for one in alike}
             if len(visits) < VISITS or int(sessions[row]) in visits:
                 chosen.append(position)
             if len(chosen) == count:
                 break
         return [found[position] for position in chosen]
-
-    def _admissible(self, keyframe: Keyframe, rules: Loop, rows: Rows | slice) -> Mask:
-        keys = self.store.keys
-        age_ns = keyframe.stamp_ns - keys["stamp_ns"][rows]
-        way_m = keyframe.path_length_m - keys["travelled_m"][rows]
-        return is_past(age_ns, way_m, rules, keys["session"][rows] == keyframe.session)
-
-    def _of_sessions(self, sessions: range, rows: Rows | slice) -> Mask:
-        numbers = self.store.keys["session"][rows]
-        return np.asarray((numbers >= sessions.start) & (numbers < sessions.stop))

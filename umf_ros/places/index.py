@@ -1,80 +1,157 @@
-"""Exact search among global descriptors, in two or three steps of growing precision."""
+"""FAISS index of the global descriptors of all places."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.places.codes import CodeTable, Rows, Scores, still_possible
-from umf_ros.places.projection import Projection, promising
+from umf_ros.core.errors import one_line
+from umf_ros.core.io import atomic_write
 
-PROJECTED_FROM = 16_384
-"""From so many rows on projections come first; they are made anew whenever there are four times as many."""
-FETCHED = 4096
-"""So many descriptors are read from the disk at most: where more are as alike as eight bits can tell, the most alike
-by those (*by hand*: no drive has come near it)."""
+logger = logging.getLogger(__name__)
 
+EXACT_UP_TO = 50_000
+"""Up to so many places every descriptor is compared (*measured*: 4 ms with 768 numbers each)."""
+SHORTLIST = 3000
+"""Descriptors whose half-precision products decide in a larger database (*measured*, as above: recall)."""
+DIRECTIONS = 96
+"""Principal components of the compressed codes, of four bits each (*measured*, as above: recall)."""
+SAMPLE = 16_384
+"""Descriptors that the compressed codes are trained with (*by hand*)."""
+SAME_NUMBER = 1e-3
+"""Half precision changes a component of a unit vector by less."""
+
+Rows = NDArray[np.intp]
 Mask = NDArray[np.bool_]
-Fetch = Callable[[Rows], Scores]
-Found = list[tuple[int, float]]
+Descriptors = NDArray[np.float32]
+Admissible = Callable[[Rows | slice], Mask]
+"""Mask of the rows that may be returned, among some rows or a slice of all."""
 
 
-class DescriptorIndex:
-    """Growing table of unit descriptors; finds exactly what comparing the query with each of them would find.
+class PlaceIndex:
+    """Growing index of unit descriptors in half precision, searched by inner product on one thread.
 
-    Memory holds codes of eight bits, and of many descriptors their projections too; the few that may be among the
-    best by strict bounds are compared in full precision. 100,000 descriptors of 768 numbers take 4 ms, not the 30 ms
-    that reading them as float32 takes.
+    Up to `EXACT_UP_TO` descriptors all are compared. In a larger index compressed codes select a shortlist, whose
+    half-precision products decide.
 
     Args:
-        table: the codes.
-        fetch: gives the descriptors (N, D) of rows in full precision, from wherever they are.
+        dimension: numbers per descriptor.
     """
 
-    def __init__(self, table: CodeTable, fetch: Fetch) -> None:
-        self._table = table
-        self._fetch = fetch
-        self._projection: Projection | None = None
-        self._projected = 0
+    def __init__(self, dimension: int) -> None:
+        with _one_thread() as faiss:
+            half = faiss.ScalarQuantizer.QT_fp16
+            self._flat = self._index = faiss.IndexScalarQuantizer(dimension, half, faiss.METRIC_INNER_PRODUCT)
 
-    def search(self, descriptor: Scores, top_k: int, admissible: Mask) -> Found:
-        """The best rows with their cosine similarity, best first; equal ones in order of row.
+    def __len__(self) -> int:
+        return int(self._flat.ntotal)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether a search compares every descriptor."""
+        return self._index is self._flat
+
+    def add(self, descriptors: Descriptors) -> None:
+        """Append (N, D) descriptors."""
+        with _one_thread():
+            self._index.add(np.ascontiguousarray(descriptors, np.float32))
+
+    def compress(self) -> None:
+        """Build the codes of an index that has become too large for exact search: some seconds of one core."""
+        if not self.is_exact or len(self) <= EXACT_UP_TO:
+            return
+        size = min(DIRECTIONS, self._flat.d)
+        with _one_thread() as faiss:
+            sample = self.descriptors(np.unique(np.linspace(0, len(self) - 1, SAMPLE).astype(np.intp)))
+            # principal axes without centring, unlike those of faiss.PCAMatrix: it would change the order of products
+            axes = np.linalg.eigh(sample.T @ sample)[1][:, -size:]
+            projection = faiss.LinearTransform(self._flat.d, size, False)
+            faiss.copy_array_to_vector(np.ascontiguousarray(axes.T).ravel(), projection.A)
+            projection.is_trained = True
+            quantizer = faiss.index_factory(size, f"PQ{size}x4fs", faiss.METRIC_INNER_PRODUCT)
+            codes = faiss.IndexPreTransform(projection, quantizer)
+            codes.train(sample)
+            for first in range(0, len(self), SAMPLE):
+                codes.add(self._flat.reconstruct_n(first, min(SAMPLE, len(self) - first)))
+            self._index = faiss.IndexRefine(codes, self._flat)
+
+    def descriptors(self, rows: Rows) -> Descriptors:
+        """(N, D) descriptors of some rows, in half precision."""
+        found: Descriptors = self._flat.reconstruct_batch(rows)
+        return found
+
+    def search(self, descriptor: Descriptors, count: int, admissible: Admissible) -> Rows:
+        """Rows of the most similar descriptors, best first.
+
+        A large index is searched through its shortlist, and exhaustively where too few of the list are admissible.
 
         Args:
-            descriptor: (D,) float32 unit vector.
-            top_k: how many at most.
-            admissible: (N,) rows that may be returned.
+            descriptor: (D,) unit vector.
+            count: how many rows at most.
+            admissible: selects the rows that may be returned.
         """
-        rows = np.flatnonzero(admissible)
-        if len(self._table) >= PROJECTED_FROM and len(rows) > top_k:
-            rows = self._outlined(descriptor, top_k, rows)
-        if len(rows) > len(self._table) // 4:
-            lower, upper = (bound[rows] for bound in self._table.bounds(descriptor))
-        else:
-            lower, upper = self._table.bounds(descriptor, rows)
-        return self._exactly(descriptor, rows, lower, upper, top_k)
+        if not self.is_exact:
+            with _one_thread():
+                _, found = self._index.search(descriptor[None], min(SHORTLIST, len(self)))
+            rows: Rows = found[0][found[0] >= 0]
+            rows = rows[admissible(rows)]
+            if len(rows) >= count:
+                return rows[:count]
+        return self.search_exactly(descriptor, count, admissible)
 
-    def best_of(self, descriptor: Scores, rows: Rows, top_k: int) -> Found:
-        """The best of some rows, as `search` gives them."""
-        return self._exactly(descriptor, rows, *self._table.bounds(descriptor, rows), top_k)
+    def search_exactly(self, descriptor: Descriptors, count: int, admissible: Admissible) -> Rows:
+        """The same by comparing every descriptor, however many there are."""
+        if not len(self):
+            return np.empty(0, np.intp)
+        with _one_thread() as faiss:
+            selector = faiss.IDSelectorBitmap(np.packbits(admissible(slice(None)), bitorder="little"))
+            rules = faiss.SearchParameters(sel=selector)
+            _, found = self._flat.search(descriptor[None], min(count, len(self)), params=rules)
+        rows: Rows = found[0][found[0] >= 0]
+        return rows
 
-    def _outlined(self, descriptor: Scores, top_k: int, rows: Rows) -> Rows:
-        """Those rows that their projections leave in the running."""
-        if self._projection is None or len(self._table) >= 4 * self._projected:
-            self._projection, self._projected = Projection(self._table), len(self._table)
-        self._projection.extend()
-        score, upper = self._projection.scores(descriptor)
-        lower, _ = self._table.bounds(descriptor, promising(score, rows, 4 * top_k))
-        worst_kept = np.partition(lower, -top_k)[-top_k]
-        return rows[upper[rows] >= worst_kept]
+    def save(self, path: Path) -> None:
+        """Write the index to a file for `load`.
 
-    def _exactly(self, descriptor: Scores, rows: Rows, lower: Scores, upper: Scores, top_k: int) -> Found:
-        kept = still_possible(lower, upper, top_k)
-        if len(kept) > FETCHED:
-            kept = np.sort(kept[np.argsort(-upper[kept], kind="stable")[:FETCHED]])
-        rows = rows[kept]
-        similarity = self._fetch(rows) @ descriptor
-        order = np.argsort(-similarity, kind="stable")[:top_k]
-        return [(int(rows[i]), float(similarity[i])) for i in order]
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        with atomic_write(path, RuntimeError) as part, _one_thread() as faiss:
+            faiss.write_index(self._index, str(part))
+
+    @classmethod
+    def load(cls, path: Path, dimension: int) -> PlaceIndex | None:
+        """The index in a file; None where there is none of this kind and dimension."""
+        if not path.is_file():
+            return None
+        index = cls(dimension)
+        with _one_thread() as faiss:
+            try:
+                stored = faiss.read_index(str(path))
+            except Exception as error:  # damaged bytes raise any exception
+                logger.warning("%s cannot be read and is built again: %s", path, one_line(error))
+                return None
+            flat = faiss.downcast_index(stored.refine_index) if isinstance(stored, faiss.IndexRefine) else stored
+            if not isinstance(flat, faiss.IndexScalarQuantizer) or flat.d != dimension:
+                return None
+            index._index, index._flat = stored, flat
+        return index
+
+
+@contextmanager
+def _one_thread() -> Iterator[Any]:
+    """FAISS on the calling thread alone: waiting OpenMP threads would take the cores from the network."""
+    import faiss
+
+    threads = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(1)
+    try:
+        yield faiss
+    finally:
+        faiss.omp_set_num_threads(threads)

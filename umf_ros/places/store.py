@@ -1,54 +1,74 @@
-"""Durable storage of keyframes: local features live on disk, the recently used ones in memory."""
+"""Durable storage of keyframes in SQLite, and the sessions of a stored database."""
 
 from __future__ import annotations
 
-import os
+import json
 import sqlite3
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
-from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Keyframe
-from umf_ros.core.locks import FileLock
-from umf_ros.core.sqlite_files import open_sqlite, take_up
-from umf_ros.places.columns import Columns
-from umf_ros.places.outbox import Outbox
+from umf_ros.core.io import Schema, SqliteFile
 from umf_ros.places.packing import pack, unpack
-from umf_ros.places.schema import KIND, check_identity, prepare
 
-Keys = Columns
-"""`id` in the file, `stamp_ns`, `session` and `travelled_m` of every keyframe; metres are NaN without odometry."""
-IDS_AT_ONCE = 1000
+SCHEMA = Schema(
+    "place database",
+    migrations=(
+        (
+            "CREATE TABLE about (content TEXT NOT NULL)",
+            # the blob comes last, so that the columns before it are read without it
+            "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, stamp_ns INTEGER NOT NULL, session INTEGER NOT NULL, "
+            "travelled_m REAL, descriptor BLOB NOT NULL, data BLOB NOT NULL)",
+        ),
+        # covers the keys of all keyframes on a hundredth of the pages
+        ("CREATE INDEX IF NOT EXISTS keyframe_by_stamp ON keyframe (stamp_ns, session, travelled_m)",),
+    ),
+    unversioned=lambda tables: int({"about", "keyframe"} <= tables),
+)
+UNVERSIONED_FORMAT = "3"
+"""Format of the files without `schema_version` that are converted; earlier ones are refused."""
+OUTBOX = Schema(
+    "outbox",
+    migrations=(
+        (
+            "CREATE TABLE fleet (store TEXT NOT NULL)",
+            "CREATE TABLE outbox (id INTEGER PRIMARY KEY)",
+            # keyframes from before there was a fleet are sent too
+            "INSERT INTO outbox SELECT id FROM keyframe",
+            "INSERT INTO fleet VALUES (lower(hex(randomblob(16))))",
+        ),
+    ),
+    unversioned=lambda tables: int({"fleet", "outbox"} <= tables),
+)
 LARGEST_NUMBER = 2**53
 _KEYS = np.dtype([("id", np.int64), ("stamp_ns", np.int64), ("session", np.int64), ("travelled_m", np.float64)])
 
 
 class KeyframeStore:
-    """A table of keyframes in SQLite, in the order they were added, with a bounded cache in front.
+    """A table of keyframes in SQLite, in the order in which they were added, with a bounded cache.
 
-    A rover that drives for days collects more local features than fit in memory; every keyframe is
-    written when it is added, so a crash loses none. What is written is never deleted here. One process at a time has a
-    file; the others may read it.
+    Local features of days of driving do not fit in memory. Every keyframe is written when it is added, so a killed
+    process loses none. One process writes a file; others may read it.
 
     Args:
-        path: database file, opened when it exists; None keeps a temporary one, which no end of the process leaves
-            behind.
-        identity: what must agree with a stored file, such as the embedder's name and dimension.
+        path: the file, opened when it exists; None: a temporary file that disappears with the process.
+        identity: the embedder's name and dimension; a stored file of another embedder is refused.
         cached: keyframes kept in memory.
-        read_only: the file is there and stays as it is, whoever else has it.
-        outgoing: whether every keyframe has to be told to a fleet's server.
+        read_only: the file must exist and is only read; another process may write it.
+        outgoing: whether every keyframe has to be sent to a fleet's server.
 
     Attributes:
         path: the file, or None.
-        keys: of all keyframes.
         read_only: as above.
 
     Raises:
@@ -59,26 +79,32 @@ class KeyframeStore:
     def __init__(
         self, path: Path | None, identity: dict[str, str], cached: int, read_only: bool = False, outgoing: bool = False
     ) -> None:
+        self.path, self.read_only = path, read_only
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, Keyframe] = OrderedDict()
-        self._cached = cached
-        self.path, self.read_only = path, read_only
-        self._dimension = int(identity["dimension"])
-        self.keys = Columns(**{name: _KEYS[name] for name in _KEYS.names or ()})
-        self._file_lock: FileLock | None = None
+        self._cached, self._dimension, self._outgoing = cached, int(identity["dimension"]), outgoing
+        name = str(path)
+        self._file = SqliteFile(path, SCHEMA, read_only=read_only, check=lambda db: _check_identity(db, name, identity))
         try:
-            self._connection = self._open_to_read(identity) if read_only else self._open(identity)
-            self._outbox = Outbox(self._connection) if outgoing else None
+            with self._reading() as connection:
+                if not connection.execute("SELECT 1 FROM about").fetchone():
+                    with self._file.writing():
+                        connection.execute("INSERT INTO about VALUES (?)", (json.dumps(identity),))
+                if outgoing:
+                    self._file.migrate(OUTBOX)
+                self._keys = _read_keys(connection)
         except BaseException:
-            self._unlock()
+            self._file.close()
             raise
-
-    @property
-    def _name(self) -> str:
-        return str(self.path or "temporary place database")
+        self._count = len(self._keys)
 
     def __len__(self) -> int:
-        return len(self.keys)
+        return self._count
+
+    @property
+    def keys(self) -> NDArray[np.void]:
+        """(N,) `id` in the file, `stamp_ns`, `session` and `travelled_m` of all keyframes; NaN m without odometry."""
+        return self._keys[: self._count]
 
     def __getitem__(self, index: int) -> Keyframe:
         """The keyframe of an index.
@@ -86,29 +112,25 @@ class KeyframeStore:
         Raises:
             UmfError: the file is damaged.
         """
+        row = int(self.keys["id"][index])
         with self._lock:
-            row = int(self.keys["id"][index])
             if row not in self._cache:
                 self._remember(row, self._read(row))
             self._cache.move_to_end(row)
             return self._cache[row]
 
     def descriptors(self, rows: NDArray[np.intp]) -> NDArray[np.float32]:
-        """(N, D) float32 descriptors of some indices, in their order.
+        """(N, D) float32 descriptors of some indices, 30,000 at most, in their order.
 
         Raises:
             UmfError: the file is damaged.
         """
-        found = np.empty((len(rows), self._dimension), np.float32)
-        for first in range(0, len(rows), IDS_AT_ONCE):
-            part = rows[first : first + IDS_AT_ONCE]
-            ids = self.keys["id"][part].tolist()
-            statement = f"SELECT id, descriptor FROM keyframe WHERE id IN ({','.join('?' * len(ids))})"
-            with self._lock, self._reading():
-                blobs = dict(self._connection.execute(statement, ids).fetchall())
-                content = b"".join(blobs[one] for one in ids)
-                found[first : first + len(part)] = np.frombuffer(content, np.float32).reshape(len(part), -1)
-        return found
+        ids = self.keys["id"][rows].tolist()
+        statement = f"SELECT id, descriptor FROM keyframe WHERE id IN ({','.join('?' * len(ids))})"
+        with self._reading() as connection:
+            blobs = dict(connection.execute(statement, ids))
+            content = b"".join(blobs[one] for one in ids)
+            return np.frombuffer(content, np.float32).reshape(len(ids), self._dimension)
 
     def rows_at(self, stamp_ns: int) -> list[int]:
         """Indices of the keyframes of a stamp, in order.
@@ -116,10 +138,7 @@ class KeyframeStore:
         Raises:
             UmfError: the file is damaged.
         """
-        with self._lock, self._reading():
-            statement = "SELECT id FROM keyframe WHERE stamp_ns = ? ORDER BY id"
-            ids = [one for (one,) in self._connection.execute(statement, (stamp_ns,))]
-        return [int(row) for row in np.searchsorted(self.keys["id"], ids)]
+        return self._rows("SELECT id FROM keyframe WHERE stamp_ns = ? ORDER BY id", stamp_ns)
 
     def add(self, keyframe: Keyframe) -> int:
         """Append a keyframe and return its index.
@@ -128,76 +147,59 @@ class KeyframeStore:
             OutputError: the file cannot be written.
         """
         with self._lock:
-            row = int(self.keys["id"][-1]) + 1 if len(self.keys) else 1
-            key = {"stamp_ns": keyframe.stamp_ns, "session": keyframe.session, "travelled_m": keyframe.path_length_m}
+            row = int(self.keys["id"][-1]) + 1 if len(self) else 1
+            key = row, keyframe.stamp_ns, keyframe.session, keyframe.path_length_m
             descriptor = np.ascontiguousarray(keyframe.embedding.descriptor, np.float32).tobytes()
-            values = (row, *key.values(), descriptor, pack(keyframe))
-            with writing(self._name, sqlite3.Error), self._connection:
-                self._connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?, ?)", values)
-                if self._outbox is not None:
-                    self._outbox.put(row)
-            self.keys.append(id=row, **key)
+            with self._file.writing() as connection:
+                values = (*key, descriptor, pack(keyframe))
+                connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?, ?)", values)
+                if self._outgoing:
+                    connection.execute("INSERT OR IGNORE INTO outbox VALUES (?)", (row,))
+            if self._count == len(self._keys):
+                self._keys = np.concatenate([self._keys, np.empty(max(256, self._count // 4), _KEYS)])
+            self._keys[self._count] = key
+            self._count += 1
             self._remember(row, keyframe)
-            return len(self.keys) - 1
+            return self._count - 1
 
     @property
     def store_id(self) -> UUID:
-        """What names the file among all those of a rover; only where keyframes go to a fleet's server."""
-        return self._the_outbox.store
+        """Identifier of the file among all files of a rover; of a store with an outbox."""
+        with self._reading() as connection:
+            return UUID(connection.execute("SELECT store FROM fleet").fetchone()[0])
 
     def outgoing(self, count: int) -> list[int]:
-        """Indices of the first keyframes that a fleet's server does not have yet."""
-        with self._lock, self._reading():
-            ids = self._the_outbox.oldest(count)
-        return [int(row) for row in np.searchsorted(self.keys["id"], ids)]
+        """Indices of the first keyframes that the fleet's server does not have yet."""
+        return self._rows("SELECT id FROM outbox JOIN keyframe USING (id) ORDER BY id LIMIT ?", count)
 
     def waiting(self) -> int:
-        """How many these are."""
-        with self._lock, self._reading():
-            return len(self._the_outbox)
+        """Number of keyframes that the fleet's server does not have yet."""
+        with self._reading() as connection:
+            return int(connection.execute("SELECT count(*) FROM outbox JOIN keyframe USING (id)").fetchone()[0])
 
     def delivered(self, rows: Sequence[int]) -> None:
-        """Take note that a fleet's server has some keyframes.
+        """Remove keyframes that the fleet's server has from the outbox.
 
         Raises:
             OutputError: the file cannot be written.
         """
-        with self._lock, writing(self._name, sqlite3.Error):
-            self._the_outbox.remove(self.keys["id"][list(rows)].tolist())
-
-    @property
-    def _the_outbox(self) -> Outbox:
-        if self._outbox is None:
-            raise ValueError("this store tells no server")
-        return self._outbox
+        ids = [(one,) for one in self.keys["id"][list(rows)].tolist()]
+        with self._lock, self._file.writing() as connection:
+            connection.executemany("DELETE FROM outbox WHERE id = ?", ids)
 
     def save(self, path: Path) -> None:
         """Write a copy to `path` while the store stays in use.
 
         Raises:
-            OutputError: the file cannot be written.
+            OutputError: the copy cannot be written.
         """
-        part = path.with_name(path.name + ".part")
-        with writing(path, sqlite3.Error), self._lock:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            part.unlink(missing_ok=True)  # of one that was killed
-            try:
-                with closing(sqlite3.connect(part)) as target:
-                    self._connection.backup(target)
-                part.replace(path)
-            finally:
-                part.unlink(missing_ok=True)
+        with self._lock:
+            self._file.copy(path)
 
     def close(self) -> None:
         """Close the file; a temporary one is deleted."""
         with self._lock:
-            self._connection.close()
-            self._unlock()
-
-    def _unlock(self) -> None:
-        if self._file_lock is not None:
-            self._file_lock.release()
-            self._file_lock = None
+            self._file.close()
 
     def _remember(self, row: int, keyframe: Keyframe) -> None:
         self._cache[row] = keyframe
@@ -206,49 +208,114 @@ class KeyframeStore:
 
     def _read(self, row: int) -> Keyframe:
         try:
-            (blob,) = self._connection.execute("SELECT data FROM keyframe WHERE id = ?", (row,)).fetchone()
+            (blob,) = self._file.connection.execute("SELECT data FROM keyframe WHERE id = ?", (row,)).fetchone()
             return unpack(blob)
         except (sqlite3.Error, SafetensorError, LookupError, ValueError, TypeError, OverflowError) as error:
-            raise UmfError(f"{self._name} is damaged at its keyframe {row}: {error}") from None
+            raise UmfError(f"{self._file.name} is damaged at its keyframe {row}: {error}") from None
 
-    def _open(self, identity: dict[str, str]) -> sqlite3.Connection:
-        return open_sqlite(self.path, KIND, lambda connection: self._prepare(connection, identity))
-
-    def _open_to_read(self, identity: dict[str, str]) -> sqlite3.Connection:
-        if self.path is None or not self.path.is_file():
-            raise UmfError(f"there is no place database {self.path}")
-        # SQLite wants to write files of its own beside what it reads, unless nobody can
-        access = "mode=ro" if os.access(self.path.parent, os.W_OK) else "immutable=1"
-        connection = sqlite3.connect(f"{self.path.resolve().as_uri()}?{access}", uri=True, check_same_thread=False)
-
-        def check(opened: sqlite3.Connection) -> None:
-            check_identity(opened, self._name, identity)
-            self._read_keys(opened)
-
-        return take_up(connection, self._name, KIND, check)
-
-    def _prepare(self, connection: sqlite3.Connection, identity: dict[str, str]) -> None:
-        """Look at what is there before anything is changed, and let nobody else write from then on."""
-        check_identity(connection, self._name, identity)
-        if self.path is not None:
-            self._file_lock = FileLock(self.path)
-        prepare(connection, identity)
-        self._read_keys(connection)
-
-    def _read_keys(self, connection: sqlite3.Connection) -> None:
-        # SQLite keeps a NaN as NULL; 9e999 is infinity
-        columns = "SELECT id, stamp_ns, session, ifnull(travelled_m, 9e999) FROM keyframe"
-        keys = np.fromiter(connection.execute(columns), _KEYS)
-        keys = keys[np.argsort(keys["id"])]
-        for name in ("id", "session"):  # the next one has to be a number too
-            if keys[name].min(initial=0) < 0 or keys[name].max(initial=0) > LARGEST_NUMBER:
-                raise ValueError(f"it holds a keyframe whose {name} is no number of ours")
-        keys["travelled_m"][np.isinf(keys["travelled_m"])] = np.nan
-        self.keys.extend(**{name: keys[name] for name in _KEYS.names or ()})
+    def _rows(self, statement: str, value: int) -> list[int]:
+        with self._reading() as connection:
+            ids = [one for (one,) in connection.execute(statement, (value,))]
+            return [int(row) for row in np.searchsorted(self.keys["id"], ids)]
 
     @contextmanager
-    def _reading(self) -> Iterator[None]:
-        try:
-            yield
-        except (sqlite3.Error, ValueError, KeyError, TypeError) as error:  # TypeError: text where bytes belong
-            raise UmfError(f"{self._name} is damaged: {error}") from None
+    def _reading(self) -> Iterator[sqlite3.Connection]:
+        with self._lock, self._file.reading() as connection:
+            yield connection
+
+
+class StoredSession(NamedTuple):
+    """A session of a place database: its number, number of keyframes, first and last stamp in ns."""
+
+    number: int
+    keyframes: int
+    first_ns: int
+    last_ns: int
+
+
+def stored_sessions(path: Path) -> list[StoredSession]:
+    """The sessions of a place database; another process may write it.
+
+    Raises:
+        UmfError: the file is missing or no place database.
+    """
+    columns = "SELECT session, count(*), min(stamp_ns), max(stamp_ns) FROM keyframe GROUP BY session"
+    with _looking(path) as connection:
+        return [StoredSession(*row) for row in connection.execute(columns)]
+
+
+def stored_identity(path: Path) -> tuple[str, int]:
+    """Embedder and numbers per descriptor of a place database; another process may write it.
+
+    Raises:
+        UmfError: the file is missing or no place database.
+    """
+    with _looking(path) as connection:
+        stored = _identity(connection)
+        return stored["embedder"], int(stored["dimension"])
+
+
+def check_sessions(path: Path, numbers: Collection[int]) -> None:
+    """Check that a place database has these sessions.
+
+    Raises:
+        UmfError: the file is no place database, or lacks one of them.
+    """
+    unknown = set(numbers) - {session.number for session in stored_sessions(path)}
+    if unknown:
+        raise UmfError(f"{path} has no session {', '.join(map(str, sorted(unknown)))}")
+
+
+def delete_sessions(path: Path, numbers: Collection[int]) -> int:
+    """Delete whole sessions for good; returns how many keyframes they had.
+
+    Raises:
+        UmfError: the file is no place database, is in use, or lacks one of the sessions.
+    """
+    check_sessions(path, numbers)
+    with closing(SqliteFile(path, SCHEMA)) as file, file.writing() as connection:
+        index_path(path).unlink(missing_ok=True)
+        statement = "DELETE FROM keyframe WHERE session = ?"
+        return sum(connection.execute(statement, (number,)).rowcount for number in set(numbers))
+
+
+def index_path(path: Path) -> Path:
+    """File beside a place database that its index is kept in."""
+    return path.with_name(path.name + ".faiss")
+
+
+@contextmanager
+def _looking(path: Path) -> Iterator[sqlite3.Connection]:
+    with closing(SqliteFile(path, SCHEMA, read_only=True)) as file, file.reading() as connection:
+        yield connection
+
+
+def _identity(connection: sqlite3.Connection) -> dict[str, Any]:
+    """Embedder and dimension of a file, as text; raise a `ValueError` if they cannot be read."""
+    about = connection.execute("SELECT content FROM about").fetchone()
+    stored = json.loads(about[0]) if about else {}
+    if not isinstance(stored, dict) or not all(isinstance(value, str) for value in stored.values()):
+        raise ValueError("its embedder cannot be read")
+    return stored
+
+
+def _check_identity(connection: sqlite3.Connection, name: str, identity: dict[str, str]) -> None:
+    """Raise an `UmfError` if the file `name` has another embedder, or a format that is not converted."""
+    stored = _identity(connection)
+    if stored.get("schema", UNVERSIONED_FORMAT) != UNVERSIONED_FORMAT:
+        raise UmfError(f"{name} was written by another version of umf_ros; name a new file (database.path)")
+    wrong = [f"{key} {stored.get(key)}, not {value}" for key, value in identity.items() if stored.get(key) != value]
+    if stored and wrong:
+        raise UmfError(f"{name} was made with {'; '.join(wrong)}")
+
+
+def _read_keys(connection: sqlite3.Connection) -> NDArray[np.void]:
+    # SQLite keeps a NaN as NULL; 9e999 is infinity
+    columns = "SELECT id, stamp_ns, session, ifnull(travelled_m, 9e999) FROM keyframe"
+    keys = np.fromiter(connection.execute(columns), _KEYS)
+    keys = keys[np.argsort(keys["id"])]
+    for name in ("id", "session"):  # the next one has to be a number too
+        if keys[name].min(initial=0) < 0 or keys[name].max(initial=0) > LARGEST_NUMBER:
+            raise ValueError(f"a keyframe's {name} is out of range")
+    keys["travelled_m"][np.isinf(keys["travelled_m"])] = np.nan
+    return keys

@@ -1,8 +1,7 @@
-"""What came to the pose graph, on disk as it comes: whoever starts again has the same graph."""
+"""Write-ahead log of the pose graph, replayed after a restart or a crash."""
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
@@ -11,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.errors import writing
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array
-from umf_ros.core.locks import FileLock
-from umf_ros.core.sqlite_files import open_sqlite, survive_crashes, tables_of
+from umf_ros.core.io import Schema, SqliteFile
 from umf_ros.pose_graph.closures import ClosureVerdict, Decision, State
 
 _TABLES = (
@@ -23,6 +21,7 @@ _TABLES = (
     "CREATE TABLE verdict (match_ns INTEGER, query_ns INTEGER, state TEXT, reason TEXT, residual REAL, "
     "residual_m REAL, PRIMARY KEY (match_ns, query_ns))",
 )
+_SCHEMA = Schema("pose graph", (_TABLES,), lambda tables: int({"event", "verdict"} <= tables))
 ODOMETRY, CLOSURE, REVOKED, DECIDED, STARTED = "odometry", "closure", "revoked", "decided", "started"
 UNSETTLED = "unsettled"
 _NUMBERS = {ODOMETRY: 16, CLOSURE: 53, REVOKED: 0, DECIDED: 0, STARTED: 0, UNSETTLED: 0}
@@ -32,7 +31,7 @@ JOURNAL = "pose_graph.sqlite"
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One thing that happened to the graph.
+    """One event of the graph.
 
     Attributes:
         kind: an odometry message came, a closure came, a pair of keyframes was revoked, what waited was decided, the
@@ -70,32 +69,27 @@ class GraphJournal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._lock = FileLock(path)
-        try:
-            self._connection = self._open()
-        except BaseException:
-            self._lock.release()
-            raise
+        self._file = SqliteFile(path, _SCHEMA)
 
     def events(self) -> Iterator[Event]:
-        """Everything that came so far.
+        """All events so far, in order.
 
         Raises:
             UmfError: the file is damaged.
         """
-        for row in self._read("SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"):
-            try:
+        with self._file.reading() as connection:
+            for row in connection.execute("SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"):
                 yield _event(*row)
-            except (ValueError, TypeError) as error:  # a damaged file holds anything anywhere
-                raise UmfError(f"{self.path} is damaged: {error}") from None
 
     def is_unsettled(self) -> bool:
-        """Whether the last thing that happened was an end without the time to settle the graph.
+        """Whether the last process ended before the graph was settled.
 
         Raises:
             UmfError: the file is damaged.
         """
-        return any(kind == UNSETTLED for (kind,) in self._read("SELECT kind FROM event ORDER BY id DESC LIMIT 1"))
+        with self._file.reading() as connection:
+            last = connection.execute("SELECT kind FROM event ORDER BY id DESC LIMIT 1").fetchone()
+            return last is not None and last[0] == UNSETTLED
 
     def verdicts(self) -> dict[tuple[int, int], Decision]:
         """The latest decision about every closure, by the stamps of match and query.
@@ -103,95 +97,73 @@ class GraphJournal:
         Raises:
             UmfError: the file is damaged.
         """
-        rows = self._read("SELECT match_ns, query_ns, state, reason, residual, residual_m FROM verdict")
-        try:
+        with self._file.reading() as connection:
+            rows = connection.execute("SELECT match_ns, query_ns, state, reason, residual, residual_m FROM verdict")
             return {
                 (match, query): (State(state), str(reason), _number(residual), _number(residual_m))
                 for match, query, state, reason, residual, residual_m in rows
             }
-        except (ValueError, TypeError) as error:
-            raise UmfError(f"{self.path} is damaged: {error}") from None
 
     @property
     def settings_mark(self) -> int:
-        """Of the settings that the verdicts were decided by, 0 where nobody left one.
+        """Mark of the settings that the verdicts were decided by, 0 without one.
 
         Raises:
             UmfError: the file is damaged.
         """
-        return int(next(self._read("PRAGMA user_version"))[0])
+        with self._file.reading() as connection:
+            return int(connection.execute("PRAGMA user_version").fetchone()[0])
 
     def mark_settings(self, mark: int) -> None:
-        """Leave a mark of 31 bits of the settings that verdicts are decided by."""
-        with writing(self.path, sqlite3.Error):
-            self._connection.execute(f"PRAGMA user_version = {int(mark)}")
+        """Write a mark of 31 bits of the settings that verdicts are decided by."""
+        with self._file.writing() as connection:
+            connection.execute(f"PRAGMA user_version = {int(mark)}")
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
-        """Write down a message of the odometry."""
+        """Write an odometry message."""
         self._add(ODOMETRY, stamp_ns, 0, odom_T_body.ravel())
 
     def add_closure(self, closure: LoopClosure) -> None:
-        """Write down a closure."""
+        """Write a closure."""
         numbers = np.concatenate([closure.match_T_query.ravel(), closure.covariance.ravel(), [closure.probability]])
         self._add(CLOSURE, closure.match_stamp_ns, closure.query_stamp_ns, numbers)
 
     def add(self, kind: str, match_ns: int = 0, query_ns: int = 0) -> None:
-        """Write down an event that has no numbers."""
+        """Write an event without numbers."""
         self._add(kind, match_ns, query_ns, np.empty(0))
 
     def put_verdicts(self, verdicts: list[ClosureVerdict]) -> None:
-        """Write down what was decided."""
+        """Write verdicts."""
         rows = [
             (v.closure.match_stamp_ns, v.closure.query_stamp_ns, v.state.value, v.reason, v.residual, v.residual_m)
             for v in verdicts
         ]
-        with writing(self.path, sqlite3.Error), self._connection:
-            self._connection.executemany("INSERT OR REPLACE INTO verdict VALUES (?, ?, ?, ?, ?, ?)", rows)
+        with self._file.writing() as connection:
+            connection.executemany("INSERT OR REPLACE INTO verdict VALUES (?, ?, ?, ?, ?, ?)", rows)
 
     def set_aside(self) -> Path:
-        """Keep what there is under another name, and begin anew; returns that name."""
+        """Rename the file and begin an empty one; returns the new name of the old file."""
         old = next(name for i in count(1) if not (name := self.path.with_suffix(f".{i}.sqlite")).exists())
-        self._connection.close()
+        self._file.close()
         try:
             with writing(self.path):
-                # while somebody reads it, its newest part lies in a log that belongs to its name
+                # while another process reads it, its newest part lies in a log that belongs to its name
                 for end in ("-wal", ""):
                     part = self.path.with_name(self.path.name + end)
                     if part.exists():
                         part.rename(old.with_name(old.name + end))
         finally:
-            self._connection = self._open()
+            self._file = SqliteFile(self.path, _SCHEMA)
         return old
 
     def close(self) -> None:
-        """Let go of the file."""
-        self._connection.close()
-        self._lock.release()
-
-    def _read(self, query: str) -> Iterator[tuple[Any, ...]]:
-        try:
-            yield from self._connection.execute(query)
-        except sqlite3.Error as error:
-            raise UmfError(f"{self.path} is damaged: {error}") from None
+        """Close the file."""
+        self._file.close()
 
     def _add(self, kind: str, first_ns: int, second_ns: int, numbers: Array) -> None:
         values = (kind, first_ns, second_ns, np.ascontiguousarray(numbers, np.float64).tobytes())
-        with writing(self.path, sqlite3.Error), self._connection:
-            self._connection.execute("INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)", values)
-
-    def _open(self) -> sqlite3.Connection:
-        return open_sqlite(self.path, "pose graph", self._prepare)
-
-    def _prepare(self, connection: sqlite3.Connection) -> None:
-        tables = tables_of(connection)
-        if tables and not {"event", "verdict"} <= tables:
-            raise UmfError(f"{self.path} holds no pose graph, but {', '.join(sorted(tables))}")
-        survive_crashes(connection)
-        if not tables:
-            with connection:
-                connection.execute("BEGIN")
-                for table in _TABLES:
-                    connection.execute(table)
+        with self._file.writing() as connection:
+            connection.execute("INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)", values)
 
 
 def _number(value: Any) -> float:
@@ -199,7 +171,7 @@ def _number(value: Any) -> float:
 
 
 def _event(kind: Any, first_ns: Any, second_ns: Any, data: Any) -> Event:
-    """A row of the table as an event.
+    """Return a row of the table as an event.
 
     Raises:
         ValueError: it is none.

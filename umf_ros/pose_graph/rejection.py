@@ -33,10 +33,10 @@ _MOST_ODDS, _MOST_ODDS_AT_LAST = 0.1, 0.2
 # before any verdict, one of five closures is taken for wrong
 _WRONG_BEFORE, _RIGHT_BEFORE = 1, 4
 # what looks alike does so for a while, so wrong closures seldom come alone: of those left undecided at the end of
-# drives in worlds 10200-10473 of benchmarks/pose_graph.py 1 of 67 wrong ones was alone and 59 of 213 right ones
+# drives in worlds 10200-10473 of `pose_graph.py` (benchmarks) 1 of 67 wrong ones was alone and 59 of 213 right ones
 _WRONG_ALONE = 0.1
 # a wrong closure between sessions that nothing joins is contradicted by nothing: at last two places have to agree, 2.5
-# nats at least (*by hand*; benchmarks/aliased_sessions.py: without, one group of wrong closures joined 4 of 40 graphs)
+# nats at least (*by hand*; `aliased_sessions.py`: without, one group of wrong closures joined 4 of 40 graphs)
 _WRONG_BETWEEN = 10.0
 _EVEN = 0.5
 _AGREES = "agrees with the map"

@@ -2,7 +2,7 @@
 
 A logistic regression on a handful of clipped, monotone criteria: each can only speak for a closure
 the way a person would read it, and none can shout. The weights are fitted on validation worlds by
-`benchmarks/fit_verification.py` and `benchmarks/fit_views.py`, and shipped as JSON.
+`umf_ros/lab/fit/scan_acceptance.py` and `umf_ros/lab/fit/view_acceptance.py`, and shipped as JSON.
 """
 
 from __future__ import annotations
@@ -70,38 +70,33 @@ def _shape(measurement: Measurement) -> float:
 
 # every range is by hand: wide enough for right poses, beyond the reach of most wrong ones
 CRITERIA: dict[str, Criterion] = {
-    "residual_like_noise": Criterion(lambda m: log_ratio(m.noise_m, m.residual_m), math.log(0.5), math.log(2.0)),
     "tail_like_noise": Criterion(lambda m: log_ratio(m.noise_m, m.residual_p90_m), math.log(0.15), math.log(0.6)),
-    "relief_explained": Criterion(lambda m: log_ratio(m.relief_m, m.residual_m), math.log(1.5), math.log(12)),
     "relief_present": Criterion(lambda m: log_ratio(m.relief_m, m.noise_m), math.log(1.2), math.log(5.0)),
     "shape": Criterion(_shape, 0.0, 1.0),
     "terrain_score": Criterion(lambda m: m.terrain_score, 3.0, 15.0),
-    "overlap": Criterion(lambda m: m.overlap, 0.4, 0.95),
     "common_view": Criterion(lambda m: _log(m.common), math.log(0.1), math.log(0.8)),
     "uncontradicted": Criterion(lambda m: _log(m.contradiction + 0.003), math.log(0.3), math.log(0.01)),
-    "counterparts": Criterion(lambda m: m.counterparts, 0.3, 0.9),
     "upright_counterparts": Criterion(lambda m: m.upright_counterparts, 0.3, 0.9, missing=0.4),
     "upright_at_all": Criterion(lambda m: m.upright_counterparts, 0.4, 0.65, missing=0.5),
     "explained": Criterion(lambda m: m.unexplained, 0.2, 0.02, missing=0.5),
     "wholly_explained": Criterion(lambda m: _log(m.unexplained + 0.004), math.log(0.2), math.log(0.01), missing=0.5),
     "known_along": Criterion(lambda m: m.rival_near, 0.0, 0.1),
-    "well_known_along": Criterion(lambda m: m.rival_near, 0.0, 0.4),
     "no_rival": Criterion(lambda m: m.rival_far, 0.0, 0.3),
     "no_rival_near_it": Criterion(lambda m: m.rival_far, 0.05, 0.5),
-    "points": Criterion(lambda m: math.log(max(m.points, 1.0)), math.log(100), math.log(1000)),
     "position_known": Criterion(lambda m: math.log(m.position_std_m), math.log(1.0), math.log(0.05)),
     "heading_known": Criterion(lambda m: math.log(m.heading_std_deg), math.log(5.0), math.log(0.2)),
     "cloud_agreement": Criterion(lambda m: m.agreement_cloud, 0.0, 6.0, missing=0.5),
-    "inliers": Criterion(lambda m: math.log1p(m.inliers_image + m.inliers_cloud), math.log(10), math.log(100), KINDS),
-    "similarity": Criterion(lambda m: m.similarity, 0.3, 0.9, KINDS),
-    "odometry_prior": Criterion(lambda m: m.prior_sigmas, 4.0, 1.0, KINDS, missing=0.7),
+    "inliers": Criterion(
+        lambda m: math.log1p(m.inliers_image + m.inliers_cloud), math.log(10), math.log(100), (IMAGE,)
+    ),
+    "similarity": Criterion(lambda m: m.similarity, 0.3, 0.9, (IMAGE,)),
+    "odometry_prior": Criterion(lambda m: m.prior_sigmas, 4.0, 1.0, missing=0.7),
     "support": Criterion(lambda m: m.support, 0.0, 3.0, KINDS),
     "view_position_known": Criterion(lambda m: math.log(m.position_std_m), math.log(0.5), math.log(0.05), (IMAGE,)),
     "view_heading_known": Criterion(lambda m: math.log(m.heading_std_deg), math.log(2.0), math.log(0.2), (IMAGE,)),
     "pose_inliers": Criterion(lambda m: math.log1p(m.pose_inliers), math.log(12), math.log(60), (IMAGE,)),
     "share": Criterion(lambda m: m.overlap, 0.1, 0.4, (IMAGE,)),
     "spread": Criterion(lambda m: m.spread, 0.03, 0.15, (IMAGE,)),
-    "residual_like_pixels": Criterion(lambda m: m.residual_sigmas, 1.5, 0.6, (IMAGE,)),
     "two_way": Criterion(lambda m: -math.log(max(m.two_way_m, 1e-3)), 0.0, -math.log(0.05), (IMAGE,)),
 }
 

@@ -2,8 +2,8 @@
 
 Where values come from: *geometry* follows from the sensors the package was made for (S3LI's Cube-1 LiDAR, 70 deg wide,
 ten thousand returns up to 28 m; a camera of 688 x 512 pixels and 61 deg); *measured* was compared with its
-alternatives; *by hand* is an engineer's choice, held since by `benchmarks/verification.py`. What a user may want to
-change is a setting (`umf_ros.core.config.Verification`), what is fitted stands in
+alternatives; *by hand* is an engineer's choice, held since by `benchmarks/accuracy/verification.py`. Values that a user
+may want to change are settings (`umf_ros.core.config.Verification`), fitted ones stand in
 `config/verification/calibration.json`, and the range of each criterion beside the criterion, in `acceptance`.
 """
 
@@ -87,7 +87,9 @@ FINE_REACH_M, FINE_STEPS = 0.4, 8  # by hand: the spacing of far returns is wide
 MIN_SCAN_POINTS = 100  # by hand: below, there is nothing to align
 BARE_RELIEF_M = 0.01  # measured on simulated drives: of bare, even ground .002, of the plainest of other places .03
 BARE_ODDS = 10.0  # by hand: bare ground whose texture comes again elsewhere is that much likelier than a view that does
-BARE_SPREAD = 0.1  # measured: of images that agree about bare ground from .097, of 80 of benchmarks/traps.py to .096
+BARE_SPREAD = (
+    0.1  # measured: of images that agree about bare ground from .097, of 80 of umf_ros/lab/simulation/scenes.py to .096
+)
 SCANS_KEPT = 60  # prepared scans in memory: bounds it, changes no result
 
 # free space: what the rays of one scan say of the points of another

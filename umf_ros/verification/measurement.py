@@ -2,7 +2,7 @@
 
 A new test is three steps: a function of what an `AlignedHypothesis` holds, a field of `Measurement` that `measure`
 fills with it, and a `Criterion` in `acceptance` that says which values speak for a closure. Its weight is 0 until
-`benchmarks/fit_verification.py` has fitted one.
+`umf_ros/lab/fit/scan_acceptance.py` has fitted one.
 """
 
 from __future__ import annotations

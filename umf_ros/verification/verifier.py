@@ -33,6 +33,7 @@ from umf_ros.verification.yaw_search import RotatedElevationMap
 
 UNTESTED, NO_POSE = "less promising than others", "no pose fits, or others fit better"
 FOUND_BEFORE = "not compared: one was found"
+LESS_SURE = "a more probable closure of this keyframe is published"
 NO_DEPTH = "no depth: neither a scan nor a stereo pair"
 """Why there is nothing to judge about a candidate."""
 
@@ -140,10 +141,19 @@ class Verifier:
             tested |= {item.candidate.stamp_ns for item in chosen}
         found = [(one.aligned.match, one.aligned.pose, one.probability >= self._threshold) for one in judged]
         self._memory.remember(query, found)
-        verdicts = self._decide(query, ranked, judged, tested)
+        verdicts = self._surest(self._decide(query, ranked, judged, tested))
         known = {verdict.candidate.index for verdict in verdicts}
         rest = [candidate for candidate, _ in candidates if candidate.index not in known]
         return verdicts + [Verdict(one, FOUND_BEFORE, uncompared(one)) for one in rest]
+
+    def _surest(self, verdicts: list[Verdict]) -> list[Verdict]:
+        """Keep the `max_closures` most probable closures: those of one keyframe are correlated."""
+        accepted = sorted(
+            (one for one in verdicts if one.closure is not None), key=lambda one: -(one.probability or 0.0)
+        )
+        surplus = {id(one) for one in accepted[self._settings.max_closures :]}
+        kept = [replace(one, closure=None, reason=LESS_SURE) if id(one) in surplus else one for one in verdicts]
+        return sorted(kept, key=lambda one: one.closure is None)
 
     def examine(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[JudgedHypothesis]:
         """Every hypothesis about every candidate, without a decision: what the decision is fitted on."""

@@ -7,8 +7,7 @@ import pytest
 from tiny_worlds import CAMERA, TINY, flat_sample, plain_view, pose_at
 
 from umf_ros.core.geometry import transform
-from umf_ros.lab.datasets.correspondences import cell_points, match_cells, match_voxels
-from umf_ros.lab.datasets.views import Augmentation, ViewMaker, view_points
+from umf_ros.lab.datasets.views import Augmentation, ViewMaker, cell_points, match_cells, match_voxels, view_points
 
 COLUMNS = TINY.image_size[1] // 4
 

@@ -10,7 +10,7 @@ import pytest
 from numpy._core.multiarray import _reconstruct
 
 from umf_ros.core.errors import UmfError
-from umf_ros.lab.datasets.pickles import load_data_frame, load_pickle
+from umf_ros.lab.datasets.s3li import load_data_frame, load_pickle
 
 DATA = Path(__file__).parent / "data"
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from umf_ros.lab.datasets.recorded import course, detours, path_length
+from umf_ros.lab.datasets.simulated import course, detours, path_length
 
 
 def test_a_rover_heads_where_it_drives() -> None:

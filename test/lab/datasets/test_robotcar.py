@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from umf_ros.core.errors import UmfError
-from umf_ros.lab.datasets.labels import label, places_of
 from umf_ros.lab.datasets.robotcar import read_evaluation, read_training
-from umf_ros.lab.evaluation.protocol import ROBOTCAR_RULE, place_recognition
+from umf_ros.lab.datasets.sample import label, places_of
+from umf_ros.lab.evaluation.retrieval import ROBOTCAR_RULE, place_recognition
 
 RUNS = ("2014-05-19-13-20-57", "2014-11-14-16-34-33")
 FOLDER = "pointcloud_20m_10overlap"

@@ -6,9 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.config import Loop
 from umf_ros.core.geometry import make_pose
-from umf_ros.lab.evaluation.protocol import ROBOTCAR_RULE, loop_closure, place_recognition, revisits
-from umf_ros.lab.evaluation.retrieval import rank
-from umf_ros.lab.evaluation.scores import score
+from umf_ros.lab.evaluation.results import score
+from umf_ros.lab.evaluation.retrieval import ROBOTCAR_RULE, loop_closure, place_recognition, rank, revisits
 
 GAPS = Loop(min_time_gap_s=20, min_travel_m=15)
 

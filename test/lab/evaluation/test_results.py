@@ -18,10 +18,10 @@ from umf_ros.lab.evaluation.results import (
     percent,
     plot_precision_recall,
     plot_recall,
+    precision_recall,
     print_table,
     rounded,
 )
-from umf_ros.lab.evaluation.scores import precision_recall
 
 TABLE = (["", "R@1", "R@5"], [["fused", "70.0", "75.0"], ["ransac both", "7.1", "-"]])
 REPORT = EvaluationReport(

@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 from sklearn.metrics import average_precision_score, precision_recall_curve
 
 from umf_ros.core.geometry import make_pose
-from umf_ros.lab.evaluation.protocol import place_recognition
-from umf_ros.lab.evaluation.retrieval import rank
-from umf_ros.lab.evaluation.scores import precision_recall, recall_by_yaw, recall_curve, recall_top_percent, score
+from umf_ros.lab.evaluation.results import precision_recall, recall_by_yaw, recall_curve, recall_top_percent, score
+from umf_ros.lab.evaluation.retrieval import place_recognition, rank
 
 
 def of(score: list[float], correct: list[int], answerable: list[int] | None = None):

@@ -16,8 +16,8 @@ from tiny_worlds import TINY
 
 from umf_ros.core.frames import Embedding, Frame
 from umf_ros.lab.evaluation import summary as summary_module
+from umf_ros.lab.evaluation.results import Scores, YawBin, precision_recall
 from umf_ros.lab.evaluation.retrieval import METHODS
-from umf_ros.lab.evaluation.scores import Scores, YawBin, precision_recall
 from umf_ros.lab.evaluation.summary import (
     WARM_UP,
     Cost,
@@ -27,7 +27,7 @@ from umf_ros.lab.evaluation.summary import (
     cost_of_weights,
     measure,
 )
-from umf_ros.lab.evaluation.worlds_run import ASKED
+from umf_ros.lab.evaluation.worlds import ASKED
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF, count_parameters
 

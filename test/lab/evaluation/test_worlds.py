@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from umf_ros.core.geometry import wrap_angle
-from umf_ros.lab.evaluation.worlds import FIRST, FIRST_SEEDS, FULL, OPPOSITE, QUICK, REVISIT, SAME_LIGHT
+from umf_ros.lab.evaluation.worlds import FIRST, FIRST_SEEDS, FULL, OPPOSITE, QUICK, REVISIT, SAME_LIGHT, work
 from umf_ros.lab.evaluation.worlds import test_worlds as make_worlds
-from umf_ros.lab.evaluation.worlds_run import work
-from umf_ros.lab.simulation.seeds import TEST, TRAINING, VALIDATION
+from umf_ros.lab.simulation.world import TEST, TRAINING, VALIDATION
 
 
 def test_the_four_worlds_differ_and_are_nobody_elses() -> None:

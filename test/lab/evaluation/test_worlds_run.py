@@ -11,9 +11,9 @@ from landmarks import CONFUSED, PLACES, LandmarkEmbedder, LineWorld
 from tiny_worlds import TINY
 
 from umf_ros.core.config import Verification
-from umf_ros.lab.evaluation import worlds_run
+from umf_ros.lab.evaluation import worlds as worlds_run
 from umf_ros.lab.evaluation.summary import WorldResult, cost_of_weights
-from umf_ros.lab.evaluation.worlds_run import PICTURES, WorldEvaluation, WorldsRun
+from umf_ros.lab.evaluation.worlds import PICTURES, WorldEvaluation, WorldsRun
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF, count_parameters
 

@@ -8,11 +8,9 @@ from scipy.spatial import cKDTree
 
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.geometry import heading, relative, rotation_angle, wrap_angle
-from umf_ros.lab.simulation.odometry import Drift, drifting
-from umf_ros.lab.simulation.passes import SETTINGS, plan_passes
-from umf_ros.lab.simulation.presets import DEMO, ETNA, SESSION, find_preset
-from umf_ros.lab.simulation.route import Walker
-from umf_ros.lab.simulation.sequences import THESIS, first_samples, sampled
+from umf_ros.lab.simulation.motion_sensors import Drift, drifting
+from umf_ros.lab.simulation.presets import DEMO, ETNA, SESSION, THESIS, find_preset, first_samples, sampled
+from umf_ros.lab.simulation.route import SETTINGS, Walker, plan_passes
 from umf_ros.lab.simulation.simulator import Simulator
 from umf_ros.lab.simulation.world import ROCK, ground
 

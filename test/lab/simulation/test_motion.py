@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.trajectories import east_north_up, read_rtklib
 from umf_ros.core.geometry import heading, make_pose, relative
-from umf_ros.lab.simulation import gnss, imu
-from umf_ros.lab.simulation.motion import Motion
-from umf_ros.lab.simulation.odometry import Drift, drifting
+from umf_ros.lab.simulation import motion_sensors
+from umf_ros.lab.simulation.motion_sensors import Drift, Motion, drifting
 from umf_ros.lab.simulation.route import Route
 from umf_ros.lab.simulation.simulator import START_NS
 
@@ -109,19 +108,19 @@ def test_the_seed_sways_the_rover_and_leaves_its_way():
 
 def test_a_turn_is_felt_as_rate_and_towards_its_centre():
     motion = move(circle(8))
-    data = imu.measure(motion, np.eye(4), motion.duration_s, seed=3)
+    data = motion_sensors.measure_imu(motion, np.eye(4), motion.duration_s, seed=3)
     steady = (data.times_s > 5) & (data.times_s < motion.duration_s - 5)
     assert data.rate[steady].mean(0) == pytest.approx([0, 0, SPEED / 8], abs=0.008)
-    wanted = [0, SPEED**2 / 8, imu.GRAVITY_M_S2]
+    wanted = [0, SPEED**2 / 8, motion_sensors.GRAVITY_M_S2]
     assert data.force[steady].mean(0) == pytest.approx(wanted, abs=0.08)  # biases of 0.02
 
 
 def test_a_slope_is_felt_by_its_gravity():
     motion = move(straight(40), Plane(0.2))
-    data = imu.measure(motion, np.eye(4), motion.duration_s, seed=3)
+    data = motion_sensors.measure_imu(motion, np.eye(4), motion.duration_s, seed=3)
     steady = (data.times_s > 5) & (data.times_s < motion.duration_s - 5)
     angle = np.arctan(0.2)
-    wanted = imu.GRAVITY_M_S2 * np.array([np.sin(angle), 0, np.cos(angle)])
+    wanted = motion_sensors.GRAVITY_M_S2 * np.array([np.sin(angle), 0, np.cos(angle)])
     assert data.force[steady].mean(0) == pytest.approx(wanted, abs=0.08)
 
 
@@ -129,7 +128,10 @@ def test_a_slope_is_felt_by_its_gravity():
 def test_an_imu_away_from_the_centre_feels_the_swing(lever):
     """The same seed gives the same noise and biases: what is left is the lever arm's."""
     motion = move(circle(8))
-    centre, away = (imu.measure(motion, make_pose(np.eye(3), arm), motion.duration_s, 3) for arm in ([0, 0, 0], lever))
+    centre, away = (
+        motion_sensors.measure_imu(motion, make_pose(np.eye(3), arm), motion.duration_s, 3)
+        for arm in ([0, 0, 0], lever)
+    )
     steady = (centre.times_s > 5) & (centre.times_s < motion.duration_s - 5)
     difference = (away.force - centre.force)[steady].mean(0)
     assert difference == pytest.approx(-((SPEED / 8) ** 2) * np.array([lever[0], lever[1], 0]), abs=1e-3)
@@ -138,16 +140,18 @@ def test_an_imu_away_from_the_centre_feels_the_swing(lever):
 
 def test_the_noise_of_the_imu_is_that_of_its_data_sheet():
     motion = move(straight(60))
-    data = imu.measure(motion, np.eye(4), motion.duration_s, seed=1)
+    data = motion_sensors.measure_imu(motion, np.eye(4), motion.duration_s, seed=1)
     # from sample to sample the motion hardly changes
-    assert np.diff(data.rate, axis=0).std() / np.sqrt(2) == pytest.approx(imu.GYRO_NOISE * 20, rel=0.03)
+    assert np.diff(data.rate, axis=0).std() / np.sqrt(2) == pytest.approx(motion_sensors.GYRO_NOISE * 20, rel=0.03)
     steady = data.force[2000:-2000]
-    assert np.diff(steady, axis=0).std() / np.sqrt(2) == pytest.approx(imu.ACCELEROMETER_NOISE * 20, rel=0.03)
+    assert np.diff(steady, axis=0).std() / np.sqrt(2) == pytest.approx(
+        motion_sensors.ACCELEROMETER_NOISE * 20, rel=0.03
+    )
 
 
 def test_satellites_err_as_they_say():
     motion = move(circle(20, turns=7))
-    track = gnss.measure(motion, motion.duration_s, seed=2)
+    track = motion_sensors.measure_gnss(motion, motion.duration_s, seed=2)
     world = motion.poses(track.times_s)[:, :3, 3]
     found = east_north_up(track.geodetic)
     error = (found - found.mean(0)) - (world - world.mean(0))
@@ -163,9 +167,9 @@ def test_satellites_err_as_they_say():
 def test_positions_written_for_rtklib_are_read_back(tmp_path, start_ns):
     """Across the turn of a second, of a day and of a year, in GPS time."""
     motion = move(circle(20))
-    track = gnss.measure(motion, motion.duration_s, seed=2)
+    track = motion_sensors.measure_gnss(motion, motion.duration_s, seed=2)
     path = tmp_path / "a.pos"
-    path.write_text(gnss.rtklib_text(track, start_ns))
+    path.write_text(motion_sensors.rtklib_text(track, start_ns))
     stamps, positions = read_rtklib(path)
     assert np.abs(stamps - start_ns - np.round(track.times_s * 1e9)).max() < 1_000_000
     np.testing.assert_allclose(positions, east_north_up(track.geodetic), atol=2e-3)

@@ -10,11 +10,9 @@ from scipy.spatial import cKDTree
 
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.geometry import wrap_angle
-from umf_ros.lab.simulation.passes import SETTINGS, plan_passes, resample
-from umf_ros.lab.simulation.presets import DEMO, ETNA, PRESETS, SENSORS, find_preset, gentle_loop
+from umf_ros.lab.simulation.presets import DEMO, ETNA, PRESETS, SENSORS, find_preset, gentle_loop, sampled, trail_length
 from umf_ros.lab.simulation.relief import SIZE_M
-from umf_ros.lab.simulation.route import NIGHT, STEP_M, Walker
-from umf_ros.lab.simulation.sequences import sampled, trail_length
+from umf_ros.lab.simulation.route import NIGHT, SETTINGS, STEP_M, Walker, plan_passes, resample
 from umf_ros.lab.simulation.world import ground
 
 ANGLE = np.linspace(0, 2 * np.pi, 2000)[:-1]

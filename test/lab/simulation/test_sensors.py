@@ -10,11 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import invert, relative, transform
 from umf_ros.embedding.inputs import is_blank
-from umf_ros.lab.simulation import gnss, imu
+from umf_ros.lab.simulation import motion_sensors
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, resized
-from umf_ros.lab.simulation.lidar import PERIOD_NS, POINTS, Lidar
-from umf_ros.lab.simulation.lighting import Sun
-from umf_ros.lab.simulation.rig import VULCANO, eyes, mosaic
+from umf_ros.lab.simulation.lidar import PERIOD_NS, POINTS, VULCANO, Lidar, eyes, mosaic
+from umf_ros.lab.simulation.shading import Sun
 from umf_ros.lab.simulation.world import ROCK
 
 
@@ -152,7 +151,7 @@ def test_motion_during_a_scan_bends_it_and_can_be_taken_out(drive):
 
 
 def test_imu_agrees_with_the_motion(drive):
-    data = imu.measure(drive.motion, drive.calibration.body_T_imu, drive.duration_s, drive.seed)
+    data = motion_sensors.measure_imu(drive.motion, drive.calibration.body_T_imu, drive.duration_s, drive.seed)
     assert 1 / np.diff(data.times_s).mean() == pytest.approx(400)
     mounting = Rotation.from_matrix(drive.calibration.body_T_imu[:3, :3])
     turn = mounting.inv() * Rotation.from_matrix(
@@ -162,16 +161,16 @@ def test_imu_agrees_with_the_motion(drive):
     for rate in data.rate[:-1]:
         step = step * Rotation.from_rotvec(rate / 400)
     assert ((turn * mounting).inv() * step).magnitude() < np.radians(1)
-    assert np.linalg.norm(data.force, axis=1).mean() == pytest.approx(imu.GRAVITY_M_S2, abs=0.3)
+    assert np.linalg.norm(data.force, axis=1).mean() == pytest.approx(motion_sensors.GRAVITY_M_S2, abs=0.3)
 
 
 def test_gnss_positions_come_back_in_gps_time(drive):
-    track = gnss.measure(drive.motion, drive.duration_s, drive.seed)
+    track = motion_sensors.measure_gnss(drive.motion, drive.duration_s, drive.seed)
     first = track.geodetic[0]
     metres = (track.geodetic[-1, :2] - first[:2]) * [111_000, 111_320 * np.cos(np.radians(first[0]))]
     true = drive.motion.pose(track.times_s[-1])[:2, 3] - drive.motion.pose(0)[:2, 3]
     assert metres[::-1] == pytest.approx(true, abs=0.15)
-    line = gnss.rtklib_text(track, 1_625_644_800 * 10**9 + 250_000_000).splitlines()[3].split()
+    line = motion_sensors.rtklib_text(track, 1_625_644_800 * 10**9 + 250_000_000).splitlines()[3].split()
     assert line[:2] == ["2021/07/07", "08:00:18.250"]
     assert float(line[2]) == pytest.approx(first[0], abs=1e-9) and line[5] in "12"
 

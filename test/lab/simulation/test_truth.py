@@ -9,10 +9,20 @@ from scipy.spatial import cKDTree
 
 from umf_ros.core.geometry import invert, make_pose, transform
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, resized
-from umf_ros.lab.simulation.lidar import LINES, PERIOD_NS, POINTS, PULSES, RANGE_M, Lidar, pulse_directions, pulse_times
-from umf_ros.lab.simulation.lighting import Sun
+from umf_ros.lab.simulation.lidar import (
+    LINES,
+    PERIOD_NS,
+    POINTS,
+    PULSES,
+    RANGE_M,
+    Lidar,
+    eyes,
+    mosaic,
+    pulse_directions,
+    pulse_times,
+)
 from umf_ros.lab.simulation.relief import SIZE_M
-from umf_ros.lab.simulation.rig import eyes, mosaic
+from umf_ros.lab.simulation.shading import Sun
 from umf_ros.lab.simulation.world import GROUND, HORIZON, ROCK
 
 SUN = Sun(30, 35)

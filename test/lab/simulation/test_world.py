@@ -9,10 +9,9 @@ from scipy.spatial import cKDTree
 
 from umf_ros.core.geometry import make_pose
 from umf_ros.lab.simulation.camera import Camera
-from umf_ros.lab.simulation.lighting import Sun
 from umf_ros.lab.simulation.relief import SIZE_M
 from umf_ros.lab.simulation.rocks import scatter_rocks
-from umf_ros.lab.simulation.shading import Shader, cast
+from umf_ros.lab.simulation.shading import Shader, Sun, cast
 from umf_ros.lab.simulation.world import GROUND, HORIZON, ROCK, grid_triangles
 
 NOWHERE = np.empty((0, 2))

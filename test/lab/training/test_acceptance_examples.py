@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from measurements import BAD, GOOD
 
-from umf_ros.lab.training.acceptance_examples import Example, load_examples, save_examples
+from umf_ros.lab.fit.acceptance import Example, load_examples, save_examples
 from umf_ros.verification.measurement import IMAGE
 
 EXAMPLES = [

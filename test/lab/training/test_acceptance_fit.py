@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from measurements import BAD, GOOD
 
-from umf_ros.lab.training.acceptance_examples import Example
-from umf_ros.lab.training.acceptance_fit import (
+from umf_ros.lab.fit.acceptance import (
+    Example,
     bounds_of,
     fit_covariance,
     fit_decision,

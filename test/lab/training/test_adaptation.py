@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 from umf_ros.core.config import dump_settings
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.lab.commands import adapt as command
-from umf_ros.lab.training.adaptation import Adaptation, Lesson, Recall, adapt, measure
+from umf_ros.lab.fit.adaptation import Adaptation, Lesson, Recall, adapt, measure
+from umf_ros.lab.fit.scene import with_scene
 from umf_ros.lab.training.drives import Drive
 from umf_ros.lab.training.networks import read_card, save_weights
-from umf_ros.lab.training.scene_fit import with_scene
 from umf_ros.networks.efficientnet import DEPTH, EfficientNetLite0
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
@@ -139,7 +139,7 @@ def run(folder: Path, bags: list[str], out: str = "mine.safetensors") -> str:
 
 
 def test_what_was_gained_is_written_and_said(given: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("umf_ros.lab.training.adaptation.Adaptation", lambda: EAGER)
+    monkeypatch.setattr("umf_ros.lab.fit.adaptation.Adaptation", lambda: EAGER)
     bags = [f"{seed}.mcap" for seed in range(12)]
     said = run(given, bags)
     assert said.startswith("Gained: held out: ") and "mine.safetensors" in said

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from umf_ros.lab.training.covariance_fit import PoseSample, covariances_of, fit_scan_covariance, honesty
+from umf_ros.lab.fit.covariance import PoseSample, covariances_of, fit_scan_covariance, honesty
 from umf_ros.verification.scan_alignment import CovarianceModel
 
 TRUE = CovarianceModel(12.0, 0.001, 0.005, 3.0, 0.8, 0.04, 0.12)

@@ -19,10 +19,10 @@ from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.commands import train as train_command
 from umf_ros.lab.datasets.simulated import WorldFolder
+from umf_ros.lab.fit.vocabulary import fit_vocabulary, vocabulary_settings
 from umf_ros.lab.training.networks import read_card
 from umf_ros.lab.training.objective import find_objective
-from umf_ros.lab.training.run import load_run, train
-from umf_ros.lab.training.vocabulary_fit import fit_vocabulary, vocabulary_settings
+from umf_ros.lab.training.trainer import load_run, train
 
 QUICK = {"batch": 8, "epoch_steps": 2, "warmup_steps": 1, "threads": 1, "batch_limit": 12}
 app = typer.Typer()

@@ -14,7 +14,7 @@ SCRIPT = """
 import json, os, sys
 from pathlib import Path
 from umf_ros.core.errors import ConfigError
-from umf_ros.lab.training.loading import made_ahead
+from umf_ros.lab.training.batches import made_ahead
 
 workers, folder = int(sys.argv[1]), Path(sys.argv[2])
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tiny_worlds import pose_at
 
-from umf_ros.lab.datasets.labels import Rule, label, places_of
+from umf_ros.lab.datasets.sample import Rule, label, places_of
 from umf_ros.lab.training.losses import (
     batch_hard_triplet,
     correspondence,

@@ -5,7 +5,7 @@ import pytest
 import torch
 from tiny_worlds import TINY
 
-from umf_ros.lab.training.masked_images_objective import (
+from umf_ros.lab.training.masked_objectives import (
     MaskedImagesObjective,
     hide,
     normalised,
@@ -17,7 +17,7 @@ from umf_ros.lab.training.masked_images_objective import (
     visible_patches,
 )
 from umf_ros.lab.training.pretraining import MaskedBatch
-from umf_ros.lab.training.run import load_run
+from umf_ros.lab.training.trainer import load_run
 from umf_ros.networks.encoders import Backbone
 from umf_ros.networks.umf import UMF
 

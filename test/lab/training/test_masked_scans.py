@@ -6,7 +6,7 @@ import torch
 from tiny_worlds import TINY
 
 from umf_ros.embedding.inputs import voxelise
-from umf_ros.lab.training.masked_scans_objective import (
+from umf_ros.lab.training.masked_objectives import (
     MaskedScansObjective,
     hidden_voxels,
     occupancy,
@@ -14,7 +14,7 @@ from umf_ros.lab.training.masked_scans_objective import (
     voxel_ranges,
 )
 from umf_ros.lab.training.pretraining import MaskedBatch
-from umf_ros.lab.training.run import load_run
+from umf_ros.lab.training.trainer import load_run
 from umf_ros.networks.umf import UMF
 
 RATIOS = (0.8, 0.5, 0.25)

@@ -10,14 +10,12 @@ import pytest
 import torch
 from tiny_worlds import TINY, pose_at
 
-from umf_ros.lab.datasets.labels import Places, Rule, places_of
+from umf_ros.lab.datasets.sample import Places, Rule, places_of
 from umf_ros.lab.datasets.views import Augmentation, ViewMaker
-from umf_ros.lab.training.batches import BatchMaker, TrainingBatch
-from umf_ros.lab.training.losses import neighbourhood_components
-from umf_ros.lab.training.metric_loss import Bank, MetricLoss, attenuate, relate
-from umf_ros.lab.training.run import load_run
-from umf_ros.lab.training.sampler import PairSampler
-from umf_ros.lab.training.settings import MetricSettings
+from umf_ros.lab.training.batches import BatchMaker, PairSampler, TrainingBatch
+from umf_ros.lab.training.losses import Bank, MetricLoss, attenuate, neighbourhood_components, relate
+from umf_ros.lab.training.networks import MetricSettings
+from umf_ros.lab.training.trainer import load_run
 from umf_ros.networks.umf import UMF
 
 RULE = Rule(positive_m=5)

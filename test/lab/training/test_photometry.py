@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from umf_ros.lab.training.photometry import CameraLook, draw_look
+from umf_ros.lab.training.prepared_views import CameraLook, draw_look
 
 RAMP = np.tile(np.linspace(20, 200, 96).astype(np.uint8), (64, 1))
 

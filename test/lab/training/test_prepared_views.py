@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from umf_ros.baselines.place_inputs import PreparedView, measured, stack
-from umf_ros.baselines.place_network import VOXELS, ImageTrunk
+from umf_ros.baselines.place_network import VOXELS, ImageTrunk, PreparedView, measured, stack
 from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import transform
 from umf_ros.core.levelling import level
@@ -18,8 +17,8 @@ from umf_ros.embedding.inputs import shrink, standardise, voxelise
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.lab.datasets.views import View, ViewMaker
+from umf_ros.lab.training.batches import Draw
 from umf_ros.lab.training.prepared_views import PreparedViews
-from umf_ros.lab.training.sampler import Draw
 
 ALL = frozenset({"image", "voxels", "points"})
 

@@ -12,13 +12,10 @@ from tiny_worlds import TINY, flat_sample, world_arrays, write_world
 
 from umf_ros.core.errors import ConfigError, WeightsError
 from umf_ros.lab.datasets.simulated import WorldFolder
-from umf_ros.lab.training.distributed import Team
-from umf_ros.lab.training.masked_images_objective import MaskedImagesObjective
+from umf_ros.lab.training.masked_objectives import MaskedImagesObjective
 from umf_ros.lab.training.networks import read_card
-from umf_ros.lab.training.objective import find_objective
-from umf_ros.lab.training.progress import Progress
-from umf_ros.lab.training.run import load_run, train
-from umf_ros.lab.training.trainer import Trainer
+from umf_ros.lab.training.objective import Progress, find_objective
+from umf_ros.lab.training.trainer import Team, Trainer, load_run, train
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
 

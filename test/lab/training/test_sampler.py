@@ -11,12 +11,9 @@ import torch
 from tiny_worlds import TINY, pose_at
 
 from umf_ros.core.errors import ConfigError
-from umf_ros.lab.datasets.correspondences import cell_points, match_cells
-from umf_ros.lab.datasets.labels import Places, Rule, distances, label, places_of
-from umf_ros.lab.datasets.sample import Sample
-from umf_ros.lab.datasets.views import Augmentation, ViewMaker
-from umf_ros.lab.training.batches import BatchMaker
-from umf_ros.lab.training.sampler import Draw, PairSampler, places_drawn
+from umf_ros.lab.datasets.sample import Places, Rule, Sample, distances, label, places_of
+from umf_ros.lab.datasets.views import Augmentation, ViewMaker, cell_points, match_cells
+from umf_ros.lab.training.batches import BatchMaker, Draw, PairSampler, places_drawn
 
 RULE = Rule(positive_m=5)
 

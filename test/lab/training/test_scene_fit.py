@@ -9,9 +9,9 @@ import pytest
 import torch
 from tiny_worlds import TINY, some_input, world_arrays
 
-from umf_ros.lab.datasets.labels import Places
+from umf_ros.lab.datasets.sample import Places
 from umf_ros.lab.datasets.simulated import SimulatedWorld
-from umf_ros.lab.training.scene_fit import PooledWorld, SceneFit, fit_scene, pool_world, whitened_start, with_scene
+from umf_ros.lab.fit.scene import PooledWorld, SceneFit, fit_scene, pool_world, whitened_start, with_scene
 from umf_ros.networks.efficientnet import DEPTH, EfficientNetLite0
 from umf_ros.networks.umf import UMF
 

@@ -15,16 +15,13 @@ import torch
 from tiny_worlds import TINY, write_world
 
 from umf_ros.core.errors import ConfigError, UmfError, WeightsError
-from umf_ros.lab.datasets.labels import Rule
+from umf_ros.lab.datasets.sample import Rule
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.lab.datasets.views import Augmentation, ViewMaker
-from umf_ros.lab.training.batches import BatchMaker
-from umf_ros.lab.training.distributed import Team
+from umf_ros.lab.training.batches import BatchMaker, PairSampler, places_drawn
 from umf_ros.lab.training.metric_objective import MetricObjective, rule_of
 from umf_ros.lab.training.networks import read_card
-from umf_ros.lab.training.run import load_run, train
-from umf_ros.lab.training.sampler import PairSampler, places_drawn
-from umf_ros.lab.training.trainer import Trainer
+from umf_ros.lab.training.trainer import Team, Trainer, load_run, train
 from umf_ros.lab.training.validation import validate
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
@@ -189,7 +186,7 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from tiny_worlds import TINY
 from umf_ros.lab.training.networks import PRESETS
-from umf_ros.lab.training.run import load_run, train
+from umf_ros.lab.training.trainer import load_run, train
 PRESETS["tiny"] = TINY
 for workers in (0, 3):
     small = dict(preset="tiny", steps=4, epoch_steps=2, batch=8, local_pairs=2, bank_from_step=2, warmup_steps=1)

@@ -14,7 +14,7 @@ from umf_ros.core.errors import ConfigError, UmfError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.lab.training.adaptation import Lesson
+    from umf_ros.lab.fit.adaptation import Lesson
     from umf_ros.lab.training.drives import Drive
     from umf_ros.networks.umf import UMF
 
@@ -39,7 +39,7 @@ def command(
 
     from rich.console import Console
 
-    from umf_ros.lab.training.adaptation import FEWEST, GAINED, Lesson, measure
+    from umf_ros.lab.fit.adaptation import FEWEST, GAINED, Lesson, measure
     from umf_ros.networks.config import locate_weights
     from umf_ros.networks.weights import load_weights
 
@@ -102,7 +102,7 @@ def _drive(
 def _fit(network: UMF, lessons: list[Lesson], console: Console) -> None:
     from rich.progress import Progress
 
-    from umf_ros.lab.training.adaptation import Adaptation, adapt
+    from umf_ros.lab.fit.adaptation import Adaptation, adapt
 
     settings = Adaptation()
     with Progress(console=console, transient=True) as bars:

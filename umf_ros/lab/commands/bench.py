@@ -1,4 +1,4 @@
-"""`umf bench`: what the package costs on this machine."""
+"""`umf bench`: time and memory of the package on this machine."""
 
 from __future__ import annotations
 
@@ -8,32 +8,33 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(help="Measure what the package costs on this machine.")
+app = typer.Typer(help="Measure time and memory on this machine.")
 
 
 @app.callback()
 def _group() -> None:
-    """Keep `places` a command of its own, however few there are."""
+    """Make `places` a subcommand although it is the only one."""
 
 
 @app.command("places")
 def places(
     out: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
     run: Annotated[
-        Path | None, typer.Option(help="Repeat the descriptors of this run with noise; default: made-up drives.")
+        Path | None, typer.Option(help="Repeat the descriptors of this run with noise; default: random drives.")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="150,000 places in place of a million.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the descriptors.")] = 0,
 ) -> None:
     """Measure search among 1,000, 100,000 and a million places: time, recall, memory and disk.
 
-    Search is exact up to 100,000 places and approximate beyond (where faiss is installed). Takes some minutes, and 7 GB
-    in the folder for temporary files.
+    Search is exact up to 50,000 places and approximate beyond. Takes some minutes, and 7 GB in the folder for temporary
+    files.
     """
     from rich.console import Console
 
     from umf_ros.lab.evaluation.places_bench import measure_places
-    from umf_ros.runs.writer import all_descriptors, write_atomically
+    from umf_ros.runs.run_file import all_descriptors
+    from umf_ros.runs.writer import write_atomically
 
     console = Console(stderr=True)
     largest = 150_000 if quick else 1_000_000
@@ -46,8 +47,8 @@ def places(
         "query_cpu_ms_1k": round(thousand.query_cpu_ms, 2),
         "query_cpu_ms_100k": round(many.query_cpu_ms, 2),
         "query_cpu_ms_1m": round(most.query_cpu_ms, 2),
-        "recall_exact_100k": round(many.recall, 4),
-        "recall_approximate_1m": round(most.recall, 4),
+        "recall_100k": round(many.recall, 4),
+        "recall_1m": round(most.recall, 4),
         "reopen_1m_s": round(most.open_s, 2),
         "reopen_1m_cpu_s": round(most.open_cpu_s, 2),
         "bytes_per_keyframe_ram": round(most.ram),

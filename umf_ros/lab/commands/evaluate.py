@@ -1,8 +1,9 @@
-"""`umf evaluate`: how well places are recognised, on a recording or on simulated worlds."""
+"""`umf evaluate`: recall, precision, rerankers, lost modalities and cost."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,14 +17,210 @@ from umf_ros.commands.recordings import (
     TruthPath,
     WeightsPath,
     check_files,
+    check_odometry_options,
+    open_frames,
+    open_recording,
 )
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.io import is_yaml
 from umf_ros.embedding import choices
-from umf_ros.lab.commands.evaluation_inputs import RecordingOptions, choose_worlds, note_on_worlds, progress_bar
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from umf_ros.core.config import Settings
+    from umf_ros.core.frames import Frame
+    from umf_ros.core.trajectory import Trajectory
+    from umf_ros.lab.evaluation.methods_run import FrameSet
     from umf_ros.lab.evaluation.results import Figures
+    from umf_ros.lab.evaluation.worlds import TestWorld
+
+
+@dataclass(frozen=True)
+class OpenRecording:
+    """A recording with its truth, ready to be read."""
+
+    frames: Iterable[Frame]
+    settings: Settings
+    truth: Trajectory
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """What the command line says of a recording."""
+
+    bag: Path
+    config: Path | None
+    dataset: str
+    embedder: str | None
+    odometry: Path | None
+    odometry_frame: str
+    ground_truth: Path | None
+
+    def open(self, console: Console, weights: Path | None) -> OpenRecording:
+        """Open it.
+
+        Raises:
+            ConfigError: wrong options, or there is no truth.
+            BagError: it cannot be read.
+        """
+        frame_of_odometry = check_odometry_options(self.odometry, self.odometry_frame)
+
+        from umf_ros.bags.trajectories import read_ground_truth
+        from umf_ros.commands.console import WARNING
+
+        recording, settings = open_recording(self.bag, self.config, self.dataset, self.embedder, weights)
+        truth = read_ground_truth(recording, self.ground_truth)
+        if truth is None:
+            raise ConfigError(f"{self.bag} holds no ground truth; name a file with --ground-truth")
+
+        def warn(text: str) -> None:
+            console.print(text, **WARNING)
+
+        frames = open_frames(recording, settings, warn, self.odometry, frame_of_odometry)
+        return OpenRecording(frames, settings, truth, recording.duration_s)
+
+
+def choose_worlds(name: str, seed: int | None, quick: bool, count: int) -> list[TestWorld]:
+    """The first worlds of a name, or those from a seed on.
+
+    Raises:
+        ConfigError: there is no such name.
+    """
+    from umf_ros.lab.evaluation.worlds import FIRST_SEEDS, FULL, QUICK, test_worlds
+
+    if name not in FIRST_SEEDS:
+        raise ConfigError(f"--worlds: expected {' or '.join(FIRST_SEEDS)}, not {name!r} (etna: with --methods all)")
+    return test_worlds(FIRST_SEEDS[name] if seed is None else seed, QUICK if quick else FULL, count)
+
+
+def note_on_worlds(worlds: Sequence[TestWorld], quick: bool) -> str:
+    """What a report says of the worlds."""
+    names = ", ".join(world.name for world in worlds)
+    return (
+        f"Worlds: {names}; hard setting (offset path up to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing)"
+        f"{', quick' if quick else ''}. A match is true within 12 m and 30 deg [UMF 5.1.2]."
+    )
+
+
+def progress_bar(console: Console) -> Progress:
+    """A bar that goes when it is done."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %")
+    return Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
+
+
+SPARSE = 3
+"""Every so many-th sample of a sequence is asked in a quick comparison."""
+REPEATS = 3
+"""Of every timed frame."""
+
+
+@dataclass(frozen=True)
+class EveryMethod:
+    """The comparison of all methods.
+
+    Attributes:
+        weights: of UMF; None: the default.
+        trained: folder with the weights of other methods; None: the shipped ones.
+        quick: a smaller sample of every world.
+        out: folder of the results.
+    """
+
+    weights: Path | None
+    trained: Path | None
+    quick: bool
+    out: Path
+
+    def worlds(self, name: str, seed: int | None, count: int) -> Figures:
+        """On simulated worlds, or on those of S3LI's simulated sequences that the thesis tests on."""
+        from rich.console import Console
+
+        from umf_ros.lab.evaluation.bag_run import drive_sets, world_set
+        from umf_ros.lab.evaluation.worlds import WORLDS
+        from umf_ros.lab.simulation.world import TEST
+
+        if name == "etna":
+            if count != WORLDS:
+                raise ConfigError("--worlds etna has no use for --count")
+            first, every = TEST.start if seed is None else seed, SPARSE if self.quick else 1
+            note = (
+                f"Simulated S3LI sequences of seed {first}, every {every}. sample: each is asked for its own past, "
+                "20 s and 15 m back; those without a true match can only be wrong. Nothing was trained on the others."
+            )
+            return self._compare(Console(), drive_sets(first, every), note)
+        chosen = choose_worlds(name, seed, self.quick, count)
+        return self._compare(Console(), map(world_set, chosen), note_on_worlds(chosen, self.quick))
+
+    def places(self, listing: Path) -> Figures:
+        """On sets of still images or scans."""
+        from rich.console import Console
+
+        from umf_ros.lab.evaluation.bag_run import still_set
+        from umf_ros.lab.evaluation.places import read_place_sets
+
+        sets = map(still_set, read_place_sets(listing))
+        return self._compare(Console(), sets, f"{listing}: a match is true where the set says so.")
+
+    def sequences(self, listing: Path, rule: str) -> Figures:
+        """On listed sequences."""
+        from rich.console import Console
+
+        from umf_ros.lab.datasets.listed import SequenceList
+        from umf_ros.lab.evaluation.bag_run import sequence_set
+        from umf_ros.lab.evaluation.retrieval import RULES
+
+        if rule not in RULES:
+            raise ConfigError(f"--rule: expected {' or '.join(RULES)}, not {rule!r}")
+        sets = [sequence_set(sequence, RULES[rule]) for sequence in SequenceList(listing).worlds]
+        note = (
+            f"{listing}: samples with a true match in an earlier pass are asked for it; same place by the rule {rule}."
+        )
+        return self._compare(Console(), sets, note)
+
+    def recording(self, options: RecordingOptions) -> Figures:
+        """On the keyframes of a recording."""
+        from rich.console import Console
+
+        from umf_ros.lab.evaluation.bag_run import recording_set
+
+        console = Console()
+        opened = options.open(console, None)
+        places = recording_set(options.bag.stem, opened.frames, opened.truth, opened.settings)
+        gaps = opened.settings.loop
+        note = (
+            f"{options.bag}: every keyframe against those at least {gaps.min_time_gap_s:g} s older and "
+            f"{gaps.min_travel_m:g} m back along the path; keyframes without a true match can only be wrong."
+        )
+        return self._compare(console, [places], note)
+
+    def _compare(self, console: Console, sets: Iterable[FrameSet], note: str) -> Figures:
+        from umf_ros.lab.evaluation.methods_run import compare_methods
+        from umf_ros.runs.writer import create_run_folder
+
+        with progress_bar(console) as bar:
+            task = bar.add_task("reading", total=None)
+            done: list[int] = []
+
+            def show(what: str, frames: int) -> None:
+                done.append(frames)
+                bar.update(task, description=f"{what}, {sum(done)} frames")
+
+            report, folder = compare_methods(
+                sets,
+                [note],
+                self.weights,
+                self.trained,
+                lambda: create_run_folder(self.out, latest=False),
+                REPEATS,
+                show,
+            )
+        report.show(console, folder)
+        return report.figures
+
 
 Optional = typer.Option
 
@@ -49,7 +246,7 @@ def command(
     weights: WeightsPath = None,
     json_file: Annotated[Path | None, Optional("--json", help="Write the figures here too.")] = None,
     out: RunsFolder = Path("results"),
-    config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording.")] = None,
+    config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording or place sets.")] = None,
     dataset: DatasetName = "auto",
     embedder: Annotated[str | None, Optional(help=f"How places are embedded: {choices()}.")] = None,
     odometry: OdometryPath = None,
@@ -68,7 +265,6 @@ def command(
     if data is not None and not is_yaml(data):
         check_files(data, config, odometry, ground_truth)
 
-    from umf_ros.lab.commands.evaluate_all import EveryMethod
     from umf_ros.lab.evaluation.places import lists_place_sets
 
     of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick, "--count": count != 4}
@@ -81,9 +277,10 @@ def command(
         chosen = str(worlds), seed, count
         figures = every.worlds(*chosen) if every else _on_worlds(*chosen, quick, weights, out)
     elif is_yaml(data) and lists_place_sets(data):
-        others = {name: value for name, value in of_recordings.items() if name != "--embedder" or every}
+        allowed = () if every else ("--embedder", "--config")
+        others = {name: value for name, value in of_recordings.items() if name not in allowed}
         _refuse("a list of place sets", of_worlds | of_lists | others)
-        figures = every.places(data) if every else _on_places(data, embedder, weights, out)
+        figures = every.places(data) if every else _on_places(data, config, embedder, weights, out)
     elif is_yaml(data):
         _refuse("a list of sequences", of_worlds | of_recordings)
         figures = every.sequences(data, rule) if every else _on_sequences(data, rule, weights, out)
@@ -119,7 +316,7 @@ def _refuse(data: str, options: Mapping[str, object]) -> None:
 def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
-    from umf_ros.lab.evaluation.worlds_run import WorldsRun, work
+    from umf_ros.lab.evaluation.worlds import WorldsRun, work
     from umf_ros.runs.writer import create_run_folder
 
     console = Console()
@@ -131,7 +328,7 @@ def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Pa
             bar.update(task, description=what, advance=done)
 
         run = WorldsRun(weights, chosen, 3 if quick else 10, progress)
-        folder = create_run_folder(out)
+        folder = create_run_folder(out, latest=False)
         summary = run.run()
         report = run.write(
             summary, folder, [note_on_worlds(chosen, quick) + " Times are medians on this machine, as busy as it was."]
@@ -143,7 +340,6 @@ def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Pa
 def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
-    from umf_ros.core.frames import Frame
     from umf_ros.embedding import make_embedder
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
     from umf_ros.runs.writer import create_run_folder
@@ -152,7 +348,7 @@ def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) ->
     opened = options.open(console, weights)
     settings, bag = opened.settings, options.bag
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, True, settings.verification.features))
-    folder = create_run_folder(out)
+    folder = create_run_folder(out, latest=False)
     with progress_bar(console) as bar:
         task = bar.add_task("embedding", total=opened.duration_s)
         start_ns: list[int] = []
@@ -181,8 +377,8 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     from rich.console import Console
 
     from umf_ros.lab.datasets.listed import SequenceList
-    from umf_ros.lab.evaluation.protocol import RULES
     from umf_ros.lab.evaluation.results import EvaluationReport
+    from umf_ros.lab.evaluation.retrieval import RULES
     from umf_ros.lab.training.validation import answerable, means, table, validate
     from umf_ros.networks.config import locate_weights
     from umf_ros.networks.weights import load_weights
@@ -195,7 +391,7 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     results = validate(network, SequenceList(listing).worlds, rule=RULES[rule])
     if not answerable(results):
         raise ConfigError(f"{listing}: no place is visited twice")
-    folder = create_run_folder(out)
+    folder = create_run_folder(out, latest=False)
     notes = [
         f"{listing}: samples with a true match in an earlier pass are asked for it; same place by the rule {rule}."
     ]
@@ -206,17 +402,19 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     return report.figures
 
 
-def _on_places(listing: Path, embedder: str | None, weights: Path | None, out: Path) -> Figures:
+def _on_places(listing: Path, config: Path | None, embedder: str | None, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
-    from umf_ros.embedding import DEFAULT
-    from umf_ros.lab.evaluation.places_run import evaluate_place_sets
+    from umf_ros.core.config import load_settings
+    from umf_ros.lab.evaluation.places import evaluate_place_sets
     from umf_ros.runs.writer import create_run_folder
 
     console = Console()
+    chosen = {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}
+    settings = load_settings(config, **chosen)
     with console.status("embedding") as status:
-        report = evaluate_place_sets(listing, embedder or DEFAULT, weights, status.update)
-    folder = create_run_folder(out)
+        report = evaluate_place_sets(listing, settings, status.update)
+    folder = create_run_folder(out, latest=False)
     report.write(folder)
     report.show(console, folder)
     return report.figures

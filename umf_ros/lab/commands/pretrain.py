@@ -46,7 +46,7 @@ def command(
 ) -> None:
     """Pretrain the encoder that the subcommand names."""
     from umf_ros.core.errors import ConfigError
-    from umf_ros.lab.training.run import load_run
+    from umf_ros.lab.training.trainer import load_run
 
     encoder = str(context.info_name)
     if encoder == "lidar" and mask_ratio is not None:

@@ -105,7 +105,7 @@ def _write_bag(
 def _write_shards(
     folder: Path, worlds: str, every: int, sequences: str, seed: int, workers: int, console: Console
 ) -> None:
-    from umf_ros.lab.simulation.sequences import SEQUENCES
+    from umf_ros.lab.simulation.presets import SEQUENCES
     from umf_ros.lab.simulation.survey import shard_plan, survey_world
 
     with _progress(console) as progress:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from umf_ros.lab.training.progress import Progress as RunProgress
-    from umf_ros.lab.training.settings import RunSettings
+    from umf_ros.lab.training.networks import RunSettings
+    from umf_ros.lab.training.objective import Progress as RunProgress
 
 
 def command(
@@ -35,7 +35,7 @@ def command(
     if method == "dbow2":
         _grow_vocabulary(config, train, seed, out)
         return
-    from umf_ros.lab.training.run import load_run
+    from umf_ros.lab.training.trainer import load_run
 
     chosen: dict[str, object] = {
         "method": method,
@@ -52,7 +52,7 @@ def command(
 def _grow_vocabulary(config: Path | None, train: str, seed: int | None, out: Path) -> None:
     from rich.console import Console
 
-    from umf_ros.lab.training.vocabulary_fit import fit_vocabulary, vocabulary_settings
+    from umf_ros.lab.fit.vocabulary import fit_vocabulary, vocabulary_settings
 
     settings = vocabulary_settings(config, train=train, seed=seed)
     console = Console()
@@ -65,7 +65,7 @@ def train_with_bar(settings: RunSettings, out: Path, resume: bool) -> None:
     """Train, with a bar over the steps, and say where the weights are."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from umf_ros.lab.training.run import train
+    from umf_ros.lab.training.trainer import train
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns) as bars:

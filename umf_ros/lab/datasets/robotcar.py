@@ -20,9 +20,9 @@ import numpy as np
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Image, Points, StereoCamera
 from umf_ros.core.geometry import Array, make_pose
-from umf_ros.lab.datasets.pickles import load_pickle
-from umf_ros.lab.datasets.recorded import RecordedSequence, course, poses_of
+from umf_ros.lab.datasets.s3li import load_pickle
 from umf_ros.lab.datasets.sample import Sample
+from umf_ros.lab.datasets.simulated import RecordedSequence, course, poses_of
 
 POINTS = 4096
 SUBMAP_M = 20.0

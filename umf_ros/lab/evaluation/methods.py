@@ -12,10 +12,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from umf_ros.lab.evaluation.protocol import RetrievalTask
-from umf_ros.lab.evaluation.results import COLOURS, Figures, TextTable, mean, percent, rounded
-from umf_ros.lab.evaluation.retrieval import Mask, Ranking
-from umf_ros.lab.evaluation.scores import Scores, score
+from umf_ros.lab.evaluation.results import COLOURS, Figures, Scores, TextTable, mean, percent, rounded, score
+from umf_ros.lab.evaluation.retrieval import Mask, Ranking, RetrievalTask
 
 DRAWS, SEED = 1000, 0
 SHARE = 0.95

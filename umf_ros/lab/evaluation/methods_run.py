@@ -1,4 +1,4 @@
-"""One comparison of all methods: from the embedders to the report."""
+"""Compare all methods on worlds, sequences or recordings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from umf_ros.core.config import EmbeddingSettings, Verification
-from umf_ros.core.errors import ConfigError
+from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.core.frames import Frame, Keyframe, LocalFeatures, SuperFeatures
 from umf_ros.embedding import DEFAULT, find_methods, make_embedder
 from umf_ros.embedding.embedder import Embedder
@@ -25,16 +25,21 @@ from umf_ros.lab.evaluation.methods import (
     sets_table,
     with_costs,
 )
-from umf_ros.lab.evaluation.pair_inliers import PairInliers
-from umf_ros.lab.evaluation.protocol import RetrievalTask
 from umf_ros.lab.evaluation.results import EvaluationReport, TextTable, percent, plot_precision_recall, plot_recall
-from umf_ros.lab.evaluation.retrieval import METHODS, PlaceCollection, Ranking, rank, rerank_all
+from umf_ros.lab.evaluation.retrieval import (
+    METHODS,
+    PairInliers,
+    PlaceCollection,
+    Ranking,
+    RetrievalTask,
+    rank,
+    rerank_all,
+)
 from umf_ros.lab.evaluation.summary import ETNA_RECALL1, measure
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import load_weights
-from umf_ros.places.codes import CodeTable
-from umf_ros.places.index import DescriptorIndex
+from umf_ros.places.index import PlaceIndex
 
 RERANKED = {"umf_superfeatures": "superfeatures both", "umf_ransac": "ransac both"}
 """UMF's rerankers that stand beside the other methods."""
@@ -251,14 +256,13 @@ def search_ms(dimension: int, repeats: int = 30) -> float:
     """Median milliseconds to find the best of 858 places by descriptors of so many numbers."""
     places = np.random.default_rng(0).standard_normal((PLACES, dimension)).astype(np.float32)
     places /= np.linalg.norm(places, axis=1, keepdims=True)
-    table = CodeTable(dimension)
-    table.extend(places)
-    index = DescriptorIndex(table, lambda rows: places[rows])
-    query, everywhere = places[0], np.ones(PLACES, bool)
+    index = PlaceIndex(dimension)
+    index.add(places)
+    everywhere = np.ones(PLACES, bool)
     took = []
     for _ in range(repeats):
         started = time.perf_counter()
-        index.search(query, 20, everywhere)
+        index.search(places[0], 20, everywhere.__getitem__)
         took.append(time.perf_counter() - started)
     return 1e3 * float(np.median(took))
 
@@ -267,3 +271,45 @@ def size_of(features: LocalFeatures | SuperFeatures) -> int:
     """Bytes of their arrays."""
     names = ("positions", "descriptors", "saliency", "points", "strength")
     return sum(getattr(features, name).nbytes for name in names if hasattr(features, name))
+
+
+TITLE = "All methods"
+
+
+def compare_methods(
+    sets: Iterable[FrameSet],
+    notes: list[str],
+    weights: Path | None,
+    trained: Path | None,
+    make_folder: Callable[[], Path],
+    repeats: int,
+    report: Callable[[str, int], None],
+) -> tuple[EvaluationReport, Path]:
+    """Ask all sets by all methods.
+
+    Args:
+        sets: what is asked.
+        notes: of the sets, for the report.
+        weights: of UMF; None: the default.
+        trained: folder with the weights of other methods; None: the shipped ones.
+        make_folder: makes the folder to write to, once everything else has worked.
+        repeats: how often each frame is embedded when time is taken.
+        report: called with the name of what is worked on, and 1 for every frame done.
+
+    Raises:
+        UmfError: a set or the weights cannot be read, or no place is seen twice.
+    """
+    others, missing = make_others(trained)
+    run = MethodsRun(weights, others, report)
+    asked = {places.name: run.add(places) for places in sets}
+    if not any(asked.values()):
+        raise UmfError(f"no place is seen twice in {', '.join(asked)}, so that nothing can be asked")
+    folder = make_folder()
+    said = [
+        "Intervals: queries drawn anew within each set, 1000 times. Matching: the best of 858 places, then 20 of them "
+        "again by local features where a reranker is named. R@1 + XFeat: UMF's default features of images rerank the "
+        "method's own 20 best. Times are medians on this machine, as busy as it was."
+    ]
+    said += [f"Not asked: {name}, where no place is seen twice in one direction." for name in asked if not asked[name]]
+    said += [f"Not compared: {line}." for line in missing]
+    return run.write(TITLE, [*notes, *said], folder, repeats), folder

@@ -1,13 +1,4 @@
-"""Place recognition on sets of still images or scans, as they are published: queries, references, and a truth.
-
-A list of sets is a YAML file; its paths are relative to it:
-
-    - {name: corridor, queries: corridor/query, references: corridor/ref, truth: corridor/truth.csv, kind: image}
-    - {name: street, queries: street/second, references: street/first, truth: street/truth.csv, kind: scan,
-       calibration: street/calibration.yaml}
-
-A line of the truth is "query,reference,reference,...": places in the sorted order of the file names, from 0.
-"""
+"""Evaluate on listed sets of places."""
 
 from __future__ import annotations
 
@@ -20,16 +11,15 @@ import cv2
 import numpy as np
 from pydantic import Field, ValidationError
 
-from umf_ros.core.config import Group, Verification, problems
+from umf_ros.core.config import Group, Settings, Verification, problems
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.core.frames import Frame, Image, Points, StereoCamera
 from umf_ros.core.geometry import transform
 from umf_ros.core.io import read_yaml
+from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
-from umf_ros.lab.evaluation.protocol import RetrievalTask
-from umf_ros.lab.evaluation.results import Figures, TextTable, percent, rounded
-from umf_ros.lab.evaluation.retrieval import Mask, PlaceCollection, rank, rerank_all
-from umf_ros.lab.evaluation.scores import Scores, score
+from umf_ros.lab.evaluation.results import EvaluationReport, Figures, Scores, TextTable, percent, rounded, score
+from umf_ros.lab.evaluation.retrieval import Mask, PlaceCollection, RetrievalTask, rank, rerank_all
 from umf_ros.sensors.calibration import Calibration, load_calibration
 from umf_ros.sensors.scan_files import SUFFIXES, read_scan
 
@@ -252,3 +242,29 @@ def _frame(
     mounting = calibration.body_T_camera, calibration.body_T_lidar
     known = camera if left is None else calibration.camera
     return Frame(number, known, *mounting, left=left, points=points, intensity=intensity)
+
+
+TITLE = "Place recognition on still images and scans"
+
+
+def evaluate_place_sets(listing: Path, settings: Settings, report: Callable[[str], None]) -> EvaluationReport:
+    """Score one method on all sets of a list.
+
+    Args:
+        listing: YAML file of the sets.
+        settings: of embedding and verification.
+        report: called with the name of each set.
+
+    Raises:
+        ConfigError: no such list, or an unknown method.
+        UmfError: something of a set is missing or damaged.
+    """
+    sets = read_place_sets(listing)
+    embedder = make_embedder(settings.embedding, super_features=True, features=settings.verification.features)
+    results = []
+    for places in sets:
+        report(places.name)
+        results.append(score_places(places, embedder, settings.verification))
+    figures = {name: value for found in results for name, value in found.flat.items()}
+    notes = [f"{listing}, embedded by {embedder.name}. A match is true where the set says so."]
+    return EvaluationReport(TITLE, notes, figures, {TITLE: table_of(results)})

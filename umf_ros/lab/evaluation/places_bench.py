@@ -1,4 +1,4 @@
-"""How search, memory and disk grow with the places: stores of made-up drives, opened and asked in a fresh process."""
+"""Query time, memory and disk of place databases with up to a million places, each opened in a fresh process."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ import numpy as np
 from umf_ros.core.config import Database, Loop
 from umf_ros.core.frames import Embedding, Keyframe, Points, StereoCamera
 from umf_ros.places.database import PlaceDatabase
+from umf_ros.places.index import PlaceIndex, Rows
 from umf_ros.places.packing import pack
-from umf_ros.places.search import PlaceSearch
 
 DIMENSION = 768
 PER_DRIVE = 250
@@ -35,15 +35,15 @@ TOP = 20
 
 
 class StoreFigures(NamedTuple):
-    """What was measured of one store.
+    """Measurements of one store.
 
     Attributes:
         query_ms: median time of `PlaceDatabase.query`.
-        query_cpu_ms: the same by the processor's clock: what it takes where nobody else computes.
-        open_s, open_cpu_s: to open the store, whose files the operating system has in its cache, by both clocks.
+        query_cpu_ms: the same in processor time, which other processes do not change.
+        open_s, open_cpu_s: to open the store, whose files are in the operating system's cache, in both times.
         ram, disk: bytes per keyframe.
         recall: share of the 20 best that search found.
-        exact: whether search looks at every place.
+        exact: whether the search compares every descriptor.
     """
 
     query_ms: float
@@ -57,10 +57,10 @@ class StoreFigures(NamedTuple):
 
 
 def made_up_drives(count: int, rng: np.random.Generator, drives_at_once: int = 100) -> Iterator[Points]:
-    """(N, 768) unit descriptors as drives through many worlds have them, a part after the other.
+    """(N, 768) unit descriptors with the statistics of drives through many worlds, in parts.
 
-    Neighbours are alike, drives have something of their own, and the variance falls with the rank of the direction:
-    more slowly than that of one drive, whose first 64 directions hold 97 % of it; here they hold 84 %.
+    Neighbours are similar, every drive has an offset, and the variance falls with the rank of the direction: more
+    slowly than in one drive, whose first 64 directions hold 97 % of it; here they hold 84 %.
     """
     spread = ((np.arange(DIMENSION) + 4.0) ** -0.75).astype(np.float32)
     common = 0.4 * rng.standard_normal(DIMENSION, dtype=np.float32)
@@ -77,7 +77,7 @@ def made_up_drives(count: int, rng: np.random.Generator, drives_at_once: int = 1
 
 
 def repeated(drive: Points, count: int, rng: np.random.Generator) -> Iterator[Points]:
-    """(N, D) descriptors of a real drive over and over, each time with noise that leaves them `REVISIT` alike."""
+    """(N, D) descriptors of a real drive, repeated with noise: `REVISIT` is their similarity to the originals."""
     for first in range(0, count, 25_000):
         rows = np.arange(first, min(first + 25_000, count)) % len(drive)
         yield _again(drive[rows], rng)
@@ -86,13 +86,13 @@ def repeated(drive: Points, count: int, rng: np.random.Generator) -> Iterator[Po
 def measure_places(
     sizes: tuple[int, ...], drive: Points | None, seed: int, report: Callable[[str], None]
 ) -> list[StoreFigures]:
-    """Make and measure a store of each size.
+    """Write and measure a store of each size.
 
     Args:
         sizes: keyframes.
-        drive: (N, D) descriptors of a real drive to repeat; None makes drives up.
+        drive: (N, D) descriptors of a real drive to repeat; None: random drives.
         seed: of the descriptors.
-        report: called with what is done next.
+        report: called with a line for the console before each step.
     """
     found = []
     for size in sizes:
@@ -115,7 +115,7 @@ def fill(path: Path, parts: Iterator[Points]) -> None:
         if not dimension:
             dimension = part.shape[1]
             _open(path, dimension).close()
-            data = pack(_keyframe(0, 0, 0.0, part[0]))
+            data = pack(bare_keyframe(0, 0, 0.0, part[0]))
         with closing(sqlite3.connect(path)) as connection, connection:
             rows = [
                 (row + i + 1, (row + i) * STEP_NS, (row + i) // PER_DRIVE, 0.5 * i, descriptor.tobytes(), data)
@@ -126,12 +126,9 @@ def fill(path: Path, parts: Iterator[Points]) -> None:
 
 
 def measure_store(path: Path, seed: int) -> StoreFigures:
-    """Open a store twice and ask it; the first time its files for a fast opening are made."""
+    """Open a store twice and query it; the first opening writes the file of the index."""
     dimension = _dimension(path)
-    first = _open(path, dimension)
-    first.search.prepare()
-    first.close()
-    del first
+    _open(path, dimension).close()
     before = _resident()
     wall, cpu = time.perf_counter(), time.process_time()
     places = _open(path, dimension)
@@ -139,7 +136,7 @@ def measure_store(path: Path, seed: int) -> StoreFigures:
     query_ms, query_cpu_ms, recall = _ask(places, np.random.default_rng(seed + 1))
     used = _resident() - before
     disk = sum(file.stat().st_size for file in path.parent.iterdir())
-    exact = places.search.is_exact
+    exact = places.index.is_exact
     places.close()
     size = len(places)
     return StoreFigures(query_ms, query_cpu_ms, open_s, open_cpu_s, used / size, disk / size, recall, exact)
@@ -152,22 +149,22 @@ def _ask(places: PlaceDatabase, rng: np.random.Generator) -> tuple[float, float,
     times, shares = [], []
     for descriptor in asked:
         wall, cpu = time.perf_counter(), time.process_time()
-        places.query(_keyframe(now_ns, session, 0.0, descriptor), Loop())
+        places.query(bare_keyframe(now_ns, session, 0.0, descriptor), Loop())
         times.append((time.perf_counter() - wall, time.process_time() - cpu))
     for descriptor in asked:
-        shares.append(_share(places.search, descriptor))
+        shares.append(_share(places.index, descriptor))
     wall_ms, cpu_ms = 1e3 * np.median(times, axis=0)
     return float(wall_ms), float(cpu_ms), float(np.mean(shares))
 
 
-def _share(search: PlaceSearch, descriptor: Points) -> float:
+def _share(index: PlaceIndex, descriptor: Points) -> float:
     """Share of the true best that search finds."""
 
-    def everywhere(rows: np.ndarray | slice) -> np.ndarray:
-        return np.ones(len(search), bool)[rows] if isinstance(rows, slice) else np.ones(len(rows), bool)
+    def everywhere(rows: Rows | slice) -> np.ndarray:
+        return np.ones(len(index), bool)[rows]
 
-    true = {row for row, _ in search.exhaustive(descriptor, TOP, everywhere)}
-    return len(true & {row for row, _ in search(descriptor, TOP, everywhere)}) / len(true)
+    true = set(index.search_exactly(descriptor, TOP, everywhere).tolist())
+    return len(true & set(index.search(descriptor, TOP, everywhere).tolist())) / len(true)
 
 
 def _again(descriptors: Points, rng: np.random.Generator) -> Points:
@@ -189,9 +186,12 @@ def _dimension(path: Path) -> int:
         return int(connection.execute("SELECT length(descriptor) FROM keyframe LIMIT 1").fetchone()[0]) // 4
 
 
-def _keyframe(stamp_ns: int, session: int, path_length_m: float, descriptor: Points) -> Keyframe:
+def bare_keyframe(
+    stamp_ns: int, session: int, path_length_m: float, descriptor: Points, points: Points | None = None
+) -> Keyframe:
+    """A keyframe without local features."""
     camera = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)
-    points = np.empty((0, 3), np.float32)
+    points = np.empty((0, 3), np.float32) if points is None else points
     return Keyframe(
         stamp_ns, Embedding(descriptor), camera, np.eye(4), points, path_length_m=path_length_m, session=session
     )

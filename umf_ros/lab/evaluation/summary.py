@@ -16,9 +16,8 @@ from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.umf import UmfEmbedder
-from umf_ros.lab.evaluation.results import Figures, TextTable, mean, percent, rounded, scores_table
+from umf_ros.lab.evaluation.results import Figures, Scores, TextTable, YawBin, mean, percent, rounded, scores_table
 from umf_ros.lab.evaluation.retrieval import METHODS, RERANKERS, TOP_K, Indices
-from umf_ros.lab.evaluation.scores import Scores, YawBin
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import load_weights

@@ -1,21 +1,49 @@
-"""Simulated worlds to test on: several passes of one trail, each harder in its own way."""
+"""Evaluate on simulated worlds."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
+from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Frame, ScanMotion
 from umf_ros.core.geometry import Array
+from umf_ros.embedding import make_embedder
+from umf_ros.embedding.embedder import Embedder
+from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures
+from umf_ros.lab.evaluation.results import (
+    EvaluationReport,
+    Scores,
+    YawBin,
+    plot_precision_recall,
+    plot_recall,
+    recall_by_yaw,
+    score,
+)
+from umf_ros.lab.evaluation.retrieval import (
+    METHODS,
+    MODES,
+    RERANKERS,
+    Indices,
+    PlaceCollection,
+    Ranking,
+    RetrievalTask,
+    place_recognition,
+    rank,
+    rerank_all,
+)
+from umf_ros.lab.evaluation.summary import WorldResult, WorldsSummary, at_full_size, cost_of_weights
 from umf_ros.lab.simulation.camera import resized
 from umf_ros.lab.simulation.families import FAMILIES
-from umf_ros.lab.simulation.passes import SETTINGS, Pass, plan_passes, thinned
-from umf_ros.lab.simulation.seeds import TEST, VALIDATION
+from umf_ros.lab.simulation.route import SETTINGS, Pass, plan_passes, thinned
 from umf_ros.lab.simulation.survey import Survey, SurveyFrame
-from umf_ros.lab.simulation.world import World, ground
+from umf_ros.lab.simulation.world import TEST, VALIDATION, World, ground
+from umf_ros.networks.config import locate_weights
+from umf_ros.networks.weights import load_weights
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
 WORLDS = 4
@@ -140,3 +168,188 @@ def visit_of(stamp_ns: int, sample: SurveyFrame, calibration: Calibration) -> Vi
         motion=ScanMotion.none(len(points)),
     )
     return Visit(frame, sample.world_T_body.astype(float), sample.pass_index)
+
+
+ASKED = {
+    # what the queries and the references are embedded with
+    "fused": ("fused", "fused"),
+    "image": ("image", "image"),
+    "lidar": ("lidar", "lidar"),
+    "image black": ("image black", "fused"),
+    "cloud empty": ("cloud empty", "fused"),
+}
+SHOWN = 3
+"""Queries whose frames are kept for pictures."""
+
+RERANKED = ("fused", "superfeatures both", "ransac both")
+TIMED_FRAMES = 8
+PICTURES = {
+    "Precision and recall (figure 5.13)": "precision_recall.png",
+    "Recall among the first candidates": "recall.png",
+    "Recall@1 by number of reranked candidates (figure 5.12)": "candidates.png",
+    "Descriptors in the plane (figures 5.10 and 5.11)": "embeddings.png",
+    "Attention of super-features on images and voxels (figures 5.5 to 5.7)": "superfeatures.png",
+    "Key-points and fusion (figure 5.8)": "keypoints.png",
+}
+
+
+class WorldEvaluation:
+    """Drives through a world and asks its questions.
+
+    Args:
+        world: to drive through.
+        embedder: what is evaluated; with super-features where their reranking is wanted.
+        settings: of the rerankers.
+        report: called after every frame and every reranked query.
+    """
+
+    def __init__(
+        self, world: TestWorld, embedder: Embedder, settings: Verification, report: Callable[[], None] = lambda: None
+    ) -> None:
+        self._world, self._settings, self._report = world, settings, report
+        self._places = PlaceCollection(embedder)
+        self._frames: list[Frame] = []
+        self._poses: list[Array] = []
+        self._passes: list[int] = []
+
+    def run(self) -> WorldResult:
+        """Embed, retrieve, rerank and score."""
+        for visit in self._world:
+            self._remember(visit)
+            self._report()
+        task, similarity = self._ask((REVISIT,))
+        ranking = rank(similarity)
+        queries, references = (
+            [self._places.keyframes[row] for row in rows] for rows in (task.queries, task.references)
+        )
+        reranking = rerank_all(queries, references, ranking, similarity, self._settings, self._report)
+        return WorldResult(
+            name=self._world.name,
+            references=len(task.references),
+            scores={
+                **{name: self._score((REVISIT,), *modes) for name, modes in ASKED.items()},
+                "same light": self._score((SAME_LIGHT,)),
+                **{method: score(task, reranking.after(method)) for method in METHODS},
+            },
+            yaw=self._recall_by_yaw(),
+            by_candidates={name: reranking.recall1_by_candidates(f"{name} both", task.positive) for name in RERANKERS},
+            milliseconds=reranking.milliseconds,
+            descriptors=self._places.descriptors("fused"),
+            world_T_body=np.stack(self._poses),
+            pass_index=np.array(self._passes),
+            examples=self._examples(task, reranking.after("ransac both")),
+        )
+
+    def _remember(self, visit: Visit) -> None:
+        modes = {FIRST: ("image", "lidar"), REVISIT: tuple(MODES)}.get(visit.pass_index, ())
+        self._places.add(visit.frame, modes)
+        self._frames.append(visit.frame)
+        self._poses.append(visit.world_T_body)
+        self._passes.append(visit.pass_index)
+
+    def _rows(self, passes: tuple[int, ...]) -> Indices:
+        """Samples of the first pass and of some others."""
+        return np.flatnonzero(np.isin(self._passes, (FIRST, *passes)))
+
+    def _task(self, rows: Indices) -> RetrievalTask:
+        return place_recognition(np.stack(self._poses)[rows], np.array(self._passes)[rows])
+
+    def _ask(
+        self, passes: tuple[int, ...], of_query: str = "fused", of_reference: str = "fused"
+    ) -> tuple[RetrievalTask, Array]:
+        """Some passes against the first: the task, and (Q, R) how alike they are."""
+        rows = self._rows(passes)
+        task = self._task(rows).of_rows(rows)
+        queries, references = self._places.descriptors(of_query), self._places.descriptors(of_reference)
+        return task, queries[task.queries] @ references[task.references].T
+
+    def _score(self, passes: tuple[int, ...], of_query: str = "fused", of_reference: str = "fused") -> Scores:
+        task, similarity = self._ask(passes, of_query, of_reference)
+        return score(task, rank(similarity))
+
+    def _recall_by_yaw(self) -> list[YawBin]:
+        task, similarity = self._ask((REVISIT, OPPOSITE))
+        return recall_by_yaw(task, rank(similarity))
+
+    def _examples(self, task: RetrievalTask, ranking: Ranking) -> list[tuple[Frame, Frame]]:
+        found = np.flatnonzero(ranking.hits(task.positive)[:, 0])
+        chosen = found[np.linspace(0, len(found) - 1, min(SHOWN, len(found))).astype(int)]
+        return [
+            (self._frames[task.queries[row]], self._frames[task.references[ranking.order[row, 0]]]) for row in chosen
+        ]
+
+
+class WorldsRun:
+    """Evaluates one network on some worlds and fills a results folder.
+
+    Args:
+        weights: safetensors file or name of shipped weights, or None for the default.
+        worlds: to drive through.
+        repeats: how often each frame is embedded when time is taken.
+        report: called with the name of what is worked on, and 1 for every frame or query done.
+    """
+
+    def __init__(
+        self,
+        weights: Path | None,
+        worlds: list[TestWorld],
+        repeats: int,
+        report: Callable[[str, int], None],
+    ) -> None:
+        self._weights = locate_weights(weights)
+        self._worlds, self._repeats, self._report = worlds, repeats, report
+        self._settings = Verification()
+        wanted = EmbeddingSettings(weights=str(self._weights))
+        self._embedder = make_embedder(wanted, super_features=True, features=self._settings.features)
+
+    def run(self) -> WorldsSummary:
+        """Drive through all worlds, then take times."""
+        results: list[WorldResult] = []
+        for world in self._worlds:
+            evaluation = WorldEvaluation(world, self._embedder, self._settings, lambda: self._report(world.name, 1))  # noqa: B023
+            results.append(evaluation.run())
+        self._report("taking times", 0)
+        seen = [frame for result in results for pair in result.examples for frame in pair]
+        frames = [at_full_size(frame) for frame in seen[:TIMED_FRAMES]]
+        return WorldsSummary(results, cost_of_weights(self._weights, frames, self._repeats))
+
+    def write(self, summary: WorldsSummary, folder: Path, notes: list[str]) -> EvaluationReport:
+        """Write tables, figures and pictures.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        self._report("drawing", 0)
+        self._draw(summary, folder)
+        title = "Evaluation on simulated worlds"
+        report = EvaluationReport(title, notes, summary.figures(), summary.tables(), PICTURES)
+        report.write(folder)
+        return report
+
+    def _draw(self, summary: WorldsSummary, folder: Path) -> None:
+        results = summary.results
+        curves = {name: [result.scores[name].curve for result in results] for name in RERANKED}
+        plot_precision_recall(folder / "precision_recall.png", curves)
+        recalls = {name: np.mean([result.scores[name].recalls for result in results], axis=0) for name in RERANKED}
+        plot_recall(folder / "recall.png", recalls, "candidates")
+        by_count = {
+            name: np.mean([result.by_candidates[name] for result in results], axis=0)
+            for name in results[0].by_candidates
+        }
+        plot_recall(folder / "candidates.png", by_count, "candidates reranked")
+        first = results[0]
+        plot_embeddings(folder / "embeddings.png", first.descriptors, first.world_T_body, first.pass_index, first.name)
+        pairs = [result.examples[len(result.examples) // 2] for result in results if result.examples]
+        _draw_attention(folder, self._weights, self._embedder, pairs)
+
+
+def _draw_attention(folder: Path, weights: Path, embedder: Embedder, pairs: list[tuple[Frame, Frame]]) -> None:
+    network = load_weights(weights)
+    seen = [(look(network, embedder, query), look(network, embedder, match)) for query, match in pairs]
+    plot_superfeatures(folder / "superfeatures.png", seen, network.config.image_size)
+    plot_keypoints(folder / "keypoints.png", [query for query, _ in seen])
+
+
+def work(world: TestWorld) -> int:
+    """How often a `WorldEvaluation` of the world reports, nearly."""
+    return len(world) + world.revisits

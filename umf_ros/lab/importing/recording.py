@@ -1,23 +1,154 @@
-"""An imported data set as a recording with its settings and its calibration beside it."""
+"""Write images, scans and poses of a data set as a recording."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import yaml
 
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.storages import message_types
 from umf_ros.core.config import Topics
-from umf_ros.lab.importing.imported import Imported
-from umf_ros.lab.simulation.bag_writer import BagWriter
-from umf_ros.lab.simulation.messages import image_message, pose_message
+from umf_ros.core.errors import SensorFileError
+from umf_ros.core.geometry import Array, make_pose, to_quaternion
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.lab.simulation.bag_writer import BagWriter, image_message, pose_message
 from umf_ros.runs.writer import write_atomically
 from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.scan_files import read_image
+
+OPTICAL = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
+"""`body_T_camera` where the camera is the body: x ahead, y left, z up."""
+
+
+@dataclass
+class Imported:
+    """Files by stamp, and how the sensors are built and mounted.
+
+    Attributes:
+        camera: entry `camera` or `raw_camera` of a calibration file, by its name.
+        body_T_camera, body_T_lidar: mountings.
+        left, right: stamps in ns and image files, in order.
+        scans: stamps in ns and what reads each scan, in order.
+        truth: poses of the body, or None.
+        guessed: what nobody told and is a guess, in words.
+    """
+
+    camera: dict[str, Any]
+    body_T_camera: Array = field(default_factory=lambda: OPTICAL)
+    body_T_lidar: Array = field(default_factory=lambda: np.eye(4))
+    left: list[tuple[int, Path]] = field(default_factory=list)
+    right: list[tuple[int, Path]] = field(default_factory=list)
+    scans: list[tuple[int, Callable[[], Cloud]]] = field(default_factory=list)
+    truth: Trajectory | None = None
+    guessed: list[str] = field(default_factory=list)
+
+    def calibration(self) -> dict[str, Any]:
+        """The content of a calibration file."""
+        poses = {"body_T_camera": self.body_T_camera, "body_T_lidar": self.body_T_lidar, "body_T_imu": np.eye(4)}
+        told: dict[str, Any] = {**self.camera, **{name: pose_entry(pose) for name, pose in poses.items()}}
+        return told | {"lidar_time_offset_s": 0.0, "min_intensity": 0.0, "max_height_m": 0.0}
+
+    def check(self, source: Path) -> Imported:
+        """The same, if it holds anything.
+
+        Raises:
+            SensorFileError: there is neither an image nor a scan.
+        """
+        if not self.left and not self.scans:
+            raise SensorFileError(f"{source} holds neither images nor scans of this format")
+        return self
+
+
+def pose_entry(pose: Array) -> dict[str, list[float]]:
+    """A pose as a calibration file has it."""
+    numbers = pose[:3, 3], to_quaternion(pose)
+    return dict(zip(("translation", "quaternion"), ([float(v) for v in values] for values in numbers), strict=True))
+
+
+def pinhole(width: int, height: int, matrix: Array, **more: Any) -> dict[str, Any]:
+    """Intrinsics as a calibration file has them, of a (3, 3) or (3, 4) matrix."""
+    fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **more}
+
+
+def lines_of(path: Path) -> list[str]:
+    """Lines of a text file that are neither empty nor comments.
+
+    Raises:
+        SensorFileError: it cannot be read.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SensorFileError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'no text'}") from None
+    return [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+
+
+def numbers_of(path: Path, separator: str | None = None) -> Array:
+    """A table of numbers (N, M).
+
+    Raises:
+        SensorFileError: it is none.
+    """
+    try:
+        return np.array([[float(word) for word in line.split(separator)] for line in lines_of(path)], float)
+    except ValueError:
+        raise SensorFileError(f"{path}: expected lines of numbers, all as long") from None
+
+
+def entries_of(path: Path) -> dict[str, Array]:
+    """`name: numbers` lines, as of KITTI's calibrations; what holds no numbers is left out."""
+    found: dict[str, Array] = {}
+    for line in lines_of(path):
+        name, _, rest = line.partition(":")
+        try:
+            found[name.strip()] = np.array([float(word) for word in rest.split()])
+        except ValueError:
+            continue
+    return found
+
+
+def entry(entries: dict[str, Array], name: str, shape: tuple[int, ...], path: Path) -> Array:
+    """One of them, in its shape.
+
+    Raises:
+        SensorFileError: it is not there, or of another size.
+    """
+    if name not in entries or entries[name].size != np.prod(shape):
+        raise SensorFileError(f"{path}: expected an entry {name} of {int(np.prod(shape))} numbers")
+    return entries[name].reshape(shape)
+
+
+def rigid(rotation: Array, translation: Array) -> Array:
+    """(4, 4) of (3, 3) and (3,)."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, np.ravel(translation)
+    return pose
+
+
+def size_of(path: Path) -> tuple[int, int]:
+    """Width and height of an image."""
+    height, width = read_image(path).shape
+    return width, height
+
+
+def depth_of(path: Path) -> Array:
+    """(H, W) of a 16-bit depth image.
+
+    Raises:
+        SensorFileError: it is none.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 2:
+        raise SensorFileError(f"{path} is no depth image")
+    return np.asarray(image, float)
+
 
 _LAYOUT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 _FLOAT32 = 7

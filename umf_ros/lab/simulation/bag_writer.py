@@ -1,4 +1,4 @@
-"""Writing recordings: mcap files that appear under their name only when they are complete."""
+"""Write simulated measurements as ROS messages into a recording."""
 
 from __future__ import annotations
 
@@ -8,10 +8,171 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
+import numpy as np
 from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 
 from umf_ros.bags.storages import message_types
 from umf_ros.core.errors import OutputError, writing
+from umf_ros.core.frames import StereoCamera
+from umf_ros.core.geometry import Array, to_quaternion
+from umf_ros.lab.simulation.lidar import Scan
+
+CLOUD_TYPE = np.dtype(
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("intensity", "<u4"),
+        ("ambient_light", "<u4"),
+        ("point_id", "<u4"),
+        ("point_time_offset", "<u4"),
+    ]
+)
+"""The 28 bytes of a Blickfeld point; the time is in ns after the stamp of the message."""
+
+_TYPES = message_types().types
+_FLOAT32, _UINT32 = 7, 6
+
+
+def _new(kind: str, **values: Any) -> Any:
+    return _TYPES[kind](**values)
+
+
+def _header(stamp_ns: int, frame: str) -> Any:
+    sec, nanosec = divmod(int(stamp_ns), 10**9)
+    stamp = _new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return _new("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def _vector(values: Array) -> Any:
+    return _new("geometry_msgs/msg/Vector3", x=float(values[0]), y=float(values[1]), z=float(values[2]))
+
+
+def _pose(pose: Array) -> Any:
+    position = _new("geometry_msgs/msg/Point", **dict(zip("xyz", map(float, pose[:3, 3]), strict=True)))
+    turn = _new("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, to_quaternion(pose)), strict=True)))
+    return _new("geometry_msgs/msg/Pose", position=position, orientation=turn)
+
+
+def image_message(image: NDArray[Any], stamp_ns: int, frame: str, encoding: str = "mono8") -> Any:
+    """sensor_msgs/Image of a (H, W) picture whose type fits the encoding."""
+    height, width = image.shape
+    return _new(
+        "sensor_msgs/msg/Image",
+        header=_header(stamp_ns, frame),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=0,
+        step=width * image.itemsize,
+        data=np.ascontiguousarray(image).view(np.uint8).reshape(-1),
+    )
+
+
+def camera_info_message(camera: StereoCamera, stamp_ns: int, frame: str, right: bool) -> Any:
+    """sensor_msgs/CameraInfo of one of a rectified pair; the right one's P[3] is -fx * baseline."""
+    k = [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
+    shift = -camera.fx * camera.baseline if right else 0.0
+    p = [camera.fx, 0, camera.cx, shift, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0]
+    whole = _new("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    return _new(
+        "sensor_msgs/msg/CameraInfo",
+        header=_header(stamp_ns, frame),
+        height=camera.height,
+        width=camera.width,
+        distortion_model="plumb_bob",
+        d=np.zeros(5),
+        k=np.array(k, float),
+        r=np.eye(3).ravel(),
+        p=np.array(p, float),
+        binning_x=0,
+        binning_y=0,
+        roi=whole,
+    )
+
+
+def cloud_message(scan: Scan, stamp_ns: int, frame: str = "lidar") -> Any:
+    """sensor_msgs/PointCloud2 of all pulses, those without a return as points at 1 m with intensity 0."""
+    records = np.empty(len(scan.points), CLOUD_TYPE)
+    records["x"], records["y"], records["z"] = scan.points.T
+    records["intensity"], records["ambient_light"] = scan.intensity, scan.ambient
+    records["point_id"] = np.arange(len(records))
+    records["point_time_offset"] = scan.offset_ns
+    fields = [
+        _new(
+            "sensor_msgs/msg/PointField",
+            name=name,
+            offset=offset,
+            datatype=_FLOAT32 if kind.kind == "f" else _UINT32,
+            count=1,
+        )
+        for name, (kind, offset, *_) in (CLOUD_TYPE.fields or {}).items()
+    ]
+    return _new(
+        "sensor_msgs/msg/PointCloud2",
+        header=_header(stamp_ns, frame),
+        height=1,
+        width=len(records),
+        fields=fields,
+        is_bigendian=False,
+        point_step=CLOUD_TYPE.itemsize,
+        row_step=CLOUD_TYPE.itemsize * len(records),
+        data=records.view(np.uint8),
+        is_dense=False,
+    )
+
+
+def imu_message(rate: Array, force: Array, stamp_ns: int, frame: str = "imu") -> Any:
+    """sensor_msgs/Imu without an orientation."""
+    unknown = np.zeros(9)
+    unknown[0] = -1
+    return _new(
+        "sensor_msgs/msg/Imu",
+        header=_header(stamp_ns, frame),
+        orientation=_new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=unknown,
+        angular_velocity=_vector(rate),
+        angular_velocity_covariance=np.eye(3).ravel() * 4e-6,
+        linear_acceleration=_vector(force),
+        linear_acceleration_covariance=np.eye(3).ravel() * 4e-4,
+    )
+
+
+def odometry_message(pose: Array, twist: Array, deviations: Array, stamp_ns: int, frames: tuple[str, str]) -> Any:
+    """nav_msgs/Odometry; `deviations` are those of position (m) and heading (rad), `frames` parent and child."""
+    variance = np.repeat(np.asarray(deviations) ** 2, 3)
+    variance[3:5] = 1e-6  # gravity keeps roll and pitch
+    return _new(
+        "nav_msgs/msg/Odometry",
+        header=_header(stamp_ns, frames[0]),
+        child_frame_id=frames[1],
+        pose=_new("geometry_msgs/msg/PoseWithCovariance", pose=_pose(pose), covariance=np.diag(variance).ravel()),
+        twist=_new(
+            "geometry_msgs/msg/TwistWithCovariance",
+            twist=_new("geometry_msgs/msg/Twist", linear=_vector(twist[:3]), angular=_vector(twist[3:])),
+            covariance=np.eye(6).ravel() * 1e-3,
+        ),
+    )
+
+
+def pose_message(pose: Array, stamp_ns: int, frame: str) -> Any:
+    """geometry_msgs/PoseStamped."""
+    return _new("geometry_msgs/msg/PoseStamped", header=_header(stamp_ns, frame), pose=_pose(pose))
+
+
+def fix_message(geodetic: Array, deviation_m: float, stamp_ns: int, frame: str = "gnss") -> Any:
+    """sensor_msgs/NavSatFix of latitude, longitude (deg) and height (m)."""
+    return _new(
+        "sensor_msgs/msg/NavSatFix",
+        header=_header(stamp_ns, frame),
+        status=_new("sensor_msgs/msg/NavSatStatus", status=2, service=1),
+        latitude=float(geodetic[0]),
+        longitude=float(geodetic[1]),
+        altitude=float(geodetic[2]),
+        position_covariance=np.diag([1.0, 1.0, 4.0]).ravel() * deviation_m**2,
+        position_covariance_type=2,
+    )
 
 
 class BagWriter:

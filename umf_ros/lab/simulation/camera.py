@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from umf_ros.core.frames import Image, StereoCamera
 from umf_ros.core.geometry import Array
-from umf_ros.lab.simulation.lighting import Sun
 from umf_ros.lab.simulation.noise import Field
-from umf_ros.lab.simulation.shading import RayHits, Shader, cast
+from umf_ros.lab.simulation.shading import RayHits, Shader, Sun, cast
 from umf_ros.lab.simulation.world import ROCK, World
 
 SKY = 255

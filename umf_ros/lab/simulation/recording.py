@@ -14,11 +14,9 @@ import numpy as np
 
 from umf_ros.core.errors import writing
 from umf_ros.core.trajectory import Trajectory, write_tum
-from umf_ros.lab.simulation import gnss, imu
-from umf_ros.lab.simulation.bag_writer import BagWriter
-from umf_ros.lab.simulation.camera import Rendering
-from umf_ros.lab.simulation.lidar import PERIOD_NS
-from umf_ros.lab.simulation.messages import (
+from umf_ros.lab.simulation import motion_sensors
+from umf_ros.lab.simulation.bag_writer import (
+    BagWriter,
     camera_info_message,
     cloud_message,
     fix_message,
@@ -27,6 +25,8 @@ from umf_ros.lab.simulation.messages import (
     odometry_message,
     pose_message,
 )
+from umf_ros.lab.simulation.camera import Rendering
+from umf_ros.lab.simulation.lidar import PERIOD_NS
 from umf_ros.lab.simulation.pool import ahead
 from umf_ros.lab.simulation.simulator import START_NS, Simulator, stamp_ns
 
@@ -75,7 +75,9 @@ def write_side_files(simulator: Simulator, bag: Path) -> None:
     run = simulator.odometry
     stamps = np.array([stamp_ns(time_s) for time_s in run.times_s], np.int64)
     write_tum(bag.with_suffix(".odometry.tum"), Trajectory(stamps, run.poses))
-    text = gnss.rtklib_text(gnss.measure(simulator.motion, simulator.duration_s, simulator.seed), START_NS)
+    text = motion_sensors.rtklib_text(
+        motion_sensors.measure_gnss(simulator.motion, simulator.duration_s, simulator.seed), START_NS
+    )
     with writing(bag.with_suffix(".pos")):
         bag.with_suffix(".pos").write_text(text, encoding="ascii")
 
@@ -147,7 +149,9 @@ def _clouds(simulator: Simulator, pool: ThreadPoolExecutor) -> Iterator[Event]:
 
 
 def _imu(simulator: Simulator) -> Iterator[Event]:
-    data = imu.measure(simulator.motion, simulator.calibration.body_T_imu, simulator.duration_s, simulator.seed)
+    data = motion_sensors.measure_imu(
+        simulator.motion, simulator.calibration.body_T_imu, simulator.duration_s, simulator.seed
+    )
     for time_s, rate, force in zip(data.times_s, data.rate, data.force, strict=True):
         stamp = stamp_ns(time_s)
         yield stamp, 2, "/imu/data", imu_message(rate, force, stamp)
@@ -169,7 +173,7 @@ def _ground_truth(simulator: Simulator) -> Iterator[Event]:
 
 
 def _fixes(simulator: Simulator) -> Iterator[Event]:
-    track = gnss.measure(simulator.motion, simulator.duration_s, simulator.seed)
+    track = motion_sensors.measure_gnss(simulator.motion, simulator.duration_s, simulator.seed)
     for time_s, geodetic, deviation in zip(track.times_s, track.geodetic, track.deviation_m, strict=True):
         stamp = stamp_ns(time_s)
         yield stamp, 5, "/gnss/fix", fix_message(geodetic, float(deviation), stamp)

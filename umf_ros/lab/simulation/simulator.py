@@ -11,13 +11,11 @@ from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import Frame, Image, ScanMotion
 from umf_ros.core.geometry import Array, relative, transform
 from umf_ros.lab.simulation.camera import Rendering
-from umf_ros.lab.simulation.lidar import PERIOD_NS, Lidar, Scan
-from umf_ros.lab.simulation.lighting import Sun
-from umf_ros.lab.simulation.motion import Motion
-from umf_ros.lab.simulation.odometry import drifting
+from umf_ros.lab.simulation.lidar import PERIOD_NS, Lidar, Scan, eyes, mosaic
+from umf_ros.lab.simulation.motion_sensors import Motion, drifting
 from umf_ros.lab.simulation.presets import Preset
-from umf_ros.lab.simulation.rig import eyes, mosaic
 from umf_ros.lab.simulation.route import NIGHT, Route
+from umf_ros.lab.simulation.shading import Sun
 from umf_ros.lab.simulation.world import World, ground
 
 START_NS = 1_625_644_800 * 10**9

@@ -14,9 +14,8 @@ from umf_ros.core.geometry import Array, transform
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, Rendering, resized
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.lidar import Lidar
-from umf_ros.lab.simulation.passes import SETTINGS, Pass, plan_passes, thinned
 from umf_ros.lab.simulation.pool import ahead
-from umf_ros.lab.simulation.rover import stand
+from umf_ros.lab.simulation.route import SETTINGS, Pass, plan_passes, stand, thinned
 from umf_ros.lab.simulation.world import World, ground
 from umf_ros.sensors.calibration import Calibration, load_calibration
 

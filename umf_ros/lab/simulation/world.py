@@ -1,4 +1,4 @@
-"""A world: ground, rocks and horizon as one scene that rays can be cast into."""
+"""A simulated world, and the split of seeds by purpose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,23 @@ from umf_ros.lab.simulation.families import FAMILIES, Traits, draw_traits
 from umf_ros.lab.simulation.noise import Field, detail_texture, smooth_step, spectral_noise
 from umf_ros.lab.simulation.relief import CELL_M, CELLS, SIZE_M, Pan, Relief
 from umf_ros.lab.simulation.rocks import Mesh, scatter_rocks, vertex_normals
-from umf_ros.lab.simulation.seeds import check_seed
+
+TRAINING = range(0, 10_000)
+VALIDATION = range(10_000, 20_000)
+TEST = range(20_000, 30_000)
+"""Seeds from 30,000 on are free for a user's own worlds and are never drawn by this package."""
+
+
+def check_seed(seed: int) -> int:
+    """The seed itself.
+
+    Raises:
+        ConfigError: the seed is negative or does not fit 32 bits.
+    """
+    if not 0 <= seed < 2**32:
+        raise ConfigError(f"seed {seed} is not between 0 and 4294967295")
+    return seed
+
 
 GROUND, HORIZON, ROCK = 0, 1, 2
 """Geometry ids in the scene, and the values of semantic maps (sky is 255)."""

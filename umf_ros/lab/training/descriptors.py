@@ -17,20 +17,15 @@ from torch import Tensor
 
 from umf_ros.baselines.place_network import PlaceNetwork
 from umf_ros.baselines.place_networks import load_place_network, make_place_network
-from umf_ros.lab.datasets.labels import Rule
 from umf_ros.lab.datasets.listed import open_source
-from umf_ros.lab.datasets.sample import SampleSequence
-from umf_ros.lab.evaluation.protocol import place_recognition
-from umf_ros.lab.evaluation.results import mean
-from umf_ros.lab.evaluation.retrieval import rank
-from umf_ros.lab.evaluation.scores import score
-from umf_ros.lab.training.losses import batch_hard_triplet, neighbourhood_components
-from umf_ros.lab.training.metric_loss import Bank, Relations, relate
-from umf_ros.lab.training.networks import Precision, save_tensors
+from umf_ros.lab.datasets.sample import Rule, SampleSequence
+from umf_ros.lab.evaluation.results import mean, score
+from umf_ros.lab.evaluation.retrieval import place_recognition, rank
+from umf_ros.lab.training.batches import PairSampler
+from umf_ros.lab.training.losses import Bank, Relations, batch_hard_triplet, neighbourhood_components, relate
+from umf_ros.lab.training.networks import DescriptorSettings, Precision, RunSettings, save_tensors
 from umf_ros.lab.training.objective import Judgement, Objective, generator
 from umf_ros.lab.training.prepared_views import PlaceBatch, PreparedViews
-from umf_ros.lab.training.sampler import PairSampler
-from umf_ros.lab.training.settings import DescriptorSettings, RunSettings
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.weights import load_weights
 

@@ -12,17 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from umf_ros.lab.datasets.labels import Rule
 from umf_ros.lab.datasets.listed import open_source
-from umf_ros.lab.datasets.sample import SampleSequence
+from umf_ros.lab.datasets.sample import Rule, SampleSequence
 from umf_ros.lab.datasets.views import Augmentation, ViewMaker
-from umf_ros.lab.evaluation.protocol import ROBOTCAR_RULE, RULES
-from umf_ros.lab.training.batches import BatchMaker, TrainingBatch
-from umf_ros.lab.training.metric_loss import Bank, MetricLoss
-from umf_ros.lab.training.networks import branch_layers, fine_layers
+from umf_ros.lab.evaluation.retrieval import ROBOTCAR_RULE, RULES
+from umf_ros.lab.training.batches import BatchMaker, PairSampler, TrainingBatch
+from umf_ros.lab.training.losses import Bank, MetricLoss
+from umf_ros.lab.training.networks import MetricSettings, branch_layers, fine_layers
 from umf_ros.lab.training.objective import Judgement, Objective, generator
-from umf_ros.lab.training.sampler import PairSampler
-from umf_ros.lab.training.settings import MetricSettings
 from umf_ros.lab.training.validation import MODES, Results, answerable, figures, mean_of, validate
 from umf_ros.networks.umf import UMF, NetworkInput
 
@@ -151,9 +148,6 @@ class MetricObjective(Objective):
         """Inverse of `get_extra_state`."""
         self.bank.restore(state["bank"])
         self.batch_size, self.best, self.stale = state["batch_size"], state["best"], state["stale"]
-
-
-OBJECTIVE = MetricObjective
 
 
 def dropped(batch: NetworkInput, chance: float, rng: np.random.Generator) -> tuple[Tensor, Tensor]:

@@ -1,14 +1,16 @@
-"""What a run learns: the one thing that differs between ways of training.
+"""An objective: network, batches, losses and progress of one way of training.
 
-A new way of training is one file here, `NAME_objective.py`, with a subclass of `Objective` as its `OBJECTIVE`
-and, where it has settings of its own, a subclass of `RunSettings`; `method: NAME` in a settings file chooses it.
+A new way of training is one file here with a subclass of `Objective`, a line in `OBJECTIVES` and, where it has settings
+of its own, a subclass of `RunSettings`; `method: NAME` in a settings file chooses it.
 """
 
 from __future__ import annotations
 
-import pkgutil
+import csv
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -18,13 +20,93 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from umf_ros.core.errors import ConfigError
-from umf_ros.lab import training
+from umf_ros.core.errors import ConfigError, WeightsError, writing
+from umf_ros.core.io import atomic_write
 from umf_ros.lab.datasets.sample import SampleSequence
-from umf_ros.lab.training.networks import Precision, make_network, save_weights
-from umf_ros.lab.training.settings import RunSettings
+from umf_ros.lab.training.networks import Precision, RunSettings, make_network, save_weights
 
-SUFFIX = "_objective"
+
+@dataclass
+class Progress:
+    """Where a run stands; plain data, for it goes into the checkpoint.
+
+    Attributes:
+        step: steps done.
+        seconds: time they took.
+        losses: means over the last steps of the epoch, by name.
+        figures: what was measured last, by name.
+        stopped: whether the objective wants no more steps.
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+    losses: dict[str, float] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)
+    stopped: bool = False
+
+
+def learning_rate(peak: float, warmup_steps: int, step: int, steps: int) -> float:
+    """Linear warm-up, then half a cosine: from `peak` down to zero at the last of the steps."""
+    warm = min(1.0, (step + 1) / max(warmup_steps, 1))
+    return peak * warm * 0.5 * (1 + math.cos(math.pi * step / steps))
+
+
+def append_row(path: Path, row: dict[str, Any]) -> None:
+    """Add a row to a CSV file, which begins with the names of its columns.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with writing(path), path.open("a", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, list(row))
+        if stream.tell() == 0:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write a checkpoint; an interrupted write leaves the previous one.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with atomic_write(path, RuntimeError) as part:
+        torch.save(state, part)
+
+
+@contextmanager
+def resuming(path: Path) -> Iterator[dict[str, Any]]:
+    """Read a checkpoint, to be taken over inside the block.
+
+    Raises:
+        WeightsError: missing, damaged, or of a run that differs.
+    """
+    try:
+        state = dict(torch.load(path, map_location="cpu", weights_only=True))
+    except Exception as error:  # torch.load raises whatever the damaged bytes provoke
+        raise WeightsError(f"cannot resume from {path}: {_one_line(error)}") from None
+    try:
+        yield state
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise WeightsError(f"cannot resume from {path}, which is of another run: {_one_line(error)}") from None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
+
+
+OBJECTIVES = {
+    "metric": ("metric_objective", "MetricObjective"),
+    "masked_images": ("masked_objectives", "MaskedImagesObjective"),
+    "masked_scans": ("masked_objectives", "MaskedScansObjective"),
+    "netvlad": ("baseline_objectives", "NetVladObjective"),
+    "pointnet2": ("baseline_objectives", "PointNet2Objective"),
+    "minkloc_visual": ("baseline_objectives", "MinkLocVisualObjective"),
+    "minkloc_lidar": ("baseline_objectives", "MinkLocLidarObjective"),
+    "minkloc_fusion": ("baseline_objectives", "MinkLocFusionObjective"),
+    "adafusion": ("baseline_objectives", "AdaFusionObjective"),
+}
+"""Module and class of every way of training."""
 
 
 class Batch(Protocol):
@@ -117,22 +199,16 @@ class Objective(nn.Module, ABC):
         return {}
 
 
-def find_methods() -> list[str]:
-    """Names of the ways of training that have a file here."""
-    names = (module.name for module in pkgutil.iter_modules(training.__path__))
-    return [name.removesuffix(SUFFIX) for name in names if name.endswith(SUFFIX)]
-
-
 def find_objective(method: str) -> type[Objective]:
-    """The objective of a way of training.
+    """Return the objective of a way of training.
 
     Raises:
         ConfigError: there is none of that name.
     """
-    known = find_methods()
-    if method not in known:
-        raise ConfigError(f"method: unknown method {method!r}; known: {', '.join(known)}")
-    found: type[Objective] = import_module(f"{__package__}.{method}{SUFFIX}").OBJECTIVE
+    if method not in OBJECTIVES:
+        raise ConfigError(f"method: unknown method {method!r}; known: {', '.join(sorted(OBJECTIVES))}")
+    module, name = OBJECTIVES[method]
+    found: type[Objective] = getattr(import_module(f"{__package__}.{module}"), name)
     return found
 
 

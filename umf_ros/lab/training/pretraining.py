@@ -23,8 +23,8 @@ from umf_ros.core.errors import ConfigError, writing
 from umf_ros.core.geometry import Array
 from umf_ros.lab.datasets.sample import Sample, SampleSequence
 from umf_ros.lab.datasets.views import Augmentation, View, ViewMaker
+from umf_ros.lab.training.networks import RunSettings
 from umf_ros.lab.training.objective import Judgement, Objective, generator
-from umf_ros.lab.training.settings import RunSettings
 from umf_ros.networks.umf import UMF
 
 EXAMPLES = 4

@@ -1,24 +1,93 @@
-"""The loop of every run: epochs of steps, with a log and a checkpoint after each."""
+"""Train an objective step by step, on one process or several, with checkpoints."""
 
 from __future__ import annotations
 
 import math
+import os
+import platform
+import re
+import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import torch.distributed as dist
+from pydantic import ValidationError
 from torch import nn
 
+from umf_ros.core.config import problems
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.io import read_values
+from umf_ros.lab.datasets.listed import Source, open_source
 from umf_ros.lab.datasets.sample import SampleSequence
-from umf_ros.lab.training.distributed import Team
-from umf_ros.lab.training.loading import made_ahead
-from umf_ros.lab.training.objective import Batch, Judgement, Objective
-from umf_ros.lab.training.progress import Progress, append_row, learning_rate, resuming, save_checkpoint
-from umf_ros.lab.training.settings import RunSettings
+from umf_ros.lab.training.batches import made_ahead
+from umf_ros.lab.training.networks import RunSettings, read_card, write_settings
+from umf_ros.lab.training.objective import (
+    Batch,
+    Judgement,
+    Objective,
+    Progress,
+    append_row,
+    find_objective,
+    learning_rate,
+    resuming,
+    save_checkpoint,
+)
+from umf_ros.networks.umf import count_parameters
+
+
+@dataclass(frozen=True, slots=True)
+class Team:
+    """Where a process stands among the others.
+
+    Attributes:
+        rank: of the process, 0 leads: it alone validates and writes.
+        size: number of processes.
+        device: what the process computes on.
+    """
+
+    rank: int
+    size: int
+    device: torch.device
+
+    @property
+    def leads(self) -> bool:
+        """Whether this is the process that validates and writes."""
+        return self.rank == 0
+
+
+def choose_device(device: str) -> str:
+    """Name of a torch device; for "auto" a GPU's where there is one."""
+    return device if device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+
+
+@contextmanager
+def join_team(device: str) -> Iterator[Team]:
+    """The team that `torchrun` started, or a team of one.
+
+    Args:
+        device: torch device, or "auto".
+    """
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    rank, local = int(os.environ.get("RANK", "0")), int(os.environ.get("LOCAL_RANK", "0"))
+    chosen = choose_device(device)
+    target = torch.device(f"{chosen}:{local}" if chosen == "cuda" and size > 1 else chosen)
+    if size == 1:
+        yield Team(0, 1, target)
+        return
+    # the others wait while the leader validates
+    dist.init_process_group("nccl" if target.type == "cuda" else "gloo", timeout=timedelta(hours=1))
+    try:
+        yield Team(rank, size, target)
+    finally:
+        dist.destroy_process_group()
+
 
 WINDOW = 50
 """Steps over which the losses that are shown are averaged."""
@@ -135,3 +204,104 @@ class Trainer:
         row |= {name: round(value, 5) for name, value in self.progress.losses.items()}
         row |= {name: round(value, 4) for name, value in figures.items()}
         append_row(self._folder / "log.csv", row | {"learning_rate": round(self._learning_rate(), 7)})
+
+
+def load_run(path: Path | None, **overrides: object) -> Any:
+    """Settings of a run from a YAML file and overrides; None is skipped.
+
+    Returns:
+        The settings class of the run's `method`, which is metric learning unless named.
+
+    Raises:
+        ConfigError: unreadable file, unknown method or name, or wrong value; names every one.
+    """
+    values = read_values(path) if path else {}
+    values |= {name: value for name, value in overrides.items() if value is not None}
+    objective = find_objective(str(values.get("method", RunSettings.model_fields["method"].default)))
+    try:
+        return objective.settings_type.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(problems(error)) from None
+
+
+def train(settings: RunSettings, output: Path, resume: bool, report: Callable[[Progress], None]) -> Path:
+    """Train a network and keep its best weights.
+
+    Args:
+        settings: of the run; written to `output`/training.yaml.
+        output: the run's folder: weights, their card, `checkpoint.pt`, `log.csv`.
+        resume: go on from the checkpoint in `output`.
+        report: called after every step.
+
+    Returns:
+        Path of the weights, `<preset>.safetensors`, with the encoder's name where one was pretrained.
+
+    Raises:
+        ConfigError: unknown preset, or no data that serves the objective.
+        OutputError: the folder cannot be written.
+        WeightsError: nothing to resume from, or weights to start from that do not fit.
+    """
+    objective_type = find_objective(settings.method)
+    torch.set_num_threads(settings.threads)
+    torch.manual_seed(settings.seed)
+    data = _open_data(settings.train)
+    earlier = earlier_runs(settings.start)
+    weights = output / f"{settings.weights_name}.safetensors"
+    with join_team(settings.device) as team:
+        network = objective_type.make_network(settings)
+        objective = objective_type(network, settings)
+        write_settings(settings, output / "training.yaml")
+        trainer = Trainer(objective, data.refresh, settings, output, team)
+        if resume:
+            trainer.resume()
+
+        def keep() -> None:
+            card = _card(settings, weights.stem, network, data, trainer.progress)
+            objective.save(weights, card | {"earlier_runs": earlier} | objective.card(), settings.stored)
+
+        trainer.run(report, keep)
+    return weights
+
+
+def _open_data(where: str) -> Source:
+    """What to learn from, of which there is some."""
+    source = open_source(Path(where))
+    if not source.refresh():
+        raise ConfigError(f"train: there are no worlds in {where}")
+    return source
+
+
+def earlier_runs(start: str) -> list[dict[str, Any]]:
+    """The runs that the weights to start from went through, oldest first, as their cards have them.
+
+    Args:
+        start: weights file; empty: none.
+
+    Raises:
+        WeightsError: the weights have no card.
+    """
+    if not start:
+        return []
+    card = read_card(Path(start))
+    told = ("command", "settings", "steps", "training_hours", "training_worlds")
+    return [*card.get("earlier_runs", []), {name: card.get(name) for name in told}]
+
+
+def _card(settings: RunSettings, name: str, network: nn.Module, data: Source, progress: Progress) -> dict[str, Any]:
+    """What every card says; of folders and files only the names, in the command too."""
+    words = [re.sub(r"[^=]*/", "", word.rstrip("/")) for word in sys.argv[1:]]
+    said = settings.model_dump()
+    places = {place: Path(said[place]).name for place in ("train", "validation", "start", "views") if place in said}
+    return {
+        "name": name,
+        "steps": progress.step,
+        "parameters": count_parameters(network),
+        "command": " ".join(["umf", *words]),
+        "training_hours": round(progress.seconds / 3600, 3),
+        "training_worlds": [world.name for world in data.worlds],
+        "training_samples": sum(len(world) for world in data.worlds),
+        "torch": torch.__version__,
+        "machine": platform.processor() or platform.machine(),
+        "settings": said | places,
+        "final_losses": {loss: round(value, 4) for loss, value in progress.losses.items()},
+    }

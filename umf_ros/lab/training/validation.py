@@ -9,13 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from umf_ros.lab.datasets.labels import Rule
-from umf_ros.lab.datasets.sample import SampleSequence
+from umf_ros.lab.datasets.sample import Rule, SampleSequence
 from umf_ros.lab.datasets.views import ViewMaker
-from umf_ros.lab.evaluation.protocol import THESIS_RULE, place_recognition, revisits
-from umf_ros.lab.evaluation.results import percent
-from umf_ros.lab.evaluation.retrieval import rank
-from umf_ros.lab.evaluation.scores import Scores, score
+from umf_ros.lab.evaluation.results import Scores, percent, score
+from umf_ros.lab.evaluation.retrieval import THESIS_RULE, place_recognition, rank, revisits
 from umf_ros.lab.training.batches import stack_views
 from umf_ros.networks.umf import UMF
 

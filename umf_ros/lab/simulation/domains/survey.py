@@ -13,10 +13,9 @@ from umf_ros.lab.simulation.domains.mounts import MOUNTS, Mount
 from umf_ros.lab.simulation.domains.places import PLACES, Place
 from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner
 from umf_ros.lab.simulation.domains.sweeps import Sweep, stamp_moment, sweep
-from umf_ros.lab.simulation.passes import Setting, plan_passes
 from umf_ros.lab.simulation.relief import Relief
-from umf_ros.lab.simulation.rover import stand
-from umf_ros.lab.simulation.seeds import check_seed
+from umf_ros.lab.simulation.route import Setting, plan_passes, stand
+from umf_ros.lab.simulation.world import check_seed
 
 SWING_DEG = 8.0  # how far a revisit's heading swings to either side
 TILT_DEG = 1.0  # of the ground under single wheels

@@ -1,0 +1,1 @@
+"""Everything that writes a fitted file: acceptance, covariance, scene, vocabulary and adaptation."""
