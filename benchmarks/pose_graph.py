@@ -9,9 +9,9 @@ way (figures named hard). Times are CPU time of this process, which is wall time
 on what else the machine does.
 
 Two standard methods run on the same worlds, as a batch over the whole graph: graduated non-convexity (`gnc`, GTSAM's
-GncLMOptimizer with truncated least squares, odometry as known inliers) [Yang 2020] and pairwise consistency maximisation
-(`pcm`, the largest set of pairwise consistent closures, then Levenberg-Marquardt) [Mangelson 2018]. `gnc_scaled` and
-`pcm_scaled` multiply the stated covariances by the noise scale that the back-end estimated in the same world.
+GncLMOptimizer with truncated least squares, odometry as known inliers) [Yang 2020] and pairwise consistency
+maximisation (`pcm`, the largest set of pairwise consistent closures, then Levenberg-Marquardt) [Mangelson 2018].
+`gnc_scaled` and `pcm_scaled` multiply the stated covariances by the noise scale that the back-end estimated in the same world.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from umf_ros.lab.simulation.pose_graphs import (
     with_lone_end,
     with_wrong_closures,
 )
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.noise_scale import NoiseScale
-from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.solver import Edge, between
 
 FIRST_SEED = 20_000
@@ -53,6 +53,7 @@ MOST_CLOSURES_OF_A_FILE = 1500
 MOST_SOLUTIONS_OF_A_FILE = 150
 SETTINGS = PoseGraphSettings(keyframe_spacing_m=1e-6, max_gap_s=1.5, max_closure_m=1e7)
 BELIEVING = SETTINGS.model_copy(update={"reject_outliers": False})
+STATED = NoiseScale()
 KINDS: tuple[Kind, ...] = ("random", "groups", "near")
 # per metre; a tenth of it is what the stated noise makes of a hundred metres
 BIAS = np.array([0, 0, np.deg2rad(0.1), 0.01, 0, 0])
@@ -67,7 +68,7 @@ class Outcome:
     error_m: float
     transient_wrong: float
     seconds: Array
-    scale: NoiseScale = NoiseScale()
+    scale: NoiseScale = STATED
 
 
 def drive(
@@ -114,7 +115,7 @@ def judged(graph: PoseGraph, right: dict[tuple[int, int], bool]) -> list[bool]:
     return [right[c.match_stamp_ns, c.query_stamp_ns] for c in accepted]
 
 
-def odometry_graph(world: GraphWorld, scale: NoiseScale = NoiseScale()) -> gtsam.NonlinearFactorGraph:
+def odometry_graph(world: GraphWorld, scale: NoiseScale = STATED) -> gtsam.NonlinearFactorGraph:
     """The world's odometry as a chain with an anchored first pose; N factors, the anchor last."""
     graph = gtsam.NonlinearFactorGraph()
     steps = invert(world.odometry[:-1]) @ world.odometry[1:]
@@ -125,7 +126,7 @@ def odometry_graph(world: GraphWorld, scale: NoiseScale = NoiseScale()) -> gtsam
     return graph
 
 
-def closure_factor(closure: WorldClosure, scale: NoiseScale = NoiseScale()) -> gtsam.BetweenFactorPose3:
+def closure_factor(closure: WorldClosure, scale: NoiseScale = STATED) -> gtsam.BetweenFactorPose3:
     return between(Edge(closure.first, closure.second, closure.pose, scale.closures**2 * closure.covariance))
 
 
@@ -239,8 +240,8 @@ def run_peers(world: GraphWorld, reference: Array, stated: float, scale: NoiseSc
     right = np.array([closure.right for closure in world.closures])
     outcomes = {}
     for name, solve in PEERS.items():
-        for suffix, factors in (("", NoiseScale()), ("_scaled", scale)):
-            if suffix and scale == NoiseScale():
+        for suffix, factors in (("", STATED), ("_scaled", scale)):
+            if suffix and scale == STATED:
                 outcomes[name + suffix] = outcomes[name]
                 continue
             before = time.process_time()

@@ -11,7 +11,7 @@ from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
 from umf_ros.detector import Detection, LoopDetector
-from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.runs.writer import RunRecorder
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter

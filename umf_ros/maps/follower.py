@@ -15,7 +15,7 @@ from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.maps.localizer import Localization, Localizer
 from umf_ros.maps.outputs import read_poses
-from umf_ros.pose_graph.closures import ClosureVerdict, State
+from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State
 from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
 
 Stamps = NDArray[np.int64]
@@ -153,9 +153,9 @@ class MapFollower:
 def _verdict(closure: LoopClosure, fate: str) -> ClosureVerdict:
     """A closure by what the localizer did with it."""
     state, reason = {
-        "agreed": (State.ACCEPTED, "agrees with the pose"),
-        "contradicted": (State.REJECTED, "contradicts the pose"),
-        "searching": (State.UNDECIDED, "the pose is not known yet"),
-        "unusable": (State.REFUSED, "its keyframe is not of the map, or no odometry is at the query"),
-    }.get(fate, (State.WAITING, "its odometry has not arrived"))
+        "agreed": (State.ACCEPTED, ClosureReason.AGREES_WITH_POSE),
+        "contradicted": (State.REJECTED, ClosureReason.CONTRADICTS_POSE),
+        "searching": (State.PENDING, ClosureReason.POSE_UNKNOWN),
+        "unusable": (State.REFUSED, ClosureReason.NOT_OF_MAP),
+    }.get(fate, (State.PENDING, ClosureReason.NO_ODOMETRY_YET))
     return ClosureVerdict(closure, state, reason)

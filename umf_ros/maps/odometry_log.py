@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from umf_ros.core.errors import UmfError, writing
 from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
 
