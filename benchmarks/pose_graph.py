@@ -11,7 +11,8 @@ on what else the machine does.
 Two standard methods run on the same worlds, as a batch over the whole graph: graduated non-convexity (`gnc`, GTSAM's
 GncLMOptimizer with truncated least squares, odometry as known inliers) [Yang 2020] and pairwise consistency
 maximisation (`pcm`, the largest set of pairwise consistent closures, then Levenberg-Marquardt) [Mangelson 2018].
-`gnc_scaled` and `pcm_scaled` multiply the stated covariances by the noise scale that the back-end estimated in the same world.
+`gnc_scaled` and `pcm_scaled` multiply the stated covariances by the noise scale that the back-end estimated in the
+same world.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from umf_ros.core.errors import GraphError
 from umf_ros.core.geometry import Array, expmap, invert
 from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops
 from umf_ros.pose_graph import solver as incremental
-from umf_ros.pose_graph.solver import Edges, Graph, IncrementalOptimizer, BatchOptimizer
+from umf_ros.pose_graph.solver import BatchOptimizer, Edges, Graph, IncrementalOptimizer
 
 WORLD = rover_loops(400, 10002)
 

@@ -11,7 +11,7 @@ from graph_worlds import chain_of, two_laps
 from umf_ros.core.errors import GraphError
 from umf_ros.core.geometry import Array, adjoint, expmap, invert, make_pose, propagate, relative
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS
-from umf_ros.pose_graph.solver import Edges, Graph, BatchOptimizer, odometry_edges
+from umf_ros.pose_graph.solver import BatchOptimizer, Edges, Graph, odometry_edges
 
 COVARIANCE = np.diag([*np.deg2rad([0.5] * 3), 0.05, 0.05, 0.05]) ** 2
 
