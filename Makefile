@@ -1,9 +1,10 @@
 # make demo   simulate a traverse, run the real graph over DDS on it, write results/latest
 # make test   the whole test suite
 # make test-jazzy   the suite against what an installed Jazzy has: NumPy 1.26.4, in a venv of its own
-# make lint   ruff, mypy, and the contracts on who may import whom
+# make check   lint and the fast tests, about two minutes
+# make lint   ruff, mypy, codespell and the import contracts
 # make docs   the documentation as a site, build/site
-.PHONY: demo test test-jazzy lint docs install clean
+.PHONY: demo test check test-jazzy lint docs install clean
 SHELL := /bin/bash
 
 VENV ?= .venv
@@ -22,6 +23,10 @@ demo: install
 
 test: install
 	@OMP_NUM_THREADS=1 $(BIN)/python $(PYTEST)
+
+# without tests that take seconds each, start nodes, a browser or a database server
+check: lint
+	@OMP_NUM_THREADS=1 $(BIN)/python $(PYTEST) -m "not (slow or ros or browser or postgres)"
 
 test-jazzy: .venv-jazzy/.installed
 	@OMP_NUM_THREADS=1 .venv-jazzy/bin/python $(PYTEST)
@@ -43,6 +48,7 @@ lint: install
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
+	@$(BIN)/codespell
 
 # every page and every link, as a site in build/site
 docs: install

@@ -24,6 +24,28 @@ os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
+MARKED = {
+    "ros": ("nodes", "lab/live", "examples"),
+    "postgres": ("fleet", "commands/test_fleet.py"),
+    "browser": ("runs/test_browser.py",),
+    "slow": (
+        *("lab", "benchmarks", "maps", "submaps", "commands", "comparison", "verification", "pose_graph", "embedding"),
+        *("baselines", "runs", "pose_graph/test_journal.py", "bags/test_hostile.py"),
+        *("test_packaging.py", "test_replay.py", "test_tasks.py", "test_mapping.py", "test_imports.py"),
+    ),
+}
+"""Markers by folders and files of tests; `make check` leaves all of them out."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    root = Path(__file__).parent
+    for item in items:
+        name = item.path.relative_to(root).as_posix()
+        for marker, places in MARKED.items():
+            if name.startswith(tuple(place if place.endswith(".py") else f"{place}/" for place in places)):
+                item.add_marker(marker)
+
+
 @pytest.fixture(scope="session")
 def converted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the tests' networks are kept once they are converted, which takes seconds each."""

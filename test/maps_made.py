@@ -13,7 +13,7 @@ from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, expmap, make_pose, relative
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
 from umf_ros.maps.odometry_log import OdometryLog
-from umf_ros.runs.tables import CLOSURES, KEYFRAMES, CsvTable, closure_row
+from umf_ros.runs.tables import CLOSURES, KEYFRAMES, closure_row, write_table
 
 PERIOD_NS = 10**9
 START_NS = 1_700_000_000 * 10**9
@@ -75,20 +75,17 @@ def made_map(path: Path, sessions: list[MadeSession], settings: Settings | None 
         run = folder.folder_of(made.name)
         run.mkdir(parents=True)
         made.log(number).save(run)
-        keyframes = CsvTable(run / "keyframes.csv", KEYFRAMES)
         metres = range(made.first_m, made.last_m + 1)
-        keyframes.append([[made.stamp(metre), number, metre - made.first_m] for metre in metres])
-        keyframes.close()
-        CsvTable(run / "closures.csv", CLOSURES).close()
+        keyframes = [[made.stamp(metre), number, metre - made.first_m] for metre in metres]
+        write_table(run / "keyframes.csv", KEYFRAMES, keyframes)
+        write_table(run / "closures.csv", CLOSURES, [])
         first, last = made.stamp(made.first_m), made.stamp(made.last_m)
         recording = {"path": f"{made.name}.mcap", "start_ns": first, "end_ns": last, "messages": {"a": number}}
         shift = folder.shift_for(first)
         folder.add(
             MapSession(made.name, recording, shift, first, last, 100 * number, len(metres), number, 1, made.odometry)
         )
-        between = CsvTable(run / BETWEEN, CLOSURES)
-        between.append([closure_row(closure, 0.9) for closure in made.between])
-        between.close()
+        write_table(run / BETWEEN, CLOSURES, [closure_row(closure, 0.9) for closure in made.between])
     return folder
 
 

@@ -111,7 +111,7 @@ def test_help_imports_nothing_heavy() -> None:
     show_help = (
         "from umf_ros import cli\nsys.argv = ['umf', '--help']\ntry:\n    cli.main()\nexcept SystemExit:\n    pass"
     )
-    assert imported_after(show_help, ["torch", "open3d", "gtsam", "cv2", "matplotlib", "rclpy", "scipy"]) == []
+    assert imported_after(show_help, ["torch", "open3d", "gtsam", "cv2", "faiss", "matplotlib", "rclpy", "scipy"]) == []
 
 
 def test_a_rover_with_openvino_carries_no_torch() -> None:

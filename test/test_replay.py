@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import multiprocessing
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,11 +24,12 @@ from umf_ros.core.errors import OutputError
 from umf_ros.core.frames import Frame
 from umf_ros.detector import Detection, LoopDetector
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.replay import FAULTS, Replay
+from umf_ros.replay import FAULTS, Replay, recover_run
 from umf_ros.sensors.decode import OdometrySample
 
-TABLES = "candidates.csv closures.csv config.yaml descriptors.f16 inliers.csv keyframes.csv".split()
-TABLES += ["latencies.csv", "summary.json"]
+TABLES = "candidates.csv closures.csv config.yaml inliers.csv keyframes.csv".split()
+TABLES += ["latencies.csv", "run.sqlite", "summary.json"]
+KILLED_AT = 8
 GRAPH = ["graph.g2o", "graph_verdicts.csv", "trajectory_odometry.tum", "trajectory_optimized.tum"]
 
 
@@ -107,11 +111,46 @@ def test_a_run_that_is_stopped_is_as_complete_as_far_as_it_went(
     assert read_tum(folder / "trajectory_odometry.tum").stamps_ns[-1] <= frames_of(stream)[7].stamp_ns
 
 
-def test_rows_are_on_disk_while_the_run_goes_on(folder: Path, settings: Settings, stream: Stream) -> None:
+def test_a_killed_replay_is_exported_like_one_that_was_stopped(
+    tmp_path: Path, settings: Settings, stream: Stream
+) -> None:
+    """The process of the killed one ends without any of its own code being run again."""
+    for name in ("stopped", "killed"):
+        (tmp_path / name).mkdir()
+    stopped = replay_of(tmp_path / "stopped", settings)
+    process = multiprocessing.get_context("fork").Process(
+        target=replay_and_die, args=(tmp_path / "killed", settings, stream)
+    )
+    process.start()
+    process.join(60)
+    assert process.exitcode == -signal.SIGKILL and names_in(tmp_path / "killed") != TABLES
+    found = 0
+    for detection in stopped.run(stream):
+        found += detection.keyframe is not None
+        if found == KILLED_AT:
+            break
+    stopped.finish({})
+    assert recover_run(tmp_path / "killed") and not recover_run(tmp_path / "killed")
+    for name in [
+        name for name in TABLES + GRAPH if name.endswith((".csv", ".tum", ".g2o")) and name != "latencies.csv"
+    ]:
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "stopped" / name).read_bytes(), name
+    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("killed", "stopped")]
+    for key in ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected", "weights"):
+        assert summaries[0][key] == summaries[1][key], key
+    assert summaries[0]["interrupted"] is True
+
+
+def replay_and_die(folder: Path, settings: Settings, stream: Stream) -> None:
     found = 0
     for detection in replay_of(folder, settings).run(stream):
         found += detection.keyframe is not None
-        assert len(keyframes_in(folder)) == found
+        if found == KILLED_AT:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_folder_without_a_killed_run_is_left_alone(tmp_path: Path) -> None:
+    assert not recover_run(tmp_path) and list(tmp_path.iterdir()) == []
 
 
 def test_without_odometry_there_is_no_graph_and_it_says_so(folder: Path, settings: Settings, stream: Stream) -> None:
@@ -160,7 +199,8 @@ def test_a_replay_that_was_cut_off_ends_like_one_that_was_not(
     for count, _ in enumerate(cut.run(stream), 1):
         if count == frames_done:
             break
-    cut._detector.database.close()  # the lock goes with the process, and nothing else is left of it
+    cut._detector.database.close()  # the locks go with the process, and nothing else is left of it
+    cut._recorder._file._file.close()
     resumed = Replay(tmp_path / "cut", settings, LoopDetector(settings, ThumbnailEmbedder()), resume=True)
     list(resumed.run(stream))
     resumed.finish({})
@@ -189,7 +229,7 @@ def test_the_same_frames_give_the_same_tables(tmp_path: Path, settings: Settings
         replay = replay_of(tmp_path / name, settings)
         list(replay.run(stream))
         replay.finish({})
-    for table in set(TABLES + GRAPH) - {"summary.json", "latencies.csv"}:
+    for table in set(TABLES + GRAPH) - {"summary.json", "latencies.csv", "run.sqlite"}:  # with times
         assert (tmp_path / "one" / table).read_bytes() == (tmp_path / "two" / table).read_bytes(), table
 
 
@@ -243,7 +283,7 @@ def test_a_full_disk_ends_the_replay_after_what_was_found_is_kept(
     assert len(keyframes_in(tmp_path / "run")) == 1
 
 
-def test_a_fault_of_ours_at_one_frame_costs_that_frame_alone(
+def test_an_internal_error_at_one_frame_costs_that_frame_alone(
     stream: Stream, settings: Settings, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, broken = frames_of(stream), frames_of(stream)[4].stamp_ns
@@ -274,6 +314,6 @@ def test_the_command_says_so_in_one_line_and_fails(
 
     monkeypatch.setattr(LoopDetector, "process", faulty)
     ended = umf("replay", bag, "--embedder", "thumbnail", "--out", tmp_path / "out")
-    assert ended.status == 1 and "frames were passed over for a fault of ours: please report " in ended.text
+    assert ended.status == 1 and "frames skipped after internal errors: please report " in ended.text
     assert "Traceback" not in ended.text
     assert (tmp_path / "out" / "latest" / "report.html").exists()

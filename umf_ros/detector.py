@@ -227,7 +227,7 @@ class LoopDetector:
         if not stored:
             row = self.database.add(keyframe)
             if self.inter_robot is not None:
-                self.inter_robot.link.remembered(row)
+                self.inter_robot.link.enqueue(row)
         self._submaps.remember(keyframe)
 
     def resume(self, frame: Frame) -> bool:

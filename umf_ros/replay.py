@@ -1,50 +1,89 @@
-"""Offline loop detection on a recording, by the same detector as the live node."""
+"""A recording through the same stages as on the rover, mapping or localising in a map."""
 
 from __future__ import annotations
 
 import traceback
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from umf_ros.core.config import Settings
+import numpy as np
+
+from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
+from umf_ros.core.geometry import to_quaternion
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector
+from umf_ros.localizer import Localization, Localizer, read_poses
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.runs.writer import RunRecorder
+from umf_ros.runs.run_file import NAME, RunFile
+from umf_ros.runs.writer import RunRecorder, write_summary
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 FAULTS = "faults.log"
 WARM_UP = 12
-"""So many of the last keyframes before an interruption are looked at again: twice what verification remembers."""
+"""Keyframes before an interruption that are processed again: twice the number that verification remembers."""
 FLEET_PATIENCE_S = 30.0
-"""So long a replay waits at its end until a fleet's server has its places; what it then has not is pushed next time."""
+"""Time that a replay waits at its end for a fleet's server; the next run sends the places that are still waiting."""
+
+
+@dataclass
+class LocalizationCounts:
+    """Counts of a localising run, as in its summary.
+
+    Attributes:
+        keyframes: of the run.
+        keyframes_until_found: up to the first known pose; None while there is none.
+        located: keyframes with a known pose.
+        relocalised: number of times that a pose was found, or another one than before.
+        agreed, contradicted: closures that agreed with the pose, or did not.
+    """
+
+    keyframes: int = 0
+    keyframes_until_found: int | None = None
+    located: int = 0
+    relocalised: int = 0
+    agreed: int = 0
+    contradicted: int = 0
 
 
 class Replay:
-    """Feeds frames to the detector, odometry and closures to the pose graph, and fills a run folder.
+    """Feed frames to the detector, odometry and closures to the pose graph, and fill a run folder.
 
-    The graph gets what the live back-end gets: every message of the odometry, and one closure after the other.
+    The graph gets the inputs of the live back-end: every odometry message, and one closure after the other. With
+    settings of mode localization, a localizer in the map takes the place of the graph.
 
     Args:
         folder: run folder.
         settings: all settings.
         detector: made with these settings, or over the store of the run that is resumed.
-        resume: go on where an earlier replay of the same recording into this folder was cut off.
+        resume: continue an earlier replay of the same recording into this folder.
 
     Attributes:
-        faults: frames that were passed over for a fault of the program; `faults.log` in the folder says which.
+        faults: frames that were skipped after internal errors; `faults.log` in the folder has the tracebacks.
+        counts: of a localising run.
+
+    Raises:
+        UmfError: the map has not been solved, or is damaged.
     """
 
     def __init__(self, folder: Path, settings: Settings, detector: LoopDetector, resume: bool = False) -> None:
         self._folder = folder
         self._detector = detector
+        self._localizer: Localizer | None = None
+        if settings.localizing:
+            self._localizer = Localizer(read_poses(Path(settings.map)), settings.pose_graph)
         self._graph = PoseGraph(settings.pose_graph)
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
-        self._feed = OdometrySessionSplitter(self._graph)
+        self._feed = OdometrySessionSplitter(self._localizer or self._graph)
         self.faults = 0
+        self.counts = LocalizationCounts()
+        self._found: list[Localization] = []
         self._has_odometry = False
         self._done = len(self._recorder.recorded) if resume else 0
         self._earlier: dict[int, list[LoopClosure]] = defaultdict(list)
@@ -52,7 +91,7 @@ class Replay:
             self._earlier[closure.query_stamp_ns].append(closure)
 
     def run(self, stream: Iterable[Frame | OdometrySample]) -> Iterator[Detection]:
-        """Process a recording's stream, yielding what became of each frame; stop iterating to stop the run.
+        """Process a recording's stream and yield the result of each frame; stop iterating to stop the run.
 
         Raises:
             OutputError: the disk is full.
@@ -60,17 +99,19 @@ class Replay:
         for item in self._detector.prefetch(stream, lambda: self._done <= WARM_UP):
             if isinstance(item, OdometrySample):
                 self._has_odometry = True
+                self._recorder.record_odometry(item.stamp_ns, item.odom_T_body)
                 self._feed.take(item.stamp_ns, item.odom_T_body)
                 continue
             if self._done > WARM_UP:
-                yield self._pass_over(item)
+                yield self._skip_known(item)
                 continue
             detection = self._process(item)
             if detection.keyframe is not None and self._done:
                 self._done -= 1
             self._recorder.record(item, detection)
-            for closure in detection.closures:
-                self._graph.add_closure(closure)
+            self._add_closures(detection.closures)
+            if self._localizer is not None and detection.keyframe is not None:
+                self._record_pose(self._localizer)
             while (inter_closure := self._detector.meet()) is not None:
                 self._recorder.record_encounter(inter_closure)
             yield detection
@@ -78,7 +119,7 @@ class Replay:
                 raise detection.fault
 
     def _process(self, frame: Frame) -> Detection:
-        """What became of a frame: hours of a recording are not given up for one that we cannot deal with."""
+        """Return the result of a frame, without a keyframe after an internal error."""
         try:
             return self._detector.process(frame)
         except UmfError:
@@ -89,38 +130,115 @@ class Replay:
                 file.write(f"frame {frame.stamp_ns}\n{traceback.format_exc()}\n")
             return Detection(frame.stamp_ns)
 
+    def _add_closures(self, closures: Iterable[LoopClosure]) -> None:
+        for closure in closures:
+            (self._localizer or self._graph).add_closure(closure)
+
     def raise_if_frames_failed(self) -> None:
-        """Say at the end, when everything else is written, that frames were passed over.
+        """Report skipped frames, once everything else is written.
 
         Raises:
-            UmfError: some were.
+            UmfError: frames were skipped after internal errors.
         """
         if self.faults:
             log = self._folder / FAULTS
-            raise UmfError(f"{self.faults} frames were passed over for a fault of ours: please report {log}")
+            raise UmfError(f"{self.faults} frames skipped after internal errors: please report {log}")
 
     def graph_counts(self) -> dict[str, int]:
-        """How many closures the graph has in which state so far; none without odometry."""
-        counts = self._graph.verdict_counts() if self._has_odometry else {}
-        return {state.value: count for state, count in counts.items()}
+        """Number of closures by state so far; none without odometry."""
+        if self._localizer is not None:
+            counts = self._localizer.counts
+            return {"accepted": counts["agreed"], "rejected": counts["contradicted"], "pending": counts["searching"]}
+        verdicts = self._graph.verdict_counts() if self._has_odometry else {}
+        return {state.value: count for state, count in verdicts.items()}
 
-    def _pass_over(self, frame: Frame) -> Detection:
-        """Take note of a frame that was dealt with before, and of its closures."""
+    @property
+    def newest_pose(self) -> Localization | None:
+        """The newest pose in the map; None while it is unknown."""
+        return self._localizer.estimate() if self._localizer is not None else None
+
+    def _skip_known(self, frame: Frame) -> Detection:
+        """Restore the state after a frame that was processed before, with its closures."""
         self._recorder.count(frame)
         if self._detector.resume(frame):
             self._done -= 1
-            for closure in self._earlier.get(frame.stamp_ns, ()):
-                self._graph.add_closure(closure)
+            self._add_closures(self._earlier.get(frame.stamp_ns, ()))
         return Detection(frame.stamp_ns)
 
+    def _record_pose(self, localizer: Localizer) -> None:
+        """Write the pose of the newest keyframe."""
+        counts, found = self.counts, localizer.estimate()
+        counts.keyframes += 1
+        counts.relocalised = localizer.relocalised
+        counts.agreed, counts.contradicted = localizer.counts["agreed"], localizer.counts["contradicted"]
+        if found is None:
+            return
+        counts.located += 1
+        if counts.keyframes_until_found is None:
+            counts.keyframes_until_found = counts.keyframes
+        if self._found and found.stamp_ns <= self._found[-1].stamp_ns:
+            return  # its clock was set back
+        self._found.append(found)
+        numbers = [*found.map_T_body[:3, 3], *to_quaternion(found.map_T_body), *np.sqrt(np.diag(found.covariance))]
+        self._recorder.record_pose([found.stamp_ns, *(f"{number:.6g}" for number in (*numbers, found.probability))])
+
     def finish(self, drops: Mapping[str, int]) -> bool:
-        """Write the summary, and trajectories and graph where there was odometry; returns whether there was."""
+        """Export the files of the run.
+
+        Returns:
+            Whether there is a trajectory: of the graph, where there was odometry, or in the map.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
         if self._detector.inter_robot is not None:
             for inter_closure in self._detector.inter_robot.rest(FLEET_PATIENCE_S):
                 self._recorder.record_encounter(inter_closure)
-        self._recorder.write_summary(drops)
+        if self._localizer is not None:
+            has_trajectory = self._write_localization()
+        elif has_trajectory := self._has_odometry:
+            self._graph.write_results(self._folder)
+        known: dict[str, Any] = {} if self._localizer is None else {"localization": asdict(self.counts)}
+        write_summary(self._folder, self._recorder.summary(drops) | known)
         self._recorder.close()
         self._detector.close()
-        if self._has_odometry:
-            self._graph.write_results(self._folder)
-        return self._has_odometry
+        return has_trajectory
+
+    def _write_localization(self) -> bool:
+        if self._found:
+            stamps = np.array([one.stamp_ns for one in self._found], np.int64)
+            poses = np.stack([one.map_T_body for one in self._found])
+            write_tum(self._folder / "trajectory_in_map.tum", Trajectory(stamps, poses))
+        return bool(self._found)
+
+
+def recover_run(folder: Path) -> bool:
+    """Export the files of a run whose process was killed.
+
+    Returns:
+        Whether there was such a run in the folder.
+
+    Raises:
+        UmfError: the file of the run is damaged, or another process writes it.
+        OutputError: the folder cannot be written.
+    """
+    if not (folder / NAME).is_file() or not (folder / "config.yaml").is_file():
+        return False
+    with closing(RunFile(folder, read_only=True)) as file:
+        facts = file.facts()
+        if facts.get("exported") and (folder / "summary.json").is_file():
+            return False
+        settings, inputs = load_settings(folder / "config.yaml"), list(file.graph_inputs())
+    recorder = RunRecorder(folder, settings, str(facts.get("weights", "")))
+    write_summary(folder, recorder.summary({}) | {"interrupted": True})
+    recorder.close()
+    graph = PoseGraph(settings.pose_graph)
+    feed = OdometrySessionSplitter(graph)
+    for item in inputs:
+        if isinstance(item, LoopClosure):
+            graph.add_closure(item)
+        else:
+            feed.take(*item)
+    if not all(isinstance(item, LoopClosure) for item in inputs):
+        graph.write_results(folder)
+    return True

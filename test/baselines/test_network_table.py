@@ -10,8 +10,7 @@ import torch
 from tiny_worlds import some_scan
 
 from umf_ros.baselines.netvlad import NetVlad
-from umf_ros.baselines.place_inputs import PreparedView, some_points, stack
-from umf_ros.baselines.place_network import EARLY, VOXELS, PlaceInput
+from umf_ros.baselines.place_network import EARLY, VOXELS, PlaceInput, PreparedView, some_points, stack
 from umf_ros.baselines.place_networks import (
     NETWORKS,
     load_place_network,

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import make_keyframe
-from domain_pairs import ELSEWHERE, SAME, TURNED, Pair, Place, pairs_of
 from domains import Outcome, summary
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.lab.simulation.domains import Domain, DomainScan
+from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, SAME, TURNED, Pair, Place, pairs_of
 from umf_ros.lab.simulation.domains.sweeps import Sweep
 
 OPEN, INDOORS = Domain("spin16", "street", "rover"), Domain("spin16", "corridor", "rover")

@@ -134,7 +134,7 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
 
 
 def test_an_exported_network_can_be_read_by_its_runtime(somewhere_empty: Path) -> None:
-    from umf_ros.embedding.export import openvino_core
+    from umf_ros.embedding.runtimes import openvino_core
 
     ended = umf("export", "net.xml")
     assert ended.status == 0 and left_behind(somewhere_empty) == ["net.bin", "net.xml"]

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 from recordings import CALIBRATION
-from scenes import landscape, pose_at, take, without_image
 
 from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.comparison import (
@@ -25,6 +24,7 @@ from umf_ros.comparison import (
 from umf_ros.core.config import Verification
 from umf_ros.core.errors import SensorFileError
 from umf_ros.core.geometry import make_pose
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image
 from umf_ros.verification import Verifier
 
 GROUND = landscape(20)

@@ -35,7 +35,7 @@ def contents(folder: Path) -> set[str]:
 
 
 def test_a_file_appears_complete_or_not_at_all(tmp_path: Path) -> None:
-    path = tmp_path / "new" / "a.json"
+    path = tmp_path / "a.json"
     with atomic_write(path) as part:
         part.write_text("one")
         assert not path.exists()

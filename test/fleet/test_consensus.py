@@ -7,7 +7,7 @@ from conftest import make_keyframe, make_pose
 
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, invert
-from umf_ros.fleet.consensus import EncounterPair, FleetConsensus
+from umf_ros.fleet.inter_robot_closures import FleetConsensus, InterRobotPair
 
 DRIFT = 0.05
 MEETING = make_pose(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([30.0, -4, 0]))
@@ -18,12 +18,12 @@ def at(metres: float) -> Array:
     return make_pose(np.eye(3), np.array([metres, 0.1 * metres, 0]))
 
 
-def pair(metres: float, off_m: float = 0.0, session: int = -1) -> EncounterPair:
+def pair(metres: float, off_m: float = 0.0, session: int = -1) -> InterRobotPair:
     """Two rovers at one place, `metres` along their common way, in odometry frames of their own."""
     query = replace(make_keyframe(100 + metres, metres), odom_T_body=at(metres))
     match = replace(make_keyframe(metres, metres, session=session), odom_T_body=MEETING @ at(metres))
     wrong = make_pose(np.eye(3), np.array([off_m, 0, 0]))
-    return EncounterPair(query, match, LoopClosure(query.stamp_ns, match.stamp_ns, wrong, np.eye(6)))
+    return InterRobotPair(query, match, LoopClosure(query.stamp_ns, match.stamp_ns, wrong, np.eye(6)))
 
 
 def test_the_second_closure_of_another_place_confirms_the_first() -> None:
@@ -39,7 +39,7 @@ def test_closures_of_one_place_confirm_nothing() -> None:
     assert [consensus.confirm(pair(metres)) for metres in (0, 2, 4, 6)] == [[]] * 4
 
 
-def test_a_wrong_one_waits_for_ever_and_does_no_harm() -> None:
+def test_a_wrong_closure_stays_pending() -> None:
     consensus = FleetConsensus(DRIFT)
     wrong, *right = pair(0, off_m=9), pair(10), pair(20)
     assert consensus.confirm(wrong) == []
@@ -47,7 +47,7 @@ def test_a_wrong_one_waits_for_ever_and_does_no_harm() -> None:
     assert consensus.confirm(pair(30, off_m=-8)) == []
 
 
-def test_neither_another_session_nor_a_long_way_nor_missing_odometry_confirms() -> None:
+def test_another_session_a_long_path_or_missing_odometry_confirms_nothing() -> None:
     consensus = FleetConsensus(DRIFT)
     assert not consensus.agree(pair(0), pair(12, session=-2))
     assert not consensus.agree(pair(0), pair(300))

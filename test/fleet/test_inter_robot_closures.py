@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from conftest import unit
 from fleets import IDENTITY, rover_places, settings
-from postgres import PostgresServer
-from scenes import landscape, pose_at, take
 
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import ConfigError
@@ -15,6 +13,8 @@ from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.detector import LoopDetector
 from umf_ros.fleet.inter_robot_closures import UNCONFIRMED, InterRobotClosure, InterRobotMatcher
+from umf_ros.lab.live.postgres import PostgresServer
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 
 GROUND = landscape(20)
 PLACES_M = (-24.0, -14.0)
@@ -40,14 +40,14 @@ def drive(server: PostgresServer, rover: str) -> list[InterRobotClosure]:
     places = rover_places(server, rover)
     inter_robot = InterRobotMatcher(Settings(database=settings(server, rover)), places.store, IDENTITY)
     for place, pose in enumerate(poses_of(rover)):
-        inter_robot.link.remembered(places.add(seen(pose, 10.0 * place, place, 10.0 * place)))
+        inter_robot.link.enqueue(places.add(seen(pose, 10.0 * place, place, 10.0 * place)))
     found = list(inter_robot.rest(60))
     inter_robot.close()
     places.close()
     return found
 
 
-def test_two_rovers_that_come_by_two_places_learn_where_they_are(server: PostgresServer) -> None:
+def test_two_rovers_at_two_common_places_get_closures(server: PostgresServer) -> None:
     assert drive(server, "bea") == []
     first, second = drive(server, "ada")
     assert (first.own, first.robot) == ("ada", "bea")

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from conftest import make_keyframe
 from fleets import IDENTITY, administrator, keyframes, rover_places, settings, stored
-from postgres import PASSWORD, CuttableLink, PostgresServer, free_port
 
 from umf_ros.core.frames import Keyframe
 from umf_ros.fleet.link import Answer, FleetLink
-from umf_ros.fleet.migrations import add_rover, migrate
+from umf_ros.fleet.server import add_rover, migrate
+from umf_ros.lab.live.postgres import PASSWORD, CuttableLink, PostgresServer, free_port
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions
 
@@ -24,7 +24,7 @@ def link_of(places: PlaceDatabase, server: PostgresServer, rover: str, port: int
 
 def drive(places: PlaceDatabase, link: FleetLink, driven: list[Keyframe]) -> None:
     for keyframe in driven:
-        link.remembered(places.add(keyframe))
+        link.enqueue(places.add(keyframe))
 
 
 def until(holds: Callable[[], bool], seconds: float = 20) -> None:
@@ -41,7 +41,7 @@ def answers_of(link: FleetLink) -> list[Answer]:
     return found
 
 
-def test_what_was_stored_before_there_was_a_fleet_goes_there_too(server: PostgresServer, tmp_path: Path) -> None:
+def test_keyframes_stored_before_the_fleet_are_pushed(server: PostgresServer, tmp_path: Path) -> None:
     path = tmp_path / "ada.sqlite"
     alone = PlaceDatabase(settings(server, "ada", path).model_copy(update={"backend": "sqlite"}), *IDENTITY)
     for keyframe in keyframes(40):
@@ -55,7 +55,7 @@ def test_what_was_stored_before_there_was_a_fleet_goes_there_too(server: Postgre
     assert [second for _, second in stored(server)] == list(range(40))
 
 
-def test_places_of_another_rover_are_found_with_numbers_that_are_nobodys(server: PostgresServer) -> None:
+def test_places_of_another_rover_are_found_with_negative_sessions(server: PostgresServer) -> None:
     bea_places, ada_places = rover_places(server, "bea"), rover_places(server, "ada")
     bea = link_of(bea_places, server, "bea")
     drive(bea_places, bea, keyframes(10))
@@ -71,7 +71,7 @@ def test_places_of_another_rover_are_found_with_numbers_that_are_nobodys(server:
     ada.close(), bea.close()
 
 
-def test_a_link_that_is_cut_again_and_again_loses_nothing(server: PostgresServer, tmp_path: Path) -> None:
+def test_repeated_disconnections_lose_no_keyframe(server: PostgresServer, tmp_path: Path) -> None:
     proxy = CuttableLink(server.port)
     places = rover_places(server, "ada", tmp_path / "ada.sqlite")
     link = link_of(places, server, "ada", proxy.port)
@@ -85,7 +85,7 @@ def test_a_link_that_is_cut_again_and_again_loses_nothing(server: PostgresServer
     proxy.close()
 
 
-def test_a_rover_without_a_link_drives_on_and_pushes_after_the_next_start(
+def test_a_disconnected_rover_continues_and_pushes_after_the_next_start(
     server: PostgresServer, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "ada.sqlite"
@@ -116,7 +116,7 @@ def test_a_keyframe_enters_the_outbox_with_the_store_or_not_at_all(server: Postg
     assert places.store.outgoing(10) == [1] and places.store.waiting() == 1
 
 
-def test_sessions_deleted_before_they_were_pushed_hold_nobody_up(server: PostgresServer, tmp_path: Path) -> None:
+def test_sessions_deleted_before_they_were_pushed_block_nothing(server: PostgresServer, tmp_path: Path) -> None:
     path = tmp_path / "ada.sqlite"
     places = rover_places(server, "ada", path)
     for second in range(6):
@@ -132,7 +132,7 @@ def test_sessions_deleted_before_they_were_pushed_hold_nobody_up(server: Postgre
     link.close()
 
 
-def test_what_cannot_be_read_of_another_rover_is_passed_over(server: PostgresServer) -> None:
+def test_unreadable_keyframes_of_another_rover_are_skipped(server: PostgresServer) -> None:
     bea_places, ada_places = rover_places(server, "bea"), rover_places(server, "ada")
     bea = link_of(bea_places, server, "bea")
     drive(bea_places, bea, keyframes(3))

@@ -7,36 +7,34 @@ import psycopg
 import pytest
 from conftest import make_keyframe
 from fleets import IDENTITY, administrator, stored
-from postgres import PASSWORD, PostgresServer, free_port
 
 from umf_ros.core.errors import UmfError
-from umf_ros.fleet.migrations import MIGRATIONS, add_rover, migrate
-from umf_ros.fleet.server import FleetServer, LinkError, OutgoingPlace
-from umf_ros.places.packing import pack, unpack
+from umf_ros.core.frames import Keyframe
+from umf_ros.fleet.server import MIGRATIONS, FleetServer, LinkError, add_rover, migrate
+from umf_ros.lab.live.postgres import PASSWORD, PostgresServer, free_port
+from umf_ros.places.packing import unpack
 
 STORE = uuid4()
 
 
-def place(second: int, session: int = 0) -> OutgoingPlace:
-    keyframe = make_keyframe(second, seed=second, session=session)
-    descriptor = keyframe.embedding.descriptor
-    return OutgoingPlace(session, keyframe.stamp_ns, keyframe.path_length_m, descriptor, pack(keyframe))
+def place(second: int, session: int = 0) -> Keyframe:
+    return make_keyframe(second, seed=second, session=session)
 
 
 def connect(server: PostgresServer, rover: str, store: UUID = STORE) -> FleetServer:
     return FleetServer(server.address(rover), store, IDENTITY)
 
 
-def test_what_one_rover_pushes_the_other_finds_and_reads(server: PostgresServer) -> None:
+def test_one_rover_finds_and_reads_keyframes_of_another(server: PostgresServer) -> None:
     ada, bea = connect(server, "ada"), connect(server, "bea")
     ada.push([place(second) for second in range(20)])
-    found = bea.nearest(place(7).descriptor, 3)
+    found = bea.nearest(place(7).embedding.descriptor, 3)
     key, similarity = found[0]
     assert (key.robot, key.stamp_ns, key.store) == ("ada", 7 * 10**9, STORE) and len(found) == 3
     assert similarity == pytest.approx(1, abs=2e-3)
     data = bea.data(key)
     assert data is not None and unpack(data).stamp_ns == 7 * 10**9
-    assert ada.nearest(place(7).descriptor, 3) == []  # nobody else has been there
+    assert ada.nearest(place(7).embedding.descriptor, 3) == []  # nobody else has been there
     assert ada.robot == "ada"
 
 
@@ -63,7 +61,7 @@ def test_pushing_twice_stores_once_and_two_stores_of_one_rover_are_kept_apart(se
         "UPDATE fleet SET embedder = 'mine'",
     ],
 )
-def test_a_rover_changes_nothing_of_anybody(server: PostgresServer, statement: str) -> None:
+def test_a_rover_cannot_change_rows_of_others(server: PostgresServer, statement: str) -> None:
     connect(server, "ada").push([place(1)])
     with psycopg.connect(server.address("bea")) as connection, pytest.raises(psycopg.errors.InsufficientPrivilege):
         connection.execute(statement)
@@ -81,7 +79,7 @@ def test_passwords_reach_neither_log_nor_message(server: PostgresServer, monkeyp
     assert "wrong, and secret" not in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_server_that_is_not_there_is_one_line() -> None:
+def test_an_unreachable_server_is_one_line() -> None:
     with pytest.raises(LinkError, match="cannot be reached") as caught:
         FleetServer(f"postgresql://ada@127.0.0.1:{free_port()}/postgres", STORE, IDENTITY)
     assert "\n" not in str(caught.value)
@@ -107,8 +105,8 @@ def test_the_graph_finds_what_an_exhaustive_search_finds(server: PostgresServer,
     rows = rng.standard_normal((2000, 16)).astype(np.float32)
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     ada, bea = connect(server, "ada"), connect(server, "bea")
-    ada.push([OutgoingPlace(0, i, float("nan"), row, b"") for i, row in enumerate(rows[:1000])])
-    bea.push([OutgoingPlace(0, i, 1.0, row, b"") for i, row in enumerate(rows[1000:])])
+    for rover, part in ((ada, rows[:1000]), (bea, rows[1000:])):
+        rover.push([make_keyframe(i * 1e-9, descriptor=row) for i, row in enumerate(part)])
     hits = 0
     for query in rows[:20]:
         true = set(np.argsort(-(rows[1000:] @ query))[:10].tolist())

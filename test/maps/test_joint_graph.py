@@ -8,8 +8,9 @@ import pytest
 from maps_made import MadeSession, made_map, on_circle, tie
 
 from umf_ros.core.geometry import transform
+from umf_ros.localizer import read_poses
 from umf_ros.maps.joint_graph import JointMap, solve
-from umf_ros.maps.outputs import read_poses, write_results
+from umf_ros.maps.outputs import write_results
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.truth import absolute_trajectory_error
 
@@ -47,7 +48,7 @@ def test_without_closures_only_one_of_them_is_in_the_map(tmp_path: Path) -> None
     assert len(joint.sessions[0].stamps) == 0
 
 
-def test_a_session_without_odometry_is_tied_in_by_closures(tmp_path: Path) -> None:
+def test_closures_join_a_session_without_odometry(tmp_path: Path) -> None:
     made = two(odometry=False)
     joint = solve(made_map(tmp_path / "map", list(made)))
     assert joint.sessions[1].joined and not joint.sessions[1].session.odometry
@@ -55,7 +56,7 @@ def test_a_session_without_odometry_is_tied_in_by_closures(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("wrong", [(20,), (20, 23, 26, 29)])
-def test_wrong_closures_between_sessions_are_not_believed(tmp_path: Path, wrong: tuple[int, ...]) -> None:
+def test_wrong_closures_between_sessions_are_rejected(tmp_path: Path, wrong: tuple[int, ...]) -> None:
     """One, or many of one place that repeats: the place is 25 m further on in truth."""
     first, second = two()
     second.between += [tie((0, DAY_NS), first, second, metre + 25, metre) for metre in wrong]
@@ -73,24 +74,21 @@ def test_wrong_closures_alone_join_nothing(tmp_path: Path) -> None:
 
 
 def test_closures_within_are_moved_to_the_maps_clock(tmp_path: Path) -> None:
-    from umf_ros.runs.tables import CLOSURES, CsvTable, closure_row
+    from umf_ros.runs.tables import CLOSURES, closure_row, write_table
 
     made = [MadeSession("first", 0, 60), MadeSession("round", 0, 160)]
     folder = made_map(tmp_path / "map", made)
-    table = CsvTable(folder.folder_of("round") / "closures.csv", CLOSURES)
     own = [tie((0, 0), made[1], replace(made[1], first_m=-100), metre) for metre in (5, 20, 35, 50)]
-    table.append(
-        [
-            closure_row(replace(c, query_stamp_ns=made[1].stamp(m + 100)), 0.9)
-            for c, m in zip(own, (5, 20, 35, 50), strict=True)
-        ]
-    )
-    table.close()
+    rows = [
+        closure_row(replace(c, query_stamp_ns=made[1].stamp(m + 100)), 0.9)
+        for c, m in zip(own, (5, 20, 35, 50), strict=True)
+    ]
+    write_table(folder.folder_of("round") / "closures.csv", CLOSURES, rows)
     joint = solve(folder)
     assert len(joint.within) == 4 and {v.state for v in joint.within} == {State.ACCEPTED}
 
 
-def test_results_say_whose_everything_is(tmp_path: Path) -> None:
+def test_results_are_listed_by_session(tmp_path: Path) -> None:
     made = two()
     folder = made_map(tmp_path / "map", list(made))
     joint = solve(folder)

@@ -24,7 +24,7 @@ def test_a_recording_made_later_keeps_its_clock(tmp_path: Path) -> None:
     assert folder.shift_for(folder.sessions[0].first_ns - 10 * DAY_NS) == 11 * DAY_NS  # an older one, added later
 
 
-def test_a_map_is_read_back_and_knows_its_recordings(tmp_path: Path) -> None:
+def test_a_map_is_read_back_and_recognises_its_recordings(tmp_path: Path) -> None:
     made = made_map(tmp_path / "map", [MadeSession("a", 0, 30), MadeSession("b", 0, 20)])
     folder = MapFolder.open(tmp_path / "map")
     assert folder.sessions == made.sessions
@@ -40,7 +40,7 @@ def test_settings_of_the_first_recording_stay(tmp_path: Path) -> None:
     assert again.settings.loop.top_k == 7
 
 
-def test_what_is_no_map_is_told_in_one_line(tmp_path: Path) -> None:
+def test_other_folders_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UmfError, match="holds no map"):
         MapFolder.open(tmp_path)
     (tmp_path / "map.json").write_text("{")

@@ -39,7 +39,7 @@ def test_a_graph_gets_it_on_another_clock_and_in_its_sessions() -> None:
     assert graph.session_spans() == [(70 * SECOND_NS, 72 * SECOND_NS), (73 * SECOND_NS, 75 * SECOND_NS)]
 
 
-def test_what_was_followed_from_scan_to_scan_has_its_own_covariances_and_breaks(tmp_path: Path) -> None:
+def test_tracked_poses_keep_their_covariances_and_sessions(tmp_path: Path) -> None:
     log = OdometryLog()
     for stamp, x, covariance in ((0, 0, None), (1, 1, 0.01), (5, 0, None), (6, 1, 0.04)):
         log.append(stamp * SECOND_NS, at(x), None if covariance is None else covariance * np.eye(6))
@@ -49,6 +49,6 @@ def test_what_was_followed_from_scan_to_scan_has_its_own_covariances_and_breaks(
     assert graph.session_spans() == [(0, SECOND_NS), (5 * SECOND_NS, 6 * SECOND_NS)]
 
 
-def test_a_missing_log_is_told(tmp_path: Path) -> None:
+def test_a_missing_log_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UmfError, match=r"odometry\.npz"):
         OdometryLog.load(tmp_path)

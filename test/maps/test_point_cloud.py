@@ -16,12 +16,12 @@ def ground(offset_m: float, noise_m: float = 0.01) -> MapCloud:
     return MapCloud(points, np.repeat(np.array([0, 1], np.uint8), 6000))
 
 
-def test_sessions_that_lie_beside_each_other_make_thick_surfaces() -> None:
+def test_misaligned_sessions_make_thick_surfaces() -> None:
     together, apart = ground(0.0).thickness(), ground(0.3).thickness()
     assert together < 0.06 < 0.12 < apart
 
 
-def test_what_one_session_alone_saw_says_nothing_about_alignment() -> None:
+def test_a_single_session_has_no_thickness() -> None:
     cloud = ground(0.0)
     alone = MapCloud(cloud.points, np.zeros(len(cloud.points), np.uint8))
     assert np.isnan(alone.thickness())
@@ -48,7 +48,7 @@ def test_files_are_read_back_as_they_were(tmp_path: Path) -> None:
         np.testing.assert_array_equal(columns["session"], cloud.sessions)
 
 
-def test_the_picture_shows_what_was_seen() -> None:
+def test_the_picture_shows_the_ground() -> None:
     heights = HeightMap(np.array([[0.0, 0.0], [10.0, 4.0]]))
     assert heights.png() is None
     heights.add(ground(0.0).points.astype(float))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scenes import landscape, pose_at, take
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, relative
-from umf_ros.maps.tracking import track
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take
+from umf_ros.maps.odometry_log import track
 
 GROUND = landscape(20)
 
@@ -19,7 +19,7 @@ def drive(count: int) -> tuple[list[Keyframe], list[Array]]:
     return [take(GROUND, pose, 10.0 + step) for step, pose in enumerate(poses)], poses
 
 
-def test_neighbours_are_chained_to_a_way() -> None:
+def test_consecutive_keyframes_are_tracked() -> None:
     keyframes, poses = drive(4)
     log, placed = track(keyframes, Verification())
     assert [one.session for one in placed] == [0, 0, 0, 0]
@@ -30,7 +30,7 @@ def test_neighbours_are_chained_to_a_way() -> None:
     assert len(log.trajectory) == 4
 
 
-def test_where_the_chain_breaks_another_way_begins() -> None:
+def test_a_gap_begins_a_session() -> None:
     keyframes, _ = drive(2)
     elsewhere = take(landscape(99), pose_at(landscape(99), -10.0, 5.0, 40.0), 12.0)
     _, placed = track([*keyframes, elsewhere], Verification())

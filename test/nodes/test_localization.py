@@ -19,8 +19,9 @@ from std_srvs.srv import Trigger
 
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import relative
+from umf_ros.localizer import read_poses
 from umf_ros.maps.joint_graph import solve
-from umf_ros.maps.outputs import read_poses, write_results
+from umf_ros.maps.outputs import write_results
 from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, to_pose, to_time
 from umf_ros.sensors.decode import decode_pose
 

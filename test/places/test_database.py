@@ -82,7 +82,7 @@ def test_best_match_comes_first_and_weak_ones_can_be_cut() -> None:
     assert len(places.query(query, Loop(min_similarity=0.99))) == 1
 
 
-def test_memory_is_bounded_and_the_disk_remembers() -> None:
+def test_memory_is_bounded_and_every_keyframe_is_read_from_disk() -> None:
     places = database(cached=20)
     scans: list[weakref.ref[np.ndarray]] = []
     for i in range(100):
@@ -95,7 +95,7 @@ def test_memory_is_bounded_and_the_disk_remembers() -> None:
         assert_same(places[index], make_keyframe(index, seed=index))
 
 
-def test_a_stored_database_is_found_again(tmp_path: Path) -> None:
+def test_a_stored_database_is_opened_again(tmp_path: Path) -> None:
     first = database(tmp_path / "map.sqlite")
     for i in range(5):
         first.add(make_keyframe(i, i, seed=i))
@@ -105,7 +105,7 @@ def test_a_stored_database_is_found_again(tmp_path: Path) -> None:
     assert_same(second[3], make_keyframe(3, 3, seed=3))
 
 
-def test_a_place_of_many_sessions_does_not_crowd_out_the_others() -> None:
+def test_a_place_of_many_sessions_does_not_displace_the_others() -> None:
     rng = np.random.default_rng(0)
     query, elsewhere = rng.standard_normal((2, 16))
     places = database()
@@ -128,7 +128,7 @@ def test_neighbours_along_one_drive_are_all_candidates() -> None:
     assert len(places.query(make_keyframe(100, descriptor=descriptor), Loop(top_k=20))) == 20
 
 
-def test_the_same_measurement_is_recognised_and_another_of_that_stamp_is_not() -> None:
+def test_a_duplicate_is_found_and_another_keyframe_of_its_stamp_is_not() -> None:
     places = database()
     places.add(make_keyframe(1, seed=1))
     row = places.add(make_keyframe(1, seed=2, session=3))
@@ -176,7 +176,7 @@ def test_places_of_named_sessions_are_found_whatever_their_age(tmp_path: Path) -
     assert [found.index for found in places.query(query, Loop(), range(1, 2))] == [1]
 
 
-def test_a_store_that_is_only_read_may_be_open_elsewhere_and_stays(tmp_path: Path) -> None:
+def test_a_reader_opens_a_database_in_use_and_changes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "a.sqlite"
     writer = database(path)
     writer.add(make_keyframe(1.0))

@@ -62,7 +62,7 @@ def test_keys_and_descriptors_are_those_of_the_keyframes(tmp_path: Path) -> None
     assert opened.descriptors(rows).dtype == np.float32
 
 
-def test_keyframes_are_found_by_stamp_also_those_of_a_clock_that_begins_at_0_each_time() -> None:
+def test_keyframes_are_found_by_stamp_also_where_stamps_repeat() -> None:
     opened = store()
     for session in (0, 1):
         for i in range(4):
@@ -70,10 +70,19 @@ def test_keyframes_are_found_by_stamp_also_those_of_a_clock_that_begins_at_0_eac
     assert opened.rows_at(2 * 10**9) == [2, 6] and opened.rows_at(77) == []
 
 
-def test_a_file_without_the_index_by_stamp_gets_it(tmp_path: Path) -> None:
+def test_a_file_of_the_last_version_is_read_and_converted(tmp_path: Path) -> None:
     path = filled(tmp_path / "map.sqlite")
-    change(path, "DROP INDEX keyframe_by_stamp")
+    for statement in ("DROP INDEX keyframe_by_stamp", "DROP TABLE schema_version"):
+        change(path, statement)
+    change(path, "UPDATE about SET content = ?", '{"schema": "3", "embedder": "test", "dimension": "16"}')
+    before = path.read_bytes()
+    reader = KeyframeStore(path, IDENTITY, 20, read_only=True)
+    assert len(reader) == 5 and reader.rows_at(3 * 10**9) == [3]
+    reader.close()
+    assert path.read_bytes() == before
     assert store(path).rows_at(3 * 10**9) == [3]
+    with sqlite3.connect(path) as connection:
+        assert connection.execute("SELECT * FROM schema_version").fetchall() == [("place database", 2)]
 
 
 def test_a_descriptor_of_another_length_is_damage(tmp_path: Path) -> None:
@@ -115,7 +124,7 @@ def test_places_added_after_reopening_come_after_the_old_ones(tmp_path: Path) ->
     assert again.next_session == 3
 
 
-def test_the_keyframe_used_longest_ago_leaves_the_memory_first() -> None:
+def test_the_least_recently_used_keyframe_leaves_the_cache() -> None:
     opened = store(cached=3)
     alive: list[weakref.ref[np.ndarray]] = []
     for i in range(3):
@@ -205,7 +214,7 @@ def test_several_threads_read_while_one_writes() -> None:
     assert wrong == [] and len(opened) == 80
 
 
-def test_an_older_file_is_refused_in_one_line_and_left_alone(tmp_path: Path) -> None:
+def test_a_file_of_an_unsupported_format_is_refused_in_one_line_and_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "old.sqlite"
     change(path, "CREATE TABLE about (content TEXT NOT NULL)")
     change(path, "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, data BLOB NOT NULL)")
@@ -217,7 +226,7 @@ def test_an_older_file_is_refused_in_one_line_and_left_alone(tmp_path: Path) -> 
     assert path.read_bytes() == before and [file.name for file in tmp_path.iterdir()] == ["old.sqlite"]
 
 
-def test_somebody_elses_database_is_refused_and_left_alone(tmp_path: Path) -> None:
+def test_another_kind_of_database_is_refused_and_unchanged(tmp_path: Path) -> None:
     (bag,) = write_db3(tmp_path / "bag", traverse(0.3)).glob("*.db3")
     before = bag.read_bytes()
     with pytest.raises(UmfError, match=r"is no place database: it holds .*messages"):
@@ -236,7 +245,7 @@ def test_an_empty_file_becomes_a_database(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("change_to", ["dimension", "embedder"])
-def test_another_network_is_named_with_what_was_and_what_is(tmp_path: Path, change_to: str) -> None:
+def test_another_embedder_is_refused_with_both_names(tmp_path: Path, change_to: str) -> None:
     path = filled(tmp_path / "map.sqlite", 1)
     with pytest.raises(UmfError, match=rf"map\.sqlite was made with {change_to} (16|test), not 99$"):
         KeyframeStore(path, IDENTITY | {change_to: "99"}, 20)
@@ -274,7 +283,7 @@ def test_a_file_whose_end_is_missing_is_one_clear_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("column", "value"), [("session", 2**63 - 1), ("id", 2**63 - 1), ("id", -5)])
-def test_numbers_after_which_none_comes_are_refused(tmp_path: Path, column: str, value: int) -> None:
+def test_ids_and_sessions_out_of_range_are_refused(tmp_path: Path, column: str, value: int) -> None:
     path = filled(tmp_path / "map.sqlite")
     change(path, f"UPDATE keyframe SET {column} = ? WHERE id = 4", value)
     with pytest.raises(UmfError, match=f"{column} is out of range"):

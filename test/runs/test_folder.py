@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,7 @@ def test_an_unwritable_place_is_one_clear_error(tmp_path: Path) -> None:
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "summary.json"
     write_atomically(path, "old")
-    (tmp_path / "summary.json.part").mkdir()
+    (tmp_path / f".summary.json.{os.getpid()}.part").mkdir()
     with pytest.raises(OutputError, match=r"cannot write .*summary\.json"):
         write_atomically(path, "new")
     assert path.read_text() == "old"

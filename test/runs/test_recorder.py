@@ -17,7 +17,9 @@ from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.detector import Detection
+from umf_ros.runs import tables
 from umf_ros.runs import writer as recorder_module
+from umf_ros.runs.run_file import ALWAYS, all_descriptors, read_descriptors
 from umf_ros.runs.tables import read_closures
 from umf_ros.runs.writer import RunRecorder, count_drops, read_summary
 from umf_ros.sensors.buffers import SURPLUS, InputCounter
@@ -75,8 +77,8 @@ def test_an_empty_run_is_valid_json(tmp_path: Path) -> None:
     assert json.loads(text, parse_constant=pytest.fail)["latency_ms"]["embed"]["p50"] is None
 
 
-def test_tables_are_complete_before_anything_is_closed(tmp_path: Path) -> None:
-    record_a_little(tmp_path)
+def test_tables_are_exported_at_the_end(tmp_path: Path) -> None:
+    record_a_little(tmp_path).close()
     with (tmp_path / "candidates.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["reason"] for row in rows] == ["accepted", "few inliers"]
@@ -88,7 +90,7 @@ def test_tables_are_complete_before_anything_is_closed(tmp_path: Path) -> None:
 
 
 def test_closures_survive_the_table(tmp_path: Path) -> None:
-    record_a_little(tmp_path)
+    record_a_little(tmp_path).close()
     (closure,) = read_closures(tmp_path / "closures.csv")
     expected = accepted(40, 2).closure
     assert expected is not None
@@ -177,41 +179,62 @@ def lines(path: Path) -> list[str]:
     return path.read_text().splitlines()
 
 
-def test_a_folder_with_results_is_never_cut_short(tmp_path: Path) -> None:
-    record_a_little(tmp_path).write_summary({})
+def test_a_folder_with_results_is_continued(tmp_path: Path) -> None:
+    record_a_little(tmp_path).close()
     before = {name: lines(tmp_path / f"{name}.csv") for name in ("closures", "candidates", "keyframes", "inliers")}
     again = RunRecorder(tmp_path, Settings(), "w")
     assert [again.summary({})[key] for key in COUNTS] == [3, 1, 2, 1, 1, 1]
     again.record(make_frame(40), detection(40, [accepted(40, 2)]))  # played again: there already
     again.record(make_frame(90), detection(90, [accepted(90, 2)]))
+    again.close()
     for name, rows in before.items():
         now = lines(tmp_path / f"{name}.csv")
         assert now[: len(rows)] == rows and len(now) == len(rows) + (2 if name == "inliers" else 1)
     assert again.summary({})["closures_published"] == 2 and again.summary({})["frames"] == 5
 
 
-def test_a_line_that_was_not_finished_goes_and_the_others_stay(tmp_path: Path) -> None:
-    record_a_little(tmp_path)
-    path = tmp_path / "candidates.csv"
-    whole = path.read_text()
-    path.write_text(whole + "50,12,0.4")
-    RunRecorder(tmp_path, Settings(), "w")
-    assert path.read_text() == whole
-
-
-def test_what_a_killed_replay_did_not_finish_is_done_again(tmp_path: Path) -> None:
-    record_a_little(tmp_path)
-    keyframes = lines(tmp_path / "keyframes.csv")
-    (tmp_path / "keyframes.csv").write_text("\n".join(keyframes[:2]) + "\n")
-    resumed = RunRecorder(tmp_path, Settings(), "w", resume=True)
-    assert resumed.recorded == {(2 * 10**9, 0)} and resumed.earlier_closures() == []
-    resumed.record(make_frame(40), detection(40, [accepted(40, 2)]))
-    assert lines(tmp_path / "keyframes.csv") == keyframes
+def test_a_keyframe_is_written_completely_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder = record_a_little(tmp_path)
+    monkeypatch.setattr(tables, "inlier_rows", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        recorder.record(make_frame(90), detection(90, [accepted(90, 2)]))
+    recorder.close()
+    assert [line.split(",")[0] for line in lines(tmp_path / "keyframes.csv")[1:]] == ["2000000000", "40000000000"]
     assert [closure.query_stamp_ns for closure in read_closures(tmp_path / "closures.csv")] == [40]
 
 
-def test_a_table_of_an_older_version_is_set_aside(tmp_path: Path) -> None:
+def test_a_second_process_may_not_write_the_same_folder(tmp_path: Path) -> None:
+    recorder = record_a_little(tmp_path)
+    with pytest.raises(UmfError, match=r"run\.sqlite is in use by another process"):
+        RunRecorder(tmp_path, Settings(), "w")
+    recorder.close()
+
+
+def test_tables_of_an_older_release_are_set_aside(tmp_path: Path) -> None:
     (tmp_path / "closures.csv").write_text("a,b\n1,2\n")
-    record_a_little(tmp_path)
+    record_a_little(tmp_path).close()
     assert (tmp_path / "closures.1.csv").read_text() == "a,b\n1,2\n"
     assert len(read_closures(tmp_path / "closures.csv")) == 1
+
+
+def test_descriptors_come_back_by_stamp(tmp_path: Path) -> None:
+    record_a_little(tmp_path).close()
+    found = read_descriptors(tmp_path, [40 * 10**9, 2 * 10**9])
+    expected = make_keyframe(40, 40).embedding.descriptor
+    assert found is not None and found.dtype == np.float32
+    np.testing.assert_allclose(found[0], expected, atol=2e-3)
+    assert read_descriptors(tmp_path, [40 * 10**9, 5]) is None
+    assert all_descriptors(tmp_path).shape == (2, len(expected))
+
+
+def test_a_run_of_an_older_release_has_no_descriptors(tmp_path: Path) -> None:
+    assert read_descriptors(tmp_path, [1]) is None
+    with pytest.raises(UmfError, match="holds no descriptors of keyframes"):
+        all_descriptors(tmp_path)
+
+
+def test_nothing_but_the_file_of_the_run_and_its_exports_is_left(tmp_path: Path) -> None:
+    record_a_little(tmp_path).close()
+    read_descriptors(tmp_path, [1])
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {f"{name}.csv" for name in ALWAYS} | {"run.sqlite", "config.yaml"}

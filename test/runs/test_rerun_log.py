@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import landscape, pose_at, take
 
 from umf_ros.core.config import Verification
 from umf_ros.core.errors import ConfigError, OutputError
 from umf_ros.core.frames import Candidate, Frame, Keyframe
 from umf_ros.detector import Detection
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 from umf_ros.runs.rerun_log import RerunLog
 from umf_ros.verification import Verifier
 

@@ -17,7 +17,7 @@ def begun(out: Path, settings: Settings) -> ReplayFolder:
     return folder
 
 
-def test_the_run_that_was_cut_off_is_gone_on_with(tmp_path: Path) -> None:
+def test_the_run_that_was_interrupted_is_resumed(tmp_path: Path) -> None:
     done, cut = begun(tmp_path, Settings()), begun(tmp_path, Settings())
     done.finish()
     found = ReplayFolder.resume(tmp_path, BAG, Settings())
@@ -27,14 +27,14 @@ def test_the_run_that_was_cut_off_is_gone_on_with(tmp_path: Path) -> None:
     assert fresh.path not in (done.path, cut.path) and not fresh.resumed
 
 
-def test_another_recording_or_other_settings_are_not_gone_on_with(tmp_path: Path) -> None:
+def test_another_recording_or_other_settings_are_not_resumed(tmp_path: Path) -> None:
     cut = begun(tmp_path, Settings())
     assert not ReplayFolder.resume(tmp_path, Path("other.mcap"), Settings()).resumed
     with pytest.raises(UmfError, match=f"{cut.path.name} was begun with other settings"):
         ReplayFolder.resume(tmp_path, BAG, load_settings(loop__top_k=3))
 
 
-def test_a_run_cut_off_before_it_began_is_gone_on_with(tmp_path: Path) -> None:
+def test_a_run_interrupted_before_its_first_row_is_resumed(tmp_path: Path) -> None:
     cut = ReplayFolder.create(tmp_path, BAG, Settings())
     assert ReplayFolder.resume(tmp_path, BAG, Settings()).path == cut.path
 
@@ -50,7 +50,7 @@ def test_places_lie_in_the_folder_until_it_is_finished(tmp_path: Path) -> None:
     assert named.working_settings.database.path == str(tmp_path / "mine.sqlite")
 
 
-def test_a_damaged_note_is_no_run_to_go_on_with(tmp_path: Path) -> None:
+def test_a_damaged_run_is_not_resumed(tmp_path: Path) -> None:
     cut = begun(tmp_path, Settings())
-    (cut.path / "run.json").write_text('{"bag": ')
+    (cut.path / "run.sqlite").write_text('{"bag": ')
     assert not ReplayFolder.resume(tmp_path, BAG, Settings()).resumed

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import errno
-import io
 import json
 from pathlib import Path
 
@@ -19,12 +17,12 @@ from umf_ros.runs.tables import (
     CANDIDATES,
     CLOSURES,
     INLIERS,
-    CsvTable,
     candidate_row,
     closure_row,
     inlier_rows,
     read_closures,
     read_table,
+    write_table,
 )
 from umf_ros.verification import Measurement, Verdict
 
@@ -39,9 +37,7 @@ def closure(seed: int = 0, probability: float = 0.97) -> LoopClosure:
 
 
 def written(path: Path, rows: list[list[object]], columns: list[str] = CLOSURES) -> Path:
-    table = CsvTable(path, columns)
-    table.append(rows)
-    table.close()
+    write_table(path, columns, rows)
     return path
 
 
@@ -99,26 +95,9 @@ def test_inliers_are_pixels_to_a_tenth(tmp_path: Path) -> None:
     assert rows == [(QUERY_NS, 1.3, 2, 3, 688.0), (QUERY_NS, 0, 0, 0, 0)]
 
 
-def test_rows_are_there_before_the_table_is_closed(tmp_path: Path) -> None:
-    table = CsvTable(tmp_path / "a.csv", ["a", "b"])
-    assert (tmp_path / "a.csv").read_bytes() == b"a,b\r\n"
-    for count in range(1, 4):
-        table.append([[count, count]] * 2)
-        assert len((tmp_path / "a.csv").read_text().splitlines()) == 1 + 2 * count
-    table.close()
-
-
-class FullDisk(io.StringIO):
-    """A file on a disk with no room left."""
-
-    def flush(self) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-
-def test_a_full_disk_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Path, "open", lambda *_, **__: FullDisk())
-    with pytest.raises(OutputError, match=r"cannot write .*a\.csv: No space left on device$"):
-        CsvTable(tmp_path / "a.csv", ["a"])
+def test_a_folder_that_is_gone_is_one_clear_line(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"cannot write .*a\.csv: No such file or directory$"):
+        write_table(tmp_path / "gone" / "a.csv", ["a"], [])
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from umf_ros.core.config import Loop
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative, transform
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.runs.tables import KEYFRAMES, CsvTable
+from umf_ros.runs.tables import KEYFRAMES, write_table
 from umf_ros.runs.truth import (
     JudgedRun,
     absolute_trajectory_error,
@@ -47,9 +47,8 @@ def truth(first: int = 0, last: int = 80, has_orientation: bool = True) -> Traje
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A run with a keyframe every two seconds."""
-    table = CsvTable(tmp_path / "keyframes.csv", KEYFRAMES)
-    table.append([[stamp(second), 0, f"{second:.4f}"] for second in range(0, 80, 2)])
-    table.close()
+    rows = [[stamp(second), 0, f"{second:.4f}"] for second in range(0, 80, 2)]
+    write_table(tmp_path / "keyframes.csv", KEYFRAMES, rows)
     return tmp_path
 
 
@@ -151,7 +150,7 @@ def test_the_summary_has_its_keys_and_plain_numbers() -> None:
 
 
 def test_a_run_without_keyframes(tmp_path: Path) -> None:
-    CsvTable(tmp_path / "keyframes.csv", KEYFRAMES).close()
+    write_table(tmp_path / "keyframes.csv", KEYFRAMES, [])
     assert judged(tmp_path, truth(), []).revisits == 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,14 @@ from finished_runs import BELOW, candidate, closure, examined, stamp, trajectory
 from umf_ros.core.config import load_settings
 from umf_ros.runs.diagnosis import ClosureDiagnosis
 from umf_ros.runs.findings import ExaminedRun
-from umf_ros.runs.writer import DescriptorFile
+from umf_ros.runs.run_file import RunFile
 from umf_ros.verification.verifier import NO_POSE, UNTESTED
 
 
 def write_descriptors(folder: Path, descriptors: np.ndarray) -> None:
-    file = DescriptorFile(folder)
-    for number, descriptor in enumerate(descriptors):
-        file.append(stamp(2 * number), descriptor)
-    file.close()
+    with closing(RunFile(folder)) as file, file.writing():
+        for number, descriptor in enumerate(descriptors):
+            file.append_descriptor(stamp(2 * number), descriptor)
 
 
 def why(about: ExaminedRun, second: float) -> ClosureDiagnosis:

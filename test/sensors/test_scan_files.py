@@ -116,6 +116,17 @@ def test_what_did_not_come_back_is_left_out(tmp_path: Path, suffix: str) -> None
     np.testing.assert_array_equal(read_scan(path).points, POINTS[[0, 4, 5]])
 
 
+def test_a_text_whose_other_fields_hold_raw_bytes_is_read_as_far_as_the_points_go(tmp_path: Path) -> None:
+    """As Livox drivers write `tag` and `line`: a byte each, which may be a space, a letter or the end of a line."""
+    header = b"FIELDS x y z intensity tag line\nSIZE 4 4 4 4 1 1\nTYPE F F F F U U\nPOINTS 40\nDATA ascii\n"
+    raw = [bytes([16 * n % 256, n]) for n in range(40)]
+    rows = [b"%.2f %.2f %.2f 7 %b\n" % (*POINTS[n], two) for n, two in enumerate(raw)]
+    (tmp_path / "livox.pcd").write_bytes(header + b"".join(rows))
+    found = read_scan(tmp_path / "livox.pcd").points
+    assert len(found) >= 36
+    np.testing.assert_allclose(found[:10], np.round(POINTS[:10], 2), atol=1e-6)
+
+
 PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
 
 

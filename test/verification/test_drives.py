@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drives import DEPTH_STRIDE, Drive, kept, path_length, worlds
-from scenes import BODY_T_CAMERA
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Frame, StereoCamera
 from umf_ros.core.geometry import Array, make_pose, relative
+from umf_ros.lab.simulation.drives import DEPTH_STRIDE, Drive, kept, path_length, worlds
 from umf_ros.lab.simulation.families import FAMILIES
+from umf_ros.lab.simulation.scenes import BODY_T_CAMERA
 
 SQUARE = StereoCamera(224, 224, 190.0, 190.0, 112.0, 112.0, 0.2)
 WALL_M = 12.0

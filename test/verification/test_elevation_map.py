@@ -3,9 +3,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scenes import landscape, pose_at, take
 
 from umf_ros.core.geometry import relative
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 from umf_ros.verification.elevation_map import ElevationMap, evaluate, shared_relief
 
 GROUND = landscape(3)

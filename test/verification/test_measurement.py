@@ -8,11 +8,11 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from scenes import landscape, pose_at, take, without_image, without_scan
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, LocalFeatures, ScanMotion
 from umf_ros.core.geometry import make_pose, relative
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan
 from umf_ros.verification import Measurement, Verifier
 from umf_ros.verification.constants import BLUR_M
 from umf_ros.verification.measurement import IMAGE, SCAN, cloud_agreement, image_agreement

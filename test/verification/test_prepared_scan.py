@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import make_frame
-from scenes import landscape, pose_at, take
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Frame, Keyframe
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 from umf_ros.verification import Verifier, thin_frame
 from umf_ros.verification.constants import SCANS_KEPT
 from umf_ros.verification.prepared_scan import PreparedScan, ScanCache, prepare, prepare_frame

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import landscape, pose_at, take, without_image, without_scan
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, SuperFeatures
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan
 from umf_ros.verification.rerank import (
     RankedCandidate,
     eligible_superfeatures,

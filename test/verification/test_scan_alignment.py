@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import landscape, pose_at, take
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, invert, make_pose, relative, rotation_angle, transform
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 from umf_ros.verification.constants import SEARCH_M
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import Alignment, CovarianceModel, align_scans, covariance_of, inspect

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import BODY_T_CAMERA, CAMERA, landscape, pose_at
 
 from umf_ros.core.frames import Embedding, Keyframe
 from umf_ros.core.geometry import make_pose, relative
+from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA, landscape, pose_at
 from umf_ros.verification.constants import MEMORY_KEYFRAMES
 from umf_ros.verification.hypotheses import TemporalMemory, prior_sigmas
 

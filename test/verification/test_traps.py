@@ -1,4 +1,4 @@
-"""Pairs that fool a matcher; see benchmarks/traps.py for how each is built."""
+"""Pairs that fool a matcher; see umf_ros/lab/simulation/scenes.py for how each is built."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from traps import TRAPS, spring
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate
+from umf_ros.lab.simulation.scenes import TRAPS, spring
 from umf_ros.verification import Verifier
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.rerank import fit_homography, mutual_neighbours, similarities

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
 from umf_ros.verification import NO_DEPTH, Verdict, Verifier
 from umf_ros.verification.constants import SAME_M, SAME_RAD
 from umf_ros.verification.hypotheses import near
@@ -177,7 +177,7 @@ def test_expected_place_is_tested_before_better_looking_ones() -> None:
 
 PROBE = """
 import sys; sys.path[:0] = [{benchmarks!r}]
-from scenes import *; from umf_ros.core.config import Verification
+from umf_ros.lab.simulation.scenes import *; from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate; from umf_ros.verification import Verifier
 ground = landscape(20); verifier = Verifier(Verification())
 for step in range(2):

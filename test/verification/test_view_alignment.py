@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import CAMERA, Landscape, landscape, pose_at, take, without_image
 
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, expmap, make_pose, relative, rotation_angle
+from umf_ros.lab.simulation.scenes import CAMERA, Landscape, landscape, pose_at, take, without_image
 from umf_ros.verification.view_alignment import PairedViews, ViewAlignment
 
 GROUND = landscape(20, landmarks=2500)

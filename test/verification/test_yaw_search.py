@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scenes import landscape, pose_at, take, yard_scan
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take, yard_scan
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.yaw_search import RotatedElevationMap, scout, search
 

@@ -8,9 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from umf_ros.baselines.minkloc import LENGTH, VoxelPyramid, frame_means
+from umf_ros.baselines.minkloc import LENGTH, Level, SparseGem, VoxelPyramid, frame_means
 from umf_ros.baselines.place_network import EARLY, LATE, Gem, ImageTrunk, PlaceInput, PlaceNetwork, Sense
-from umf_ros.networks.encoders import Level, SparseGem
 
 SUMMARY = 64
 """Numbers that say of one scale how much it is worth."""

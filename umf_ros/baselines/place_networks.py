@@ -10,8 +10,7 @@ import torch
 from umf_ros.baselines.adafusion import AdaFusion
 from umf_ros.baselines.minkloc import MinkLocFusion, MinkLocLidar, MinkLocVisual
 from umf_ros.baselines.netvlad import NetVlad
-from umf_ros.baselines.place_inputs import stack, stack_images, view_frame
-from umf_ros.baselines.place_network import PlaceNetwork
+from umf_ros.baselines.place_network import PlaceNetwork, stack, stack_images, view_frame
 from umf_ros.baselines.pointnet2 import PointNet2
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, UmfError, WeightsError, either

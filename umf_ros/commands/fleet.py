@@ -30,7 +30,7 @@ def setup(
 ) -> None:
     """Make the tables of a fleet, or bring them up to date; PostgreSQL 15 and pgvector 0.8 or later."""
     with _connected(server) as connection:
-        from umf_ros.fleet.migrations import migrate
+        from umf_ros.fleet.server import migrate
 
         before, after = migrate(connection, embedder, dimension)
     typer.echo(f"the tables are of version {after}" + (", as before" if before == after else f", were of {before}"))
@@ -45,7 +45,7 @@ def add(server: Address, rover: Annotated[str, typer.Argument(help="Name of the 
     if not secret:
         raise UmfError("a rover needs a password")
     with _connected(server) as connection:
-        from umf_ros.fleet.migrations import add_rover
+        from umf_ros.fleet.server import add_rover
 
         add_rover(connection, rover, secret)
     typer.echo(f"{rover} may come in; database.server: postgresql://{rover}@...")

@@ -22,8 +22,8 @@ from umf_ros.commands.recordings import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.mapping import Opening
     from umf_ros.maps.map_folder import MapFolder
+    from umf_ros.maps.mapping import Opening
 
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.")]
 Workers = Annotated[int, typer.Option(min=1, max=256, help="Processes that replay and compare recordings.")]
@@ -60,8 +60,8 @@ def command(
     from rich.console import Console
 
     from umf_ros.core.tasks import spread
-    from umf_ros.mapping import Opening, find_recordings, unmatched
     from umf_ros.maps.joint_graph import solve
+    from umf_ros.maps.mapping import Opening, find_recordings, unmatched
     from umf_ros.maps.outputs import write_results
     from umf_ros.runs.writer import check_writable
 
@@ -93,7 +93,7 @@ def _add_all(
     target: MapFolder, recordings: list[Path], opening: Opening, spread: Callable[..., None], console: Console
 ) -> None:
     """Replay all recordings at once, then compare all with those before them; the same map as one after the other."""
-    from umf_ros.mapping import add_session, match_task, replay_task, unmatched
+    from umf_ros.maps.mapping import add_session, match_task, replay_task, unmatched
 
     new = _new_ones(target, recordings, console)
     tasks = [(recording, opening, target.folder_of(name)) for name, recording in new.items()]
@@ -134,7 +134,7 @@ def _add(target: MapFolder, recording: Path, opening: Opening, console: Console)
     """Replay a recording into the map, unless it is there."""
     from umf_ros.bags.reader import open_bag
     from umf_ros.commands.console import FrameProgress
-    from umf_ros.mapping import add_session, replay_session
+    from umf_ros.maps.mapping import add_session, replay_session
     from umf_ros.runs.reader import describe_recording
 
     known = target.knows(describe_recording(open_bag(recording)))
@@ -153,7 +153,7 @@ def _match(target: MapFolder, name: str, console: Console) -> None:
     """Compare a session with those before it."""
     from rich.progress import track
 
-    from umf_ros.mapping import match_session
+    from umf_ros.maps.mapping import match_session
 
     session = next(one for one in target.sessions if one.name == name)
     matches = match_session(target, session)
@@ -162,7 +162,7 @@ def _match(target: MapFolder, name: str, console: Console) -> None:
 
 
 def _tell(out: Path, summary: dict[str, Any], console: Console) -> None:
-    from umf_ros.maps.report import crispness, sentence
+    from umf_ros.maps.outputs import crispness, sentence
 
     for one in summary["sessions"]:
         tied = f"{one['closures_between']} ends of closures with others"

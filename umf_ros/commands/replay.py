@@ -148,20 +148,20 @@ def _localize(
     from umf_ros.commands.console import FrameProgress, stop_on_interrupt, undisturbed
     from umf_ros.core.watchdog import watching
     from umf_ros.detector import LoopDetector
-    from umf_ros.localization import LocalizingReplay
+    from umf_ros.replay import Replay
     from umf_ros.runs.reader import remember_recording
     from umf_ros.runs.writer import count_drops, create_run_folder
 
     detector = LoopDetector(settings, network)  # a map that cannot be used is told before there is a folder
     folder = create_run_folder(out)
     inputs.tell_absent(settings, odometry_from_file=False)
-    replay = LocalizingReplay(folder, settings, detector)
+    replay = Replay(folder, settings, detector)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
         for detection in replay.run(reader.stream()):
             progress.show(reader.progress, detection)
             if interrupted():
                 break
-    newest = replay.newest
+    newest = replay.newest_pose
     with undisturbed():
         found = replay.finish(count_drops(reader.counters))
         remember_recording(folder, recording)
@@ -174,4 +174,5 @@ def _localize(
         sigma_m = float(newest.covariance[:2, :2].trace() ** 0.5)
         text += f"; at last at ({x:.1f}, {y:.1f}, {z:.1f}) m, +- {sigma_m:.2f} m, p = {newest.probability:.4f}"
     console.print(f"{text}\n{folder}", markup=False, highlight=False, soft_wrap=True)
+    replay.raise_if_frames_failed()
     return 0 if found else 3

@@ -33,15 +33,16 @@ def command(
 
     Also which parameter would have let it through, and what that costs. Reads the run folder alone.
     """
-    check_run(folder)
-
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
+    from umf_ros.replay import recover_run
     from umf_ros.runs.reader import read_run
     from umf_ros.runs.report import judge
     from umf_ros.runs.writer import read_summary
 
+    recover_run(folder)
+    check_run(folder)
     summary = read_summary(folder)
     known = bag or Path(summary.get("recording", {}).get("path", ""))
     recording: Bag | None = open_bag(known) if bag or known.is_file() or (known.is_dir() and known.name) else None

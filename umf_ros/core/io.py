@@ -30,7 +30,7 @@ def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
     ends without an error and is deleted otherwise.
 
     Args:
-        path: the file; its folder is made where it is missing.
+        path: the file, in a folder that exists.
         kinds: exceptions of the block, besides `OSError`, that mean that the file cannot be written.
 
     Raises:
@@ -38,7 +38,6 @@ def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     with writing(path, *kinds):
-        path.parent.mkdir(parents=True, exist_ok=True)
         try:
             yield part
             part.replace(path)
@@ -185,6 +184,8 @@ class SqliteFile:
         Raises:
             OutputError: the copy cannot be written.
         """
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path, sqlite3.Error) as part:
             target = sqlite3.connect(part)
             try:

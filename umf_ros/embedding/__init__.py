@@ -1,7 +1,7 @@
 """Embedders: from a frame to a descriptor and local features.
 
-Methods are found by name, those of other packages through the entry point group `umf_ros.embedders`. An entry point
-names a function `make(settings, asked)` that returns an `Embedder`; it is imported only when its method is used.
+The registry finds methods by name. Other packages add methods through the entry point group `umf_ros.embedders`: an
+entry point names a function `make(settings, asked)` that returns an `Embedder`. A method is imported when it is used.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def make_embedder(settings: EmbeddingSettings, super_features: bool = False, fea
 
     Args:
         settings: method, weights, runtime, device and threads.
-        super_features: whether the network's super-features are wanted too.
-        features: local features of images: "umf", those of the embedder itself, or "xfeat".
+        super_features: compute the super-features of the network too.
+        features: local features of images: "umf" (from the embedder itself) or "xfeat".
 
     Raises:
         ConfigError: unknown method or device, or an entry point that cannot be loaded.

@@ -1,4 +1,4 @@
-"""Where image features lie in space: depth from the LiDAR where it looks, from stereo elsewhere."""
+"""Depth of image features: from the LiDAR within its field of view, from stereo elsewhere."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from scipy.spatial import cKDTree
 from umf_ros.core.frames import Embedding, Frame, Image, LocalFeatures, Points, StereoCamera
 from umf_ros.core.geometry import Array, transform
 
-NEIGHBOURS = 4  # LiDAR returns that vote on a pixel's depth
-MAX_SPREAD = 0.1  # relative depth difference above which they lie on different surfaces
-NEAREST_M = 1.5  # no disparity nearer than this is searched for
-FARTHEST_M = 60.0  # beyond, a third of a pixel is half the distance for S3LI's 0.2 m baseline
-HALF = 2  # block matching sees the pictures this many times smaller, in a quarter of the time
-BLOCK, UNIQUENESS, TEXTURE = 15, 10, 5  # of block matching: pixels, per cent, and the contrast a block needs
-WINDOW = 21  # pixels of the full picture that the tracker compares
+NEIGHBOURS = 4  # LiDAR returns that are averaged for the depth of a pixel
+MAX_SPREAD = 0.1  # relative depth difference above which the returns lie on different surfaces
+NEAREST_M = 1.5  # lower limit of the stereo search
+FARTHEST_M = 60.0  # upper limit: with a baseline of 0.2 m, a third of a pixel is half the distance
+HALF = 2  # factor by which images are reduced for block matching
+BLOCK, UNIQUENESS, TEXTURE = 15, 10, 5  # block matching: side in pixels, margin in per cent, least contrast
+WINDOW = 21  # pixels, side of the tracking window at full resolution
 PRECISE = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 FROM_GUESS = cv2.OPTFLOW_USE_INITIAL_FLOW
-MAX_CLIMB, MAX_DRIFT = 1.0, 3.0  # pixels, across the rows and from what block matching found
+MAX_CLIMB, MAX_DRIFT = 1.0, 3.0  # pixels, vertical shift and difference from block matching
 
 
 def lift(frame: Frame, embedding: Embedding) -> Embedding:
-    """The embedding with a 3-D point (body frame, m) for each image feature whose depth is known.
+    """Return the embedding with a 3-D point (body frame, m) for each image feature whose depth is known.
 
-    Features whose depth is known already keep it.
+    Features with known depth stay as they are.
     """
     features = embedding.image
     if features is None or np.isfinite(features.points).any():
@@ -36,18 +36,17 @@ def lift(frame: Frame, embedding: Embedding) -> Embedding:
 
 
 def lift_features(frame: Frame, features: LocalFeatures) -> LocalFeatures:
-    """The features of a frame's left image with a 3-D point for each whose depth is known.
+    """Return the features of the left image with a 3-D point (body frame, m) for each whose depth is known.
 
-    LiDAR depth comes first (2 cm, day and night); stereo fills in outside the scan or without one.
+    Depth from the LiDAR (2 cm, day and night) takes precedence over stereo.
     """
     return dataclasses.replace(features, points=_locate(frame, features))
 
 
 def disparities(left: Image, right: Image, pixels: Array, camera: StereoCamera) -> Array:
-    """Disparity in pixels at (K, 2) pixels of the left image, NaN where it is unknown.
+    """Return the disparity (K,) in pixels at positions (K, 2) of the left image, NaN where it is unknown.
 
-    Block matching of the whole picture at half its size says roughly where each pixel went; Lucas and Kanade's
-    tracker finds it there to a fraction of a pixel.
+    Block matching at half the resolution gives an initial value; the Lucas-Kanade tracker refines it to sub-pixels.
     """
     found = np.full(len(pixels), np.nan)
     rough = _rough_disparities(left, right, pixels, camera)
@@ -60,15 +59,15 @@ def disparities(left: Image, right: Image, pixels: Array, camera: StereoCamera) 
         left, right, here, guess, winSize=(WINDOW, WINDOW), maxLevel=0, criteria=PRECISE, flags=FROM_GUESS
     )
     disparity, climb = (here - there).astype(float).T
-    # rectified pairs keep their rows, and the tracker must not leave what the block matching found
-    right_ones = (seen.ravel() > 0) & (np.abs(climb) < MAX_CLIMB) & (np.abs(disparity - rough[known]) < MAX_DRIFT)
-    right_ones &= disparity >= camera.fx * camera.baseline / FARTHEST_M
-    found[known[right_ones]] = disparity[right_ones]
+    # rectified pairs keep their rows; the tracker has to stay near the result of block matching
+    valid = (seen.ravel() > 0) & (np.abs(climb) < MAX_CLIMB) & (np.abs(disparity - rough[known]) < MAX_DRIFT)
+    valid &= disparity >= camera.fx * camera.baseline / FARTHEST_M
+    found[known[valid]] = disparity[valid]
     return found
 
 
 def _rough_disparities(left: Image, right: Image, pixels: Array, camera: StereoCamera) -> Array:
-    """The same to a pixel or so."""
+    """Return the disparity by block matching, to about a pixel."""
     nearest = camera.fx * camera.baseline / NEAREST_M / HALF
     matcher = cv2.StereoBM.create(math.ceil(nearest / 16) * 16, BLOCK)
     matcher.setUniquenessRatio(UNIQUENESS)
@@ -78,7 +77,7 @@ def _rough_disparities(left: Image, right: Image, pixels: Array, camera: StereoC
     found = matcher.compute(halves[0], halves[1])
     cells = np.rint((pixels + 0.5) / HALF - 0.5).astype(int)
     column, row = np.clip(cells, 0, np.array(size) - 1).T
-    disparity = found[row, column] * (HALF / 16.0)  # the matcher counts in sixteenths
+    disparity = found[row, column] * (HALF / 16.0)  # fixed point, sixteenths of a pixel
     return np.where(disparity > 0, disparity, np.nan)
 
 
@@ -95,7 +94,7 @@ def _locate(frame: Frame, features: LocalFeatures) -> Points:
 
 
 def _lidar_depths(frame: Frame, pixels: Points) -> Array:
-    """Depth along the optical axis at (K, 2) pixels from the scan's returns around them, NaN where there are none."""
+    """Return depth (K,) along the optical axis, m, from the LiDAR returns around pixels (K, 2), NaN without returns."""
     unknown = np.full(len(pixels), np.nan)
     if frame.points is None or not len(frame.points) or not len(pixels):
         return unknown
@@ -116,7 +115,7 @@ def _lidar_depths(frame: Frame, pixels: Points) -> Array:
     found = np.isfinite(distance)
     around = np.where(found, depth[np.minimum(index, len(depth) - 1)], np.nan)
     enough = found.sum(axis=1) >= 2
-    around[~enough] = 1.0  # keeps the reductions below silent
+    around[~enough] = 1.0  # avoids warnings of the reductions below
     low, high = np.nanmin(around, axis=1), np.nanmax(around, axis=1)
     weight = np.where(found, 1.0 / (np.where(found, distance, 0) + 0.5), 0.0)
     mean = np.nansum(around * weight, axis=1) / np.maximum(weight.sum(axis=1), 1e-9)

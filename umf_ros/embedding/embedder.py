@@ -1,4 +1,4 @@
-"""What an embedder is, and what several of them need."""
+"""Protocol of an embedder."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from umf_ros.core.geometry import Array
 
 
 class FeatureRequest(NamedTuple):
-    """Which local features an embedder is asked for, of those that it has; what is not asked for costs nothing.
+    """Local features that an embedder is asked for; features that are not requested are not computed.
 
     Attributes:
-        image: those of the image.
+        image: local features of the image.
         supers: super-features.
     """
 
@@ -34,7 +34,7 @@ class Embedder(Protocol):
 
 
 def unit_descriptor(values: Array) -> Points:
-    """The values at unit length; what has none becomes the first axis, so that similarities stay cosines."""
+    """Return the values at unit length, and the first axis for values of length zero."""
     norm = float(np.linalg.norm(values))
     if norm < 1e-6:
         return np.eye(1, len(values), dtype=np.float32)[0]

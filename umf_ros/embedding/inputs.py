@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 from umf_ros.core.frames import Frame, Image, Points
 from umf_ros.core.geometry import transform
 from umf_ros.core.levelling import level
-from umf_ros.networks.config import NetworkConfig
+from umf_ros.networks.config import CELLS, FEATURES, NetworkConfig
 
 ORIGIN_M = np.array([0.0, -20.0, -6.0], np.float32)
 VOXEL_M = np.array([1.0, 1.0, 0.3], np.float32)
-CELLS = 40
-FEATURES = 6
 MIN_POINTS = 20
+DARK_STD = 2.0
+"""Grey levels; a blank image has a smaller standard deviation."""
 FULL_SCALES = (1.0, 255.0)
-"""Largest intensities of sensors that say less than the network was trained on, smallest first."""
+"""Full scales of sensors with a smaller intensity range than the training data, ascending."""
 TRAINED_SCALE = 4095.0
-"""Of the Cube-1's, which the network was trained on."""
+"""Full scale of the Cube-1, the LiDAR of the training data."""
 TRAINED_SPREAD, STRANGE_SPREAD = 1.2, 1.8
-"""Of the logarithm of intensity within a scan: .4 to 1.1 in all simulated domains, 2 to 3.1 in KITTI's 64 beams."""
+"""Standard deviations of log intensity in a scan: .4 to 1.1 in all simulated domains, 2 to 3.1 in KITTI (64 beams)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class VoxelScan:
 def voxelise(points: Points, intensity: Points | None, coarse_limit: int, fine_limit: int) -> VoxelScan:
     """Voxelise a scan.
 
-    When more cells are occupied than fit, those with most points are kept, ties by index.
+    If more cells are occupied than the limit, those with most points are kept; ties go to the lower index.
 
     Args:
         points: (N, 3) metres, on the ground, x ahead (`levelling.level`); rows that are not finite are ignored.
@@ -92,10 +92,10 @@ def _mean(flat: NDArray[np.int64], values: Points, occupied: NDArray[np.int64], 
 
 
 def _brightness(intensity: Points | None, inside: Any) -> Points:
-    """Logarithm of the intensity, standardised within the scan: units differ between sensors.
+    """Return the logarithm of the intensity, standardised within the scan, as units differ between sensors.
 
-    It fades where its logarithm varies as it never did in training: what such a sensor calls intensity (coarse steps,
-    many zeros) says something else, and places are found better without it.
+    It is scaled down to zero for scans whose log intensity varies more than in the training data (coarse steps, many
+    zeros): recall is higher without such intensities.
     """
     if intensity is None or not inside.any():
         return np.zeros(int(inside.sum()), np.float32)
@@ -106,9 +106,9 @@ def _brightness(intensity: Points | None, inside: Any) -> Points:
 
 
 def _in_trained_unit(intensity: Points) -> Points:
-    """Intensities (N,) of a scan in the Cube-1's unit: those of 0 to 1 and 0 to 255 stretched, none below 0.
+    """Return non-negative intensities (N,) in the unit of the Cube-1; ranges of 0 to 1 and 0 to 255 are stretched.
 
-    The logarithm alone does not take the unit out: below 1 it is a straight line.
+    The logarithm alone does not remove the unit: log(1 + x) is linear below 1.
     """
     strongest = intensity.max(initial=0.0)
     scale = next((scale for scale in FULL_SCALES if strongest <= scale), TRAINED_SCALE)
@@ -134,7 +134,7 @@ def _fold(occupied: NDArray[np.int64], features: Points) -> Points:
 
 
 def _corner(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Places (3, N) of voxels along the axes."""
+    """Return the indices (3, N) of voxels along the axes."""
     return np.stack(np.unravel_index(voxels, (CELLS,) * 3))
 
 
@@ -151,7 +151,7 @@ def _pad(index: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArra
 
 
 class InputArrays(NamedTuple):
-    """A batch as arrays: the fields of `NetworkInput` in their order, without torch."""
+    """A batch as arrays, with the fields of `NetworkInput` in the same order."""
 
     image: NDArray[np.float32]
     image_present: NDArray[np.bool_]
@@ -168,10 +168,10 @@ def pack(
     """Stack preprocessed frames.
 
     Args:
-        images: (H, W) standardised, or None where there is none.
-        scans: voxelised, empty where there is none.
-        config: of the network.
-        trim: cut off padding that no scan of the batch needs; the result is the same, and cheaper.
+        images: (H, W) standardised, None for a missing image.
+        scans: voxelised, empty for a missing scan.
+        config: configuration of the network.
+        trim: cut off padding that no scan of the batch needs; the outputs stay the same.
     """
     blank = np.zeros(config.image_size, np.float32)
     lengths: dict[str, int | None] = {"grid": None}
@@ -190,45 +190,42 @@ def pack(
 
 
 def prepare_image(image: Image | None, config: NetworkConfig) -> NDArray[np.float32] | None:
-    """The image at the network's size, standardised."""
+    """Return the image at the size of the network input, standardised."""
     return None if image is None else standardise(shrink(image, config.image_size))
 
 
 def prepare_scan(points: Points | None, intensity: Points | None, config: NetworkConfig) -> VoxelScan:
-    """The scan (N, 3) in metres and its intensity (N,), voxelised; an empty one for None."""
+    """Voxelise a scan (N, 3) in metres with intensity (N,); None gives an empty scan."""
     if points is None:
         points, intensity = np.empty((0, 3), np.float32), None
     return voxelise(points, intensity, config.coarse_voxels, config.fine_voxels)
 
 
 def read_frame(frame: Frame, config: NetworkConfig) -> InputArrays:
-    """A batch of one frame as the network reads it: a black image is none, a scan loses its mount's tilt."""
+    """Return a batch of one frame: a blank image counts as missing, the tilt of the mount is removed from the scan."""
     image = None if frame.left is None or is_blank(frame.left) else prepare_image(frame.left, config)
     points = None if frame.points is None else transform(level(frame.points, keep_slope=True), frame.points)
     return pack([image], [prepare_scan(points, frame.intensity, config)], config)
 
 
 def blank_input(config: NetworkConfig) -> InputArrays:
-    """A batch of one frame without image and scan, for its shapes."""
+    """Return a batch of one frame without image and scan, of the usual shapes."""
     return pack([None], [prepare_scan(None, None, config)], config)
 
 
-DARK_STD = 2.0
-
-
 def is_blank(image: Image) -> bool:
-    """Whether an image shows nothing: a rover in the dark, or a covered lens."""
+    """Return whether an image has no contrast (darkness, covered lens)."""
     return float(cv2.meanStdDev(image)[1].max()) < DARK_STD
 
 
 def shrink(image: Image, size: tuple[int, int]) -> Image:
-    """The whole view at (height, width) = `size`, whatever the aspect."""
+    """Resize the whole image to (height, width) = `size`; the aspect ratio may change."""
     if image.shape[:2] == size:
         return image
     return cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
 def standardise(image: NDArray[np.floating] | Image) -> NDArray[np.float32]:
-    """Zero mean and unit contrast, so that exposure does not matter."""
+    """Return the image with zero mean and unit contrast, independent of the exposure."""
     values = image.astype(np.float32) / 255
     return (values - values.mean()) / (values.std() + np.float32(0.05))

@@ -1,4 +1,4 @@
-"""UMF as an embedder: descriptor and local features of a frame."""
+"""The UMF network as an embedder."""
 
 from __future__ import annotations
 
@@ -14,23 +14,30 @@ from umf_ros.core.geometry import Array, invert, transform
 from umf_ros.core.levelling import level
 from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.inputs import VoxelScan, is_blank, pack, prepare_image, prepare_scan
-from umf_ros.embedding.runtimes import Outputs, make_runtime
+from umf_ros.embedding.runtimes import make_runtime, outputs_of
 from umf_ros.networks.config import locate_weights, read_config
+
+KEYPOINTS = 400
+MIN_SALIENCY = 0.01
+"""In fair shares of attention; it limits the features of a poor view, and `KEYPOINTS` those of a rich one."""
+PREPROCESSING = b"scans without the tilt of their mount"
+"""Part of the name of the descriptors; it changes with the preprocessing."""
+Outputs = dict[str, NDArray[np.float32]]
 
 
 def select_salient(saliency: Points, group: NDArray[np.int64], threshold: float, limit: int) -> NDArray[np.int64]:
-    """Choose features so that no region takes more than its share.
+    """Select the most salient features, spread over the regions.
 
-    The k-th best of every region comes before any region's (k+1)-th; ties go to the lower index.
+    The k-th best feature of every region precedes the (k+1)-th of any region; ties go to the lower index.
 
     Args:
-        saliency: (N,) attention received, 1 is the fair share.
+        saliency: (N,) attention received; 1 is the fair share.
         group: (N,) region of each feature.
         threshold: features below are dropped.
-        limit: most features to keep.
+        limit: maximum number of features.
 
     Returns:
-        Indices of the chosen features, most salient first.
+        Indices of the selected features, most salient first.
     """
     candidates = np.flatnonzero(saliency >= threshold)
     by_region = candidates[np.lexsort((candidates, -saliency[candidates], group[candidates]))]
@@ -43,33 +50,27 @@ def select_salient(saliency: Points, group: NDArray[np.int64], threshold: float,
 
 
 def cell_regions(rows: int, columns: int, side: int = 4) -> NDArray[np.int64]:
-    """(rows * columns,) region of each cell of a map: squares of `side` cells."""
+    """Return the region (rows * columns,) of each cell of a map: squares of `side` cells."""
     row, column = np.divmod(np.arange(rows * columns), columns)
     return row // side * (columns // side + 1) + column // side
 
 
 def ground_regions(points: Points, side_m: float = 4.0) -> NDArray[np.int64]:
-    """(N,) region of each point: squares of `side_m` on the ground."""
+    """Return the region (N,) of each point: squares of `side_m` on the ground."""
     cell = np.floor(points[:, :2] / side_m).astype(np.int64) + 1000
     return cell[:, 0] * 10000 + cell[:, 1]
 
 
-KEYPOINTS = 400
-# of the fair share of attention; the cap decides in a rich view, this in a poor one
-MIN_SALIENCY = 0.01
-READ_AS = b"scans without the tilt of their mount"
-
-
 class UmfEmbedder:
-    """Descriptor and local features of a frame by the UMF network.
+    """Computes the descriptor and the local features of a frame with the UMF network.
 
-    Image features lie at the centres of the fine cells, in pixels of the full-resolution image; cloud
-    features at the mean of the points of a voxel.
+    Image features are the centres of the fine cells, in pixels of the full-resolution image; cloud features are the
+    means of the points of a voxel.
 
     Args:
-        weights: safetensors file or name of shipped weights, or None for the default.
+        weights: safetensors file, name of shipped weights, or None for the default.
         settings: runtime, device and threads.
-        asked: which local features to compute.
+        asked: local features to compute.
 
     Raises:
         WeightsError: the weights cannot be used.
@@ -84,12 +85,13 @@ class UmfEmbedder:
     ) -> None:
         path = locate_weights(weights)
         self._config = read_config(path)
-        # descriptors of other weights, or of scans read otherwise, are another language: the name tells them apart
-        self.name = f"{path.stem}-{hashlib.sha256(path.read_bytes() + READ_AS).hexdigest()[:8]}"
+        # descriptors of other weights or another preprocessing cannot be compared: their names differ
+        self.name = f"{path.stem}-{hashlib.sha256(path.read_bytes() + PREPROCESSING).hexdigest()[:8]}"
         self.dimension = self._config.length
         self._asked = asked
         rows, columns = (side // 4 for side in self._config.image_size)
         self._regions = cell_regions(rows, columns)
+        self._outputs = outputs_of(asked)
         self._runtime = make_runtime(path, settings or EmbeddingSettings(), asked)
 
     def embed(self, frame: Frame) -> Embedding:
@@ -98,7 +100,8 @@ class UmfEmbedder:
         level_T_body = np.eye(4) if frame.points is None else level(frame.points, keep_slope=True)
         points = None if frame.points is None else transform(level_T_body, frame.points)
         scan = prepare_scan(points, frame.intensity, self._config)
-        found = self._runtime.run(pack([prepare_image(image, self._config)], [scan], self._config))
+        values = self._runtime.run(pack([prepare_image(image, self._config)], [scan], self._config))
+        found = dict(zip(self._outputs, values, strict=True))
         supers = self._supers(found) if self._asked.supers else (None, None)
         return Embedding(
             descriptor=found["descriptor"],
@@ -129,7 +132,7 @@ class UmfEmbedder:
 
 
 def make(settings: EmbeddingSettings, asked: FeatureRequest) -> UmfEmbedder:
-    """With the weights that the settings name."""
+    """Return the embedder with the weights that the settings name."""
     return UmfEmbedder(Path(settings.weights) if settings.weights else None, settings, asked)
 
 

@@ -1,1 +1,1 @@
-"""One memory of places for many rovers: PostgreSQL with pgvector. The rover's own store stays its truth."""
+"""Place database of a fleet: PostgreSQL with pgvector beside the store of every rover."""

@@ -5,28 +5,49 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
 
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Keyframe, LoopClosure
-from umf_ros.fleet.consensus import EncounterPair, FleetConsensus
+from umf_ros.core.geometry import invert, relative, rotation_angle
 from umf_ros.fleet.link import Answer, FleetLink
 from umf_ros.places.store import KeyframeStore
 from umf_ros.verification import Verdict, Verifier
 
-UNCONFIRMED = "waits for a closure of another place that agrees"
-"""Why a closure that verification accepted is not published yet."""
+UNCONFIRMED = "pending: no closure of another place agrees yet"
+"""Reason of a closure that verification accepted and that is not published yet."""
+APART_M = 8.0
+"""Closures nearer to each other show one place and may share one error (*by hand*)."""
+REACH_M = 150.0
+"""Longest path by which odometry confirms a closure: beyond, its own error fits anything (*by hand*)."""
+SLACK_M, SLACK_RAD = 1.0, 0.12
+"""Error allowed to a closure itself (*by hand*: three times the error of accepted ones)."""
+DRIFT_RAD_PER_M = 0.003
+"""Drift of the heading of odometry (*by hand*)."""
+KEPT = 200
+"""Pending and confirmed closures that are kept of each rover."""
+
+
+class InterRobotPair(NamedTuple):
+    """A closure between two rovers, with both its keyframes."""
+
+    query: Keyframe
+    match: Keyframe
+    closure: LoopClosure
 
 
 @dataclass(frozen=True, slots=True)
 class InterRobotClosure:
-    """What verification says of a keyframe and those of one other rover.
+    """Verification of a keyframe against those of one other rover.
 
     Attributes:
         keyframe: of this rover.
         own: the rover's name; its keyframes are `keyframe/<own>/<stamp>` to the fleet.
         robot: the other's name.
-        verdicts: what was tested; a closure among them may wait for another one that agrees.
-        closures: what is believed from now on, of earlier keyframes too.
+        verdicts: of all candidates; a closure among them may be pending.
+        closures: accepted from now on, of earlier keyframes too.
     """
 
     keyframe: Keyframe
@@ -36,8 +57,55 @@ class InterRobotClosure:
     closures: list[LoopClosure]
 
 
+class FleetConsensus:
+    """Keeps a closure between two rovers pending until one of another place agrees with it.
+
+    Within one rover the pose graph rejects wrong closures. Two rovers have no common graph on board, so the loop
+    through two closures and both odometries has to close.
+
+    Args:
+        drift: odometry error per path length.
+    """
+
+    def __init__(self, drift: float) -> None:
+        self._drift = drift
+        self._pending: list[InterRobotPair] = []
+        self._confirmed: list[InterRobotPair] = []
+
+    def confirm(self, pair: InterRobotPair) -> list[InterRobotPair]:
+        """Take a closure; returns the closures that are confirmed by it, itself included."""
+        agreeing = [other for other in self._pending if self.agree(pair, other)]
+        if not agreeing and not any(self.agree(pair, other) for other in self._confirmed):
+            self._pending = [*self._pending[-KEPT + 1 :], pair]
+            return []
+        self._pending = [other for other in self._pending if not any(other is one for one in agreeing)]
+        new = [*agreeing, pair]
+        self._confirmed = [*self._confirmed, *new][-KEPT:]
+        return new
+
+    def agree(self, one: InterRobotPair, other: InterRobotPair) -> bool:
+        """Whether the loop through two closures of different places and both odometries closes."""
+        if one.query.session != other.query.session or one.match.session != other.match.session:
+            return False
+        poses = one.query.odom_T_body, other.query.odom_T_body, one.match.odom_T_body, other.match.odom_T_body
+        query_one, query_other, match_one, match_other = poses
+        if query_one is None or query_other is None or match_one is None or match_other is None:
+            return False
+        own_step, other_step = relative(query_one, query_other), relative(match_one, match_other)
+        distances = [float(np.linalg.norm(step[:3, 3])) for step in (own_step, other_step)]
+        path_m = abs(one.query.path_length_m - other.query.path_length_m)
+        path_m += abs(one.match.path_length_m - other.match.path_length_m)
+        if min(distances) < APART_M or path_m > REACH_M:
+            return False
+        predicted = invert(other_step) @ one.closure.match_T_query @ own_step
+        gap = relative(predicted, other.closure.match_T_query)
+        most_m = SLACK_M + self._drift * path_m
+        most_rad = SLACK_RAD + DRIFT_RAD_PER_M * path_m
+        return bool(np.linalg.norm(gap[:3, 3]) < most_m and rotation_angle(gap) < most_rad)
+
+
 class InterRobotMatcher:
-    """Verifies what a fleet's server finds, each rover by a verifier of its own, for memories must not mix.
+    """Verifies the candidates of a fleet's server, with a verifier for each rover: their histories must not mix.
 
     Args:
         settings: all settings.
@@ -51,43 +119,39 @@ class InterRobotMatcher:
     def __init__(self, settings: Settings, store: KeyframeStore, identity: tuple[str, int]) -> None:
         self._settings = settings.verification
         self.link = FleetLink(store, settings.database, identity)
-        self._verifiers: dict[str, Verifier] = {}
-        self._consensus: dict[str, FleetConsensus] = {}
+        self._verifiers: dict[str, tuple[Verifier, FleetConsensus]] = {}
 
     def next(self) -> InterRobotClosure | None:
-        """Verify what the server found first; None while there is nothing new."""
+        """Verify the oldest answer of the server; None while there is none."""
         answer = self.link.answer()
         return self._verify(answer) if answer is not None else None
 
     def rest(self, timeout_s: float) -> Iterator[InterRobotClosure]:
-        """Push and ask what waits, as long as there is time, and verify all that comes of it."""
+        """Finish pushing and asking within a time limit, and verify all answers."""
         end = time.monotonic() + timeout_s
         while True:
             done = self.link.drain(0.1) or time.monotonic() > end
-            while (inter_closure := self.next()) is not None:
-                yield inter_closure
+            while (found := self.next()) is not None:
+                yield found
             if done:
                 return
 
     def close(self) -> None:
-        """Leave the server."""
+        """Disconnect from the server."""
         self.link.close()
 
     def _verify(self, answer: Answer) -> InterRobotClosure:
         robot = answer.robot
         if robot not in self._verifiers:
-            self._verifiers[robot] = Verifier(self._settings)
-            self._consensus[robot] = FleetConsensus(self._settings.odometry_drift)
-        verifier, consensus = self._verifiers[robot], self._consensus[robot]
+            self._verifiers[robot] = Verifier(self._settings), FleetConsensus(self._settings.odometry_drift)
+        verifier, consensus = self._verifiers[robot]
         matches = {candidate.stamp_ns: match for candidate, match in answer.found}
-        verdicts = verifier.verify(answer.keyframe, answer.found)
-        told, closures = [], []
-        for verdict in verdicts:
-            if verdict.closure is None:
-                told.append(verdict)
-                continue
-            pair = EncounterPair(answer.keyframe, matches[verdict.candidate.stamp_ns], verdict.closure)
-            confirmed = consensus.confirm(pair)
-            closures += [one.closure for one in confirmed]
-            told.append(verdict if confirmed else replace(verdict, reason=UNCONFIRMED))
-        return InterRobotClosure(answer.keyframe, self.link.robot, robot, told, closures)
+        verdicts, closures = [], []
+        for verdict in verifier.verify(answer.keyframe, answer.found):
+            if verdict.closure is not None:
+                pair = InterRobotPair(answer.keyframe, matches[verdict.candidate.stamp_ns], verdict.closure)
+                confirmed = consensus.confirm(pair)
+                closures += [one.closure for one in confirmed]
+                verdict = verdict if confirmed else replace(verdict, reason=UNCONFIRMED)
+            verdicts.append(verdict)
+        return InterRobotClosure(answer.keyframe, self.link.robot, robot, verdicts, closures)

@@ -1,4 +1,4 @@
-"""The thread that tells a fleet's server what the rover stores, and asks it what others have seen there."""
+"""The thread that pushes a rover's places to the fleet's server, and queries those of other rovers."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ from collections import OrderedDict, deque
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-
 from umf_ros.core.config import Database
 from umf_ros.core.frames import Candidate, Keyframe
-from umf_ros.fleet.server import FleetKey, FleetServer, LinkError, OutgoingPlace
-from umf_ros.places.packing import pack, unpack
+from umf_ros.fleet.server import FleetKey, FleetServer, LinkError
+from umf_ros.places.packing import unpack
 from umf_ros.places.store import KeyframeStore
 
 logger = logging.getLogger(__name__)
@@ -22,22 +20,22 @@ logger = logging.getLogger(__name__)
 BATCH = 16
 """Keyframes of one transaction."""
 ASKS_KEPT = 1000
-"""Keyframes that wait to be asked about while the link is cut: ten minutes of driving; the oldest give way."""
+"""Queries kept while disconnected, ten minutes of driving; the oldest are dropped."""
 ANSWERS_KEPT = 20
-"""Answers that wait for verification; while there are more, places are pushed and nothing is asked."""
+"""Answers pending verification; while there are more, places are pushed and nothing is queried."""
 CACHED = 100
-"""Keyframes of others kept in memory."""
+"""Keyframes of other rovers kept in memory."""
 RETRY_S = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-"""After so long a server that is gone is looked for again."""
+"""Times between attempts to reconnect."""
 
 
 class Answer(NamedTuple):
-    """Places of one session of another rover that look like a keyframe of this one.
+    """Places of one session of another rover that are similar to a keyframe of this one.
 
     Attributes:
         keyframe: of this rover.
         robot: the other's name.
-        found: what looks alike, with the other's keyframes; their session has a number below 0 here.
+        found: candidates with the other's keyframes, whose sessions have negative numbers here.
     """
 
     keyframe: Keyframe
@@ -46,20 +44,20 @@ class Answer(NamedTuple):
 
 
 class FleetLink:
-    """Pushes what the store's outbox holds, in order, and asks about every keyframe of this run.
+    """Pushes the store's outbox in order, and queries every keyframe of this run.
 
-    Nothing here makes the rover wait: a link that is cut is looked for again and again, and meanwhile the outbox grows.
+    No call waits for the server: while it is disconnected the outbox grows, and the thread reconnects.
 
     Args:
         store: the rover's places, with an outbox.
-        settings: address of the server, and how many candidates to ask for.
+        settings: address of the server, and the number of candidates per query.
         identity: name of the embedder and its dimension.
 
     Attributes:
         robot: the rover's name on the server; empty until the first contact.
-        connected: whether the server answered last.
-        pushed: places it has got from here in this run.
-        trouble: what went wrong last, in one line; empty when nothing is.
+        connected: whether the latest request succeeded.
+        pushed: places pushed in this run.
+        trouble: the latest error, in one line; empty while there is none.
     """
 
     def __init__(self, store: KeyframeStore, settings: Database, identity: tuple[str, int]) -> None:
@@ -75,24 +73,24 @@ class FleetLink:
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
         self._thread.start()
 
-    def remembered(self, row: int) -> None:
-        """A keyframe was stored: push it, and ask about it."""
+    def enqueue(self, row: int) -> None:
+        """Push and query a keyframe that was stored."""
         self._asks.append(row)
         self._work.set()
 
     def answer(self) -> Answer | None:
-        """What came first of all that was not taken yet."""
+        """Take the oldest answer; None where there is none."""
         if not self._answers:
             return None
         self._work.set()
         return self._answers.popleft()
 
     def waiting(self) -> int:
-        """How many places the server does not have yet."""
+        """Number of places that are not pushed yet."""
         return self._store.waiting()
 
     def drain(self, timeout_s: float) -> bool:
-        """Wait until all is pushed and asked; returns whether it is. Answers have to be taken meanwhile."""
+        """Wait until all is pushed and queried; returns whether it is. Answers have to be taken meanwhile."""
         end = time.monotonic() + timeout_s
         while self._asks or self._asking or self._store.waiting():
             if time.monotonic() > end:
@@ -101,7 +99,7 @@ class FleetLink:
         return True
 
     def close(self) -> None:
-        """Leave the server; what was not pushed is at the next start."""
+        """Disconnect; places that were not pushed are pushed after the next start."""
         self._end.set()
         self._work.set()
         self._thread.join()
@@ -112,7 +110,7 @@ class FleetLink:
             try:
                 busy = self._step()
                 failures = 0
-            except Exception as error:  # a thread that ended would lose places without a word
+            except Exception as error:  # a thread that ended would lose places unnoticed
                 self._lose(error)
                 self._end.wait(RETRY_S[min(failures, len(RETRY_S) - 1)])
                 failures += 1
@@ -124,13 +122,13 @@ class FleetLink:
             self._server.close()
 
     def _step(self) -> bool:
-        """Do the next thing; returns whether there was any."""
+        """Push or query once; returns whether there was anything to do."""
         if self._server is None:
             self._server = FleetServer(self._settings.server, self._store.store_id, self._identity)
             self.robot, self.connected, self.trouble = self._server.robot, True, ""
         rows = self._store.outgoing(BATCH)
         if rows:
-            self._server.push([_outgoing(self._store[row]) for row in rows])
+            self._server.push([self._store[row] for row in rows])
             self._store.delivered(rows)
             self.pushed += len(rows)
             return True
@@ -164,10 +162,10 @@ class FleetLink:
                 return None
             try:
                 keyframe = unpack(data)
-            except Exception as error:  # whatever another rover wrote there
+            except Exception as error:  # another rover may write any bytes
                 logger.warning("%s of %s cannot be read: %s", key.stamp_ns, key.robot, error)
                 return None
-            # two rovers may have sessions of one number, and even keyframes of one stamp
+            # sessions and stamps of two rovers may coincide
             name = key.robot, key.store, key.session
             session = self._sessions.setdefault(name, -1 - len(self._sessions))
             self._cache[key] = replace(keyframe, stamp_ns=key.stamp_ns, session=session)
@@ -177,15 +175,10 @@ class FleetLink:
         return self._cache[key]
 
     def _lose(self, error: Exception) -> None:
-        """The link is cut, or something worse; told when it is new."""
+        """Disconnect after an error, and log it when it is new."""
         if str(error) != self.trouble:
-            logger.warning("%s; %d places wait for it", error, self._store.waiting())
+            logger.warning("%s; %d places are not pushed yet", error, self._store.waiting())
         self.trouble, self.connected = str(error), False
         if self._server is not None and isinstance(error, LinkError):
             self._server.close()
             self._server = None
-
-
-def _outgoing(keyframe: Keyframe) -> OutgoingPlace:
-    descriptor = np.asarray(keyframe.embedding.descriptor, np.float32)
-    return OutgoingPlace(keyframe.session, keyframe.stamp_ns, keyframe.path_length_m, descriptor, pack(keyframe))

@@ -1,10 +1,10 @@
-"""A rover's connection to the fleet's server."""
+"""The PostgreSQL server of a fleet: its tables and roles, and the connection of a rover."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from typing import NamedTuple
 from uuid import UUID
 
 import numpy as np
@@ -12,14 +12,42 @@ import psycopg
 from numpy.typing import NDArray
 from pgvector import HalfVector
 from pgvector.psycopg import register_vector
+from psycopg import Connection, sql
 
-from umf_ros.core.errors import UmfError
-from umf_ros.fleet.migrations import MIGRATIONS, version_of
+from umf_ros.core.errors import UmfError, one_line
+from umf_ros.core.frames import Keyframe
+from umf_ros.places.packing import pack
 
-LOOKED_AT = 100
-"""Places that the search in the server's graph keeps in hand (`hnsw.ef_search`): recall against time."""
-ANSWER_S = 5.0
-"""A server that has not answered by then counts as gone."""
+ROVERS = "umf_rover"
+"""Role of all rovers: its members read every row and add rows of their own name."""
+SEARCHED = 100
+"""Places that the search in the server's graph keeps (`hnsw.ef_search`): recall against time."""
+TIMEOUT_S = 5.0
+"""A server that has not answered by then counts as disconnected."""
+_KEY = "robot text, store uuid, session integer, stamp_ns bigint"
+_KEY_NAMES = "robot, store, session, stamp_ns"
+MIGRATIONS = (
+    (
+        "CREATE EXTENSION IF NOT EXISTS vector",
+        # one row: every rover of a fleet embeds with the same network
+        "CREATE TABLE fleet (embedder text NOT NULL, dimension integer NOT NULL)",
+        f"CREATE TABLE place ({_KEY}, travelled_m double precision, descriptor halfvec({{dimension}}) NOT NULL, "
+        f"PRIMARY KEY ({_KEY_NAMES}))",
+        # apart from the descriptors, so that those of a million places stay in memory
+        f"CREATE TABLE place_data ({_KEY}, data bytea STORAGE EXTERNAL NOT NULL, PRIMARY KEY ({_KEY_NAMES}), "
+        f"FOREIGN KEY ({_KEY_NAMES}) REFERENCES place)",
+        "CREATE INDEX place_descriptor ON place USING hnsw (descriptor halfvec_ip_ops)",
+        "ALTER TABLE place ENABLE ROW LEVEL SECURITY",
+        "ALTER TABLE place_data ENABLE ROW LEVEL SECURITY",
+        "CREATE POLICY everybody_reads ON place FOR SELECT USING (true)",
+        "CREATE POLICY everybody_reads ON place_data FOR SELECT USING (true)",
+        "CREATE POLICY its_own ON place FOR INSERT WITH CHECK (robot = current_user)",
+        "CREATE POLICY its_own ON place_data FOR INSERT WITH CHECK (robot = current_user)",
+        f"GRANT SELECT ON fleet, fleet_version TO {ROVERS}",
+        f"GRANT SELECT, INSERT ON place, place_data TO {ROVERS}",
+    ),
+)
+"""Statements that lead from version n to n + 1; a released migration is never changed, only added to."""
 _INSERT = "INSERT INTO place VALUES (current_user, %s, %s, %s, %s, %s) ON CONFLICT DO NOTHING"
 _INSERT_DATA = "INSERT INTO place_data VALUES (current_user, %s, %s, %s, %s) ON CONFLICT DO NOTHING"
 _NEAREST = (
@@ -29,20 +57,59 @@ _NEAREST = (
 _DATA = "SELECT data FROM place_data WHERE robot = %s AND store = %s AND session = %s AND stamp_ns = %s"
 
 
-class LinkError(UmfError):
-    """The server cannot be reached, or went away: what was to be done is done later."""
+def migrate(connection: Connection, embedder: str, dimension: int) -> tuple[int, int]:
+    """Bring the tables up to date in one transaction; returns the version before and after.
 
+    Args:
+        connection: of a user who may create roles and tables.
+        embedder: the network of the fleet, for new tables.
+        dimension: numbers per descriptor, for new tables.
 
-@dataclass(frozen=True, slots=True)
-class FleetKey:
-    """What names a keyframe in a fleet.
-
-    Attributes:
-        robot: the rover, which is the name of its role on the server.
-        store: its file of places.
-        session: number of the session in that file.
-        stamp_ns: key of the keyframe.
+    Raises:
+        UmfError: a later version of umf_ros made the tables.
     """
+    with connection.transaction():
+        # a second administrator waits here, and finds nothing to do
+        connection.execute("SELECT pg_advisory_xact_lock(7215)")
+        before = _version(connection)
+        if before > len(MIGRATIONS):
+            raise UmfError(f"the server has tables of version {before}, this umf_ros knows {len(MIGRATIONS)}")
+        if not before:
+            if not connection.execute("SELECT 1 FROM pg_roles WHERE rolname = %s", (ROVERS,)).fetchone():
+                connection.execute(sql.SQL("CREATE ROLE {} NOLOGIN").format(sql.Identifier(ROVERS)))
+            connection.execute("CREATE TABLE IF NOT EXISTS fleet_version (version integer PRIMARY KEY)")
+        for version, statements in enumerate(MIGRATIONS[before:], before + 1):
+            for statement in statements:
+                connection.execute(sql.SQL(statement).format(dimension=sql.Literal(dimension)))
+            connection.execute("INSERT INTO fleet_version VALUES (%s)", (version,))
+        if not before:
+            connection.execute("INSERT INTO fleet VALUES (%s, %s)", (embedder, dimension))
+    return before, len(MIGRATIONS)
+
+
+def add_rover(connection: Connection, name: str, password: str) -> None:
+    """Add a rover, or change its password. The server receives the password's verifier only.
+
+    Args:
+        connection: of a user who may create roles.
+        name: of the rover, its role and its rows.
+        password: new password.
+    """
+    verifier = connection.pgconn.encrypt_password(password.encode(), name.encode(), b"scram-sha-256").decode()
+    known = connection.execute("SELECT 1 FROM pg_roles WHERE rolname = %s", (name,)).fetchone()
+    verb = sql.SQL("ALTER ROLE" if known else "CREATE ROLE")
+    with connection.transaction():
+        parts = verb, sql.Identifier(name), sql.Literal(verifier)
+        connection.execute(sql.SQL("{} {} LOGIN PASSWORD {}").format(*parts))
+        connection.execute(sql.SQL("GRANT {} TO {}").format(sql.Identifier(ROVERS), sql.Identifier(name)))
+
+
+class LinkError(UmfError):
+    """The server is unreachable or disconnected; the request has to be repeated later."""
+
+
+class FleetKey(NamedTuple):
+    """Key of a keyframe in a fleet: rover, id of its place database, session in that database, stamp in ns."""
 
     robot: str
     store: UUID
@@ -50,31 +117,13 @@ class FleetKey:
     stamp_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class OutgoingPlace:
-    """A keyframe on its way to the server.
-
-    Attributes:
-        session, stamp_ns: its key in its store.
-        path_length_m: metres driven, NaN where they are unknown.
-        descriptor: (D,) float32.
-        data: the keyframe, packed.
-    """
-
-    session: int
-    stamp_ns: int
-    path_length_m: float
-    descriptor: NDArray[np.float32]
-    data: bytes
-
-
 class FleetServer:
-    """Places of all rovers of a fleet; every call ends within seconds, whatever becomes of the link.
+    """A rover's connection to the server; every call ends within seconds, with a `LinkError` if the server is gone.
 
     Args:
-        address: `postgresql://ROVER@HOST/DATABASE?sslmode=verify-full`; the password comes from a `.pgpass` file or
-            the environment, as libpq has it.
-        store: the rover's file of places.
+        address: `postgresql://ROVER@HOST/DATABASE?sslmode=verify-full`; libpq takes the password from a `.pgpass` file
+            or the environment.
+        store: id of the rover's place database.
         identity: name of the embedder and its dimension.
 
     Attributes:
@@ -91,13 +140,13 @@ class FleetServer:
             self._connection = psycopg.connect(
                 address,
                 autocommit=True,
-                connect_timeout=round(ANSWER_S),
-                tcp_user_timeout=round(1e3 * ANSWER_S),
+                connect_timeout=round(TIMEOUT_S),
+                tcp_user_timeout=round(1e3 * TIMEOUT_S),
                 keepalives_idle=5,
                 keepalives_interval=2,
                 keepalives_count=2,
                 application_name="umf_ros",
-                options=f"-c statement_timeout={round(1e3 * ANSWER_S)}",
+                options=f"-c statement_timeout={round(1e3 * TIMEOUT_S)}",
             )
         try:
             with _link():
@@ -106,72 +155,64 @@ class FleetServer:
             self.close()
             raise
 
-    def push(self, places: Sequence[OutgoingPlace]) -> None:
-        """Store places for good, all or none; those that are there already are left as they are.
-
-        Raises:
-            LinkError: the link was cut; whether they were stored is unknown.
-        """
-        key = [(self._store, place.session, place.stamp_ns) for place in places]
-        rows = [
-            (*one, None if np.isnan(place.path_length_m) else place.path_length_m, HalfVector(place.descriptor))
-            for one, place in zip(key, places, strict=True)
-        ]
+    def push(self, keyframes: Sequence[Keyframe]) -> None:
+        """Store keyframes, all or none; those that are stored already stay unchanged."""
+        places, data = [], []
+        for one in keyframes:
+            key = self._store, one.session, one.stamp_ns
+            path_m = None if np.isnan(one.path_length_m) else one.path_length_m
+            places.append((*key, path_m, HalfVector(np.asarray(one.embedding.descriptor, np.float32))))
+            data.append((*key, pack(one)))
         with _link(), self._connection.transaction(), self._connection.cursor() as cursor:
-            cursor.executemany(_INSERT, rows)
-            cursor.executemany(_INSERT_DATA, [(*one, place.data) for one, place in zip(key, places, strict=True)])
+            cursor.executemany(_INSERT, places)
+            cursor.executemany(_INSERT_DATA, data)
 
     def nearest(self, descriptor: NDArray[np.float32], count: int) -> list[tuple[FleetKey, float]]:
-        """The places of other rovers most like a descriptor with their similarity, best first.
-
-        Raises:
-            LinkError: the link was cut.
-        """
+        """The most similar places of other rovers with their similarity, best first."""
         vector = HalfVector(descriptor)
         with _link():
             rows = self._connection.execute(_NEAREST, (vector, vector, count)).fetchall()
         return [(FleetKey(*key), float(similarity)) for *key, similarity in rows]
 
     def data(self, key: FleetKey) -> bytes | None:
-        """A keyframe, packed; None where there is none.
-
-        Raises:
-            LinkError: the link was cut.
-        """
+        """A packed keyframe; None where there is none."""
         with _link():
-            values = key.robot, key.store, key.session, key.stamp_ns
-            row = self._connection.execute(_DATA, values, binary=True).fetchone()
+            row = self._connection.execute(_DATA, key, binary=True).fetchone()
         return row[0] if row else None
 
     def close(self) -> None:
-        """Leave the server."""
+        """Close the connection."""
         self._connection.close()
 
     def _check(self, identity: tuple[str, int]) -> str:
-        version = version_of(self._connection)
+        version = _version(self._connection)
         if version != len(MIGRATIONS):
-            what = f"tables of version {version}, not {len(MIGRATIONS)}" if version else "no tables of a fleet"
-            raise UmfError(f"the fleet's server has {what}; its administrator runs umf fleet setup")
+            found = f"tables of version {version}, not {len(MIGRATIONS)}" if version else "no tables of a fleet"
+            raise UmfError(f"the fleet's server has {found}; its administrator runs umf fleet setup")
         known = self._connection.execute("SELECT embedder, dimension FROM fleet").fetchone()
         if known != identity:
             raise UmfError(f"the fleet's places are of {known}, not of {identity}")
         register_vector(self._connection)
-        self._connection.execute("SELECT set_config('hnsw.ef_search', %s, false)", (str(LOOKED_AT),))
+        self._connection.execute("SELECT set_config('hnsw.ef_search', %s, false)", (str(SEARCHED),))
         self._connection.execute("SET hnsw.iterative_scan = strict_order")
         row = self._connection.execute("SELECT current_user::text").fetchone()
         return str(row[0]) if row else ""
 
 
+def _version(connection: Connection) -> int:
+    """Version of the server's tables; 0 where there are none."""
+    if connection.execute("SELECT to_regclass('fleet_version')").fetchone() == (None,):
+        return 0
+    row = connection.execute("SELECT max(version) FROM fleet_version").fetchone()
+    return int(row[0] or 0) if row else 0
+
+
 @contextmanager
 def _link() -> Iterator[None]:
-    """Tell whatever goes wrong with the server in one line; neither libpq nor this names a password."""
+    """Report errors of the server in one line; neither libpq nor this line contains a password."""
     try:
         yield
     except psycopg.errors.InsufficientPrivilege as error:
-        raise UmfError(f"the fleet's server refuses: {_line(error)}") from None
+        raise UmfError(f"the fleet's server refuses: {one_line(error)}") from None
     except psycopg.Error as error:
-        raise LinkError(f"the fleet's server cannot be reached: {_line(error)}") from None
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+        raise LinkError(f"the fleet's server cannot be reached: {one_line(error)}") from None

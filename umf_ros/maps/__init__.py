@@ -1,1 +1,1 @@
-"""Maps of many recordings: sessions that share one pose graph and one frame, and who finds himself in them again."""
+"""Multi-session maps: recordings that share one pose graph and one frame."""

@@ -1,4 +1,4 @@
-"""The joint pose graph of a map: every session's odometry, closures within and between, solved together."""
+"""The joint pose graph of a map: odometry of every session, closures within and between sessions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class JointSession:
 
     Attributes:
         session: the recording.
-        joined: whether it shares the map's frame.
+        joined: whether closures connect it to the map's frame.
         stamps: (N,) of its keyframes with a pose in the map, ns of its own clock.
         poses: (N, 4, 4) `map_T_body` there.
         odometry: (N, 4, 4) `odom_T_body` there.
@@ -42,10 +42,10 @@ class JointMap:
     """A solved map.
 
     Attributes:
-        graph: of everything, on the map's clock.
+        graph: of all sessions, on the map's clock.
         sessions: its recordings.
-        within: verdicts on closures inside a recording.
-        between: those on closures between two.
+        within: verdicts on closures within a recording.
+        between: verdicts on closures between two recordings.
     """
 
     graph: PoseGraph
@@ -54,15 +54,15 @@ class JointMap:
     between: list[ClosureVerdict]
 
     def accepted_between(self) -> list[LoopClosure]:
-        """The closures that tie recordings together."""
+        """Accepted closures between recordings."""
         return [verdict.closure for verdict in self.between if verdict.state is State.ACCEPTED]
 
 
 def solve(folder: MapFolder) -> JointMap:
-    """Build and settle the joint graph of a map from what its sessions left.
+    """Build and settle the joint graph of a map from the run folders of its sessions.
 
-    Closures between recordings are judged by the same outlier rejection as those within: two sessions that nothing
-    joins yet are joined once closures of several places are consistent with each other.
+    The same outlier rejection applies to closures within and between recordings: two unconnected sessions are joined
+    once closures of several places are consistent with each other.
 
     Raises:
         UmfError: a file of the map is missing or damaged.
@@ -75,7 +75,7 @@ def solve(folder: MapFolder) -> JointMap:
             graph.begin_session()
         logs[session.name] = OdometryLog.load(run)
         logs[session.name].feed(graph, session.shift_ns)
-    # after all odometry: a closure may name any session
+    # after all odometry, as a closure may refer to any session
     for session in folder.sessions:
         run = folder.folder_of(session.name)
         graph.add_closures(
@@ -93,7 +93,7 @@ def solve(folder: MapFolder) -> JointMap:
 
 
 def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, log: OdometryLog) -> JointSession:
-    """Where the keyframes of a recording are in the solved map."""
+    """A recording with the poses of its keyframes in the solved map."""
     rows = read_keyframes(folder.folder_of(session.name) / "keyframes.csv")
     stamps = np.array([row.stamp_ns for row in rows], np.int64)
     poses, known = graph.poses_at(stamps + session.shift_ns)
@@ -102,6 +102,6 @@ def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, log: Odome
 
 
 def _shifted(closure: LoopClosure, shift_ns: int) -> LoopClosure:
-    """A closure inside a recording, on the map's clock."""
+    """A closure within a recording, on the map's clock."""
     query_ns, match_ns = closure.query_stamp_ns + shift_ns, closure.match_stamp_ns + shift_ns
     return replace(closure, query_stamp_ns=query_ns, match_stamp_ns=match_ns)

@@ -1,4 +1,4 @@
-"""The folder of a map: which recordings it was made of, and where everything about them lies."""
+"""The folder of a map: its recordings and the paths of their files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SCHEMA_VERSION = 1
 BETWEEN = "closures_between.csv"
 _DAY_NS = 86_400 * 10**9
 APART_NS = 60 * 10**9
-"""Sessions lie at least this far apart on the map's clock: further than odometry is ever interpolated."""
+"""Least gap between sessions on the map's clock: longer than odometry is ever interpolated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,13 +25,13 @@ class MapSession:
     """One recording of a map.
 
     Attributes:
-        name: also of its folder.
-        recording: what tells it from any other, as in the summary of a run.
+        name: of the session and its folder.
+        recording: its description, as in the summary of a run.
         shift_ns: from its own clock to the map's, on which no two recordings overlap.
         first_ns, last_ns: the time it covers, own clock.
-        first_place, places: its rows in the store of places.
-        first_number, numbers: its sessions in the store of places: one, or more where odometry began anew.
-        odometry: whether it has some of its own; else its scans were followed from one keyframe to the next.
+        first_place, places: its rows in the place database.
+        first_number, numbers: its sessions in the place database: one, or more where its odometry restarted.
+        odometry: whether the recording has odometry; otherwise its keyframes were tracked.
     """
 
     name: str
@@ -46,12 +46,12 @@ class MapSession:
     odometry: bool
 
     def covers(self, map_ns: int) -> bool:
-        """Whether a stamp of the map's clock is of this recording."""
+        """Whether the recording covers a stamp of the map's clock."""
         return self.first_ns <= map_ns - self.shift_ns <= self.last_ns
 
 
 class MapFolder:
-    """A map on disk: `map.json` says what it is made of.
+    """A map on disk; `map.json` lists its sessions.
 
     Attributes:
         path: the folder.
@@ -64,10 +64,10 @@ class MapFolder:
 
     @classmethod
     def open(cls, path: Path) -> MapFolder:
-        """A map that is there.
+        """Open an existing map.
 
         Raises:
-            UmfError: there is none, or it was written by another version.
+            UmfError: there is none, or another version wrote it.
         """
         folder = cls(path)
         if not folder.exists:
@@ -77,10 +77,10 @@ class MapFolder:
 
     @classmethod
     def open_or_create(cls, path: Path, settings: Settings) -> MapFolder:
-        """A map that is there, or a new one with these settings.
+        """Open an existing map, or create one with these settings.
 
         Raises:
-            UmfError: it was written by another version.
+            UmfError: another version wrote it.
             OutputError: it cannot be written.
         """
         folder = cls(path)
@@ -95,17 +95,17 @@ class MapFolder:
 
     @property
     def exists(self) -> bool:
-        """Whether there is a map."""
+        """Whether the folder holds a map."""
         return (self.path / "map.json").is_file()
 
     @property
     def settings(self) -> Settings:
-        """Those of its first recording: it is verified and solved by them."""
+        """Settings of the first recording, which apply to all."""
         return load_settings(self.path / "config.yaml")
 
     @property
     def places(self) -> Path:
-        """The store of places of all recordings, stamped by the map's clock."""
+        """Place database of all recordings, stamped by the map's clock."""
         return self.path / PLACES_OF_MAP
 
     def folder_of(self, name: str) -> Path:
@@ -117,25 +117,25 @@ class MapFolder:
         return next((session for session in self.sessions if session.covers(map_ns)), None)
 
     def knows(self, recording: dict[str, Any]) -> MapSession | None:
-        """The session of this recording, wherever its file lay then."""
+        """The session of a recording, whatever the path of its file."""
         keys = "start_ns", "end_ns", "messages"
         same = (s for s in self.sessions if all(s.recording[key] == recording[key] for key in keys))
         return next(same, None)
 
     def free_name(self, path: Path, promised: Collection[str] = ()) -> str:
-        """A name for a recording's session that none has, and that is promised to none."""
+        """A session name for a recording that is neither taken nor promised."""
         taken = {session.name for session in self.sessions} | set(promised)
         names = (path.stem if number == 1 else f"{path.stem}_{number}" for number in range(1, len(taken) + 2))
         return next(name for name in names if name not in taken)
 
     def shift_for(self, first_ns: int) -> int:
-        """By how much a recording that begins then has to be moved to lie behind all others; whole days, or none."""
+        """Shift in ns, of whole days, that puts a recording with this first stamp behind all others."""
         newest = max((session.last_ns + session.shift_ns for session in self.sessions), default=None)
         missing = 0 if newest is None else newest + APART_NS - first_ns
         return 0 if missing <= 0 else -(-missing // _DAY_NS) * _DAY_NS
 
     def add(self, session: MapSession) -> None:
-        """Remember a recording that is in the store of places by now.
+        """Add a session whose places are in the place database.
 
         Raises:
             OutputError: the folder cannot be written.
@@ -151,7 +151,7 @@ class MapFolder:
         try:
             content = json.loads((self.path / "map.json").read_text(encoding="utf-8"))
             if content["schema"] != SCHEMA_VERSION:
-                raise UmfError(f"{self.path} is a map of another version of umf_ros; make it anew from its recordings")
+                raise UmfError(f"{self.path} is of another version of umf_ros; build the map again from its recordings")
             self.sessions = [MapSession(**session) for session in content["sessions"]]
         except (OSError, ValueError, KeyError, TypeError):
             raise UmfError(f"{self.path / 'map.json'} is damaged") from None

@@ -1,34 +1,39 @@
-"""The odometry of a recording, every message as it came, for the graphs that are built later."""
+"""The odometry of a recording: its messages, or the poses of keyframes that were tracked where there are none."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.config import Verification
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array
+from umf_ros.core.io import atomic_write
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
+from umf_ros.verification import Verifier
 
 NAME = "odometry.npz"
 Item = TypeVar("Item")
 
 
 class OdometryLog:
-    """Messages of one odometry in the order of their arrival.
+    """Odometry messages of a recording in the order of their arrival.
 
     Attributes:
         stamps: of each, ns.
         poses: (4, 4) `odom_T_body` of each.
-        covariances: (6, 6) of the motion since the one before, ROS order, axes of the body before; only where
-            every message has one.
-        starts: numbers of the messages that go on from nothing before; only with covariances.
+        covariances: (6, 6) of the motion since the previous message, ROS order, axes of the previous body; empty, or
+            one for every message.
+        starts: rows of the messages without a motion since the previous one; only with covariances.
     """
 
     def __init__(self) -> None:
@@ -41,7 +46,7 @@ class OdometryLog:
         return len(self.stamps)
 
     def following(self, stream: Iterable[Item]) -> Iterator[Item]:
-        """The stream of a recording as it is, its odometry noted on the way."""
+        """Pass on the stream of a recording unchanged, and log its odometry."""
         for item in stream:
             if isinstance(item, OdometrySample):
                 self.stamps.append(item.stamp_ns)
@@ -49,7 +54,7 @@ class OdometryLog:
             yield item
 
     def append(self, stamp_ns: int, pose: Array, covariance: Array | None) -> None:
-        """Note a pose that was found; without a covariance nothing joins it to the one before."""
+        """Append a tracked pose; without a covariance it has no motion since the previous one."""
         if covariance is None:
             self.starts.append(len(self))
         self.stamps.append(stamp_ns)
@@ -63,7 +68,7 @@ class OdometryLog:
         return Trajectory(stamps, np.array(self.poses, float).reshape(-1, 4, 4)[first])
 
     def feed(self, graph: PoseGraph, shift_ns: int) -> None:
-        """Give every message to a graph whose newest session is empty, on another clock."""
+        """Add every message, its stamp shifted, to a graph whose newest session is empty."""
         if not self.covariances:
             feed = OdometrySessionSplitter(graph)
             for stamp, pose in zip(self.stamps, self.poses, strict=True):
@@ -77,7 +82,7 @@ class OdometryLog:
             graph.add_odometry(stamp + shift_ns, pose, known)
 
     def save(self, folder: Path) -> None:
-        """Write it into a run folder.
+        """Write the log into a run folder.
 
         Raises:
             OutputError: the folder cannot be written.
@@ -88,12 +93,12 @@ class OdometryLog:
             "covariances": np.array(self.covariances, float).reshape(-1, 6, 6),
             "starts": np.array(self.starts, np.int64),
         }
-        with writing(folder / NAME), (folder / NAME).open("wb") as file:
+        with atomic_write(folder / NAME) as part, part.open("wb") as file:
             np.savez(file, **arrays)  # type: ignore[arg-type]
 
     @classmethod
     def load(cls, folder: Path) -> OdometryLog:
-        """Read it from a run folder.
+        """Read the log of a run folder.
 
         Raises:
             UmfError: it is missing or damaged.
@@ -106,3 +111,47 @@ class OdometryLog:
         except (OSError, ValueError, KeyError) as error:
             raise UmfError(f"{folder / NAME} cannot be read: {error}") from None
         return log
+
+
+def track(keyframes: Iterable[Keyframe], settings: Verification) -> tuple[OdometryLog, list[Keyframe]]:
+    """Track a recording without odometry by closures between consecutive keyframes.
+
+    Where two consecutive keyframes have no closure, a new session begins, which other closures have to connect.
+
+    Args:
+        keyframes: of one recording, in order, without odometry.
+        settings: of the verification of closures.
+
+    Returns:
+        The poses, and the keyframes with `odom_T_body`, `path_length_m` and `session`, which counts from 0.
+    """
+    log = OdometryLog()
+    tracked: list[Keyframe] = []
+    pose, path_m, session = np.eye(4), 0.0, 0
+    for keyframe, found in _consecutive(keyframes, settings):
+        if found is None:
+            session += bool(tracked)
+            pose, path_m, covariance = np.eye(4), 0.0, None
+        else:
+            step, covariance = found
+            pose, path_m = pose @ step, path_m + float(np.linalg.norm(step[:3, 3]))
+        log.append(keyframe.stamp_ns, pose, covariance)
+        tracked.append(replace(keyframe, odom_T_body=pose, path_length_m=path_m, session=session))
+    return log, tracked
+
+
+def _consecutive(
+    keyframes: Iterable[Keyframe], settings: Verification
+) -> Iterator[tuple[Keyframe, tuple[Array, Array] | None]]:
+    """Every keyframe with its pose in the previous one and the covariance, None where no closure was accepted."""
+    before: Keyframe | None = None
+    for keyframe in keyframes:
+        found = None
+        if before is not None:
+            similarity = float(before.embedding.descriptor @ keyframe.embedding.descriptor)
+            # a verifier that keeps earlier closures would need odometry between them
+            verdicts = Verifier(settings).verify(keyframe, [(Candidate(0, before.stamp_ns, similarity), before)])
+            closure = verdicts[0].closure
+            found = None if closure is None else (closure.match_T_query, closure.covariance)
+        yield keyframe, found
+        before = keyframe

@@ -1,10 +1,9 @@
-"""What a solved map leaves in its folder: trajectories, graph, verdicts, cloud, pictures and summary."""
+"""Results of a solved map: trajectories, graph, verdicts, cloud, pictures, summary and report."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import asdict
 from math import isnan, nan
 from pathlib import Path
 from typing import Any
@@ -13,20 +12,18 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from umf_ros.core.errors import UmfError, writing
-from umf_ros.core.geometry import Array
+from umf_ros.core.errors import writing
+from umf_ros.core.io import atomic_write
 from umf_ros.core.trajectory import Trajectory, write_tum
+from umf_ros.localizer import POSES
 from umf_ros.maps.joint_graph import JointMap, JointSession
 from umf_ros.maps.map_folder import MapFolder
-from umf_ros.maps.point_cloud import Crispness, write_cloud
-from umf_ros.maps.report import write_report
+from umf_ros.maps.point_cloud import write_cloud
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.g2o import verdict_table
-from umf_ros.runs.report import plot_trajectories
+from umf_ros.runs.gallery import data_address
+from umf_ros.runs.report import plot_trajectories, render
 from umf_ros.runs.writer import write_atomically
-
-POSES = "poses.npz"
-"""Every place that has a pose in the map: `stamps` (N,) on the map's clock, `poses` (N, 4, 4) `map_T_body`."""
 
 
 def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
@@ -45,33 +42,22 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
         write_tum(trajectories / f"{one.session.name}.tum", Trajectory(one.stamps, one.poses))
     joint.graph.write_g2o(path / "graph.g2o")
     _draw(path / "trajectories.png", joint)
-    crispness = write_cloud(folder, joint) if folder.places.is_file() else Crispness(nan, nan)
-    summary = summarise(joint) | {"thickness_m": {name: _rounded(value) for name, value in asdict(crispness).items()}}
+    thickness = write_cloud(folder, joint) if folder.places.is_file() else (nan, nan)
+    rounded = (None if isnan(value) else round(value, 4) for value in thickness)
+    summary = summarise(joint) | {"thickness_m": dict(zip(("before", "after"), rounded, strict=True))}
     write_atomically(path / "summary.json", json.dumps(summary, indent=2) + "\n")
-    write_report(path, summary)
+    _write_report(path, summary)
     return summary
 
 
-def read_poses(path: Path) -> Trajectory:
-    """The poses of a map's places, on the map's clock.
-
-    Raises:
-        UmfError: the map has not been solved, or the file is damaged.
-    """
-    try:
-        with np.load(path / POSES) as stored:
-            return Trajectory(stored["stamps"], stored["poses"])
-    except (OSError, ValueError, KeyError):
-        raise UmfError(f"{path / POSES} cannot be read: umf map writes it when a map is solved") from None
-
-
 def summarise(joint: JointMap) -> dict[str, Any]:
-    """What `summary.json` holds."""
+    """Contents of `summary.json`."""
     ties = Counter(
-        name
+        one.session.name
         for closure in joint.accepted_between()
         for stamp in (closure.query_stamp_ns, closure.match_stamp_ns)
-        for name in _names_at(joint, stamp)
+        for one in joint.sessions
+        if one.session.covers(stamp)
     )
     return {
         "sessions": [_about(joint, one, ties[one.session.name]) for one in joint.sessions],
@@ -81,13 +67,27 @@ def summarise(joint: JointMap) -> dict[str, Any]:
     }
 
 
-def _rounded(value: float) -> float | None:
-    return None if isnan(value) else round(value, 4)
+def sentence(summary: dict[str, Any]) -> str:
+    """Joined sessions and closures between them, in one sentence."""
+    between, joined = summary["closures_between"], summary["joined"]
+    return (
+        f"{joined} of {len(summary['sessions'])} sessions in one frame; closures between them: "
+        f"{between['accepted']} of {between['found']} accepted"
+    )
+
+
+def crispness(summary: dict[str, Any]) -> str:
+    """Thickness of surfaces in a sentence; empty where no two sessions overlap."""
+    thickness = summary["thickness_m"]
+    if thickness["after"] is None:
+        return ""
+    before, after = (f"{100 * thickness[when]:.1f}" for when in ("before", "after"))
+    return f"surfaces seen by several sessions are {after} cm thick, by odometry alone {before} cm"
 
 
 def _about(joint: JointMap, one: JointSession, ties: int) -> dict[str, Any]:
     session = one.session
-    steps = np.linalg.norm(np.diff(one.poses[:, :3, 3], axis=0), axis=1) if len(one.poses) > 1 else np.zeros(1)
+    steps = np.linalg.norm(np.diff(one.poses[:, :3, 3], axis=0), axis=1)
     spans = joint.graph.session_spans()
     return {
         "name": session.name,
@@ -108,26 +108,15 @@ def _counts(verdicts: list[Any]) -> dict[str, int]:
     return {"found": len(verdicts), **{state.value: counts[state] for state in (State.ACCEPTED, State.REJECTED)}}
 
 
-def _names_at(joint: JointMap, stamp_ns: int) -> list[str]:
-    return [one.session.name for one in joint.sessions if one.session.covers(stamp_ns)]
-
-
 def _write_poses(path: Path, joint: JointMap) -> None:
-    stamps = [one.stamps + one.session.shift_ns for one in joint.sessions]
-    poses = [one.poses for one in joint.sessions]
-    part = path.with_name(path.name + ".part")
-    with writing(path):
-        with part.open("wb") as file:
-            np.savez(file, stamps=np.concatenate([np.empty(0, np.int64), *stamps]), poses=_joined(poses))
-        part.replace(path)
-
-
-def _joined(poses: list[Array]) -> Array:
-    return np.concatenate([np.empty((0, 4, 4)), *poses])
+    stamps = [np.empty(0, np.int64), *(one.stamps + one.session.shift_ns for one in joint.sessions)]
+    poses = [np.empty((0, 4, 4)), *(one.poses for one in joint.sessions)]
+    with atomic_write(path) as part, part.open("wb") as file:
+        np.savez(file, stamps=np.concatenate(stamps), poses=np.concatenate(poses))
 
 
 def _draw(path: Path, joint: JointMap) -> None:
-    """All sessions from above, each in its colour, and the closures that tie them together."""
+    """Plot all joined sessions from above, and the accepted closures between them."""
     palette = colormaps["tab10"]
     shown = [one for one in joint.sessions if one.joined]
     curves = [(one.session.name, to_hex(palette(i % 10)), one.poses[:, :3, 3]) for i, one in enumerate(shown)]
@@ -137,3 +126,21 @@ def _draw(path: Path, joint: JointMap) -> None:
     lines = poses[:, :3, 3].reshape(-1, 2, 3)[known.reshape(-1, 2).all(axis=1)]
     with writing(path):
         plot_trajectories(path, curves, lines, [None] * len(lines))
+
+
+def _write_report(folder: Path, summary: dict[str, Any]) -> None:
+    """Write the self-contained `report.html` from the summary and the pictures in the folder of a map."""
+    joined, count = summary["joined"], len(summary["sessions"])
+    pictures = {"trajectories": folder / "trajectories.png", "ground": folder / "map.png"}
+    page = render(
+        "map.html",
+        name=folder.resolve().name,
+        sentence=sentence(summary),
+        mark="good" if joined == count else "warn",
+        sessions=summary["sessions"],
+        between=summary["closures_between"],
+        within=summary["closures_within"],
+        crispness=crispness(summary),
+        **{name: data_address("image/png", p.read_bytes()) if p.is_file() else "" for name, p in pictures.items()},
+    )
+    write_atomically(folder / "report.html", page)

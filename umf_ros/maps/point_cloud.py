@@ -1,4 +1,4 @@
-"""The map as a point cloud: aligned scans, thinned by voxels, and how crisp their surfaces are."""
+"""The map as a point cloud: aligned scans, thinned by voxels, and the thickness of their surfaces."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from umf_ros.core.errors import writing
 from umf_ros.core.frames import Points
-from umf_ros.core.geometry import Array, invert, transform
+from umf_ros.core.geometry import invert, transform
+from umf_ros.core.io import atomic_write
 from umf_ros.maps.joint_graph import JointMap
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.places.database import PlaceDatabase
@@ -21,7 +21,7 @@ from umf_ros.places.store import stored_identity
 from umf_ros.runs.gallery import HeightMap
 
 VOXEL_M = 0.1
-REACH_M = 25.0  # by hand: beyond, a scan's points lie too thin to show whether it is aligned
+REACH_M = 25.0  # by hand: beyond, points are too sparse to show an alignment
 _NEIGHBOURS_M, _FEWEST = 0.5, 12
 _MOST_PROBED = 20_000
 _RECORD = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("session", "u1")])
@@ -33,14 +33,14 @@ class MapCloud:
 
     Attributes:
         points: (N, 3) float32, m, map frame.
-        sessions: (N,) number of the recording that saw each; counts from 0, and again from 0 after 255.
+        sessions: (N,) number of the recording of each point, modulo 256.
     """
 
     points: Points
     sessions: NDArray[np.uint8]
 
     def thinned(self, voxel_m: float = VOXEL_M) -> MapCloud:
-        """One point for each voxel: the first of those in it."""
+        """Keep the first point in every voxel."""
         cells = np.floor(self.points / voxel_m).astype(np.int64)
         cells -= cells.min(axis=0, initial=0)
         size = cells.max(axis=0, initial=0) + 1
@@ -48,10 +48,10 @@ class MapCloud:
         return MapCloud(self.points[first], self.sessions[first])
 
     def thickness(self) -> float:
-        """Median thickness in m of the surfaces that at least two recordings saw: the less, the crisper the map.
+        """Median thickness in m of the surfaces that at least two recordings saw; thinner surfaces: a crisper map.
 
-        Around points all over the map, the standard deviation across the plane through the neighbours within half a
-        metre [after the mean plane variance of Razlaw 2015]; NaN where no two recordings meet.
+        The standard deviation across the plane through the neighbours within half a metre of points all over the map
+        [after the mean plane variance of Razlaw 2015]; NaN where no two recordings overlap.
         """
         tree = cKDTree(self.points)
         rows = np.unique(np.linspace(0, len(self.points) - 1, min(len(self.points), _MOST_PROBED)).astype(int))
@@ -63,16 +63,8 @@ class MapCloud:
         return float(np.median(found)) if found else float("nan")
 
 
-@dataclass(frozen=True)
-class Crispness:
-    """Thickness of surfaces, m, by the odometry of every session from where it began, and by the joint graph."""
-
-    before: float
-    after: float
-
-
 def gather(folder: MapFolder, joint: JointMap, optimised: bool = True) -> MapCloud:
-    """The scans of all joined recordings where the map puts them, or their odometry from where each began."""
+    """The scans of all joined recordings at their poses in the map, or at those of their odometry alone."""
     points, sessions = [np.empty((0, 3), np.float32)], [np.empty(0, np.uint8)]
     for number, scan in _scans(folder, joint, optimised):
         points.append(scan)
@@ -80,8 +72,11 @@ def gather(folder: MapFolder, joint: JointMap, optimised: bool = True) -> MapClo
     return MapCloud(np.concatenate(points), np.concatenate(sessions))
 
 
-def write_cloud(folder: MapFolder, joint: JointMap) -> Crispness:
-    """Write `map.ply`, `map.pcd` and the picture `map.png`; returns how crisp the map is.
+def write_cloud(folder: MapFolder, joint: JointMap) -> tuple[float, float]:
+    """Write `map.ply`, `map.pcd` and the picture `map.png`.
+
+    Returns:
+        Thickness of surfaces in m by the odometry of every session alone, and by the joint graph.
 
     Raises:
         OutputError: a file cannot be written.
@@ -91,8 +86,15 @@ def write_cloud(folder: MapFolder, joint: JointMap) -> Crispness:
     thin = cloud.thinned()
     write_ply(folder.path / "map.ply", thin)
     write_pcd(folder.path / "map.pcd", thin)
-    _draw(folder.path / "map.png", joint, cloud)
-    return Crispness(gather(folder, joint, optimised=False).thinned().thickness(), thin.thickness())
+    path = np.concatenate([np.empty((0, 2)), *(one.poses[:, :2, 3] for one in joint.sessions)])
+    if len(path):
+        heights = HeightMap(path)
+        heights.add(cloud.points)
+        png = heights.png()
+        if png is not None:
+            with atomic_write(folder.path / "map.png") as part:
+                part.write_bytes(png)
+    return gather(folder, joint, optimised=False).thinned().thickness(), thin.thickness()
 
 
 def write_ply(path: Path, cloud: MapCloud) -> None:
@@ -126,8 +128,8 @@ def _write(path: Path, header: str, cloud: MapCloud) -> None:
     records = np.empty(len(cloud.points), _RECORD)
     records["x"], records["y"], records["z"] = cloud.points.T
     records["session"] = cloud.sessions
-    with writing(path):
-        path.write_bytes(header.encode("ascii") + records.tobytes())
+    with atomic_write(path) as part:
+        part.write_bytes(header.encode("ascii") + records.tobytes())
 
 
 def _scans(folder: MapFolder, joint: JointMap, optimised: bool) -> Iterator[tuple[int, Points]]:
@@ -135,7 +137,9 @@ def _scans(folder: MapFolder, joint: JointMap, optimised: bool) -> Iterator[tupl
     identity = stored_identity(folder.places)
     with closing(PlaceDatabase.of_map(folder.path, *identity)) as places:
         for number, one in enumerate(joint.sessions):
-            poses = one.poses if optimised else _by_odometry(one.poses, one.odometry)
+            poses = one.poses
+            if len(poses) and not optimised:
+                poses = poses[0] @ invert(one.odometry[0]) @ one.odometry
             known = dict(zip((one.stamps + one.session.shift_ns).tolist(), poses, strict=True))
             for row in range(one.session.first_place, one.session.first_place + one.session.places):
                 keyframe = places[row]
@@ -143,20 +147,3 @@ def _scans(folder: MapFolder, joint: JointMap, optimised: bool) -> Iterator[tupl
                 if pose is not None:
                     near = keyframe.points[np.linalg.norm(keyframe.points, axis=1) < REACH_M]
                     yield number, transform(pose, near)
-
-
-def _by_odometry(poses: Array, odometry: Array) -> Array:
-    """Where odometry alone would have led from the first pose."""
-    return poses if not len(poses) else poses[0] @ invert(odometry[0]) @ odometry
-
-
-def _draw(path: Path, joint: JointMap, cloud: MapCloud) -> None:
-    way = np.concatenate([np.empty((0, 2)), *(one.poses[:, :2, 3] for one in joint.sessions)])
-    if not len(way):
-        return
-    heights = HeightMap(way)
-    heights.add(cloud.points)
-    png = heights.png()
-    if png is not None:
-        with writing(path):
-            path.write_bytes(png)

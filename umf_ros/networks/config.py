@@ -14,12 +14,16 @@ from safetensors import safe_open
 from umf_ros.core.errors import WeightsError, one_line, shortened
 from umf_ros.core.resources import find
 
+CELLS = 40
+"""Voxels along each side of the grid."""
+FEATURES = 6
+"""Features of a voxel (`umf_ros.embedding.inputs.VoxelScan`)."""
 XFEAT_CELL = 8
-"""Pixels along a side of the cell that one descriptor of XFeat stands for."""
+"""Side, in pixels, of the cell of one descriptor of XFeat."""
 XFEAT_STRIDE = 32
-"""Of its deepest layer: images are cut to multiples of this many pixels."""
+"""Stride of the deepest layer of XFeat, in pixels; sides of images are multiples of it."""
 LARGEST = 8192
-"""No size of a network is larger."""
+"""Upper limit of every size in a weights file."""
 _MOST = {"voxel_blocks": 64, "layers": 64, "super_iterations": 64, "width": 1024}
 _MAY_BE_NONE = ("voxel_blocks", "scene")
 Backbone = Literal["resnet18", "resnet34", "resnet50", "efficientnet_lite0"]
@@ -27,24 +31,24 @@ Backbone = Literal["resnet18", "resnet34", "resnet50", "efficientnet_lite0"]
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """What has to be known to build the network that a weights file belongs to.
+    """Architecture of the network.
 
     Attributes:
         backbone: image encoder.
-        width: channels of its first stage (64 is the published ResNet); EfficientNet-Lite0 has its own.
+        width: channels of its first stage (64 in the published ResNet); ignored by EfficientNet-Lite0.
         image_size: height and width of the network's input, multiples of 32.
         pyramid: channels of the image feature pyramid.
         voxel_channels: channels of the voxel encoder at 20^3, 10^3 and 5^3 cells.
         voxel_blocks: residual blocks of the voxel encoder at 10^3 and at 5^3 cells.
         tokens: width of the fusion transformer.
         heads, layers, feedforward: of the fusion transformer.
-        descriptor: length of the global descriptor, without the scene's part.
-        coarse_voxels, fine_voxels: most occupied voxels kept for fusion and for local features.
+        descriptor: length of the global descriptor, without the scene descriptor.
+        coarse_voxels, fine_voxels: maximum number of occupied voxels for fusion and for local features.
         local: width of the two local transformer layers.
         image_local, cloud_local: lengths of the local descriptors.
         super_iterations: rounds of the iterative attention of the super-features.
         image_supers, cloud_supers: number of super-features and their length.
-        scene: length of what a trunk that has seen photographs adds to the descriptor; 0: there is none.
+        scene: length of the scene descriptor (a trunk pretrained on photographs); 0 for none.
     """
 
     backbone: Backbone = "resnet18"
@@ -78,7 +82,7 @@ class NetworkConfig:
             raise ValueError("the width of a transformer must be a multiple of its heads")
 
     def _check_sizes(self) -> None:
-        """See that each is a whole number, or as many, that a network can have: a weights file may say anything."""
+        """Raise ValueError unless every size is a whole number (or a tuple of them) within its limits."""
         for field in fields(self):
             value, usual = getattr(self, field.name), field.default
             if isinstance(usual, str):
@@ -92,16 +96,16 @@ class NetworkConfig:
 
     @property
     def length(self) -> int:
-        """Of the whole descriptor."""
+        """Length of the whole descriptor."""
         return self.descriptor + self.scene
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for a JSON card."""
+        """Return plain values for a JSON file."""
         return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
-        """Inverse of `as_dict`.
+        """Return the configuration from the result of `as_dict`.
 
         Raises:
             WeightsError: a name or a value does not describe this architecture.
@@ -118,13 +122,13 @@ DEFAULT = "umf_scene"
 
 
 def locate_weights(weights: Path | None) -> Path:
-    """A weights file: as given, one of the shipped by its name, or for None the shipped default."""
+    """Return a weights file: as given, by the name of shipped weights, or the default for None."""
     name = DEFAULT if weights is None else str(weights)
     return find(f"models/{name}.safetensors") if name in SHIPPED else Path(name)
 
 
 def read_config(path: Path) -> NetworkConfig:
-    """The sizes of the network of a weights file.
+    """Return the architecture of the network of a weights file.
 
     Raises:
         WeightsError: missing, truncated or foreign file, or of another architecture.
@@ -135,7 +139,7 @@ def read_config(path: Path) -> NetworkConfig:
 
 @contextmanager
 def open_weights(path: Path, framework: str) -> Iterator[Any]:
-    """An open weights file; whatever goes wrong while it is read is a `WeightsError`."""
+    """Open a weights file; every error while it is read becomes a `WeightsError`."""
     try:
         if not path.is_file():
             raise WeightsError(f"weights {shortened(path)} do not exist")
@@ -143,15 +147,15 @@ def open_weights(path: Path, framework: str) -> Iterator[Any]:
             yield stream
     except WeightsError:
         raise
-    except Exception as error:  # shapes that do not fit, sizes that nobody has memory for
+    except Exception as error:  # shapes that do not fit, sizes beyond the memory
         raise WeightsError(f"{shortened(path)} is truncated or not a safetensors file: {one_line(error)}") from None
 
 
 def parse_architecture(path: Path, stream: Any) -> dict[str, Any]:
-    """What an open weights file states of its network.
+    """Return the architecture that an open weights file states.
 
     Raises:
-        WeightsError: it states nothing, or nothing that can be read.
+        WeightsError: the file states none, or it cannot be parsed.
     """
     metadata = stream.metadata() or {}
     if "architecture" not in metadata:

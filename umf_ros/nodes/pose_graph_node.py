@@ -26,7 +26,7 @@ from umf_ros.core import watchdog
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import Array
-from umf_ros.maps.follower import MapFollower
+from umf_ros.localizer import MapFollower
 from umf_ros.nodes import conversions as messages
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import (

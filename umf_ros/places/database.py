@@ -130,7 +130,11 @@ class PlaceDatabase:
         """
 
         def admissible(rows: Rows | slice) -> Mask:
-            return self._admissible(keyframe, rules, rows) if sessions is None else self._of_sessions(sessions, rows)
+            keys = self.store.keys[rows]
+            if sessions is not None:
+                return np.asarray((keys["session"] >= sessions.start) & (keys["session"] < sessions.stop))
+            age_ns, path_m = keyframe.stamp_ns - keys["stamp_ns"], keyframe.path_length_m - keys["travelled_m"]
+            return is_past(age_ns, path_m, rules, keys["session"] == keyframe.session)
 
         for wanted in (2 * rules.top_k, WIDER * rules.top_k):
             found = self._most_similar(keyframe.embedding.descriptor, wanted, admissible)
@@ -211,13 +215,3 @@ class PlaceDatabase:
             if len(chosen) == count:
                 break
         return [found[position] for position in chosen]
-
-    def _admissible(self, keyframe: Keyframe, rules: Loop, rows: Rows | slice) -> Mask:
-        keys = self.store.keys
-        age_ns = keyframe.stamp_ns - keys["stamp_ns"][rows]
-        path_m = keyframe.path_length_m - keys["travelled_m"][rows]
-        return is_past(age_ns, path_m, rules, keys["session"][rows] == keyframe.session)
-
-    def _of_sessions(self, sessions: range, rows: Rows | slice) -> Mask:
-        numbers = self.store.keys["session"][rows]
-        return np.asarray((numbers >= sessions.start) & (numbers < sessions.stop))

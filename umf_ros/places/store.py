@@ -8,9 +8,8 @@ import threading
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from uuid import UUID
 
 import numpy as np
@@ -51,7 +50,6 @@ OUTBOX = Schema(
     ),
     unversioned=lambda tables: int({"fleet", "outbox"} <= tables),
 )
-IDS_AT_ONCE = 1000
 LARGEST_NUMBER = 2**53
 _KEYS = np.dtype([("id", np.int64), ("stamp_ns", np.int64), ("session", np.int64), ("travelled_m", np.float64)])
 
@@ -122,21 +120,17 @@ class KeyframeStore:
             return self._cache[row]
 
     def descriptors(self, rows: NDArray[np.intp]) -> NDArray[np.float32]:
-        """(N, D) float32 descriptors of some indices, in their order.
+        """(N, D) float32 descriptors of some indices, 30,000 at most, in their order.
 
         Raises:
             UmfError: the file is damaged.
         """
-        found = np.empty((len(rows), self._dimension), np.float32)
-        for first in range(0, len(rows), IDS_AT_ONCE):
-            part = rows[first : first + IDS_AT_ONCE]
-            ids = self.keys["id"][part].tolist()
-            statement = f"SELECT id, descriptor FROM keyframe WHERE id IN ({','.join('?' * len(ids))})"
-            with self._reading() as connection:
-                blobs = dict(connection.execute(statement, ids).fetchall())
-                content = b"".join(blobs[one] for one in ids)
-                found[first : first + len(part)] = np.frombuffer(content, np.float32).reshape(len(part), -1)
-        return found
+        ids = self.keys["id"][rows].tolist()
+        statement = f"SELECT id, descriptor FROM keyframe WHERE id IN ({','.join('?' * len(ids))})"
+        with self._reading() as connection:
+            blobs = dict(connection.execute(statement, ids))
+            content = b"".join(blobs[one] for one in ids)
+            return np.frombuffer(content, np.float32).reshape(len(ids), self._dimension)
 
     def rows_at(self, stamp_ns: int) -> list[int]:
         """Indices of the keyframes of a stamp, in order.
@@ -230,15 +224,8 @@ class KeyframeStore:
             yield connection
 
 
-@dataclass(frozen=True, slots=True)
-class StoredSession:
-    """One session of a place database.
-
-    Attributes:
-        number: of the session.
-        keyframes: how many it has.
-        first_ns, last_ns: their first and last stamp.
-    """
+class StoredSession(NamedTuple):
+    """A session of a place database: its number, number of keyframes, first and last stamp in ns."""
 
     number: int
     keyframes: int
@@ -304,11 +291,7 @@ def _looking(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _identity(connection: sqlite3.Connection) -> dict[str, Any]:
-    """Embedder and dimension of a file, as text.
-
-    Raises:
-        ValueError: they cannot be read.
-    """
+    """Embedder and dimension of a file, as text; raise a `ValueError` if they cannot be read."""
     about = connection.execute("SELECT content FROM about").fetchone()
     stored = json.loads(about[0]) if about else {}
     if not isinstance(stored, dict) or not all(isinstance(value, str) for value in stored.values()):
@@ -317,11 +300,7 @@ def _identity(connection: sqlite3.Connection) -> dict[str, Any]:
 
 
 def _check_identity(connection: sqlite3.Connection, name: str, identity: dict[str, str]) -> None:
-    """Check that the file `name` was made with an embedder.
-
-    Raises:
-        UmfError: it was made with another one, or has a format that is not converted.
-    """
+    """Raise an `UmfError` if the file `name` has another embedder, or a format that is not converted."""
     stored = _identity(connection)
     if stored.get("schema", UNVERSIONED_FORMAT) != UNVERSIONED_FORMAT:
         raise UmfError(f"{name} was written by another version of umf_ros; name a new file (database.path)")

@@ -45,10 +45,10 @@ _MOST_ODDS, _MOST_ODDS_AT_LAST = 0.1, 0.2
 # before any verdict, one of five closures counts as wrong
 _WRONG_BEFORE, _RIGHT_BEFORE = 1, 4
 # wrong closures seldom come alone: of those pending at the end of drives in worlds 10200-10473 of
-# benchmarks/pose_graph.py 1 of 67 wrong ones was alone and 59 of 213 right ones
+# `pose_graph.py` (benchmarks) 1 of 67 wrong ones was alone and 59 of 213 right ones
 _WRONG_ALONE = 0.1
 # nothing contradicts a wrong closure between sessions that are not joined: at the end two places have to agree, by 2.5
-# nats at least (*by hand*; benchmarks/aliased_sessions.py: without, one group of wrong closures joined 4 of 40 graphs)
+# nats at least (*by hand*; `aliased_sessions.py`: without, one group of wrong closures joined 4 of 40 graphs)
 _WRONG_BETWEEN = 10.0
 _EVEN = 0.5
 

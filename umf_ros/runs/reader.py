@@ -18,7 +18,8 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure, Points
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs import tables
-from umf_ros.runs.writer import read_descriptors, read_summary, write_summary
+from umf_ros.runs.run_file import read_descriptors
+from umf_ros.runs.writer import read_summary, write_summary
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.decode import TYPES
 from umf_ros.sensors.sessions import Input

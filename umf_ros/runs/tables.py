@@ -1,20 +1,20 @@
-"""The CSV tables of a run, appended row by row so that an interrupted run keeps what it found."""
+"""Columns and rows of the CSV tables of a run."""
 
 from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
+from umf_ros.core.io import atomic_write
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, State
 
 if TYPE_CHECKING:
@@ -31,6 +31,17 @@ STAGES = ("embed", "query", "verify", "submaps", "total")
 LATENCIES = ["stamp_ns", *STAGES]
 _KEYFRAME = tuple(zip((int, int, float), KEYFRAMES, strict=True))
 INLIERS = ["query_stamp_ns", "match_stamp_ns", "query_u", "query_v", "match_u", "match_v"]
+LOCALIZATION = ["stamp_ns", *POSE, *SIGMA, "probability"]
+COLUMNS = {
+    "keyframes": KEYFRAMES,
+    "latencies": LATENCIES,
+    "candidates": CANDIDATES,
+    "closures": CLOSURES,
+    "inliers": INLIERS,
+    "closures_between": CLOSURES_BETWEEN,
+    "localization": LOCALIZATION,
+}
+"""Columns of each table, which is exported as `<name>.csv`."""
 Row = TypeVar("Row")
 
 Endpoints = tuple[int, int]
@@ -91,61 +102,16 @@ class KeyframeRow:
     path_length_m: float
 
 
-class CsvTable:
-    """A CSV file with a header, flushed after every block of rows.
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV file in one step.
 
-    Rows that are there already stay, less the last line where it was not finished; a table of other columns, as of an
-    older version, gets out of the way by its name.
-
-    Args:
-        path: the file.
-        columns: its columns.
-        keep: which of the rows that are there stay; None: all.
-
-    Attributes:
-        rows: those that were there, as text by column.
+    Raises:
+        OutputError: the file cannot be written.
     """
-
-    def __init__(self, path: Path, columns: list[str], keep: Callable[[dict[str, str]], bool] | None = None) -> None:
-        self._path = path
-        with writing(path):
-            self.rows = _taken_up(path, columns, keep)
-            fresh = not path.exists()
-            self._file: TextIO = path.open("a", newline="", encoding="utf-8")
-        self._writer = csv.writer(self._file)
-        if fresh:
-            self.append([columns])
-
-    def append(self, rows: list[Any]) -> None:
-        """Write rows and hand them to the operating system."""
-        with writing(self._path):
-            self._writer.writerows(rows)
-            self._file.flush()
-
-    def close(self) -> None:
-        """Close the file."""
-        with writing(self._path):
-            self._file.close()
-
-
-def _taken_up(path: Path, columns: list[str], keep: Callable[[dict[str, str]], bool] | None) -> list[dict[str, str]]:
-    """The rows of a table that an earlier run left; nothing but them and the header is in the file then."""
-    if not path.exists():
-        return []
-    with path.open("rb") as file:
-        lines = file.read().decode("utf-8", "replace").splitlines(keepends=True)
-    whole = [line for line in lines if line.endswith("\n") and "\0" not in line]
-    if not whole or next(csv.reader(whole[:1])) != columns:
-        older = next(name for i in count(1) if not (name := path.with_suffix(f".{i}{path.suffix}")).exists())
-        path.rename(older)
-        return []
-    table = [(line, dict(zip(columns, row, strict=False))) for line, row in zip(whole, csv.reader(whole), strict=True)]
-    kept = table[:1] + [(line, row) for line, row in table[1:] if len(row) == len(columns) and (not keep or keep(row))]
-    if len(kept) != len(lines):
-        part = path.with_name(path.name + ".part")
-        part.write_text("".join(line for line, _ in kept), encoding="utf-8", newline="")
-        part.replace(path)
-    return [row for _, row in kept[1:]]
+    with atomic_write(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(rows)
 
 
 def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:

@@ -7,22 +7,24 @@ import os
 import resource
 import time
 from array import array
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
+from contextlib import closing, suppress
 from datetime import datetime
-from math import nan
+from math import isnan, nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from umf_ros import __version__
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import OutputError, UmfError, writing
-from umf_ros.core.frames import Frame, LoopClosure, Points
+from umf_ros.core.frames import Frame, LoopClosure
+from umf_ros.core.geometry import Array
+from umf_ros.core.io import atomic_write
 from umf_ros.detector import Detection
 from umf_ros.runs import tables
+from umf_ros.runs.run_file import NAME, RunFile
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
@@ -30,8 +32,12 @@ if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure
 
 
-def create_run_folder(out: Path) -> Path:
-    """Make a new folder named after the local time inside `out` and point `out/latest` at it.
+def create_run_folder(out: Path, latest: bool = True) -> Path:
+    """Make a new folder named after the local time inside `out`.
+
+    Args:
+        out: the folder of all runs.
+        latest: whether `out/latest` leads to it from now on, as it should for runs, whose report it shows.
 
     Raises:
         OutputError: `out` cannot be written.
@@ -40,10 +46,10 @@ def create_run_folder(out: Path) -> Path:
     with writing(f"to {out}"):
         out.mkdir(parents=True, exist_ok=True)
         folder = _make_unique(out, stamp)
-        # in one step, so that `latest` always leads somewhere
-        fresh = out / f".latest-{os.getpid()}"
-        fresh.symlink_to(folder.name, target_is_directory=True)
-        fresh.replace(out / "latest")
+        if latest:  # in one step, so that it always leads to a folder
+            fresh = out / f".latest-{os.getpid()}"
+            fresh.symlink_to(folder.name, target_is_directory=True)
+            fresh.replace(out / "latest")
     return folder
 
 
@@ -73,92 +79,16 @@ def write_atomically(path: Path, text: str) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    part = path.with_name(path.name + ".part")
-    with writing(path):
-        try:
-            part.write_text(text, encoding="utf-8")
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-
-
-NAME = "descriptors.f16"
-_HEAD = np.dtype("<i4")
-
-
-def _record(dimension: int) -> np.dtype[np.void]:
-    return np.dtype([("stamp_ns", "<i8"), ("descriptor", "<f2", (dimension,))])
-
-
-class DescriptorFile:
-    """Appends stamps and descriptors in half precision behind one number, their dimension.
-
-    What an earlier process left stays, less a last record that was not finished.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / NAME
-        with writing(self._path):
-            self._file: BinaryIO = self._path.open("ab", buffering=0)
-            size = self._path.stat().st_size
-            if size >= _HEAD.itemsize:
-                step = _record(int(np.fromfile(self._path, _HEAD, 1)[0])).itemsize
-                self._file.truncate(size - (size - _HEAD.itemsize) % step)
-            self._empty = size < _HEAD.itemsize
-
-    def append(self, stamp_ns: int, descriptor: Points) -> None:
-        """Write the descriptor (D,) of one keyframe."""
-        with writing(self._path):
-            if self._empty:
-                self._file.truncate(0)
-                self._file.write(np.array(len(descriptor), _HEAD).tobytes())
-                self._empty = False
-            self._file.write(np.array((stamp_ns, descriptor), _record(len(descriptor))).tobytes())
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-def all_descriptors(folder: Path) -> Points:
-    """Descriptors (N, D) float32 of all keyframes of a run, in order.
-
-    Raises:
-        UmfError: it has none.
-    """
-    rows = _read(folder)
-    if rows is None or not len(rows):
-        raise UmfError(f"{folder} holds no descriptors of keyframes")
-    return rows["descriptor"].astype(np.float32)
-
-
-def read_descriptors(folder: Path, stamps_ns: Sequence[int]) -> Points | None:
-    """Descriptors (N, D) float32 of keyframes by their stamps; None where one has none, as of an older version."""
-    rows = _read(folder)
-    if rows is None or not stamps_ns:
-        return None
-    place = {int(stamp): row for row, stamp in enumerate(rows["stamp_ns"])}
-    if any(stamp not in place for stamp in stamps_ns):
-        return None
-    return rows["descriptor"][[place[stamp] for stamp in stamps_ns]].astype(np.float32)
-
-
-def _read(folder: Path) -> NDArray[np.void] | None:
-    path = folder / NAME
-    content = path.read_bytes() if path.is_file() else b""
-    if len(content) < _HEAD.itemsize:
-        return None
-    kind = _record(int(np.frombuffer(content, _HEAD, 1)[0]))
-    return np.frombuffer(content, kind, (len(content) - _HEAD.itemsize) // kind.itemsize, _HEAD.itemsize)
+    with atomic_write(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 PLACES = "places.sqlite"
-"""Where a replay without a store of its own keeps its places until it is finished."""
-_RUN = "run.json"
+"""Store of places of a replay whose settings name none, until it is finished."""
 
 
 class ReplayFolder:
-    """The folder of a replay, new or that of one that was cut off.
+    """The folder of a replay: a new one, or that of a replay that was interrupted.
 
     Args:
         path: the folder.
@@ -179,23 +109,23 @@ class ReplayFolder:
             OutputError: it cannot be written.
         """
         folder = cls(create_run_folder(out), settings)
-        write_atomically(folder.path / _RUN, json.dumps({"bag": str(bag.resolve()), "finished": False}) + "\n")
+        _note(folder.path, bag=str(bag.resolve()), finished=False)
         return folder
 
     @classmethod
     def resume(cls, out: Path, bag: Path, settings: Settings) -> ReplayFolder:
-        """The newest folder inside `out` of a replay of `bag` that was not finished; a new one where there is none.
+        """Find the newest folder inside `out` of a replay of `bag` that was not finished; make one where there is none.
 
         Raises:
             UmfError: it was begun with other settings.
             OutputError: a new one cannot be written.
         """
-        begun = [path.parent for path in sorted(out.glob(f"*/{_RUN}"), reverse=True) if not path.parent.is_symlink()]
+        begun = [path.parent for path in sorted(out.glob(f"*/{NAME}"), reverse=True) if not path.parent.is_symlink()]
         for path in begun:
-            about = _resumption_read(path / _RUN)
-            if about.get("bag") != str(bag.resolve()) or about.get("finished") is not False:
+            facts = _facts(path)
+            if facts.get("bag") != str(bag.resolve()) or facts.get("finished"):
                 continue
-            # cut off before its settings were written: nothing is in it
+            # without settings, the process was killed before its first row
             if (path / "config.yaml").exists() and load_settings(path / "config.yaml") != settings:
                 raise UmfError(f"{path} was begun with other settings; leave out --resume, or give the same options")
             (path / "summary.json").unlink(missing_ok=True)  # of a run that was interrupted by Ctrl-C
@@ -212,44 +142,47 @@ class ReplayFolder:
         return self._settings.model_copy(update=update)
 
     def finish(self) -> None:
-        """The run has come to its end: it needs no places any more.
+        """Mark the run as finished, and delete its store of places.
 
         Raises:
             OutputError: the folder cannot be written.
         """
         for path in self.path.glob(f"{PLACES}*"):
             path.unlink(missing_ok=True)
-        about = _resumption_read(self.path / _RUN) | {"finished": True}
-        write_atomically(self.path / _RUN, json.dumps(about) + "\n")
+        _note(self.path, finished=True)
 
 
-def _resumption_read(path: Path) -> dict[str, object]:
-    with suppress(OSError, ValueError):
-        about = json.loads(path.read_text(encoding="utf-8"))
-        return about if isinstance(about, dict) else {}
+def _note(folder: Path, **values: Any) -> None:
+    with closing(RunFile(folder)) as file, file.writing():
+        file.note(**values)
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    with suppress(UmfError), closing(RunFile(folder, read_only=True)) as file:
+        return file.facts()
     return {}
 
 
-COUNTS = ("frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected")
 STAGES = tables.STAGES
 
 
 class RunRecorder:
-    """Fills a run folder: `config.yaml` at once, tables row by row, `summary.json` on `write_summary`.
+    """Writes a run: `config.yaml` at once, `run.sqlite` keyframe by keyframe, CSV tables and `summary.json` at the end.
 
-    What an earlier process left in the folder is never cut short: tables are appended to, counts go on. A keyframe
-    that is there already, as when a recording is played again, is not written twice.
+    A folder that an earlier process has begun is continued: rows and counts of both are kept, and a keyframe that is
+    there already, as when a recording is played again, is not written twice.
 
     Args:
         folder: an existing, writable folder.
         settings: the effective settings.
         weights: name of the network's weights, for the summary.
-        resume: what was not finished of a recording is done again: rows of a keyframe that is not there whole go.
+        resume: all frames of the recording pass again, and are counted again.
 
     Attributes:
         recorded: stamps and sessions of the keyframes in the folder.
 
     Raises:
+        UmfError: another process writes the folder, or its file is damaged.
         OutputError: the folder cannot be written.
     """
 
@@ -258,29 +191,27 @@ class RunRecorder:
         self._settings = settings
         self._weights = weights
         write_atomically(folder / "config.yaml", dump_settings(settings))
-        self._keyframes = tables.CsvTable(folder / "keyframes.csv", tables.KEYFRAMES)
-        self._latencies = tables.CsvTable(folder / "latencies.csv", tables.LATENCIES)
-        self._descriptors = DescriptorFile(folder)
-        self.recorded = {(int(row["stamp_ns"]), int(row["session"])) for row in self._keyframes.rows}
-        whole = {row["stamp_ns"] for row in self._keyframes.rows}
-
-        def table(name: str, columns: list[str]) -> tables.CsvTable:
-            keep = (lambda row: row["query_stamp_ns"] in whole) if resume else None
-            return tables.CsvTable(folder / f"{name}.csv", columns, keep)
-
-        self._closures = table("closures", tables.CLOSURES)
-        self._candidates = table("candidates", tables.CANDIDATES)
-        self._inliers = table("inliers", tables.INLIERS)
-        self._between: tables.CsvTable | None = None
-        self._pairs = {(int(row["query_stamp_ns"]), int(row["match_stamp_ns"])) for row in self._closures.rows}
-        self._latency = {stage: array("f") for stage in STAGES}
+        self._file = RunFile(folder)
+        self.recorded = {(int(row[0]), int(row[1])) for row in self._file.rows("keyframes")}
+        self._closures = self._file.closures()
+        self._pairs = {(closure.query_stamp_ns, closure.match_stamp_ns) for closure in self._closures}
+        latencies = self._file.rows("latencies")
+        self._latency = {
+            stage: array("f", (value for row in latencies if not isnan(value := float(row[place]))))
+            for place, stage in enumerate(STAGES, 1)
+        }
         self._counts = self._earlier_counts(resume)
+        self._odometry = 0
         self._started = time.monotonic()
         self._recorded_ns = 0
         self._last_stamp_ns: int | None = None
 
     def record(self, frame: Frame, detection: Detection) -> None:
-        """Write down what became of one frame."""
+        """Write the results of one frame, all of them or none.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
         self.count(frame)
         if self._last_stamp_ns is not None:
             self._recorded_ns += max(0, frame.stamp_ns - self._last_stamp_ns)
@@ -288,46 +219,54 @@ class RunRecorder:
         keyframe = detection.keyframe
         if keyframe is None or (keyframe.stamp_ns, keyframe.session) in self.recorded:
             return
+        stamp_ns = keyframe.stamp_ns
+        new = [
+            one for one in detection.verdicts if one.closure and (stamp_ns, one.candidate.stamp_ns) not in self._pairs
+        ]
+        times = [f"{detection.latency_ms.get(stage, nan):.1f}" for stage in STAGES]
+        closures = [tables.closure_row(one.closure, one.candidate.similarity) for one in new if one.closure]
+        with self._file.writing():
+            self._file.append("keyframes", [[stamp_ns, keyframe.session, f"{keyframe.path_length_m:.4f}"]])
+            self._file.append("latencies", [[stamp_ns, *times]])
+            self._file.append_descriptor(stamp_ns, keyframe.embedding.descriptor)
+            self._file.append("candidates", [tables.candidate_row(stamp_ns, one) for one in detection.verdicts])
+            self._file.append("closures", closures, odometry_before=self._odometry)
+            self._file.append("inliers", [row for one in new for row in tables.inlier_rows(stamp_ns, one)])
+            self._file.note(**self._facts())
         self._counts["keyframes"] += 1
         self._counts["queries"] += bool(detection.verdicts)
-        times = [f"{detection.latency_ms.get(stage, nan):.1f}" for stage in STAGES]
-        self._latencies.append([[keyframe.stamp_ns, *times]])
-        self._descriptors.append(keyframe.stamp_ns, keyframe.embedding.descriptor)
-        self._candidates.append([tables.candidate_row(keyframe.stamp_ns, verdict) for verdict in detection.verdicts])
-        for verdict in detection.verdicts:
-            if verdict.closure is None:
-                self._counts["closures_rejected"] += 1
-                continue
-            pair = keyframe.stamp_ns, verdict.candidate.stamp_ns
-            if pair in self._pairs:
-                continue
-            self._pairs.add(pair)
-            self._counts["closures_published"] += 1
-            self._closures.append([tables.closure_row(verdict.closure, verdict.candidate.similarity)])
-            self._inliers.append(tables.inlier_rows(keyframe.stamp_ns, verdict))
-        # last: a keyframe that is there is there with all that was found for it
-        self._keyframes.append([[keyframe.stamp_ns, keyframe.session, f"{keyframe.path_length_m:.4f}"]])
-        self.recorded.add((keyframe.stamp_ns, keyframe.session))
+        self._counts["closures_rejected"] += sum(verdict.closure is None for verdict in detection.verdicts)
+        self._counts["closures_published"] += len(new)
+        self._pairs.update((stamp_ns, one.candidate.stamp_ns) for one in new)
+        self.recorded.add((stamp_ns, keyframe.session))
         for stage, milliseconds in detection.latency_ms.items():
             self._latency[stage].append(milliseconds)
 
+    def record_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
+        """Write the next odometry message of the recording, with the next keyframe."""
+        self._file.append_odometry(self._odometry, stamp_ns, odom_T_body)
+        self._odometry += 1
+
     def record_encounter(self, inter_closure: InterRobotClosure) -> None:
-        """Write down the closures with another rover of a fleet."""
-        if not inter_closure.closures:
-            return
-        if self._between is None:
-            self._between = tables.CsvTable(self.folder / "closures_between.csv", tables.CLOSURES_BETWEEN)
-        rows = [[inter_closure.robot, *tables.closure_row(closure, float("nan"))] for closure in inter_closure.closures]
-        self._between.append(rows)
+        """Write the closures with another rover of a fleet."""
+        closures = inter_closure.closures
+        with self._file.writing():
+            rows = [[inter_closure.robot, *tables.closure_row(closure, nan)] for closure in closures]
+            self._file.append("closures_between", rows)
+
+    def record_pose(self, row: list[Any]) -> None:
+        """Write a row of `localization.csv`."""
+        with self._file.writing():
+            self._file.append("localization", [row])
 
     def count(self, frame: Frame) -> None:
-        """Count a frame, also one that was dealt with before."""
+        """Count a frame, also one that was processed before."""
         self._counts["frames"] += 1
         self._counts["pairs"] += frame.left is not None and frame.points is not None
 
     def earlier_closures(self) -> list[LoopClosure]:
-        """The closures that were in the folder before."""
-        return [tables.parse_closure(row) for row in self._closures.rows]
+        """Closures that an earlier process wrote."""
+        return self._closures
 
     def summary(self, drops: Mapping[str, int]) -> dict[str, Any]:
         """What `summary.json` holds; `ground_truth` is filled in by the report."""
@@ -349,25 +288,35 @@ class RunRecorder:
         write_summary(self.folder, self.summary(drops))
 
     def close(self) -> None:
-        """Close the tables."""
-        for table in (self._closures, self._candidates, self._keyframes, self._latencies, self._inliers):
-            table.close()
-        if self._between is not None:
-            self._between.close()
-        self._descriptors.close()
+        """Export the CSV tables, and close the file.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        try:
+            self._file.export()
+            with self._file.writing():
+                self._file.note(**(self._facts() | {"exported": True}))
+        finally:
+            self._file.close()
+
+    def _facts(self) -> dict[str, Any]:
+        """The facts about a run that `umf report` takes from the file of a process that was killed."""
+        counts = {name: self._counts[name] for name in ("frames", "pairs")}
+        return counts | {"weights": self._weights, "exported": False}
 
     def _earlier_counts(self, resume: bool) -> dict[str, int]:
-        """Counts of what the folder holds; of a recording that is resumed, all frames come by again."""
-        counts = dict.fromkeys(COUNTS, 0)
-        if not resume and (self.folder / "summary.json").exists():
-            with suppress(UmfError):
-                earlier = read_summary(self.folder)
-                counts |= {name: int(earlier[name]) for name in ("frames", "pairs") if name in earlier}
-        counts["keyframes"] = len(self.recorded)
-        counts["queries"] = len({row["query_stamp_ns"] for row in self._candidates.rows})
-        counts["closures_published"] = len(self._closures.rows)
-        counts["closures_rejected"] = len(self._candidates.rows) - len(self._closures.rows)
-        return counts
+        """Count the rows in the file; all frames of a recording that is resumed pass again."""
+        facts = self._file.facts() if not resume else {}
+        candidates, closures = self._file.rows("candidates"), len(self._closures)
+        return {
+            "frames": int(facts.get("frames", 0)),
+            "pairs": int(facts.get("pairs", 0)),
+            "keyframes": len(self.recorded),
+            "queries": len({row[0] for row in candidates}),
+            "closures_published": closures,
+            "closures_rejected": sum(row[3] != "accepted" for row in candidates),
+        }
 
 
 def count_drops(counters: Mapping[Input, InputCounter], worker: int = 0) -> dict[str, int]:

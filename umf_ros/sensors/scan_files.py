@@ -23,6 +23,8 @@ from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import FURTHEST_RETURN_M, Cloud, real_returns
 
 Columns = dict[str, NDArray[Any]]
+MOST_READABLE = 0.9
+"""Share of the points of a text that have to be readable: raw bytes may hold line ends."""
 _KINDS = {"F": "f", "U": "u", "I": "i"}
 
 
@@ -104,11 +106,34 @@ def _parse_text(body: bytes, header: _Header) -> Columns:
     try:
         numbers = np.array(body.decode("ascii").split(), dtype=np.float64)
     except ValueError:
-        raise SensorFileError("PCD data that are not numbers") from None
+        return _parse_leading(body, header, widths)
     whole = len(numbers) // sum(widths)
     rows = numbers[: whole * sum(widths)].reshape(whole, -1)[: header.points or whole]
     parts = np.split(rows, np.cumsum(widths)[:-1], axis=1)
     return {name: part[:, 0] if part.shape[1] == 1 else part for name, part in zip(names, parts, strict=True)}
+
+
+def _parse_leading(body: bytes, header: _Header, widths: list[int]) -> Columns:
+    """Fields up to the last of x, y and z, for files whose other fields hold raw bytes (Livox `tag line`).
+
+    Raises:
+        SensorFileError: these are no numbers either.
+    """
+    names = list(header.record.names or ())
+    last = max((names.index(name) for name in "xyz" if name in names), default=-1) + 1
+    rows = []
+    for line in body.split(b"\n"):
+        words = line.split(maxsplit=sum(widths[:last]))[: sum(widths[:last])]
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            continue
+        if last and len(values) == sum(widths[:last]):
+            rows.append(values)
+    if not rows or len(rows) < MOST_READABLE * header.points:
+        raise SensorFileError("PCD data that are not numbers")
+    parts = np.split(np.array(rows), np.cumsum(widths[:last])[:-1], axis=1)
+    return {name: part[:, 0] if part.shape[1] == 1 else part for name, part in zip(names, parts, strict=False)}
 
 
 def _unpack(body: bytes, header: _Header) -> Columns:

@@ -2,7 +2,7 @@
 
 A logistic regression on a handful of clipped, monotone criteria: each can only speak for a closure
 the way a person would read it, and none can shout. The weights are fitted on validation worlds by
-`benchmarks/fit_verification.py` and `benchmarks/fit_views.py`, and shipped as JSON.
+`umf_ros/lab/fit/scan_acceptance.py` and `umf_ros/lab/fit/view_acceptance.py`, and shipped as JSON.
 """
 
 from __future__ import annotations
@@ -115,6 +115,8 @@ def refuted(measurement: Measurement) -> str:
     """Why a hypothesis is no closure however probable, or nothing."""
     if measurement.misfit > const.MAX_MISFIT:
         return f"surfaces are {measurement.misfit:.0f} times their noise apart"
+    if measurement.passage_rival < 1.0:
+        return "surfaces fit as well elsewhere along the passage"
     return "another pose fits as well" if measurement.runner_up < const.MIN_RUNNER_UP else ""
 
 

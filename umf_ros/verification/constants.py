@@ -2,8 +2,8 @@
 
 Where values come from: *geometry* follows from the sensors the package was made for (S3LI's Cube-1 LiDAR, 70 deg wide,
 ten thousand returns up to 28 m; a camera of 688 x 512 pixels and 61 deg); *measured* was compared with its
-alternatives; *by hand* is an engineer's choice, held since by `benchmarks/verification.py`. What a user may want to
-change is a setting (`umf_ros.core.config.Verification`), what is fitted stands in
+alternatives; *by hand* is an engineer's choice, held since by `benchmarks/accuracy/verification.py`. Values that a user
+may want to change are settings (`umf_ros.core.config.Verification`), fitted ones stand in
 `config/verification/calibration.json`, and the range of each criterion beside the criterion, in `acceptance`.
 """
 
@@ -87,7 +87,9 @@ FINE_REACH_M, FINE_STEPS = 0.4, 8  # by hand: the spacing of far returns is wide
 MIN_SCAN_POINTS = 100  # by hand: below, there is nothing to align
 BARE_RELIEF_M = 0.01  # measured on simulated drives: of bare, even ground .002, of the plainest of other places .03
 BARE_ODDS = 10.0  # by hand: bare ground whose texture comes again elsewhere is that much likelier than a view that does
-BARE_SPREAD = 0.1  # measured: of images that agree about bare ground from .097, of 80 of benchmarks/traps.py to .096
+BARE_SPREAD = (
+    0.1  # measured: of images that agree about bare ground from .097, of 80 of umf_ros/lab/simulation/scenes.py to .096
+)
 SCANS_KEPT = 60  # prepared scans in memory: bounds it, changes no result
 
 # free space: what the rays of one scan say of the points of another
@@ -112,6 +114,22 @@ RIVAL_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: beyond the error 
 RIVAL_FAR_M = np.concatenate([np.arange(-6.0, -0.9, 0.5), np.arange(1.0, 6.1, 0.5)])  # geometry: what repeats: doors
 RIVAL_EVERY = 10  # of the sample: bounds the time
 RIVAL_MISFIT = 3.0  # by hand: how bad a misfit can be, in counterparts' reach
+
+# passages: corridors, tunnels, aisles, canyons, where a scan looks the same all along
+BAND_DEG = 2.0  # geometry: elevations about one ring of sixteen
+PLANE_NEIGHBOURS, PLANE_REACH_M = 8, 0.8  # measured: 12 neighbours leave next to no planes of sixteen rings
+PLANE_WIDTH_M, PLANE_ROUNDNESS = 0.1, 0.45  # by hand: narrower neighbourhoods lie on a single ring
+PLANE_THICKNESS_M = 0.04  # by hand: twice the noise of a range
+PLANE_SIGMA_M, PLANE_MISFIT_FLOOR = 0.1, 0.05  # measured: .05 and .2 m tell right poses from wrong ones less well
+PASSAGE_RATIO = 0.2  # measured: of surfaces along to surfaces across; passages have up to .17
+PASSAGE_SURFACE = 0.1  # measured: share of points on planes; woods and orchards have less, passages from .2
+PASSAGE_COMMON = 0.25  # by hand: of the compared points that a rival needs
+PASSAGE_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: as RIVAL_NEAR_M
+PASSAGE_FAR_M = np.concatenate([np.arange(-15.0, -0.9, 0.5), np.arange(1.0, 15.1, 0.5)])  # geometry: scans overlap
+PASSAGE_SAMPLE, PASSAGE_SCOUTS, PASSAGE_KEPT = 750, 100, 6  # by hand: points of a half, first of all, of few rivals
+FAN = 0.5  # geometry: length of the mean bearing; .94 of a view of 70 deg, .5 of one of 217 deg
+# measured on `corridors.py` (benchmarks), seeds from 10000 on: of wrong closures 1 in 700 has more, none with a narrow view
+PASSAGE_RIVAL, NARROW_PASSAGE_RIVAL = 0.3, 0.12
 
 HOPELESS = 0.5  # by definition: what is wrong more likely than right, whatever its rivals, is held against none
 RUNNER_UP_ROOM = 0.02  # by hand: shares nearer to nothing than this are alike

@@ -2,7 +2,7 @@
 
 A new test is three steps: a function of what an `AlignedHypothesis` holds, a field of `Measurement` that `measure`
 fills with it, and a `Criterion` in `acceptance` that says which values speak for a closure. Its weight is 0 until
-`benchmarks/fit_verification.py` has fitted one.
+`umf_ros/lab/fit/scan_acceptance.py` has fitted one.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from umf_ros.core.frames import Candidate, Keyframe, Points
 from umf_ros.core.geometry import Array, transform
 from umf_ros.verification import constants as const
+from umf_ros.verification.ambiguity import passage_rival
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, near, prior_sigmas
 from umf_ros.verification.prepared_scan import PreparedScan, joint_blur, levelled
@@ -71,6 +72,8 @@ class Measurement:
         rival_near: logarithm of how much worse the fit is half a metre on, along the way that is known least; NaN
             where a hypothesis could not have become probable any more.
         rival_far: the same of the best fit 1 to 6 m on: 0 when another place fits as well.
+        passage_rival: how much worse the surfaces of two scans fit at the best other pose along a passage: 0 when
+            another fits as well, 1 when a closure can be accepted; NaN outside passages and for improbable hypotheses.
         pose_inliers: feature pairs that agree with the pose.
         spread: of those pairs across the image: smaller deviation of column and row, of its width and height.
         two_way_m: distance of the poses that the query's depths and the match's give by themselves.
@@ -106,6 +109,7 @@ class Measurement:
     unexplained: float = measured(SCAN)
     rival_near: float = measured(SCAN)
     rival_far: float = measured(SCAN)
+    passage_rival: float = measured(SCAN)
     pose_inliers: float = measured(IMAGE)
     spread: float = measured(IMAGE)
     two_way_m: float = measured(IMAGE)
@@ -236,6 +240,13 @@ def against_rivals(measurement: Measurement, aligned: AlignedHypothesis) -> Meas
         return measurement
     near_by, far = rivalry(*aligned.scans, aligned.pose, aligned.alignment.information)
     return replace(measurement, rival_near=near_by, rival_far=far)
+
+
+def against_passage(measurement: Measurement, aligned: AlignedHypothesis) -> Measurement:
+    """The same, knowing how much worse the surfaces fit elsewhere along a passage."""
+    if aligned.scans is None or isinstance(aligned.alignment, ViewAlignment):
+        return measurement
+    return replace(measurement, passage_rival=passage_rival(*aligned.scans, aligned.pose))
 
 
 def beside(measurement: Measurement, pose: Array, others: Sequence[tuple[Array, Measurement]]) -> Measurement:

@@ -15,6 +15,7 @@ from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.core.levelling import upright
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import ElevationMap
+from umf_ros.verification.surfaces import Surfaces
 from umf_ros.verification.surroundings import FieldOfView, RangeImage, Surroundings
 
 
@@ -178,6 +179,14 @@ class PreparedScan:
     def normals(self) -> Array:
         """(M, 3) unit normals, zero where the neighbourhood is too small."""
         return np.asarray(self.cloud.normals())[:, :3]
+
+    @cached_property
+    def surfaces(self) -> tuple[Surfaces, Surfaces]:
+        """Planes through the points of every second band of elevations, and through those between."""
+        seen = transform(self._lidar_T_body, self.points)
+        elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
+        odd = (np.floor(elevation / const.BAND_DEG) % 2).astype(bool)
+        return Surfaces.of(self.points[~odd]), Surfaces.of(self.points[odd])
 
     @cached_property
     def noise_m(self) -> float:

@@ -18,6 +18,7 @@ from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, find_hyp
 from umf_ros.verification.measurement import (
     AlignedHypothesis,
     Measurement,
+    against_passage,
     against_rivals,
     beside,
     image_agreement,
@@ -209,7 +210,10 @@ class Verifier:
             known = beside(measurement, one.pose, others)
             if self._acceptance.at_best(known) >= hopeless:
                 known = against_rivals(known, one)
-            judged.append(JudgedHypothesis(one, known, self._probability(one, known)))
+            probability = self._probability(one, known)
+            if probability >= self._threshold:
+                known = against_passage(known, one)
+            judged.append(JudgedHypothesis(one, known, probability))
         return judged
 
     def _probability(self, aligned: AlignedHypothesis, measurement: Measurement) -> float:

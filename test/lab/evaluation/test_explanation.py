@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 from command_line import umf
-from scenes import landscape, pose_at, take
 
 from umf_ros.core.config import Verification
 from umf_ros.core.errors import OutputError
 from umf_ros.lab.evaluation.explanation import Explanation, draw, explain
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 
 GROUND = landscape(20)
 

@@ -85,7 +85,18 @@ def test_the_command_reranks_with_the_network_and_writes_the_figures(
     monkeypatch.setenv("XDG_CACHE_HOME", str(converted))
     app = typer.Typer()
     app.command()(evaluate.command)
-    arguments = [str(folder / "places.yaml"), "--json", str(folder / "f.json"), "--out", str(folder / "results")]
+    (folder / "results").mkdir()
+    (folder / "results" / "latest").symlink_to("a run")
+    (folder / "settings.yaml").write_text("verification: {rerank_weight: 0.1}\n")
+    arguments = [
+        str(folder / "places.yaml"),
+        "--config",
+        str(folder / "settings.yaml"),
+        "--json",
+        str(folder / "f.json"),
+        "--out",
+        str(folder / "results"),
+    ]
     found = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert found.exit_code == 0, found.output
     figures = json.loads((folder / "f.json").read_text())
@@ -93,6 +104,7 @@ def test_the_command_reranks_with_the_network_and_writes_the_figures(
     assert set(figures) == {f"{each}.{name}" for each in ("walls", "sheets") for name in names}
     assert figures["walls.recall1_reranked"] == 1.0
     assert "walls" in next((folder / "results").rglob("evaluation.md")).read_text()
+    assert str((folder / "results" / "latest").readlink()) == "a run"  # the report of a run stays in reach
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from umf_ros.baselines.place_inputs import PreparedView, measured, stack
-from umf_ros.baselines.place_network import VOXELS, ImageTrunk
+from umf_ros.baselines.place_network import VOXELS, ImageTrunk, PreparedView, measured, stack
 from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import transform
 from umf_ros.core.levelling import level

@@ -210,7 +210,13 @@ class EveryMethod:
                 bar.update(task, description=f"{what}, {sum(done)} frames")
 
             report, folder = compare_methods(
-                sets, [note], self.weights, self.trained, lambda: create_run_folder(self.out), REPEATS, show
+                sets,
+                [note],
+                self.weights,
+                self.trained,
+                lambda: create_run_folder(self.out, latest=False),
+                REPEATS,
+                show,
             )
         report.show(console, folder)
         return report.figures
@@ -240,7 +246,7 @@ def command(
     weights: WeightsPath = None,
     json_file: Annotated[Path | None, Optional("--json", help="Write the figures here too.")] = None,
     out: RunsFolder = Path("results"),
-    config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording.")] = None,
+    config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording or place sets.")] = None,
     dataset: DatasetName = "auto",
     embedder: Annotated[str | None, Optional(help=f"How places are embedded: {choices()}.")] = None,
     odometry: OdometryPath = None,
@@ -271,9 +277,10 @@ def command(
         chosen = str(worlds), seed, count
         figures = every.worlds(*chosen) if every else _on_worlds(*chosen, quick, weights, out)
     elif is_yaml(data) and lists_place_sets(data):
-        others = {name: value for name, value in of_recordings.items() if name != "--embedder" or every}
+        allowed = () if every else ("--embedder", "--config")
+        others = {name: value for name, value in of_recordings.items() if name not in allowed}
         _refuse("a list of place sets", of_worlds | of_lists | others)
-        figures = every.places(data) if every else _on_places(data, embedder, weights, out)
+        figures = every.places(data) if every else _on_places(data, config, embedder, weights, out)
     elif is_yaml(data):
         _refuse("a list of sequences", of_worlds | of_recordings)
         figures = every.sequences(data, rule) if every else _on_sequences(data, rule, weights, out)
@@ -321,7 +328,7 @@ def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Pa
             bar.update(task, description=what, advance=done)
 
         run = WorldsRun(weights, chosen, 3 if quick else 10, progress)
-        folder = create_run_folder(out)
+        folder = create_run_folder(out, latest=False)
         summary = run.run()
         report = run.write(
             summary, folder, [note_on_worlds(chosen, quick) + " Times are medians on this machine, as busy as it was."]
@@ -341,7 +348,7 @@ def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) ->
     opened = options.open(console, weights)
     settings, bag = opened.settings, options.bag
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, True, settings.verification.features))
-    folder = create_run_folder(out)
+    folder = create_run_folder(out, latest=False)
     with progress_bar(console) as bar:
         task = bar.add_task("embedding", total=opened.duration_s)
         start_ns: list[int] = []
@@ -384,7 +391,7 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     results = validate(network, SequenceList(listing).worlds, rule=RULES[rule])
     if not answerable(results):
         raise ConfigError(f"{listing}: no place is visited twice")
-    folder = create_run_folder(out)
+    folder = create_run_folder(out, latest=False)
     notes = [
         f"{listing}: samples with a true match in an earlier pass are asked for it; same place by the rule {rule}."
     ]
@@ -395,17 +402,19 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     return report.figures
 
 
-def _on_places(listing: Path, embedder: str | None, weights: Path | None, out: Path) -> Figures:
+def _on_places(listing: Path, config: Path | None, embedder: str | None, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
-    from umf_ros.embedding import DEFAULT
+    from umf_ros.core.config import load_settings
     from umf_ros.lab.evaluation.places import evaluate_place_sets
     from umf_ros.runs.writer import create_run_folder
 
     console = Console()
+    chosen = {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}
+    settings = load_settings(config, **chosen)
     with console.status("embedding") as status:
-        report = evaluate_place_sets(listing, embedder or DEFAULT, weights, status.update)
-    folder = create_run_folder(out)
+        report = evaluate_place_sets(listing, settings, status.update)
+    folder = create_run_folder(out, latest=False)
     report.write(folder)
     report.show(console, folder)
     return report.figures

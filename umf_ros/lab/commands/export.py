@@ -18,17 +18,15 @@ def command(
 
     from umf_ros.core.errors import ConfigError
     from umf_ros.embedding.embedder import FeatureRequest
-    from umf_ros.embedding.export import save
-    from umf_ros.embedding.runtimes import outputs_of
-    from umf_ros.embedding.torch_runtimes import converted
+    from umf_ros.embedding.runtimes import convert_umf, outputs_of, save_model
     from umf_ros.networks.config import locate_weights
     from umf_ros.runs.writer import check_writable
 
     if out.suffix != ".xml":
         raise ConfigError(f"{out}: OpenVINO's files end in .xml")
     check_writable(out.parent)
-    model = converted(locate_weights(weights), outputs_of(FeatureRequest(supers=super_features)))
-    save(model, out)
+    model = convert_umf(locate_weights(weights), outputs_of(FeatureRequest(supers=super_features)))
+    save_model(model, out)
     megabytes = out.with_suffix(".bin").stat().st_size / 1e6
     sizes = f"{len(model.inputs)} inputs, {len(model.outputs)} outputs, {megabytes:.1f} MB of weights"
     Console().print(f"{out}: {sizes}", markup=False, soft_wrap=True)

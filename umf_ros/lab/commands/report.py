@@ -17,14 +17,17 @@ def command(
 ) -> None:
     """Judge a run against the truth, draw its matches and trajectory, and write report.html.
 
-    A recording or a truth that is not of the run changes nothing.
+    The tables and trajectories of a run that was killed are written first. A recording or a truth of another run
+    changes nothing.
     """
-    check_run(folder)
     check_files(bag, ground_truth)
 
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
+    from umf_ros.replay import recover_run
     from umf_ros.runs.report import finish_run
 
+    recover_run(folder)
+    check_run(folder)
     finish_run(folder, open_bag(bag), Console(), ground_truth)

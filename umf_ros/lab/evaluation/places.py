@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from pydantic import Field, ValidationError
 
-from umf_ros.core.config import EmbeddingSettings, Group, Verification, problems
+from umf_ros.core.config import Group, Settings, Verification, problems
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.core.frames import Frame, Image, Points, StereoCamera
 from umf_ros.core.geometry import transform
@@ -247,29 +247,24 @@ def _frame(
 TITLE = "Place recognition on still images and scans"
 
 
-def evaluate_place_sets(
-    listing: Path, method: str, weights: Path | None, report: Callable[[str], None]
-) -> EvaluationReport:
+def evaluate_place_sets(listing: Path, settings: Settings, report: Callable[[str], None]) -> EvaluationReport:
     """Score one method on all sets of a list.
 
     Args:
         listing: YAML file of the sets.
-        method: embedder by name.
-        weights: of the network; None: the default.
-        report: called with what is worked on.
+        settings: of embedding and verification.
+        report: called with the name of each set.
 
     Raises:
         ConfigError: no such list, or an unknown method.
         UmfError: something of a set is missing or damaged.
     """
     sets = read_place_sets(listing)
-    settings = Verification()
-    wanted = EmbeddingSettings(method=method, weights=str(weights or ""))
-    embedder = make_embedder(wanted, super_features=True, features=settings.features)
+    embedder = make_embedder(settings.embedding, super_features=True, features=settings.verification.features)
     results = []
     for places in sets:
         report(places.name)
-        results.append(score_places(places, embedder, settings))
+        results.append(score_places(places, embedder, settings.verification))
     figures = {name: value for found in results for name, value in found.flat.items()}
     notes = [f"{listing}, embedded by {embedder.name}. A match is true where the set says so."]
     return EvaluationReport(TITLE, notes, figures, {TITLE: table_of(results)})

@@ -115,7 +115,7 @@ def fill(path: Path, parts: Iterator[Points]) -> None:
         if not dimension:
             dimension = part.shape[1]
             _open(path, dimension).close()
-            data = pack(_keyframe(0, 0, 0.0, part[0]))
+            data = pack(bare_keyframe(0, 0, 0.0, part[0]))
         with closing(sqlite3.connect(path)) as connection, connection:
             rows = [
                 (row + i + 1, (row + i) * STEP_NS, (row + i) // PER_DRIVE, 0.5 * i, descriptor.tobytes(), data)
@@ -149,7 +149,7 @@ def _ask(places: PlaceDatabase, rng: np.random.Generator) -> tuple[float, float,
     times, shares = [], []
     for descriptor in asked:
         wall, cpu = time.perf_counter(), time.process_time()
-        places.query(_keyframe(now_ns, session, 0.0, descriptor), Loop())
+        places.query(bare_keyframe(now_ns, session, 0.0, descriptor), Loop())
         times.append((time.perf_counter() - wall, time.process_time() - cpu))
     for descriptor in asked:
         shares.append(_share(places.index, descriptor))
@@ -186,9 +186,12 @@ def _dimension(path: Path) -> int:
         return int(connection.execute("SELECT length(descriptor) FROM keyframe LIMIT 1").fetchone()[0]) // 4
 
 
-def _keyframe(stamp_ns: int, session: int, path_length_m: float, descriptor: Points) -> Keyframe:
+def bare_keyframe(
+    stamp_ns: int, session: int, path_length_m: float, descriptor: Points, points: Points | None = None
+) -> Keyframe:
+    """A keyframe without local features."""
     camera = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)
-    points = np.empty((0, 3), np.float32)
+    points = np.empty((0, 3), np.float32) if points is None else points
     return Keyframe(
         stamp_ns, Embedding(descriptor), camera, np.eye(4), points, path_length_m=path_length_m, session=session
     )

@@ -20,6 +20,8 @@ from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, re
 from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
 from umf_ros.verification.scan_alignment import CovarianceModel, covariance_of
 
+EXAMPLES = Path(__file__).with_name("acceptance_examples.npz")
+"""Examples that the shipped decision was fitted to."""
 NUMBERS = tuple(one.name for one in fields(Measurement) if one.name != "kind")
 
 

@@ -13,15 +13,14 @@ A shard is an `.npz` with, for N frames of P points at most:
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from umf_ros.core.errors import OutputError
+from umf_ros.core.errors import writing
 from umf_ros.core.geometry import Array
+from umf_ros.core.io import atomic_write
 from umf_ros.lab.simulation.survey import Survey, SurveyFrame, shard_plan, survey_world
 
 
@@ -63,21 +62,15 @@ def write_world(task: tuple[Path, int, int]) -> None:
 
 
 def save(path: Path, arrays: dict[str, Array]) -> None:
-    """Write an `.npz` under a temporary name and rename it.
+    """Write an `.npz` in one step.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with unfinished.open("wb") as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
-        unfinished.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            unfinished.unlink(missing_ok=True)
-        raise OutputError(f"cannot write {path}: {error.strerror}") from None
+    with atomic_write(path) as part, part.open("wb") as stream:
+        np.savez(stream, allow_pickle=False, **arrays)
 
 
 def _arrays(survey: Survey, samples: list[SurveyFrame], setting: str) -> dict[str, Array]:

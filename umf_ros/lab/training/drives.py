@@ -19,6 +19,7 @@ from umf_ros.core.config import Database, Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array
+from umf_ros.core.io import atomic_write
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.embedding.inputs import read_frame
@@ -69,11 +70,9 @@ class Drive:
     closures: NDArray[np.int64]
 
     def save(self, path: Path) -> None:
-        """Write an `.npz`, which appears under its name only when it is complete."""
-        unfinished = path.with_suffix(".part")
-        with unfinished.open("wb") as stream:
+        """Write an `.npz` in one step."""
+        with atomic_write(path) as part, part.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **{one.name: getattr(self, one.name) for one in fields(self)})
-        unfinished.replace(path)
 
     @classmethod
     def load(cls, path: Path) -> Drive:

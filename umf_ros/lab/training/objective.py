@@ -20,7 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from umf_ros.core.errors import ConfigError, OutputError, WeightsError, writing
+from umf_ros.core.errors import ConfigError, WeightsError, writing
+from umf_ros.core.io import atomic_write
 from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.training.networks import Precision, RunSettings, make_network, save_weights
 
@@ -69,12 +70,8 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    unfinished = path.with_suffix(".part")
-    try:
-        torch.save(state, unfinished)
-        unfinished.replace(path)
-    except (OSError, RuntimeError) as error:
-        raise OutputError(f"cannot write {path}: {_one_line(error)}") from None
+    with atomic_write(path, RuntimeError) as part:
+        torch.save(state, part)
 
 
 @contextmanager

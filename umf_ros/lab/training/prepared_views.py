@@ -16,8 +16,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from umf_ros.baselines.place_inputs import EMPTY_MAPS, measured, some_points
-from umf_ros.baselines.place_network import IMAGE_SIZE, MEASURED, POINTS, VOXELS, ImageTrunk, PlaceInput, Sense
+from umf_ros.baselines.place_network import (
+    EMPTY_MAPS,
+    IMAGE_SIZE,
+    MEASURED,
+    POINTS,
+    VOXELS,
+    ImageTrunk,
+    PlaceInput,
+    Sense,
+    measured,
+    some_points,
+)
 from umf_ros.core.errors import OutputError
 from umf_ros.core.frames import Image
 from umf_ros.core.geometry import transform

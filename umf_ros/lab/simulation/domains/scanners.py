@@ -34,12 +34,22 @@ class Scanner:
     all_round: bool
 
 
+_HDL32_DEG = tuple(np.linspace(-30.67, 10.67, 32))
 _HDL64_DEG = (*np.linspace(2.0, -8.33, 32), *np.linspace(-8.83, -24.33, 32))
 
 SCANNERS: dict[str, Scanner] = {
     "cube1": Scanner(eye, 0.2128, 100.0, 0.02, 4095.0, timed=True, all_round=False),
     "spin16": Scanner(
         partial(spinning, tuple(np.linspace(-15, 15, 16)), 1800), 0.1, 100.0, 0.03, 255.0, timed=True, all_round=True
+    ),
+    "spin32": Scanner(
+        partial(spinning, _HDL32_DEG, 1085),
+        0.1,
+        100.0,
+        0.02,
+        255.0,
+        timed=True,
+        all_round=True,
     ),
     "spin64": Scanner(partial(spinning, _HDL64_DEG, 1000), 0.1, 100.0, 0.02, 1.0, timed=False, all_round=True),
     "spin128": Scanner(

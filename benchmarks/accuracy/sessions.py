@@ -1,0 +1,275 @@
+"""Five sessions on one hard world in one map, and ten cold starts in it.
+
+    python benchmarks/accuracy/sessions.py --json sessions.json               # five test worlds, some hours
+    python benchmarks/accuracy/sessions.py --quick --seed 20001 --json F      # three short sessions, four cold starts
+
+Every session drives a part of one way of 100 m by a route, light and noise of its own; the world repeats itself
+(aliasing 1.0), and all clocks start at the same second. Recordings and maps stay in `--work` and are taken up again.
+A seed is a world; recordings are seeds + 1, + 2, and so on; the rover that wakes up drives the one after the last.
+
+Prints and writes, over all worlds:
+- `wrong_between`: closures between sessions that the map believes and the truth refutes (0.5 m, 5 deg);
+- `ate_before_m`: error of each session's odometry, every one aligned to the truth by itself, rms over sessions;
+- `ate_joint_m`: error of all sessions, aligned to the truth once; of the worst world, as is every other mean below;
+- `relocalised_of_10`: cold starts that knew their pose within 20 keyframes, per ten; `relocalised_wrong`: those that
+  ever claimed a pose more than 1 m or 5 deg from the truth; `relocalise_keyframes_median`: keyframes until they knew;
+- `crispness_before`, `crispness_after`: median thickness in m of surfaces that several sessions saw, by odometry from
+  each session's true start in the map and by the joint graph; the less, the crisper.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.presets import settings_for
+from umf_ros.bags.reader import open_bag
+from umf_ros.bags.trajectories import read_ground_truth
+from umf_ros.core.config import Settings
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import Array, align, heading, relative, rotation_angle, wrap_angle
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.detector import LoopDetector, make_detector_embedder
+from umf_ros.lab.simulation.bag_writer import BagWriter
+from umf_ros.lab.simulation.families import FAMILIES
+from umf_ros.lab.simulation.presets import SESSION
+from umf_ros.lab.simulation.recording import record
+from umf_ros.lab.simulation.simulator import Simulator
+from umf_ros.lab.simulation.world import TEST
+from umf_ros.localizer import Localizer, read_poses
+from umf_ros.maps.joint_graph import JointMap, solve
+from umf_ros.maps.map_folder import MapFolder
+from umf_ros.maps.mapping import Opening, add_session, match_session, replay_session, unmatched
+from umf_ros.maps.outputs import write_results
+from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, absolute_trajectory_error, judge_closure
+from umf_ros.sensors.decode import OdometrySample
+from umf_ros.sensors.sessions import OdometrySessionSplitter
+
+WITHIN_KEYFRAMES = 20
+WRONG_M, WRONG_DEG = 1.0, 5.0
+OVERLAP_M = 20.0
+Stream = list[Frame | OdometrySample]
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is driven: sessions, seconds of each (None: the whole route), cold starts."""
+
+    sessions: int
+    duration_s: float | None
+    starts: int
+
+
+FULL, QUICK = Size(5, None, 10), Size(3, 40.0, 4)
+
+
+def simulated(work: Path, world: int, number: int, size: Size) -> Path:
+    """The recording of a session, simulated unless it is there."""
+    path = work / f"s{number}.mcap"
+    if not path.exists():
+        family = FAMILIES[world % len(FAMILIES)]
+        simulator = Simulator(SESSION, world + number, size.duration_s, None, family, 1.0, world)
+        with BagWriter(path) as bag:
+            record(simulator, bag, workers=1)
+    return path
+
+
+def mapped(work: Path, recordings: list[Path]) -> tuple[MapFolder, JointMap, dict[str, Any]]:
+    """The map of all recordings, of which those that are in it already are not replayed again."""
+    opening = Opening()
+    folder = MapFolder.open_or_create(work / "map", opening.settings(open_bag(recordings[0])))
+    known = {session.name for session in folder.sessions}
+    for recording in recordings:
+        if recording.stem not in known:
+            replay_session(recording, opening, folder.folder_of(recording.stem))
+            add_session(folder, recording.stem, recording)
+    for session in unmatched(folder):
+        list(match_session(folder, session))
+    joint = solve(folder)
+    return folder, joint, write_results(folder, joint)
+
+
+def truth_of(recording: Path) -> Trajectory:
+    truth = read_ground_truth(open_bag(recording))
+    assert truth is not None
+    return truth
+
+
+def judge(joint: JointMap, truths: dict[str, Trajectory], summary: dict[str, Any]) -> dict[str, Any]:
+    """Closures, trajectories and crispness of one map held against the truth."""
+    true = [truths[one.session.name].at(one.stamps)[0] for one in joint.sessions]
+    placed = np.concatenate([one.poses[:, :3, 3] for one in joint.sessions])
+    odometry = [
+        absolute_trajectory_error(one.odometry[:, :3, 3], poses[:, :3, 3])
+        for one, poses in zip(joint.sessions, true, strict=True)
+        if one.joined
+    ]
+    believed = joint.accepted_between()
+    return {
+        "sessions": len(joint.sessions),
+        "joined": summary["joined"],
+        "overlapping_apart": overlapping_apart(joint, truths),
+        "closures_between": len(believed),
+        "wrong_between": wrong_closures(joint, truths, [c for c in believed]),
+        "wrong_between_published": wrong_closures(joint, truths, [v.closure for v in joint.between]),
+        "closures_between_published": len(joint.between),
+        "ate_before_m": float(np.sqrt(np.mean(np.square(odometry)))),
+        "ate_joint_m": absolute_trajectory_error(placed, np.concatenate([poses[:, :3, 3] for poses in true])),
+        "crispness_before": summary["thickness_m"]["before"],
+        "crispness_after": summary["thickness_m"]["after"],
+    }
+
+
+def wrong_closures(joint: JointMap, truths: dict[str, Trajectory], closures: list[Any]) -> int:
+    """How many closures the truth refutes."""
+
+    def true_pose(map_ns: int) -> Array:
+        session = next(one.session for one in joint.sessions if one.session.covers(map_ns))
+        return truths[session.name].at(np.array([map_ns - session.shift_ns]))[0][0]
+
+    judged = [judge_closure(c, true_pose(c.query_stamp_ns), true_pose(c.match_stamp_ns)) for c in closures]
+    return sum(not one.is_true for one in judged)
+
+
+def overlapping_apart(joint: JointMap, truths: dict[str, Trajectory]) -> int:
+    """Pairs of sessions that see the same way for 20 m or more, of which one is not in the map."""
+    joined = {one.session.name: one.joined for one in joint.sessions}
+    names = list(joined)
+    pairs = [(a, b) for i, a in enumerate(names) for b in names[:i] if not (joined[a] and joined[b])]
+    return sum(shared_m(truths[a], truths[b]) >= OVERLAP_M for a, b in pairs)
+
+
+def shared_m(one: Trajectory, other: Trajectory) -> float:
+    """Metres of the one's way on which the other was near and looked the same way."""
+    again = sees_again(one.poses, other.poses)
+    steps = np.linalg.norm(np.diff(one.poses[:, :3, 3], axis=0), axis=1)
+    return float(steps[again[1:]].sum())
+
+
+def sees_again(poses: Array, known: Array) -> Any:
+    """(N,) which of N poses lie within a place of any known one, in about its direction."""
+    rows = known[:: max(1, len(known) // 500)]
+    near = np.linalg.norm(poses[:, None, :3, 3] - rows[None, :, :3, 3], axis=-1) <= PLACE_RADIUS_M
+    turned = np.abs(wrap_angle(heading(poses)[:, None] - heading(rows)[None]))
+    return (near & (turned <= np.radians(PLACE_ANGLE_DEG))).any(axis=1)
+
+
+def cold_starts(
+    folder: MapFolder, joint: JointMap, truths: dict[str, Trajectory], visitor: Path, count: int
+) -> list[tuple[int | None, bool]]:
+    """Keyframes until each cold start knew its pose, None where it did not, and whether it was ever wrong."""
+    bag, truth = open_bag(visitor), truth_of(visitor)
+    settings = settings_for(bag, None, "auto", mode="localization", map=str(folder.path))
+    stream = list(FrameReader(bag, settings).stream())
+    true = np.concatenate([truths[one.session.name].at(one.stamps)[0] for one in joint.sessions])
+    placed = np.concatenate([one.poses for one in joint.sessions])
+    map_T_world = align(true[:, :3, 3], placed[:, :3, 3])[0]
+    frames = [row for row, item in enumerate(stream) if isinstance(item, Frame)]
+    poses, known = truth.at(np.array([stream[row].stamp_ns for row in frames], np.int64))
+    usable = np.array(frames)[known & sees_again(poses, true)]
+    rows = usable[np.linspace(0, max(len(usable) - 60, 0), count).astype(int)]
+    detector = LoopDetector(settings, make_detector_embedder(settings))
+    return [wake(stream[row:], detector, settings, folder, map_T_world, truth) for row in rows]
+
+
+def wake(
+    stream: Stream, detector: LoopDetector, settings: Settings, folder: MapFolder, map_T_world: Array, truth: Trajectory
+) -> tuple[int | None, bool]:
+    """One cold start."""
+    detector.end_session()
+    localizer = Localizer(read_poses(folder.path), settings.pose_graph)
+    feed, keyframes, found, wrong = OdometrySessionSplitter(localizer), 0, None, False
+    for item in stream:
+        if isinstance(item, OdometrySample):
+            feed.take(item.stamp_ns, item.odom_T_body)
+            continue
+        detection = detector.process(item)
+        keyframes += detection.keyframe is not None
+        for closure in detection.closures:
+            localizer.add_closure(closure)
+        estimate = localizer.estimate()
+        if estimate is not None:
+            found = keyframes if found is None else found
+            error = relative(map_T_world @ truth.at(np.array([estimate.stamp_ns]))[0][0], estimate.map_T_body)
+            wrong |= bool(np.linalg.norm(error[:3, 3]) > WRONG_M or np.degrees(rotation_angle(error)) > WRONG_DEG)
+        if keyframes >= WITHIN_KEYFRAMES:
+            break
+    return found, wrong
+
+
+def run_world(world: int, size: Size, work: Path) -> dict[str, Any]:
+    """All figures of one world."""
+    work.mkdir(parents=True, exist_ok=True)
+    recordings = [simulated(work, world, number, size) for number in range(1, size.sessions + 1)]
+    visitor = simulated(work, world, size.sessions + 1, size)
+    folder, joint, summary = mapped(work, recordings)
+    truths = {recording.stem: truth_of(recording) for recording in recordings}
+    starts = cold_starts(folder, joint, truths, visitor, size.starts)
+    found = [keyframes for keyframes, _ in starts if keyframes is not None]
+    return {
+        "world": world,
+        **judge(joint, truths, summary),
+        "cold_starts": len(starts),
+        "relocalised": len(found),
+        "relocalised_wrong": sum(wrong for _, wrong in starts),
+        "relocalise_keyframes": found,
+    }
+
+
+def summarise(worlds: list[dict[str, Any]]) -> dict[str, Any]:
+    """The figures over all worlds: sums of counts, the worst of the errors, medians of the rest."""
+    keyframes = [number for world in worlds for number in world["relocalise_keyframes"]]
+    counts = ("sessions", "joined", "overlapping_apart", "closures_between", "wrong_between", "relocalised_wrong")
+    crispness = {name: median(world[name] for world in worlds) for name in ("crispness_before", "crispness_after")}
+    return {
+        **{name: sum(world[name] for world in worlds) for name in counts},
+        **{name: round(max(world[name] for world in worlds), 3) for name in ("ate_before_m", "ate_joint_m")},
+        "relocalised_of_10": round(
+            10 * sum(world["relocalised"] for world in worlds) / sum(world["cold_starts"] for world in worlds), 1
+        ),
+        "relocalise_keyframes_median": median(keyframes),
+        **crispness,
+        "worlds": worlds,
+    }
+
+
+def median(values: Any) -> float | None:
+    known = [value for value in values if value is not None]
+    return round(float(np.median(known)), 4) if known else None
+
+
+def seeds(first: int | None) -> Iterator[int]:
+    """One world, or five test worlds whose recordings' seeds do not meet."""
+    return iter([first] if first is not None else range(TEST.start + 1, TEST.start + 51, 10))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="three sessions of 40 s, four cold starts")
+    parser.add_argument("--seed", type=int, help="one world alone")
+    parser.add_argument(
+        "--work", type=Path, default=Path("results/sessions"), help="where recordings and maps are kept"
+    )
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    arguments = parser.parse_args()
+    size = QUICK if arguments.quick else FULL
+    kind = "quick" if arguments.quick else "full"
+    worlds = []
+    for world in seeds(arguments.seed):
+        worlds.append(run_world(world, size, arguments.work / f"{kind}_{world}"))
+        print(json.dumps(worlds[-1]), flush=True)
+    figures = summarise(worlds)
+    print(json.dumps({name: value for name, value in figures.items() if name != "worlds"}, indent=2))
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

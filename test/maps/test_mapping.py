@@ -1,0 +1,140 @@
+"""The steps of a map, on recordings of noise: what each leaves, and what is left when a process dies between them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import CALIBRATION, ODOMETRY, START_NS, drive, traverse, write_mcap
+
+from umf_ros.bags.reader import open_bag
+from umf_ros.core.errors import BagError, UmfError
+from umf_ros.core.trajectory import Trajectory, write_tum
+from umf_ros.maps.map_folder import MapFolder
+from umf_ros.maps.mapping import (
+    Opening,
+    add_session,
+    find_recordings,
+    match_session,
+    open_places,
+    replay_session,
+    unmatched,
+)
+from umf_ros.maps.odometry_log import OdometryLog
+from umf_ros.places.store import stored_sessions
+
+DAY_NS = 86_400 * 10**9
+
+
+@pytest.fixture
+def opening(tmp_path: Path) -> Opening:
+    (tmp_path / "calibration.yaml").write_text(CALIBRATION)
+    config = tmp_path / "config.yaml"
+    config.write_text(
+        f"calibration: {tmp_path / 'calibration.yaml'}\nkeyframe: {{min_translation_m: 0.2, min_period_s: 0.0, "
+        "untracked_period_s: 0.5}\nverification: {features: umf}\n"
+    )
+    return Opening(config, embedder="thumbnail")
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    return write_mcap(tmp_path / "a.mcap", traverse(3.0))
+
+
+def new_map(path: Path, opening: Opening, bag: Path) -> MapFolder:
+    return MapFolder.open_or_create(path, opening.settings(open_bag(bag)))
+
+
+def test_recordings_are_found_in_folders_and_once(tmp_path: Path) -> None:
+    folder = tmp_path / "bags"
+    (folder / "c").mkdir(parents=True)
+    for name in ("b.mcap", "a.db3", "c/metadata.yaml", "notes.txt"):
+        (folder / name).touch()
+    found = find_recordings([folder, folder / "b.mcap"])
+    assert [path.name for path in found] == ["a.db3", "b.mcap", "c"]
+    with pytest.raises(BagError, match="there is no recording"):
+        find_recordings([tmp_path / "x.mcap"])
+
+
+def test_one_recording_becomes_a_run_with_places_and_all_its_odometry(
+    tmp_path: Path, opening: Opening, bag: Path
+) -> None:
+    heard: list[float] = []
+    replay_session(bag, opening, tmp_path / "run", lambda done, _: heard.append(done))
+    assert heard == sorted(heard) and 0.9 < heard[-1] <= 1
+    log = OdometryLog.load(tmp_path / "run")
+    assert len(log) == 60 and log.stamps[0] == START_NS
+    places = open_places(tmp_path / "run" / "places.sqlite")
+    assert len(places) > 5
+    assert (tmp_path / "run" / "closures.csv").is_file()
+    replay_session(bag, opening, tmp_path / "run")  # made anew, not appended to
+    assert len(open_places(tmp_path / "run" / "places.sqlite")) == len(places)
+
+
+def test_a_second_session_is_stored_behind_the_first_on_the_maps_clock(
+    tmp_path: Path, opening: Opening, bag: Path
+) -> None:
+    target = new_map(tmp_path / "map", opening, bag)
+    for name in ("one", "two"):
+        replay_session(bag, opening, target.folder_of(name))
+        add_session(target, name, bag)
+    first, second = MapFolder.open(tmp_path / "map").sessions
+    assert second.shift_ns == DAY_NS and second.first_place == first.places and second.first_number == 1
+    places = open_places(target.places)
+    assert places[second.first_place].stamp_ns == places[0].stamp_ns + DAY_NS
+    assert places[second.first_place].session == 1
+    assert not (target.folder_of("two") / "places.sqlite").exists()
+    assert [session.name for session in unmatched(target)] == ["one", "two"]
+    for session in unmatched(target):
+        matches = list(match_session(target, session))
+        assert len(matches) == session.places
+        assert all(v.candidate.index < session.first_place for verdicts in matches for v in verdicts)
+    assert unmatched(target) == []
+
+
+def test_places_of_a_killed_process_are_removed(tmp_path: Path, opening: Opening, bag: Path) -> None:
+    target = new_map(tmp_path / "map", opening, bag)
+    replay_session(bag, opening, target.folder_of("one"))
+    add_session(target, "one", bag)
+    (tmp_path / "map" / "map.json").write_text('{"schema": 1, "sessions": []}\n')  # killed before it was written down
+    again = MapFolder.open(tmp_path / "map")
+    replay_session(bag, opening, again.folder_of("one"))
+    add_session(again, "one", bag)
+    assert [(one.number, one.keyframes) for one in stored_sessions(again.places)] == [(0, again.sessions[0].places)]
+
+
+def test_an_interrupted_match_counts_as_unmatched(tmp_path: Path, opening: Opening, bag: Path) -> None:
+    target = new_map(tmp_path / "map", opening, bag)
+    replay_session(bag, opening, target.folder_of("one"))
+    session = add_session(target, "one", bag)
+    next(match_session(target, session))
+    assert unmatched(target) == [session]
+
+
+def test_another_network_is_refused(tmp_path: Path, opening: Opening, bag: Path) -> None:
+    target = new_map(tmp_path / "map", opening, bag)
+    replay_session(bag, opening, target.folder_of("one"))
+    add_session(target, "one", bag)
+    other = Opening(opening.config, embedder="gradients")
+    replay_session(bag, other, target.folder_of("two"))
+    with pytest.raises(UmfError, match="was made with embedder thumbnail"):
+        add_session(target, "two", bag)
+
+
+def test_odometry_comes_from_a_file_of_its_name(tmp_path: Path, opening: Opening) -> None:
+    bag = write_mcap(tmp_path / "b.mcap", [entry for entry in traverse(3.0) if entry[0] != ODOMETRY])
+    seconds = np.arange(0, 3, 0.1)
+    path = Trajectory(START_NS + np.round(seconds * 1e9).astype(np.int64), np.stack([drive(s) for s in seconds]))
+    (tmp_path / "odometry").mkdir()
+    write_tum(tmp_path / "odometry" / "b.odometry.tum", path)
+    with_file = Opening(opening.config, embedder="thumbnail", odometry=tmp_path / "odometry")
+    replay_session(bag, with_file, tmp_path / "run")
+    log = OdometryLog.load(tmp_path / "run")
+    assert len(log) == len(path) and not log.covariances
+    replay_session(bag, opening, tmp_path / "blind")
+    blind = OdometryLog.load(tmp_path / "blind")
+    # noise is found in no other noise: every keyframe is a way of its own
+    assert len(blind.starts) == len(blind) > 3
+    assert [one.number for one in stored_sessions(tmp_path / "blind" / "places.sqlite")] == list(range(len(blind)))

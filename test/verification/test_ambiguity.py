@@ -1,0 +1,112 @@
+"""Passages: the pattern of a LiDAR's rings must not be taken for the place."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from umf_ros.core.geometry import Array, make_pose
+from umf_ros.verification import Measurement
+from umf_ros.verification.acceptance import refuted
+from umf_ros.verification.ambiguity import passage_direction, passage_rival
+from umf_ros.verification.measurement import SCAN
+from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
+from umf_ros.verification.scan_alignment import align_scans
+from umf_ros.verification.scan_consistency import rivalry
+
+ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
+AZIMUTHS = np.radians(np.arange(0.0, 360.0, 0.4))
+HALF_WIDTH_M, HEIGHT_M, LIDAR_M = 1.1, 2.6, 0.8
+CUPBOARDS = (-11.3, -6.1, -3.2, 2.4, 5.3, 9.8)  # on alternating sides, m along
+
+
+def rays() -> Array:
+    """(N, 3) directions of a LiDAR of sixteen rings."""
+    azimuth, elevation = (part.ravel() for part in np.meshgrid(AZIMUTHS, ELEVATIONS))
+    flat = np.cos(elevation)
+    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+
+
+def corridor_ranges(ways: Array, x: float, cupboards: tuple[float, ...], depth: float) -> Array:
+    """(N,) distances to floor, ceiling, walls and cupboards of a corridor from `x` along it, m."""
+    with np.errstate(divide="ignore"):
+        up = np.where(ways[:, 2] > 0, HEIGHT_M - LIDAR_M, -LIDAR_M) / ways[:, 2]
+        reach = np.minimum(up, HALF_WIDTH_M / np.abs(ways[:, 1]))
+        for number, middle in enumerate(cupboards):
+            side = 1 if number % 2 == 0 else -1
+            low = np.array([middle - x - 0.5, side * (HALF_WIDTH_M - depth / 2) - depth / 2, -LIDAR_M])
+            first, second = low / ways, (low + np.array([1.0, depth, 2.0])) / ways
+            enter, leave = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
+            reach = np.where((enter > 0) & (enter < leave), np.minimum(reach, enter), reach)
+    return reach
+
+
+def vault_ranges(ways: Array, radius: float) -> Array:
+    """(N,) distances to the lining of a round tunnel whose axis the LiDAR is on."""
+    with np.errstate(divide="ignore"):
+        return radius / np.hypot(ways[:, 1], ways[:, 2])
+
+
+def scan(reach: Array, seed: int) -> PreparedScan:
+    """A scan with noise of 2 cm and a range of 35 m."""
+    seen = reach < 35
+    noisy = reach[seen] + np.random.default_rng(seed).normal(0, 0.02, int(seen.sum()))
+    return PreparedScan(thin_scan((rays()[seen] * noisy[:, None]).astype(np.float32)))
+
+
+def corridor(x: float, seed: int, cupboards: tuple[float, ...] = (), depth: float = 0.5) -> PreparedScan:
+    return scan(corridor_ranges(rays(), x, cupboards, depth), seed)
+
+
+def shift(metres: float) -> Array:
+    return make_pose(np.eye(3), [metres, 0.0, 0.0])
+
+
+PAIRS = {
+    "corridor": (corridor(0.0, 1), corridor(5.0, 2)),
+    "tunnel": (scan(vault_ranges(rays(), 2.0), 3), scan(vault_ranges(rays(), 2.0), 4)),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_points_find_the_identity_in_a_passage_and_surfaces_do_not(name: str) -> None:
+    match, query = PAIRS[name]
+    alignment = align_scans(match, query, np.eye(4))
+    assert np.linalg.norm(alignment.pose[:3, 3]) < 0.3  # 5 m off in the corridor
+    _, far = rivalry(match, query, alignment.pose, alignment.information)
+    assert far > 0.3  # from point to point every other pose looks worse
+    assert passage_rival(match, query, alignment.pose) < 0.8
+
+
+def test_cupboards_tell_where_in_a_corridor_two_scans_were_taken() -> None:
+    match, query = corridor(0.0, 1, CUPBOARDS), corridor(1.5, 2, CUPBOARDS)
+    alignment = align_scans(match, query, shift(1.4))
+    assert abs(alignment.pose[0, 3] - 1.5) < 0.1
+    assert passage_rival(match, query, alignment.pose) > 1.0
+    assert passage_rival(match, query, shift(0.0)) < 1.0
+
+
+def test_identical_door_frames_at_equal_distances_are_rivals_of_each_other() -> None:
+    doors = tuple(np.arange(-37.5, 38.0, 3.0))
+    match, query = corridor(0.0, 1, doors, 0.06), corridor(6.0, 2, doors, 0.06)
+    assert passage_rival(match, query, shift(0.0)) < 1.0
+    assert passage_rival(match, query, shift(6.0)) < 1.0
+
+
+@pytest.mark.parametrize(("rival", "refused"), [(0.9, True), (1.1, False), (math.nan, False)])
+def test_a_pose_with_a_rival_along_the_passage_is_refused(rival: float, refused: bool) -> None:
+    assert ("passage" in refuted(Measurement(similarity=0.9, kind=SCAN, passage_rival=rival))) == refused
+
+
+def test_a_passage_is_found_in_its_direction_and_a_room_is_none() -> None:
+    match, query = PAIRS["corridor"]
+    way = passage_direction(match, query, np.eye(4))
+    assert way is not None and abs(way[0]) > 0.99
+    ways = rays()
+    with np.errstate(divide="ignore"):
+        reach = np.minimum(corridor_ranges(ways, 0.0, (), 0.5), 2.5 / np.abs(ways[:, 0]))
+    room = scan(reach, 7)
+    assert passage_direction(room, room, np.eye(4)) is None
+    assert math.isnan(passage_rival(room, room, np.eye(4)))

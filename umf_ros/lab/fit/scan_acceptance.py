@@ -1,0 +1,347 @@
+"""Fit the acceptance model of scans to simulated validation worlds, in all domains together."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import pickle
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import track
+from scipy.spatial.transform import Rotation
+
+from umf_ros.core.config import Database, EmbeddingSettings, Loop, Verification
+from umf_ros.core.frames import Candidate, Keyframe
+from umf_ros.core.geometry import Array, invert, make_pose, relative, rotation_angle, transform
+from umf_ros.embedding import make_embedder
+from umf_ros.embedding.embedder import Embedder
+from umf_ros.lab.fit.acceptance import (
+    EXAMPLES,
+    Example,
+    bounds_of,
+    fit_decision,
+    save_acceptance,
+    save_examples,
+)
+from umf_ros.lab.simulation.domains import DOMAINS, Domain
+from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, QUICK, Pair, Place, pairs_of, places_of
+from umf_ros.lab.simulation.drives import Drive, embedded, kept, worlds
+from umf_ros.lab.simulation.scenes import TRAPS
+from umf_ros.lab.simulation.world import VALIDATION
+from umf_ros.places.database import PlaceDatabase
+from umf_ros.verification import Verifier
+from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance, refuted
+from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory
+from umf_ros.verification.measurement import SCAN, AlignedHypothesis, Measurement, beside, measure
+from umf_ros.verification.prepared_scan import ScanCache
+from umf_ros.verification.rerank import RankedCandidate, rerank
+from umf_ros.verification.scan_alignment import align_scans
+
+RIGHT_M, RIGHT_DEG = 0.3, 2.5
+WRONG_M, WRONG_DEG = 0.75, 4.0  # what lies between is neither
+SAME_BASIN_M, SAME_BASIN_RAD = 0.1, 0.02
+VIEWS = ("whole", "whole", "untimed", "narrow", "near", "sparse")
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A pair of keyframes as one variant of the sensor would have seen it."""
+
+    query: Keyframe
+    match: Keyframe
+    pair: Pair
+
+    @property
+    def true(self) -> Array | None:
+        """The true pose; None between worlds."""
+        return self.pair.match_T_query if self.pair.query.world == self.pair.match.world else None
+
+    def is_right(self, pose: Array) -> bool | None:
+        """Whether a pose is; None where it is neither right nor quite wrong."""
+        if self.true is None:
+            return False
+        gap = relative(self.true, pose)
+        return is_right(float(np.linalg.norm(gap[:3, 3])), float(np.degrees(rotation_angle(gap))))
+
+
+def is_right(metres: float, degrees: float) -> bool | None:
+    """Whether an error is that of a right pose; None between right and wrong."""
+    if metres < RIGHT_M and degrees < RIGHT_DEG:
+        return True
+    return False if metres > WRONG_M or degrees > WRONG_DEG else None
+
+
+def kept_examples(
+    domain: Domain, seeds: range, pairs: int, scans: Path | None, embedder: Embedder, kept: Path | None
+) -> list[Example]:
+    """The same as `examples_of`, from a file in the folder `kept` where an earlier call left it."""
+    path = kept / f"examples_{domain.name}_{seeds.start}_{len(seeds)}_{pairs}.pkl" if kept else None
+    if path is not None and path.exists():
+        found: list[Example] = pickle.loads(path.read_bytes())
+        return found
+    found = list(examples_of(domain, seeds, pairs, scans, embedder))
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(pickle.dumps(found))
+    return found
+
+
+def examples_of(domain: Domain, seeds: range, pairs: int, scans: Path | None, embedder: Embedder) -> Iterator[Example]:
+    """Examples from pairs of surveys: half of one place, a quarter of two, a quarter of two worlds."""
+    places = places_of(domain, seeds, QUICK, scans, embedder)
+    rng = np.random.default_rng([seeds.start, 60])
+    every = list(pairs_of(places, domain, rng))
+    mixed = [every[index] for index in rng.permutation(len(every))]
+    chosen = [pair for pair in mixed if pair.kind != ELSEWHERE][: pairs // 2]
+    chosen += [pair for pair in mixed if pair.kind == ELSEWHERE][: pairs // 4]
+    chosen += [_between_worlds(places, rng) for _ in range(pairs // 4)]
+    verifier = Verifier(Verification())
+    for number, pair in enumerate(chosen):
+        view = VIEWS[number % len(VIEWS)]
+        query, match = (_seen(place.keyframe, view, domain.scanner.all_round) for place in (pair.query, pair.match))
+        tried = Tried(query, match, pair)
+        yield from _examples(tried, verifier, domain, rng)
+
+
+def _examples(tried: Tried, verifier: Verifier, domain: Domain, rng: np.random.Generator) -> Iterator[Example]:
+    """What verification finds of itself, and what it would make of poses that it may find another time."""
+    verifier.reset()
+    candidates = [(Candidate(0, tried.match.stamp_ns, tried.pair.similarity), tried.match)]
+    found = [
+        (one.aligned.pose, one.measurement)
+        for one in verifier.examine(tried.query, candidates)
+        if one.measurement.kind == SCAN
+    ]
+    scans = ScanCache()
+    if all(scans[keyframe].usable for keyframe in (tried.match, tried.query)):
+        ranked = rerank(tried.query, candidates, Verification())[0]
+        guesses = _guesses(tried, domain.scanner.all_round, rng)
+        guessed = [_aligned(tried, ranked, scans, guess) for guess in guesses]
+        found += [(pose, beside(measurement, pose, found)) for pose, measurement in guessed]
+    kept: list[Array] = []
+    for pose, measurement in found:
+        right = tried.is_right(pose)
+        # nobody can know a pose that is right where the scans see nothing of each other
+        if right is None or (right and measurement.common < 0.1) or any(_same_basin(pose, other) for other in kept):
+            continue
+        kept.append(pose)
+        yield Example(measurement, right, domain.name)
+
+
+def _guesses(tried: Tried, all_round: bool, rng: np.random.Generator) -> list[Array]:
+    """Poses to align from: near the truth, slid along and across the way, turned round; elsewhere, road on road."""
+    beside = [*rng.normal(0, 0.4, 2), 0.0]
+    around = [make_pose(_yaw(180.0), [*rng.normal(0, 1, 2), 0.0])] if all_round else []
+    if tried.true is None or tried.pair.kind == ELSEWHERE:
+        anywhere = make_pose(_yaw(rng.normal(0, 4)), [*rng.normal(0, 1.5, 2), 0.0])
+        return [make_pose(np.eye(3), beside), anywhere, *around]
+    along, across = rng.choice([-1.0, 1.0], 2) * rng.uniform([1.0, 0.8], [5.0, 3.5])
+    moves = [
+        make_pose(np.eye(3), [0.0, 0.0, 0.0]),
+        make_pose(_yaw(rng.normal(0, 3)), beside),
+        make_pose(np.eye(3), [along, 0.0, 0.0]),
+        make_pose(_yaw(rng.normal(0, 4)), [rng.normal(), across, 0.0]),
+    ]
+    return [tried.true @ move for move in moves + around]
+
+
+def _aligned(tried: Tried, ranked: RankedCandidate, scans: ScanCache, guess: Array) -> tuple[Array, Measurement]:
+    prepared = scans[tried.match], scans[tried.query]
+    alignment = align_scans(*prepared, guess)
+    aligned = AlignedHypothesis(tried.query, Hypothesis(ranked, guess, 0.0), alignment, prepared)
+    return alignment.pose, measure(aligned, TemporalMemory(), Verification().odometry_drift)
+
+
+def _between_worlds(places: list[Place], rng: np.random.Generator) -> Pair:
+    """Two keyframes of different worlds; with one world only, of any."""
+    query = places[int(rng.integers(len(places)))]
+    others = [place for place in places if place.world != query.world] or places
+    return Pair(query, others[int(rng.integers(len(others)))], ELSEWHERE)
+
+
+def _seen(keyframe: Keyframe, view: str, all_round: bool) -> Keyframe:
+    """What another sensor would have seen: one without time stamps, a narrow, a short-sighted, a sparse one."""
+    if view == "untimed":
+        return replace(keyframe, motion=None)
+    points = transform(invert(keyframe.body_T_lidar), keyframe.points.astype(float))
+    if view == "narrow":
+        half_deg = 36.0 if all_round else 25.0
+        ahead = keyframe.points @ np.array([1.0, 0.0, 0.0]), keyframe.points @ np.array([0.0, 1.0, 0.0])
+        chosen = np.abs(np.degrees(np.arctan2(ahead[1], ahead[0]))) < half_deg
+    elif view == "near":
+        chosen = np.linalg.norm(points, axis=1) < 14.0
+    elif view == "sparse":
+        chosen = np.random.default_rng(keyframe.stamp_ns % 1000).random(len(points)) < 0.4
+    else:
+        return keyframe
+    return replace(keyframe, points=keyframe.points[chosen])
+
+
+def _same_basin(a: Array, b: Array) -> bool:
+    gap = relative(a, b)
+    return bool(np.linalg.norm(gap[:3, 3]) < SAME_BASIN_M and rotation_angle(gap) < SAME_BASIN_RAD)
+
+
+def _yaw(degrees: float) -> Array:
+    turn: Array = Rotation.from_rotvec([0.0, 0.0, np.radians(degrees)]).as_matrix()
+    return turn
+
+
+EXAMINED = 5  # candidates per query: what retrieval offers first
+EVERY, CONSECUTIVE = 12, 3  # of so many keyframes, the first few are queries
+THRESHOLD = Verification().min_probability
+ACCEPTED_ODDS = math.log(THRESHOLD / (1 - THRESHOLD))
+SURVEYS, PAIRS = range(VALIDATION[0], VALIDATION[0] + 3), 60  # in every domain
+ENOUGH = 100  # right examples that a fit needs
+Survey = tuple[Drive, list[Keyframe]]
+DEFAULT_OUT = Path("config/verification/calibration.json")
+
+
+def main(
+    count: Annotated[int, typer.Option("--worlds", help="how many validation worlds")] = 4,
+    drives: Annotated[Path | None, typer.Option(help="folder that keeps simulated drives for the next time")] = None,
+    weights: Annotated[str, typer.Option(help="safetensors; empty: the shipped ones")] = "",
+    method: Annotated[str, typer.Option(help="embedder")] = "umf",
+    folder: Annotated[Path | None, typer.Option(help="keeps the domains' simulated scans for the next time")] = None,
+    pairs: Annotated[int, typer.Option(help="pairs per domain")] = PAIRS,
+    jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1,
+    examples: Annotated[Path | None, typer.Option(help="keeps the domains' examples, for the same code")] = None,
+    out: Annotated[Path, typer.Option(help="where the model goes")] = DEFAULT_OUT,
+) -> None:
+    """Examine candidates of validation worlds, fit acceptance and covariance to them, and write the model.
+
+    Run it again whenever the weights of the network change; no other step is needed.
+
+    Prints how many poses were right, what share of them a model fitted to the other worlds accepts, how many
+    wrong ones, and how many errors lie inside the 95 % ellipsoid. Zero wrong is what counts.
+    """
+    console = Console()
+    settings = EmbeddingSettings(method=method, weights=weights, threads=1)
+    elsewhere = in_domains(settings, pairs, folder, examples, jobs)
+    embedder = make_embedder(settings)
+    surveyed: list[Survey] = []
+    for number, family, aliasing in worlds(VALIDATION[0], count):
+        with console.status(f"simulating world {number} ({family}, aliasing {aliasing:g})"):
+            drive = kept(drives, number, family, aliasing)
+        surveyed.append((drive, embedded(drive, embedder)))
+    model, results = fit([example for survey in surveyed for example in examine(*survey)] + elsewhere)
+    for name, value in results.items():
+        console.print(f"{name:32} {value:.4g}")
+    save_acceptance(model, out, {SCAN: f"python -m umf_ros.lab.fit.scan_acceptance --worlds {count}"}, results)
+    console.print(f"wrote {out}")
+
+
+def in_domains(
+    settings: EmbeddingSettings, pairs: int, folder: Path | None, kept: Path | None, jobs: int
+) -> list[Example]:
+    """Examples of all domains."""
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        waiting = [pool.submit(_in_domain, domain, settings, pairs, folder, kept) for domain in DOMAINS]
+        found = [one.result() for one in track(waiting, "domains", transient=True)]
+    return [example for domain in found for example in domain]
+
+
+def _in_domain(
+    domain: Domain, settings: EmbeddingSettings, pairs: int, folder: Path | None, kept: Path | None
+) -> list[Example]:
+    return kept_examples(domain, SURVEYS, pairs, folder, make_embedder(settings), kept)
+
+
+def fit(examples: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
+    """The model that explains the examples, and how it does in domains left out.
+
+    What the shipped model says of other kinds than scans stays.
+    """
+    shipped = load_acceptance()
+    mine = [example for example in examples + _sprung_traps() if example.measurement.kind == SCAN]
+    save_examples(mine, EXAMPLES)
+    model, odds = fit_decision(mine, SCAN, THRESHOLD)
+    bounds = shipped.bounds | {SCAN: bounds_of(mine, SCAN)}
+    fitted = replace(shipped, models=dict(shipped.models) | {SCAN: model}, bounds=bounds)
+    return fitted, _judge(SCAN, mine, odds)
+
+
+def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Example]:
+    """Hypotheses about candidates along a drive, and whether their poses are right; its world counts as a domain."""
+    rng = np.random.default_rng(drive.seed)
+    rules = Loop()
+    database = PlaceDatabase(Database(), "drive", len(keyframes[0].embedding.descriptor))
+    verifier = Verifier(Verification())
+    for query, keyframe in enumerate(track(keyframes, f"world {drive.name}", transient=True)):
+        candidates = database.query(keyframe, rules)
+        # consecutive ones, for a keyframe is supported by what its neighbours found
+        if candidates and query % EVERY < CONSECUTIVE:
+            chosen = _choose(drive, query, candidates, rng)
+            strength = float(rng.choice([0.0, 0.0, 1.0, 2.0]))
+            pairs = [(one, _degraded(database[one.index], strength, rng)) for one in chosen]
+            for one in verifier.examine(_degraded(keyframe, strength, rng), pairs):
+                metres, degrees = drive.error(query, one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose)
+                right = is_right(metres, degrees)
+                if right is not None:
+                    yield Example(one.measurement, right, f"drive {drive.seed}")
+        database.add(keyframe)
+    database.close()
+
+
+def _choose(drive: Drive, query: int, candidates: list[Candidate], rng: np.random.Generator) -> list[Candidate]:
+    """The first candidates of the retrieval, and a near and a far one that it may have missed."""
+    chosen = candidates[:EXAMINED]
+    places = drive.truth[:, :2, 3]
+    away = np.linalg.norm(places[: max(candidate.index for candidate in candidates) + 1] - places[query], axis=1)
+    for pool in (np.flatnonzero(away < 5), np.flatnonzero(away > 8)):
+        if len(pool):
+            index = int(rng.choice(pool))
+            if drive.frames[query].stamp_ns - drive.frames[index].stamp_ns > 20e9:
+                chosen.append(Candidate(index, drive.frames[index].stamp_ns, candidates[-1].similarity))
+    return list({candidate.index: candidate for candidate in chosen}.values())
+
+
+def _degraded(keyframe: Keyframe, strength: float, rng: np.random.Generator) -> Keyframe:
+    """What real scans suffer and simulated ones do not: range noise and motion that odometry did not remove."""
+    points = keyframe.points.astype(float)
+    reach = np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1.0)
+    points *= 1 + strength * 0.01 * rng.standard_normal((len(points), 1)) / reach
+    moment = np.clip(np.arctan2(points[:, 2:], reach) / 0.26, -1, 1)  # a scan sweeps upwards
+    turn, shift = strength * np.radians(0.15) * rng.standard_normal(), strength * 0.01 * rng.standard_normal(3)
+    points[:, :2] += moment * turn * np.column_stack([-points[:, 1], points[:, 0]])
+    embedding = keyframe.embedding
+    if rng.random() < 0.2:
+        embedding = replace(embedding, image=None)
+    return replace(keyframe, points=(points + moment * shift).astype(np.float32), embedding=embedding)
+
+
+def _sprung_traps() -> list[Example]:
+    """Every trap a few times over, as wrong examples of its kind."""
+    found = []
+    for trap in TRAPS.values():
+        for seed in range(100, 110):
+            query, match = trap(seed)
+            examined = Verifier(Verification()).examine(query, [(Candidate(0, match.stamp_ns, 0.9), match)])
+            found += [Example(one.measurement, False, "traps") for one in examined]
+    return found
+
+
+def _judge(kind: str, examples: list[Example], odds: Array) -> dict[str, float]:
+    """Figures of log-odds that every example got without its domain."""
+    right, refused = np.array([(example.right, bool(refuted(example.measurement))) for example in examples]).T
+    accepted = (odds >= ACCEPTED_ODDS) & ~refused
+    domains = np.array([example.domain for example in examples])
+    recall = [float(accepted[right & (domains == name)].mean()) for name in np.unique(domains[right])]
+    return {
+        f"{kind}_examples": float(len(examples)),
+        f"{kind}_right": float(right.sum()),
+        f"{kind}_recall_left_out": float(np.mean(recall)),
+        f"{kind}_recall_left_out_worst": min(recall),
+        f"{kind}_wrong_left_out": float(accepted[~right].sum()),
+    }
+
+
+if __name__ == "__main__":
+    typer.run(main)

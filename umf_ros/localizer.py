@@ -1,0 +1,399 @@
+"""Localisation in a fixed map: closures with the map give the pose, odometry propagates it."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+from math import exp, log
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.core.config import PoseGraphSettings, Settings
+from umf_ros.core.errors import GraphError, UmfError, writing
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import (
+    Array,
+    adjoint,
+    expmap,
+    gtsam_to_ros_covariance,
+    invert,
+    logmap,
+    propagate,
+    relative,
+    rotation_angle,
+)
+from umf_ros.core.trajectory import Trajectory, write_tum
+from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State, check_closure, check_pose
+from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
+
+ACCEPTED_ODDS = log(0.999 / 0.001)
+"""A pose is reported from these odds on, nats (*by hand*: one wrong in a thousand)."""
+POSES = "poses.npz"
+"""In the folder of a map, its places with a pose: `stamps` (N,) on the map's clock, `poses` (N, 4, 4) `map_T_body`."""
+_MOST_PER_CLOSURE = log(0.99 / 0.01)
+# neighbouring places are mistaken for the same wrong place: consecutive closures count by the path length between them
+_NATS_PER_M = 1.0
+_MOST_ODDS, _LEAST_ODDS = 12.0, -3.0
+_MOST_HYPOTHESES = 8
+_KEPT_MESSAGES = 3000
+_SAME_M, _SAME_RAD = 0.5, 0.1
+# lower bound of the uncertainty of the poses in the map
+_MAP_SIGMAS = np.array([0.005, 0.005, 0.005, 0.05, 0.05, 0.05])
+_TURN_M_PER_RAD = 0.5
+_SPACING_M = 0.25
+
+
+class Localization(NamedTuple):
+    """A pose in the map.
+
+    Attributes:
+        stamp_ns: of the pose.
+        map_T_body: (4, 4).
+        covariance: (6, 6) in ROS order about the map's axes.
+        probability: that the rover is not at a similar place elsewhere.
+    """
+
+    stamp_ns: int
+    map_T_body: Array
+    covariance: Array
+    probability: float
+
+
+class _Sample(NamedTuple):
+    """An odometry message, and the path length up to it in m, turns included."""
+
+    stamp_ns: int
+    pose: Array
+    path_m: float
+
+
+@dataclass(eq=False)
+class _PoseHypothesis:
+    """A pose that the rover may have at a sample of the odometry.
+
+    Attributes:
+        at: the sample.
+        pose: (4, 4) `map_T_body`.
+        covariance: (6, 6) in the tangent space of the body, rotation first.
+        odds: of the hypothesis, nats.
+        counted_m: path length at the latest closure that counted.
+    """
+
+    at: _Sample
+    pose: Array
+    covariance: Array
+    odds: float
+    counted_m: float
+
+
+class Localizer:
+    """Tracks pose hypotheses in a fixed map, from closures and odometry.
+
+    A closure that agrees with no hypothesis adds one. Later closures agree with a hypothesis or contradict it, within
+    the covariances of closure and odometry, and change its odds by the path length between them. The pose is that of
+    the accepted hypothesis until another one is accepted, so a rover that was moved is relocalised.
+
+    Args:
+        poses: of the map's keyframes, by the stamps that closures name as their match.
+        settings: of the odometry's noise, and the gate.
+
+    Attributes:
+        relocalised: number of times that a hypothesis was accepted.
+        counts: closures that agreed with the pose, contradicted it, came before there was one, or were unusable.
+    """
+
+    def __init__(self, poses: Trajectory, settings: PoseGraphSettings) -> None:
+        self._map = dict(zip(poses.stamps_ns.tolist(), poses.poses, strict=True))
+        self._settings = settings
+        self.relocalised = 0
+        self.counts = {"agreed": 0, "contradicted": 0, "searching": 0, "unusable": 0}
+        self.begin_session()
+
+    def begin_session(self) -> None:
+        """Forget every pose: the odometry starts again, at any place."""
+        self._samples: deque[_Sample] = deque(maxlen=_KEPT_MESSAGES)
+        self._pending: deque[LoopClosure] = deque(maxlen=50)
+        self._hypotheses: list[_PoseHypothesis] = []
+        self._accepted: _PoseHypothesis | None = None
+
+    def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> bool:
+        """Take one message; returns whether it could be used."""
+        try:
+            check_pose(odom_T_body)
+        except GraphError:
+            return False
+        last = self._samples[-1] if self._samples else None
+        if last is not None and stamp_ns <= last.stamp_ns:
+            return False
+        path_m = 0.0 if last is None else last.path_m + _path_length(last.pose, odom_T_body)
+        self._samples.append(_Sample(stamp_ns, np.asarray(odom_T_body, float), path_m))
+        for _ in range(len(self._pending)):
+            self.add_closure(self._pending.popleft())
+        return True
+
+    def add_closure(self, closure: LoopClosure) -> Localization | None:
+        """Take a closure with a keyframe of the map; returns the pose at the query, None while it is unknown."""
+        if self._samples and closure.query_stamp_ns > self._samples[-1].stamp_ns:
+            self._pending.append(closure)
+            return None
+        at, match = self._sample(closure.query_stamp_ns), self._map.get(closure.match_stamp_ns)
+        try:
+            covariance = check_closure(closure, self._settings.max_closure_m)
+        except GraphError:
+            at = None
+        if at is None or match is None:
+            self.counts["unusable"] += 1
+            return None
+        self._update(at, match @ closure.match_T_query, covariance + np.diag(_MAP_SIGMAS**2), closure.probability)
+        return None if self._accepted is None else self._localization(self._accepted, at)
+
+    def estimate(self) -> Localization | None:
+        """The pose at the newest odometry; None while it is unknown."""
+        if self._accepted is None or not self._samples:
+            return None
+        return self._localization(self._accepted, self._samples[-1])
+
+    def map_T_odom(self) -> Array | None:
+        """(4, 4) pose of the odometry's frame in the map; None while it is unknown."""
+        known = self._accepted
+        return None if known is None else known.pose @ invert(known.at.pose)
+
+    def _update(self, at: _Sample, pose: Array, covariance: Array, probability: float) -> None:
+        """Compare a measured pose with every hypothesis, and add one where none agrees."""
+        trust = min(_logit(probability), _MOST_PER_CLOSURE)
+        agreed = [one for one in self._hypotheses if self._agrees(one, at, pose, covariance)]
+        gain = trust
+        for one in agreed:
+            gain = min(gain, _NATS_PER_M * max(at.path_m - one.counted_m, 0.0))
+            self._correct(one, at, pose, covariance)
+        for one in self._hypotheses:
+            one.odds += gain if one in agreed else -trust if not agreed else -gain
+            one.odds = min(one.odds, _MOST_ODDS)
+            one.counted_m = at.path_m if one in agreed else one.counted_m
+        if not agreed:
+            self._hypotheses.append(_PoseHypothesis(at, pose, covariance, trust, at.path_m))
+        self._count(agreed)
+        self._choose()
+
+    def _count(self, agreed: list[_PoseHypothesis]) -> None:
+        if self._accepted is None:
+            self.counts["searching"] += 1
+        else:
+            self.counts["agreed" if self._accepted in agreed else "contradicted"] += 1
+
+    def _choose(self) -> None:
+        """Keep the likeliest hypotheses, one of each pose, and accept the best where its odds suffice."""
+        kept: list[_PoseHypothesis] = []
+        for one in sorted(self._hypotheses, key=lambda one: -one.odds):
+            if one.odds > _LEAST_ODDS and not any(self._same(one, other) for other in kept):
+                kept.append(one)
+        self._hypotheses = kept[:_MOST_HYPOTHESES]
+        best = kept[0] if kept else None
+        if best is not None and best.odds >= ACCEPTED_ODDS and best is not self._accepted:
+            self._accepted = best
+            self.relocalised += 1
+        elif self._accepted not in self._hypotheses:
+            self._accepted = None
+
+    def _agrees(self, one: _PoseHypothesis, at: _Sample, pose: Array, covariance: Array) -> bool:
+        expected, spread = self._propagated(one, at)
+        miss = logmap(relative(expected, pose)[None])[0]
+        return float(miss @ np.linalg.solve(spread + covariance, miss)) <= self._settings.gate_chi2
+
+    def _correct(self, one: _PoseHypothesis, at: _Sample, pose: Array, covariance: Array) -> None:
+        """Correct a hypothesis by a measured pose (Kalman update)."""
+        expected, spread = self._propagated(one, at)
+        gain = spread @ np.linalg.inv(spread + covariance)
+        one.pose = expected @ expmap((gain @ logmap(relative(expected, pose)[None])[0])[None])[0]
+        one.covariance = (np.eye(6) - gain) @ spread
+        one.covariance = 0.5 * (one.covariance + one.covariance.T)
+        one.at = at
+
+    def _propagated(self, one: _PoseHypothesis, at: _Sample) -> tuple[Array, Array]:
+        """Pose and covariance of a hypothesis, propagated by odometry to another sample."""
+        step = relative(one.at.pose, at.pose)
+        path_m = abs(at.path_m - one.at.path_m)
+        turn = np.deg2rad(self._settings.odometry_sigma_deg) ** 2
+        noise = path_m * np.diag([turn] * 3 + [self._settings.odometry_sigma_m**2] * 3)
+        # an error of heading made on the path is a translation at its end
+        noise[3:, 3:] += np.eye(3) * turn * path_m**3 / 3
+        return one.pose @ step, propagate(adjoint(invert(step)), one.covariance) + noise
+
+    def _same(self, one: _PoseHypothesis, other: _PoseHypothesis) -> bool:
+        gap = relative(self._propagated(other, one.at)[0], one.pose)
+        return bool(np.linalg.norm(gap[:3, 3]) < _SAME_M and rotation_angle(gap) < _SAME_RAD)
+
+    def _localization(self, one: _PoseHypothesis, at: _Sample) -> Localization:
+        pose, covariance = self._propagated(one, at)
+        others = sum(exp(other.odds) for other in self._hypotheses if other is not one)
+        probability = exp(one.odds) / (1 + exp(one.odds) + others)
+        return Localization(at.stamp_ns, pose, gtsam_to_ros_covariance(covariance, pose), probability)
+
+    def _sample(self, stamp_ns: int) -> _Sample | None:
+        """The odometry at a stamp; None before the first message, or in a gap."""
+        samples = list(self._samples)
+        stamps = np.array([one.stamp_ns for one in samples], np.int64)
+        pose, known = Trajectory(stamps, np.array([one.pose for one in samples]).reshape(-1, 4, 4)).at(
+            np.array([stamp_ns], np.int64)
+        )
+        if not known[0]:
+            return None
+        path_m = float(np.interp(stamp_ns - stamps[0], stamps - stamps[0], [one.path_m for one in samples]))
+        return _Sample(stamp_ns, pose[0], path_m)
+
+
+def _path_length(a: Array, b: Array) -> float:
+    step = relative(a, b)
+    return float(np.linalg.norm(step[:3, 3])) + _TURN_M_PER_RAD * rotation_angle(step)
+
+
+def _logit(probability: float) -> float:
+    """Odds in nats; an unknown probability counts as 0.9, that of a closure that is just accepted."""
+    known = min(max(probability, 0.5), 0.9999) if np.isfinite(probability) else 0.9
+    return log(known / (1 - known))
+
+
+def read_poses(path: Path) -> Trajectory:
+    """Read the poses of a map's places, on the map's clock.
+
+    Raises:
+        UmfError: the map has not been solved, or the file is damaged.
+    """
+    try:
+        with np.load(path / POSES) as stored:
+            return Trajectory(stored["stamps"], stored["poses"])
+    except (OSError, ValueError, KeyError):
+        raise UmfError(f"{path / POSES} cannot be read: umf map writes it when a map is solved") from None
+
+
+class MapFollower:
+    """Localisation in a map behind the interface of `DurableGraph` and its graph, for `pose_graph_node`.
+
+    It keeps the trajectory only; closures are counted by their state.
+
+    Args:
+        settings: all settings, mode localization.
+
+    Attributes:
+        feed: splits the odometry into sessions.
+        counts: odometry messages and closures, by their state.
+
+    Raises:
+        UmfError: there is no such map, or it has not been solved.
+    """
+
+    taken_up = changed = 0
+    unsettled = False
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self.end()
+
+    def end(self) -> None:
+        """Forget the pose and the trajectory: the rover may be anywhere."""
+        self._localizer = Localizer(read_poses(Path(self._settings.map)), self._settings.pose_graph)
+        self.feed = OdometrySessionSplitter(self._localizer)
+        self._poses: list[Localization] = []
+        self._states: Counter[State] = Counter()
+        self.counts: Counter[str] = Counter()
+
+    @property
+    def graph(self) -> MapFollower:
+        """Itself: there is no graph."""
+        return self
+
+    @property
+    def probability(self) -> float:
+        """Probability of the pose; 0 while it is unknown."""
+        found = self._localizer.estimate()
+        return 0.0 if found is None else found.probability
+
+    def take_odometry(self, stamp_ns: int, odom_T_body: Array) -> Reset | None:
+        """Take one message; returns the reason if a new session begins with it."""
+        reset = self.feed.take(stamp_ns, odom_T_body)
+        found = self._localizer.estimate()
+        if found is not None:
+            last = self._poses[-1].map_T_body[:3, 3] if self._poses else np.full(3, np.inf)
+            if np.linalg.norm(found.map_T_body[:3, 3] - last) >= _SPACING_M:
+                self._poses.append(found)
+        return reset
+
+    def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
+        """Take a closure with the map; returns its verdict."""
+        before = Counter(self._localizer.counts)
+        self._localizer.add_closure(closure)
+        change = Counter(self._localizer.counts) - before
+        state, reason = _STATES.get(next(iter(change), ""), (State.PENDING, ClosureReason.NO_ODOMETRY_YET))
+        self._states[state] += 1
+        return [ClosureVerdict(closure, state, reason)]
+
+    def update(self) -> list[ClosureVerdict]:
+        """Return no verdicts: no closure is pending."""
+        return []
+
+    def prepare(self, within_s: float) -> None:
+        """Do nothing: there is no graph to settle."""
+
+    def revoke(self, match_ns: int, query_ns: int) -> list[ClosureVerdict]:
+        """Refuse to reject a closure by hand: none are kept.
+
+        Raises:
+            GraphError: always.
+        """
+        raise GraphError("localisation in a fixed map keeps no closures to reject")
+
+    def close(self) -> None:
+        """Do nothing: no file is open."""
+
+    def retune(self, settings: object) -> None:
+        """Do nothing: the settings are those of the start."""
+
+    def map_T_odom(self) -> Array | None:
+        """(4, 4) pose of the odometry frame in the map; None while it is unknown."""
+        return self._localizer.map_T_odom()
+
+    def covariance(self) -> Array:
+        """(6, 6) of the newest pose in ROS order; zero while it is unknown."""
+        found = self._localizer.estimate()
+        return np.zeros((6, 6)) if found is None else found.covariance
+
+    def trajectory(self) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (N,) in ns and `map_T_body` (N, 4, 4) since the rover was localised, 0.25 m apart."""
+        stamps = np.array([one.stamp_ns for one in self._poses], np.int64)
+        return stamps, np.array([one.map_T_body for one in self._poses]).reshape(-1, 4, 4)
+
+    def closures(self) -> list[ClosureVerdict]:
+        """No closures: none are kept."""
+        return []
+
+    def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
+        """No closures and no lines (0, 2, 3)."""
+        return [], np.empty((0, 2, 3))
+
+    def verdict_counts(self) -> Counter[State]:
+        """Number of closures by state."""
+        return Counter(self._states)
+
+    def write_results(self, folder: str | Path, within_s: float = float("inf")) -> bool:
+        """Write the trajectory, `trajectory_in_map.tum`; returns true, there is nothing to settle before.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        stamps, poses = self.trajectory()
+        with writing(f"to {folder}"):
+            Path(folder).mkdir(parents=True, exist_ok=True)
+        write_tum(Path(folder) / "trajectory_in_map.tum", Trajectory(stamps, poses))
+        return True
+
+
+_STATES = {
+    "agreed": (State.ACCEPTED, ClosureReason.AGREES_WITH_POSE),
+    "contradicted": (State.REJECTED, ClosureReason.CONTRADICTS_POSE),
+    "searching": (State.PENDING, ClosureReason.POSE_UNKNOWN),
+    "unusable": (State.REFUSED, ClosureReason.NOT_OF_MAP),
+}
+"""State of a closure by what the localizer counted it as."""

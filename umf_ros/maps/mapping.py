@@ -1,0 +1,256 @@
+"""Map many recordings: replay each, match it against the earlier ones, and solve one joint pose graph.
+
+Three steps, each a function of files alone, so that the first two can run on any machine:
+
+1. `replay_session`: one recording becomes a run folder with its own place database;
+2. `match_session`: closures between a recording and the earlier ones;
+3. `umf_ros.maps.joint_graph.solve`: one graph of all sessions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from shutil import rmtree
+from typing import Any
+
+from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.presets import settings_for
+from umf_ros.bags.reader import Bag, open_bag
+from umf_ros.bags.trajectories import read_odometry
+from umf_ros.core.config import Database, Settings
+from umf_ros.core.errors import BagError, writing
+from umf_ros.core.frames import Keyframe
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
+from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
+from umf_ros.maps.odometry_log import OdometryLog, track
+from umf_ros.places.database import PlaceDatabase
+from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
+from umf_ros.replay import Replay
+from umf_ros.runs.reader import describe_recording, remember_recording
+from umf_ros.runs.tables import CLOSURES, closure_row, write_table
+from umf_ros.runs.writer import PLACES, count_drops
+from umf_ros.verification import Verdict, Verifier
+
+OnFrame = Callable[[float, Detection], None]
+"""Called for every frame with the share of the recording that is done, 0 to 1, and the detection."""
+RECORDINGS = (".mcap", ".db3", ".bag")
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """Options of `umf replay` that recordings are opened with.
+
+    Attributes:
+        odometry: folder of TUM files named like the recordings, `NAME.tum` or `NAME.odometry.tum`; None: none.
+        odometry_frame: frame whose poses the files hold.
+    """
+
+    config: Path | None = None
+    dataset: str = "auto"
+    embedder: str | None = None
+    weights: str | None = None
+    odometry: Path | None = None
+    odometry_frame: str = "body"
+
+    def settings(self, bag: Bag) -> Settings:
+        """Settings for a recording.
+
+        Raises:
+            UmfError: they are wrong, or the recording's data set is unknown.
+        """
+        overrides = {"embedding__method": self.embedder, "embedding__weights": self.weights}
+        return settings_for(bag, self.config, self.dataset, mode="mapping", **overrides)
+
+    def odometry_of(self, recording: Path, settings: Settings) -> Trajectory | None:
+        """The odometry of a recording from its TUM file; None where there is none.
+
+        Raises:
+            BagError: the file is damaged, or its frame is unknown.
+        """
+        folder = self.odometry
+        paths = [folder / f"{recording.stem}{ending}" for ending in (".tum", ".odometry.tum")] if folder else []
+        path = next((path for path in paths if path.is_file()), None)
+        return None if path is None else read_odometry(path, self.odometry_frame, settings)
+
+
+def find_recordings(paths: list[Path]) -> list[Path]:
+    """The recordings among files and folders, those of a folder sorted by name.
+
+    Raises:
+        BagError: a path is missing, or a folder holds no recording.
+    """
+    found = []
+    for path in paths:
+        if not path.exists():
+            raise BagError(f"there is no recording {path}")
+        inside = [path] if path.is_file() or _is_recording(path) else sorted(filter(_is_recording, path.iterdir()))
+        if not inside:
+            raise BagError(f"{path} holds no recording ({', '.join(RECORDINGS)}, or a folder with metadata.yaml)")
+        found += inside
+    return list(dict.fromkeys(path.resolve() for path in found))
+
+
+def _is_recording(path: Path) -> bool:
+    return path.suffix in RECORDINGS if path.is_file() else (path / "metadata.yaml").is_file()
+
+
+def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: OnFrame = lambda *_: None) -> None:
+    """Replay one recording into a run folder, which replaces an earlier one.
+
+    Args:
+        recording: any that `umf replay` can read.
+        opening: options.
+        folder: becomes a run folder with `places.sqlite` and `odometry.npz`, stamped by the recording's own clock.
+        on_frame: called for every frame.
+
+    Raises:
+        UmfError: the recording cannot be read, or the folder cannot be written.
+    """
+    bag = open_bag(recording)
+    settings = opening.settings(bag)
+    if folder.exists():
+        rmtree(folder)
+    with writing(f"to {folder}"):
+        folder.mkdir(parents=True)
+    store = Database(path=str(folder / PLACES), cached_keyframes=settings.database.cached_keyframes)
+    settings = settings.model_copy(update={"database": store})
+    reader, log = FrameReader(bag, settings, opening.odometry_of(recording, settings)), OdometryLog()
+    replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
+    for detection in replay.run(log.following(reader.stream())):
+        on_frame(reader.progress, detection)
+    replay.finish(count_drops(reader.counters))
+    remember_recording(folder, bag)
+    if not len(log):
+        log = _track(folder, settings)
+    log.save(folder)
+    replay.raise_if_frames_failed()
+
+
+def _track(folder: Path, settings: Settings) -> OdometryLog:
+    """Track a recording without odometry, and store its keyframes with the tracked poses as odometry."""
+    old, new = folder / PLACES, folder / f"tracked_{PLACES}"
+    with closing(open_places(old)) as places:
+        log, tracked = track((places[row] for row in range(len(places))), settings.verification)
+    with closing(_create(new, *stored_identity(old))) as places:
+        for keyframe in tracked:
+            places.add(keyframe)
+    with writing(old):
+        new.replace(old)
+    return log
+
+
+def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
+    """Add the run folder of a recording to the map: its places move to the map's store, on the map's clock.
+
+    Places that a killed process left behind are removed first.
+
+    Raises:
+        UmfError: the recording was embedded by another network than the earlier ones.
+        OutputError: the map cannot be written.
+    """
+    run = target.folder_of(name)
+    bag = open_bag(recording)
+    _discard_unfinished(target)
+    with closing(_create(target.places, *stored_identity(run / PLACES))) as places:
+        first_place, first_number = len(places), places.next_session
+        with closing(open_places(run / PLACES)) as own:
+            known = [own[row] for row in range(len(own))]
+            stamps = [keyframe.stamp_ns for keyframe in known] or [bag.start_ns]
+            log = OdometryLog.load(run)
+            span = [*stamps, *log.stamps]
+            shift_ns = target.shift_for(min(span))
+            for keyframe in known:
+                places.add(_moved(keyframe, shift_ns, first_number))
+        session = MapSession(
+            name=name,
+            recording=describe_recording(bag),
+            shift_ns=shift_ns,
+            first_ns=min(span),
+            last_ns=max(span),
+            first_place=first_place,
+            places=len(known),
+            first_number=first_number,
+            numbers=places.next_session - first_number,
+            odometry=not log.covariances,
+        )
+    target.add(session)
+    with writing(run):
+        for path in run.glob(f"{PLACES}*"):
+            path.unlink()
+    return session
+
+
+def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Verdict]]:
+    """Match a recording against the earlier ones; yields the verdicts of every keyframe, accepted ones first.
+
+    Writes `closures_between.csv`, complete or not at all. The map's store is only read: several sessions may be
+    matched at once.
+
+    Raises:
+        UmfError: the map's store cannot be read.
+        OutputError: the table cannot be written.
+    """
+    settings = target.settings
+    rows = range(session.first_place, session.first_place + session.places)
+    verifier, number = Verifier(settings.verification), -1
+    found_rows: list[list[Any]] = []
+    with closing(open_places(target.places)) as places:
+        for row in rows:
+            keyframe = places[row]
+            if keyframe.session != number:
+                verifier.reset()
+                number = keyframe.session
+            candidates = places.query(keyframe, settings.loop, range(session.first_number))
+            verdicts = verifier.verify(keyframe, [(found, places[found.index]) for found in candidates])
+            found_rows += [closure_row(v.closure, v.candidate.similarity) for v in verdicts if v.closure]
+            yield verdicts
+    write_table(target.folder_of(session.name) / BETWEEN, CLOSURES, found_rows)
+
+
+def replay_task(task: tuple[Path, Opening, Path]) -> None:
+    """`replay_session` as a task of another process."""
+    replay_session(*task)
+
+
+def match_task(task: tuple[Path, str]) -> None:
+    """`match_session` as a task of another process, given the folder of the map and the name of the session."""
+    target = MapFolder.open(task[0])
+    session = next(one for one in target.sessions if one.name == task[1])
+    for _ in match_session(target, session):
+        pass
+
+
+def unmatched(target: MapFolder) -> list[MapSession]:
+    """Sessions that were added and are not matched completely against the earlier ones."""
+    return [session for session in target.sessions if not (target.folder_of(session.name) / BETWEEN).is_file()]
+
+
+def _discard_unfinished(target: MapFolder) -> None:
+    """Delete the places of a recording that a killed process had not added completely."""
+    if not target.places.is_file():
+        return
+    known = max((session.first_number + session.numbers for session in target.sessions), default=0)
+    unfinished = [one.number for one in stored_sessions(target.places) if one.number >= known]
+    if unfinished:
+        delete_sessions(target.places, unfinished)
+
+
+def open_places(path: Path) -> PlaceDatabase:
+    """Open a place database of any embedder for reading.
+
+    Raises:
+        UmfError: it cannot be read.
+    """
+    return PlaceDatabase(Database(path=str(path)), *stored_identity(path), read_only=True)
+
+
+def _create(path: Path, embedder: str, dimension: int) -> PlaceDatabase:
+    return PlaceDatabase(Database(path=str(path)), embedder, dimension)
+
+
+def _moved(keyframe: Keyframe, shift_ns: int, number: int) -> Keyframe:
+    return replace(keyframe, stamp_ns=keyframe.stamp_ns + shift_ns, session=keyframe.session + number)

@@ -1,0 +1,205 @@
+"""One SQLite file per run, written as it goes; the CSV tables are exported from it."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.frames import LoopClosure, Points
+from umf_ros.core.geometry import Array
+from umf_ros.core.io import Schema, SqliteFile
+from umf_ros.runs import tables
+
+NAME = "run.sqlite"
+ALWAYS = ("keyframes", "latencies", "candidates", "closures", "inliers")
+"""Tables that are exported without rows too."""
+
+
+def _create(connection: sqlite3.Connection) -> None:
+    """Create a table for every CSV file, in whose columns the text of the CSV file is kept, and the others."""
+    for name, columns in tables.COLUMNS.items():
+        connection.execute(f"CREATE TABLE {name} ({', '.join(columns)})")
+    # odometry messages that came before the closure
+    connection.execute("ALTER TABLE closures ADD COLUMN odometry_before INTEGER")
+    connection.execute("CREATE TABLE descriptor (stamp_ns INTEGER, data BLOB NOT NULL)")
+    connection.execute("CREATE TABLE odometry (number INTEGER PRIMARY KEY, stamp_ns INTEGER, odom_T_body BLOB)")
+    connection.execute("CREATE TABLE about (name TEXT PRIMARY KEY, value)")
+
+
+SCHEMA = Schema("run", migrations=(_create,))
+
+
+class RunFile:
+    """The file of a run. Rows of a transaction are kept together or not at all, also when the process is killed.
+
+    Args:
+        folder: of the run.
+        read_only: the file must exist; another process may write it.
+
+    Raises:
+        UmfError: the file is damaged, or another process writes it.
+        OutputError: the file cannot be written.
+    """
+
+    def __init__(self, folder: Path, read_only: bool = False) -> None:
+        self._folder, self._path = folder, folder / NAME
+        self._read_only = read_only
+        if not read_only and not self._path.exists():
+            _set_aside(folder)
+        self._file = SqliteFile(self._path, SCHEMA, read_only=read_only)
+        self._odometry: deque[tuple[int, int, bytes]] = deque()
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """One transaction; the odometry that came since the last one is written with it.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        with self._file.writing() as connection:
+            connection.executemany("INSERT OR IGNORE INTO odometry VALUES (?, ?, ?)", self._odometry)
+            yield
+        self._odometry.clear()
+
+    def append(self, table: str, rows: Iterable[Sequence[Any]], **more: Any) -> None:
+        """Add rows to a table, within a transaction; `more` are values of columns that are not exported."""
+        columns = [*tables.COLUMNS[table], *more]
+        statement = f"INSERT INTO {table} ({', '.join(columns)}) VALUES ({', '.join('?' * len(columns))})"
+        self._file.connection.executemany(statement, ([*row, *more.values()] for row in rows))
+
+    def append_descriptor(self, stamp_ns: int, descriptor: Points) -> None:
+        """Add the descriptor (D,) of a keyframe in half precision, within a transaction."""
+        data = np.asarray(descriptor, np.float16).tobytes()
+        self._file.connection.execute("INSERT INTO descriptor VALUES (?, ?)", (stamp_ns, data))
+
+    def append_odometry(self, number: int, stamp_ns: int, odom_T_body: Array) -> None:
+        """Add the n-th odometry message of the recording with the next transaction; a known one stays."""
+        self._odometry.append((number, stamp_ns, np.ascontiguousarray(odom_T_body[:3], np.float64).tobytes()))
+
+    def note(self, **values: Any) -> None:
+        """Write facts about the run by name, within a transaction."""
+        self._file.connection.executemany("INSERT OR REPLACE INTO about VALUES (?, ?)", values.items())
+
+    def facts(self) -> dict[str, Any]:
+        """Facts about the run by name.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        with self._file.reading() as connection:
+            return dict(connection.execute("SELECT name, value FROM about"))
+
+    def rows(self, table: str) -> list[tuple[Any, ...]]:
+        """Rows of a table in the columns of its CSV file, in the order in which they came.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        return self._select(f"SELECT {', '.join(tables.COLUMNS[table])} FROM {table} ORDER BY rowid")
+
+    def closures(self) -> list[LoopClosure]:
+        """The closures of the run.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        with self._file.reading():
+            rows = self.rows("closures")
+            return [tables.parse_closure(dict(zip(tables.CLOSURES, map(str, row), strict=True))) for row in rows]
+
+    def graph_inputs(self) -> Iterator[LoopClosure | tuple[int, Array]]:
+        """Odometry as (stamp in ns, pose (4, 4)) and closures, in the order in which the graph got them.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        before = self._select("SELECT odometry_before FROM closures ORDER BY rowid")
+        waiting = deque(zip((number for (number,) in before), self.closures(), strict=True))
+        odometry = self._select("SELECT number, stamp_ns, odom_T_body FROM odometry ORDER BY number")
+        for number, stamp_ns, data in odometry:
+            while waiting and waiting[0][0] <= number:
+                yield waiting.popleft()[1]
+            with self._file.reading():
+                yield stamp_ns, np.vstack([np.frombuffer(data, np.float64).reshape(3, 4), (0, 0, 0, 1)])
+        yield from (closure for _, closure in waiting)
+
+    def descriptors(self) -> dict[int, Points]:
+        """Descriptors (D,) float32 of the keyframes by their stamps, in order.
+
+        Raises:
+            UmfError: the file is damaged.
+        """
+        with self._file.reading() as connection:
+            rows = connection.execute("SELECT stamp_ns, data FROM descriptor ORDER BY rowid")
+            return {int(stamp): np.frombuffer(data, np.float16).astype(np.float32) for stamp, data in rows}
+
+    def export(self) -> None:
+        """Write the CSV tables.
+
+        Raises:
+            UmfError: the file is damaged.
+            OutputError: a table cannot be written.
+        """
+        for name, columns in tables.COLUMNS.items():
+            rows = self.rows(name)
+            if rows or name in ALWAYS:
+                tables.write_table(self._folder / f"{name}.csv", columns, rows)
+
+    def close(self) -> None:
+        """Write the odometry in hand, and close the file."""
+        if self._odometry:
+            with self.writing():
+                pass
+        if not self._read_only:
+            with suppress(sqlite3.Error):  # another process reads it
+                self._file.connection.execute("PRAGMA journal_mode = DELETE")  # readers leave no files beside it
+        self._file.close()
+        if not self._read_only:
+            with suppress(OSError):
+                self._path.with_name(f"{NAME}.lock").unlink()
+
+    def _select(self, statement: str) -> list[tuple[Any, ...]]:
+        with self._file.reading() as connection:
+            return connection.execute(statement).fetchall()
+
+
+def _set_aside(folder: Path) -> None:
+    """Rename the tables that an earlier release left, before the tables of a new run take their names."""
+    for path in [found for name in tables.COLUMNS if (found := folder / f"{name}.csv").exists()]:
+        with writing(path):
+            path.rename(next(name for i in count(1) if not (name := path.with_suffix(f".{i}.csv")).exists()))
+
+
+def all_descriptors(folder: Path) -> Points:
+    """Descriptors (N, D) float32 of all keyframes of a run, in order.
+
+    Raises:
+        UmfError: it has none.
+    """
+    found = _descriptors(folder)
+    if not found:
+        raise UmfError(f"{folder} holds no descriptors of keyframes")
+    return np.stack(list(found.values()))
+
+
+def read_descriptors(folder: Path, stamps_ns: Sequence[int]) -> Points | None:
+    """Descriptors (N, D) float32 of keyframes by their stamps; None where one has none, as of an older release."""
+    found = _descriptors(folder)
+    if not stamps_ns or any(stamp not in found for stamp in stamps_ns):
+        return None
+    return np.stack([found[stamp] for stamp in stamps_ns])
+
+
+def _descriptors(folder: Path) -> dict[int, Points]:
+    if not (folder / NAME).is_file():
+        return {}
+    with closing(RunFile(folder, read_only=True)) as file:
+        return file.descriptors()

@@ -1,0 +1,100 @@
+"""Whether two scans of a passage fit as well elsewhere along it, measured between surfaces.
+
+The pattern of one sensor lies on floor, walls and ceiling of a passage in the same way wherever it stands. Points of
+two scans therefore coincide at the identity pose although the places differ, and a test that measures from point to
+point finds every other pose worse. Here a point's distance is that to a plane, and the points of one half of a scan,
+every second band of elevations, are compared with planes of the other half alone: no ring meets itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from umf_ros.core.geometry import Array
+from umf_ros.verification import constants as const
+from umf_ros.verification.prepared_scan import PreparedScan, joint_blur
+from umf_ros.verification.surroundings import Sight
+from umf_ros.verification.yaw_search import alternatives
+
+
+def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> float:
+    """How much worse the surfaces of two scans fit at the best other pose along a passage.
+
+    A place is a passage where surfaces across it outweigh those along it. Poses are shifted along the passage as far
+    as the scans overlap; the other peaks of the search at the same heading are rivals, too.
+
+    Args:
+        match: the matched scan.
+        query: the query's scan.
+        pose: (4, 4) `match_T_query`.
+
+    Returns:
+        Logarithm of the ratio of the mean misfits, of what a closure needs: 0 when another pose fits as well, 1 when
+        all others fit so much worse that the pose is known. NaN where there is no passage.
+    """
+    way = passage_direction(match, query, pose)
+    if way is None:
+        return float("nan")
+    needed = const.NARROW_PASSAGE_RIVAL if _is_fan(match) or _is_fan(query) else const.PASSAGE_RIVAL
+    near = _rival(match, query, np.stack([pose, *_shifted(pose, way, const.PASSAGE_NEAR_M)]), const.PASSAGE_SAMPLE)
+    if near.min() < needed:
+        return float(near.min()) / needed
+    others = [one for one in alternatives(match, query, pose) if np.linalg.norm((one - pose)[:3, 3]) > const.DISTINCT_M]
+    poses = np.stack([pose, *_shifted(pose, way, const.PASSAGE_FAR_M), *others])
+    best = np.argsort(_rival(match, query, poses, const.PASSAGE_SCOUTS))[: const.PASSAGE_KEPT] + 1
+    far = _rival(match, query, poses[[0, *best]], const.PASSAGE_SAMPLE)
+    return float(min(near.min(), far.min())) / needed
+
+
+def passage_direction(match: PreparedScan, query: PreparedScan, pose: Array) -> Array | None:
+    """(3,) the horizontal direction of the passage about the match that both scans show; None where there is none."""
+    normals = [planes.normals[planes.planar] for planes in match.surfaces]
+    normals += [planes.normals[planes.planar] @ pose[:3, :3].T for planes in query.surfaces]
+    flat = (np.concatenate(normals) @ match.up.T)[:, :2]
+    weights, ways = np.linalg.eigh(flat.T @ flat)
+    points = len(match.points) + len(query.points)
+    if len(flat) < const.PASSAGE_SURFACE * points or weights[0] > const.PASSAGE_RATIO * weights[1]:
+        return None
+    way: Array = match.up.T @ np.append(ways[:, 0], 0.0)
+    return way
+
+
+def _is_fan(scan: PreparedScan) -> bool:
+    """Whether a scan looks to one side; the bearings that it sees cancel out where it looks all around."""
+    return bool(np.abs(np.fft.fft(scan.view.seen)[1]) > const.FAN * scan.view.seen.sum())
+
+
+def _shifted(pose: Array, way: Array, shifts: Array) -> Array:
+    """(K, 4, 4) the pose, shifted by each of (K,) metres along a way (3,) of the match."""
+    shifted = np.repeat(pose[None], len(shifts), axis=0)
+    shifted[:, :3, 3] += shifts[:, None] * way
+    return shifted
+
+
+def _rival(match: PreparedScan, query: PreparedScan, poses: Array, sample: int) -> Array:
+    """(K,) logarithm of the misfit at all but the first of poses (1 + K, 4, 4), against that at the first."""
+    there = _misfits(query, match, np.linalg.inv(poses), sample)
+    logarithm = np.log((_misfits(match, query, poses, sample) + there) / 2 + const.PLANE_MISFIT_FLOOR)
+    found: Array = logarithm[1:] - logarithm[0]
+    return found
+
+
+def _misfits(scan: PreparedScan, other: PreparedScan, poses: Array, sample: int) -> Array:
+    """(K,) mean misfit, 0 to 1, of the other scan's points with the scan's planes; 1 where few can be compared.
+
+    Points of every second band of elevations are compared with planes of the bands between: a ring never meets itself.
+    """
+    total, count = np.zeros(len(poses)), np.zeros(len(poses), int)
+    for planes, others in zip(scan.surfaces, reversed(other.surfaces), strict=True):
+        picks = np.linspace(0, len(others.points) - 1, min(sample, len(others.points))).astype(np.intp)
+        points = (others.points[picks] @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
+        index, squared = planes.nearest(points)
+        away = np.einsum("ij,ij->i", points - planes.centres[index], planes.normals[index])
+        sigmas = (away / (const.PLANE_SIGMA_M + 2 * joint_blur(scan, other))) ** 2
+        passed = scan.look_at(points) == Sight.PASSED
+        misfit = np.where(passed, 1.0, sigmas / (1.0 + sigmas)).reshape(len(poses), -1)
+        known = (passed | (planes.planar[index] & (squared < planes.reach_m[index] ** 2))).reshape(misfit.shape)
+        total += (misfit * known).sum(axis=1)
+        count += known.sum(axis=1)
+    enough = count >= max(const.MEETING_POINTS, const.PASSAGE_COMMON * count[0])
+    return np.where(enough, total / np.maximum(count, 1), 1.0)
