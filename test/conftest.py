@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from umf_ros.core.frames import Embedding, Frame, Keyframe, LocalFeatures, StereoCamera, SuperFeatures
 from umf_ros.core.geometry import make_pose
@@ -22,6 +23,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # real DDS, on this machine alone and in a domain of its own
 os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+# the same examples in every run, whatever the load of the machine
+settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
+settings.load_profile("repeatable")
 
 
 MARKED = {

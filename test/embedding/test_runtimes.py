@@ -202,6 +202,6 @@ def test_concurrent_inference_does_not_deadlock():
 def test_a_network_that_cannot_run_is_refused_at_the_start(monkeypatch):
     from umf_ros.embedding import runtimes
 
-    monkeypatch.setattr(runtimes, "XFEAT_BLANK", np.zeros((1, 1, 384, 7), np.float32))  # no multiple of 32
+    monkeypatch.setattr(runtimes, "XFEAT_BLANK", np.zeros((1, 3, 384, 512), np.float32))  # three channels
     with pytest.raises(WeightsError, match=r"xfeat.safetensors cannot be run: ."):
         make_xfeat_runtime(find("models/xfeat.safetensors"), EmbeddingSettings(runtime="openvino", threads=1))

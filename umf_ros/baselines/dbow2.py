@@ -27,39 +27,31 @@ TENSORS = ("nodes", "first_child", "children", "idf")
 
 
 def hamming(one: Binary, two: Binary) -> Indices:
-    """Differing bits (...) of descriptors (..., 32)."""
+    """Return the number of differing bits (...) of descriptors (..., 32)."""
     return ONES[one ^ two].sum(axis=-1, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class WordBag:
-    """What an image says in words.
+    """Visual words of an image.
 
     Attributes:
         words: (W,) leaves of the tree, ascending.
-        weights: (W,) float32 tf-idf, their sum one.
-        nodes: (F,) for every feature the node of the second level from below it came through: the direct index.
+        weights: (W,) float32 tf-idf, with sum one.
     """
 
     words: Indices
     weights: Points
-    nodes: Indices
-
-
-def similarity(one: WordBag, two: WordBag) -> float:
-    """1 - |v - w| / 2 of the two bags [Gálvez-López 2012]: what they share, 0 to 1."""
-    _, of_one, of_two = np.intersect1d(one.words, two.words, assume_unique=True, return_indices=True)
-    return float(np.minimum(one.weights[of_one], two.weights[of_two]).sum())
 
 
 @dataclass(frozen=True, slots=True)
 class Vocabulary:
-    """The tree; node 0 is the root, and the children of a node lie side by side.
+    """Vocabulary tree; node 0 is the root, and the children of a node are contiguous.
 
     Attributes:
         nodes: (M, 32) uint8 medians.
         first_child: (M,) int64 of the inner nodes.
-        children: (M,) int64 how many; 0: a leaf, hence a word.
+        children: (M,) int64 number of children; 0 for a leaf, which is a word.
         idf: (M,) float32 weight of a word.
     """
 
@@ -70,17 +62,15 @@ class Vocabulary:
 
     @property
     def words(self) -> int:
-        """How many there are."""
+        """Number of words."""
         return int((self.children == 0).sum())
 
-    def descend(self, descriptors: Binary) -> tuple[Indices, Indices]:
-        """Leaves (F,) of descriptors (F, 32), and the nodes two levels above them."""
+    def descend(self, descriptors: Binary) -> Indices:
+        """Return the leaves (F,) of descriptors (F, 32)."""
         here = np.zeros(len(descriptors), np.int64)
-        path = [here]
         while self.children[here].any():
             here = self._step(here, descriptors)
-            path.append(here)
-        return here, path[max(len(path) - 3, 0)]
+        return here
 
     def _step(self, here: Indices, descriptors: Binary) -> Indices:
         count = self.children[here]
@@ -91,18 +81,17 @@ class Vocabulary:
         return np.where(count > 0, nearest, here)
 
     def bag(self, descriptors: Binary) -> WordBag:
-        """The bag of an image's descriptors (F, 32)."""
-        leaves, nodes = self.descend(descriptors)
-        words, times = np.unique(leaves, return_counts=True)
+        """Return the bag of words of descriptors (F, 32)."""
+        words, times = np.unique(self.descend(descriptors), return_counts=True)
         weights = times * self.idf[words]
         total = weights.sum()
-        return WordBag(words, (weights / total if total > 0 else weights).astype(np.float32), nodes)
+        return WordBag(words, (weights / total if total > 0 else weights).astype(np.float32))
 
     def save(self, path: Path) -> None:
-        """Write it as safetensors.
+        """Write the vocabulary as safetensors.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the file cannot be written.
         """
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -112,7 +101,7 @@ class Vocabulary:
 
     @classmethod
     def load(cls, path: Path) -> Vocabulary:
-        """Read what `save` wrote.
+        """Read a vocabulary.
 
         Raises:
             WeightsError: missing, damaged or foreign file.
@@ -125,55 +114,29 @@ class Vocabulary:
             raise WeightsError(f"{path} holds no vocabulary: {' '.join(str(error).split())[:200]}") from None
 
 
-class InvertedIndex:
-    """Bags by their words: only images that share a word with the query are looked at."""
-
-    def __init__(self) -> None:
-        self._entries: dict[int, list[tuple[int, float]]] = {}
-        self._size = 0
-
-    def __len__(self) -> int:
-        return self._size
-
-    def add(self, bag: WordBag) -> int:
-        """Remember a bag and return its number."""
-        for word, weight in zip(bag.words.tolist(), bag.weights.tolist(), strict=True):
-            self._entries.setdefault(word, []).append((self._size, weight))
-        self._size += 1
-        return self._size - 1
-
-    def scores(self, query: WordBag) -> Points:
-        """(N,) similarity of every remembered bag, as `similarity` gives it."""
-        found = np.zeros(self._size, np.float32)
-        for word, weight in zip(query.words.tolist(), query.weights.tolist(), strict=True):
-            for number, other in self._entries.get(word, ()):
-                found[number] += min(weight, other)
-        return found
-
-
 METHOD = "dbow2"
 FEATURES = 500
 LONGEST = 1 << 14
-"""Numbers of a descriptor at most; words of a larger vocabulary share some."""
+"""Maximum length of a descriptor; words of a larger vocabulary share entries."""
 
 
 class OrbFeatures:
-    """ORB [Rublee 2011] of an image as it is, with a threshold low enough for dust."""
+    """ORB features [Rublee 2011] at full resolution, with a low threshold for scenes of low contrast."""
 
     def __init__(self) -> None:
         self._orb = cv2.ORB.create(FEATURES, fastThreshold=7)
 
     def of(self, image: Image) -> Binary:
-        """(F, 32) descriptors, at most 500."""
+        """Return descriptors (F, 32), at most 500."""
         _, found = self._orb.detectAndCompute(image, None)
         return np.empty((0, 32), np.uint8) if found is None else np.asarray(found, np.uint8)
 
 
 class Dbow2Embedder:
-    """The bag of an image as a descriptor.
+    """Bag of words of an image as a descriptor.
 
-    The database compares by cosine, so a descriptor holds the roots of the weights: the product of two is then the
-    Bhattacharyya coefficient of the bags, which orders them nearly as DBoW2's L1 score (`vocabulary.similarity`) does.
+    The database compares by cosine, so a descriptor holds the square roots of the weights: the product of two is the
+    Bhattacharyya coefficient of the bags, which ranks them nearly as DBoW2's L1 score does.
     """
 
     def __init__(self, vocabulary: Vocabulary, name: str) -> None:
@@ -191,16 +154,16 @@ class Dbow2Embedder:
         return Embedding(unit_descriptor(np.sqrt(spread)))
 
     def bag(self, image: Image) -> WordBag:
-        """The words of an image."""
+        """Return the bag of words of an image."""
         return self._vocabulary.bag(self._orb.of(image))
 
 
 def make(settings: EmbeddingSettings, asked: FeatureRequest) -> Dbow2Embedder:
-    """With the vocabulary that the settings name, or the shipped one.
+    """Return the embedder with the vocabulary that the settings name, or the shipped one.
 
     Raises:
-        ConfigError: there is none.
-        WeightsError: it cannot be used.
+        ConfigError: there is no vocabulary.
+        WeightsError: the vocabulary cannot be used.
     """
     path = locate_place_weights(METHOD, settings.weights)
     vocabulary = Vocabulary.load(path)

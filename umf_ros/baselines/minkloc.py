@@ -40,7 +40,7 @@ class Level:
     def neighbours(self, kernel: int) -> Tensor:
         """Rows (N, kernel^3) of the cells around each cell, itself in the middle; N for those that are empty.
 
-        The table is wider than the grid, so that nobody has to ask whether a neighbour is outside.
+        The table has a margin around the grid, so that neighbours outside the grid need no check.
         """
         reach = torch.arange(kernel, device=self.cells.device) - kernel // 2
         around = torch.cartesian_prod(reach, reach, reach) @ reach.new_tensor([self._wide**2, self._wide, 1])

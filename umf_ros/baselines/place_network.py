@@ -1,8 +1,8 @@
-"""What the networks of other methods have in common: what they read, and the trunk of those that see.
+"""Common parts of the networks of other methods: their inputs and the image trunk.
 
 The thesis compares with NetVLAD, PointNet++, MinkLoc++ and AdaFusion [UMF 5.3.1]. Their image branches begin with
 networks trained on photographs (VGG-16, ResNet-18); here all begin with the first stages of EfficientNet-Lite0, the
-only such weights with a licence like ours. As NetVLAD does, the early stages stay and the last one learns on.
+only such weights with a permissive licence. As NetVLAD does, the early stages stay and the last one learns on.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class PreparedView:
 
 
 def view_frame(frame: Frame, reads: frozenset[str]) -> PreparedView:
-    """What a network reads of a frame; a black image is none, and a scan stands upright on its ground."""
+    """Return the inputs that a network reads; a blank image counts as missing, and the scan is levelled."""
     image = frame.left if "image" in reads else None
     seen = None if image is None or is_blank(image) else standardise(shrink(image, IMAGE_SIZE))
     if frame.points is None or not len(frame.points) or not reads & {"voxels", "points"}:

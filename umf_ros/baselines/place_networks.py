@@ -98,7 +98,7 @@ class NetworkEmbedder:
 
 
 def make(settings: EmbeddingSettings, asked: FeatureRequest) -> NetworkEmbedder:
-    """With the weights that the settings name, or the shipped ones.
+    """Return the embedder with the weights that the settings name, or the shipped ones.
 
     Raises:
         ConfigError: there are none, or no such device.

@@ -28,17 +28,14 @@ from umf_ros.core.errors import ConfigError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.bags.frames import FrameReader
-    from umf_ros.bags.reader import Bag
-    from umf_ros.commands.console import InputConsole
-    from umf_ros.core.config import Settings
-    from umf_ros.embedding.embedder import Embedder
+    from umf_ros.localizer import Localization
+    from umf_ros.replay import LocalizationCounts
 
 MinProbability = Annotated[
     float | None, typer.Option("--min-probability", min=0, max=1, help="Publish closures from here on.")
 ]
 Resume = Annotated[
-    bool, typer.Option("--resume", help="Go on with the newest replay of this recording in --out that was cut off.")
+    bool, typer.Option("--resume", help="Continue the newest interrupted replay of this recording in --out.")
 ]
 RerunPath = Annotated[
     Path | None, typer.Option("--rerun", help="Also write the run for the Rerun viewer: an .rrd file.")
@@ -68,8 +65,8 @@ def command(
     """Find loop closures in a recording as fast as the machine goes.
 
     Needs no ROS. Writes closures, trajectories, the pose graph and a report to a new folder.
-    Ctrl-C ends the run early and keeps what was found; --resume goes on from there, or after a crash. Ends with 3 where
-    the inputs could give nothing.
+    Ctrl-C ends the run early and keeps its results; --resume continues it, also after a crash. Ends with 3 where the
+    inputs could give nothing.
     """
     check_files(bag, config, odometry, ground_truth)
     check_map(map_folder)
@@ -100,19 +97,17 @@ def command(
     inputs = InputConsole(console, recording)
     reader = open_frames(recording, settings, inputs.warn, odometry, odometry_frame)
     if ground_truth is not None:
-        read_ground_truth(recording, ground_truth)  # what is wrong with it is said now, not after the run
+        read_ground_truth(recording, ground_truth)  # its errors are reported now, not after the run
     if settings.localizing and rerun:
         raise ConfigError("--rerun shows a run that maps: leave it out with --map")
     network = make_detector_embedder(settings)
-    if settings.localizing:
-        raise typer.Exit(_localize(recording, settings, reader, network, out, inputs, console))
     viewer = RerunLog(rerun) if rerun else None
-    # a store that cannot be used is told before there is a folder
-    detector = LoopDetector(settings, network) if settings.database.path else None
-    folder = (ReplayFolder.resume if resume else ReplayFolder.create)(out, bag, settings)
-    detector = detector or LoopDetector(folder.working_settings, network)
+    # a store or a map that cannot be used is reported before there is a folder
+    detector = LoopDetector(settings, network) if settings.database.path or settings.localizing else None
+    run = (ReplayFolder.resume if resume and not settings.localizing else ReplayFolder.create)(out, bag, settings)
+    detector = detector or LoopDetector(run.working_settings, network)
     inputs.tell_absent(settings, odometry is not None)
-    replay = Replay(folder.path, settings, detector, folder.resumed)
+    replay = Replay(run.path, settings, detector, run.resumed)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
         stream = reader.stream()
         for detection in replay.run(viewer.watch(stream) if viewer else stream):
@@ -121,58 +116,34 @@ def command(
                 viewer.show(detection)
             if interrupted():
                 break
-    if interrupted():
-        console.print("[yellow]Interrupted: the results cover what was done so far; --resume goes on from here.")
-    with undisturbed():
-        replay.finish(count_drops(reader.counters))
-        if not interrupted():
-            folder.finish()
-        if viewer:
-            viewer.finish(folder.path)
-        inputs.remember(folder.path, reader.counters, interrupted(), odometry, odometry_frame)
-        verdict = finish_run(folder.path, recording, console, ground_truth, inputs.told)
-    replay.raise_if_frames_failed()
-    raise typer.Exit(verdict.exit_code)
-
-
-def _localize(
-    recording: Bag,
-    settings: Settings,
-    reader: FrameReader,
-    network: Embedder,
-    out: Path,
-    inputs: InputConsole,
-    console: Console,
-) -> int:
-    """Find the rover of a recording in a map; 3 where it was not found."""
-    from umf_ros.commands.console import FrameProgress, stop_on_interrupt, undisturbed
-    from umf_ros.core.watchdog import watching
-    from umf_ros.detector import LoopDetector
-    from umf_ros.replay import Replay
-    from umf_ros.runs.reader import remember_recording
-    from umf_ros.runs.writer import count_drops, create_run_folder
-
-    detector = LoopDetector(settings, network)  # a map that cannot be used is told before there is a folder
-    folder = create_run_folder(out)
-    inputs.tell_absent(settings, odometry_from_file=False)
-    replay = Replay(folder, settings, detector)
-    with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
-        for detection in replay.run(reader.stream()):
-            progress.show(reader.progress, detection)
-            if interrupted():
-                break
+    if interrupted() and not settings.localizing:
+        console.print("[yellow]Interrupted: the results cover the recording so far; --resume continues from here.")
     newest = replay.newest_pose
     with undisturbed():
-        found = replay.finish(count_drops(reader.counters))
-        remember_recording(folder, recording)
-    counts = replay.counts
+        replay.finish(count_drops(reader.counters))
+        if not interrupted() or settings.localizing:
+            run.finish()
+        if viewer:
+            viewer.finish(run.path)
+        inputs.remember(run.path, reader.counters, interrupted(), odometry, odometry_frame)
+        if settings.localizing:
+            status = _report_localization(console, run.path, replay.counts, newest)
+        else:
+            status = finish_run(run.path, recording, console, ground_truth, inputs.told).exit_code
+    replay.raise_if_frames_failed()
+    raise typer.Exit(status)
+
+
+def _report_localization(
+    console: Console, folder: Path, counts: LocalizationCounts, newest: Localization | None
+) -> int:
+    """Print the result of a localising run; 3 where the rover was not found in the map."""
     text = "not found in the map"
-    if found:
+    if counts.located:
         text = f"found after {counts.keyframes_until_found} keyframes, known at {counts.located} of {counts.keyframes}"
     if newest is not None:
         x, y, z = newest.map_T_body[:3, 3]
         sigma_m = float(newest.covariance[:2, :2].trace() ** 0.5)
         text += f"; at last at ({x:.1f}, {y:.1f}, {z:.1f}) m, +- {sigma_m:.2f} m, p = {newest.probability:.4f}"
     console.print(f"{text}\n{folder}", markup=False, highlight=False, soft_wrap=True)
-    replay.raise_if_frames_failed()
-    return 0 if found else 3
+    return 0 if counts.located else 3

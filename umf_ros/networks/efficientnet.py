@@ -1,4 +1,4 @@
-"""EfficientNet-Lite0 [Tan 2019] and the scene descriptor that rests on it."""
+"""EfficientNet-Lite0 [Tan 2019] and the scene descriptor built on it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 CONTRAST = 0.5
-"""Standard deviation of a photograph in the numbers of ImageNet's training, (x - 127) / 128; ours is one."""
+"""Standard deviation of the training images (ImageNet, (x - 127) / 128); inputs of this package have 1."""
 STEM = 32
 
 
 class Stage(NamedTuple):
-    """Blocks of one width; the first of them has the stride."""
+    """Blocks of one width; the first block has the stride."""
 
     kernel: int
     stride: int
@@ -32,11 +32,11 @@ STAGES = (
     Stage(3, 1, 6, 320, 1),
 )
 ENDS = (1, 2, 4, 6)
-"""The last stages at strides 4, 8, 16 and 32."""
+"""Indices of the last stages at strides 4, 8, 16 and 32."""
 
 
 class SamePadding(nn.Module):
-    """A convolution padded as TensorFlow does: what is odd goes to the right and to the bottom."""
+    """Convolution with the padding of TensorFlow: an odd pixel goes to the right and to the bottom."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ class SamePadding(nn.Module):
 
 
 class LiteBlock(nn.Module):
-    """Inverted residual: widen, depth-wise, narrow."""
+    """Inverted residual block: expansion, depth-wise convolution, projection."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
         super().__init__()
@@ -69,10 +69,10 @@ class LiteBlock(nn.Module):
 
 
 class EfficientNetLite0(nn.Module):
-    """The trunk without its classifier; takes one grey channel of zero mean and unit contrast.
+    """EfficientNet-Lite0 without classifier, for one grey channel of zero mean and unit contrast.
 
     Args:
-        depth: stages to keep.
+        depth: number of stages.
     """
 
     def __init__(self, depth: int = len(STAGES)) -> None:
@@ -105,13 +105,13 @@ class EfficientNetLite0(nn.Module):
 
 
 GRID = (3, 5)
-"""Rows and columns: finer, and a turned head is another place."""
+"""Rows and columns; a finer grid lowers recall between different headings."""
 DEPTH = 5
-"""Stages of the trunk; the later ones know what a thing is rather than how it looks."""
+"""Stages of the trunk; later stages encode object classes rather than appearance."""
 
 
 class SceneDescriptor(nn.Module):
-    """EfficientNet-Lite0 up to stride 16, pooled, centred and projected; its trunk is not trained with the rest."""
+    """EfficientNet-Lite0 up to stride 16, pooled, centred and projected; the trunk is not trained."""
 
     def __init__(self, length: int) -> None:
         super().__init__()
@@ -121,7 +121,7 @@ class SceneDescriptor(nn.Module):
         self.projection = nn.Linear(GRID[0] * GRID[1] * channels, length, bias=False)
 
     def pool(self, image: Tensor) -> Tensor:
-        """Maps (B, C, 3, 5) of a standardised image (B, 1, H, W), without what the cells share."""
+        """Maps (B, C, 3, 5) of a standardised image (B, 1, H, W), with the mean over the cells removed."""
         cells = F.adaptive_avg_pool2d(self.trunk(image)[-1], GRID)
         return cells - cells.mean(dim=(2, 3), keepdim=True)
 
@@ -131,5 +131,5 @@ class SceneDescriptor(nn.Module):
         return scene * scene.norm(dim=1, keepdim=True)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 1, H, W) to (B, length), short where the view resembles those it was fitted to."""
+        """(B, 1, H, W) to (B, length), shorter for views similar to the data it was fitted to."""
         return self.project(self.pool(image).flatten(1))

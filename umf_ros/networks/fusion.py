@@ -15,7 +15,7 @@ MASKED = -1e4
 
 
 class Attention(nn.Module):
-    """Multi-head attention [UMF 4.1] that can also say where it looked."""
+    """Multi-head attention [UMF 4.1] that also returns the attention maps."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -30,7 +30,7 @@ class Attention(nn.Module):
         Args:
             queries: (B, N, C).
             keys: (B, M, C).
-            mask: (B, M) bool, True where a key exists; None: everywhere.
+            mask: (B, M) bool, True where a key exists; None for all.
 
         Returns:
             (B, N, C), and the attention maps (B, heads, N, M), rows summing to one.
@@ -70,7 +70,7 @@ class Block(nn.Module):
 
 
 def received(weights: Tensor, query_mask: Tensor | None = None, key_mask: Tensor | None = None) -> Tensor:
-    """How much each key was looked at, 1 being its fair share.
+    """Return the attention that each key received; 1 is the fair share.
 
     Args:
         weights: (B, heads, N, M) attention maps.
@@ -83,8 +83,8 @@ def received(weights: Tensor, query_mask: Tensor | None = None, key_mask: Tensor
     if query_mask is None or key_mask is None:
         return weights.float().mean(dim=(1, 2)) * weights.shape[-1]
     share = query_mask.to(weights.dtype) / query_mask.sum(1, keepdim=True).clamp(min=1)
-    looked = (share[:, None, None] @ weights).squeeze(2).float().mean(1)
-    return looked * key_mask.float().sum(1, keepdim=True).clamp(min=1)
+    attention = (share[:, None, None] @ weights).squeeze(2).float().mean(1)
+    return attention * key_mask.float().sum(1, keepdim=True).clamp(min=1)
 
 
 def sine_encoding(positions: Tensor, channels: int) -> Tensor:
@@ -92,7 +92,7 @@ def sine_encoding(positions: Tensor, channels: int) -> Tensor:
 
     Args:
         positions: (..., A), one column per axis.
-        channels: length of the encoding; what A axes of whole sine-cosine pairs leave over is zero.
+        channels: length of the encoding, zero beyond the whole sine-cosine pairs of A axes.
 
     Returns:
         (..., channels).
@@ -125,7 +125,7 @@ class Tokens:
 
 
 class AbsentToken(nn.Module):
-    """Stands in for a modality that is missing, so that a rover in the dark degrades and does not die."""
+    """Learned token in place of a missing modality."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -140,7 +140,7 @@ class AbsentToken(nn.Module):
 
 
 class FusionLayer(nn.Module):
-    """Self-attention within, then cross-attention between the modalities, in both directions at once."""
+    """Self-attention within and then cross-attention between the modalities, in both directions."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -176,8 +176,8 @@ class Fused(NamedTuple):
 
     Attributes:
         descriptor: (B, D) float32, L2-normalised: both halves, weighted.
-        image, cloud: (B, D/2) float32, L2-normalised halves, the scene being part of the image's; without
-            meaning where the modality is absent.
+        image, cloud: (B, D/2) float32, L2-normalised halves, the scene descriptor is part of the image half;
+            undefined for an absent modality.
         weights: (B, 2) share of the image and of the cloud in the descriptor, summing to one.
     """
 
@@ -190,9 +190,8 @@ class Fused(NamedTuple):
 class Fusion(nn.Module):
     """Fusion transformer, GeM pooling and fully connected layer per modality, and their weighted union.
 
-    Each modality fills its half of the descriptor. How much a half counts is decided frame by frame
-    (adaptive weights [UMF 3.9]), and a missing modality counts nothing: similarity to a complete
-    frame then rests on what both have.
+    Each modality fills its half of the descriptor, with a weight computed for each frame (adaptive weights [UMF 3.9]).
+    A missing modality has weight zero, so that similarity to a complete frame depends on the common modality.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -207,20 +206,20 @@ class Fusion(nn.Module):
     def forward(
         self, image: Tokens, cloud: Tokens, image_present: Tensor, cloud_present: Tensor, scene: Tensor | None = None
     ) -> Fused:
-        """Fuse tokens of which the absent rows (present: (B,) bool) hold the learned token alone.
+        """Fuse tokens; rows of an absent modality hold the learned token only.
 
         Args:
-            image: its tokens.
-            cloud: its tokens.
+            image: image tokens.
+            cloud: cloud tokens.
             image_present: (B,) bool.
             cloud_present: (B,) bool.
-            scene: (B, S), of a network that has such a part; its length is its weight beside the image's half.
+            scene: (B, S) scene descriptors or None; their length is their weight beside the image half.
         """
         seen, felt = self.pool(image, cloud)
         return self.describe(seen, felt, image_present, cloud_present, scene)
 
     def pool(self, image: Tokens, cloud: Tokens) -> tuple[Tensor, Tensor]:
-        """(B, C) of the image and of the cloud: all that the heads see of the tokens."""
+        """Return the pooled tokens (B, C) of the image and of the cloud, the input of the heads."""
         for layer in self.layers:
             image, cloud = layer(image, cloud)
         seen = self.image_pool(Tokens(self.image_norm(image.values), image.mask))
@@ -230,7 +229,7 @@ class Fusion(nn.Module):
     def describe(
         self, seen: Tensor, felt: Tensor, image_present: Tensor, cloud_present: Tensor, scene: Tensor | None = None
     ) -> Fused:
-        """Descriptors of what was pooled; the other arguments as in `forward`."""
+        """Return the descriptors of pooled tokens; the other arguments as in `forward`."""
         with torch.autocast(seen.device.type, enabled=False):
             image_half = nn.functional.normalize(self.image_head(seen.float()), dim=-1)
             if scene is not None:
@@ -238,10 +237,10 @@ class Fusion(nn.Module):
             cloud_half = nn.functional.normalize(self.cloud_head(felt.float()), dim=-1)
             scores = self.weigh(torch.cat([seen, felt], dim=-1).float())
             present = torch.stack([image_present, cloud_present], dim=-1)
-            # with neither, both stay: the descriptor must be a number
+            # without any modality both weights stay, as the descriptor must be finite
             present = present | ~present.any(dim=-1, keepdim=True)
             weights = (scores + (~present).to(scores.dtype) * MASKED).softmax(dim=-1)
-            # not quite zero: the root's slope must stay finite
+            # positive, as the gradient of the square root must stay finite
             shares = (weights + 1e-12).sqrt()
             descriptor = torch.cat([image_half * shares[:, :1], cloud_half * shares[:, 1:]], dim=-1)
             return Fused(nn.functional.normalize(descriptor, dim=-1), image_half, cloud_half, weights)

@@ -1,7 +1,7 @@
 """Local features [UMF 4.4] and super-features [UMF 4.3].
 
-Local features: two transformer layers whose attention says what is salient. Super-features: an ordered set of
-learned templates that gather local features, written from the equations of [Weinzaepfel 2022].
+Local features come from two transformer layers; the attention they receive is their saliency. Super-features are an
+ordered set of learned templates that aggregate local features, after the equations of [Weinzaepfel 2022].
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class LocalMap:
 
 
 class ImageLocal(nn.Module):
-    """Attention within windows, then between the windows at equal places: local detail, global context."""
+    """Attention within windows, then between equal positions of all windows."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -89,7 +89,7 @@ class CloudLocal(nn.Module):
 
         Args:
             fine: (B, V, C) features.
-            positions: (B, V, C) encodings of the voxels' places.
+            positions: (B, V, C) position encodings of the voxels.
             mask: (B, V) bool, False beyond the voxels of a scan.
         """
         tokens = fine + positions.to(fine.dtype)
@@ -112,7 +112,7 @@ class SuperMap:
     Attributes:
         descriptors: (B, S, D) float32, L2-normalised; the column is the feature's ID.
         strength: (B, S) float32, norm before the normalisation.
-        attention: (B, S, N) float32, where each looked after the last round, summing to one over N.
+        attention: (B, S, N) float32, attention of the last iteration, with sum one over N.
     """
 
     descriptors: Tensor
@@ -121,7 +121,7 @@ class SuperMap:
 
 
 class IterativeAttention(nn.Module):
-    """Local iterative transformer (LIT): templates compete for the local features, round after round."""
+    """Local iterative transformer (LIT): templates compete for the local features in every iteration."""
 
     def __init__(self, inputs: int, count: int, outputs: int, iterations: int) -> None:
         super().__init__()
@@ -135,7 +135,7 @@ class IterativeAttention(nn.Module):
         self.output = nn.Linear(inputs, outputs)
 
     def forward(self, tokens: Tensor, mask: Tensor) -> SuperMap:
-        """Gather tokens (B, N, C), of which those with mask (B, N) exist, into the super-features."""
+        """Aggregate tokens (B, N, C) with mask (B, N) to super-features."""
         inputs = self.norm_inputs(tokens)
         key, value = self.key(inputs), self.value(inputs)
         templates = self.templates.expand(tokens.shape[0], -1, -1).to(tokens.dtype)

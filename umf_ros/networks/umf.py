@@ -45,13 +45,13 @@ class NetworkInput(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """What the encoders saw, before fusion.
+    """Features of the encoders, before fusion.
 
     Attributes:
         image, cloud: tokens for fusion, positions included.
         fine_image: (B, C, H/4, W/4).
         fine_cloud: (B, V, C).
-        scene: (B, S), longer where the view is a strange one, or None where the network has no such part.
+        scene: (B, S), scene descriptors, longer for unfamiliar views; None without this part.
     """
 
     image: Tokens
@@ -63,12 +63,12 @@ class Features:
 
 @dataclass(frozen=True, slots=True)
 class NetworkOutput:
-    """What the network says of a batch.
+    """Output of the network for a batch.
 
     Attributes:
         descriptor: (B, D) float32, L2-normalised.
         image, cloud: local features.
-        super_image, super_cloud: super-features, when asked for.
+        super_image, super_cloud: super-features, on request.
     """
 
     descriptor: Tensor
@@ -87,7 +87,7 @@ class UMF(nn.Module):
         self.image_encoder = ImageEncoder(config)
         self.voxel_encoder = VoxelEncoder(config)
         self.scene = SceneDescriptor(config.scene) if config.scene else None
-        # content and position on one scale, or one of them drowns
+        # normalised, as content and position need the same scale
         self.image_tokens, self.cloud_tokens = nn.LayerNorm(config.tokens), nn.LayerNorm(config.tokens)
         self.fusion = Fusion(config)
         self.absent_image, self.absent_cloud = AbsentToken(config.tokens), AbsentToken(config.tokens)
@@ -110,7 +110,7 @@ class UMF(nn.Module):
         self.register_buffer("voxels", fine, persistent=False)
 
     def encode(self, batch: NetworkInput, branch: Branch = "both") -> Features:
-        """Run the encoders and add the positions to the tokens; of the branch left out all is zero."""
+        """Run the encoders and add the positions to the tokens; the features of an omitted branch are zero."""
         scene = None
         if branch == "cloud":
             size = batch.image.shape[0]
@@ -138,7 +138,7 @@ class UMF(nn.Module):
         return self.fusion(image, cloud, image_present, cloud_present, features.scene)
 
     def stand_in(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> tuple[Tokens, Tokens]:
-        """Tokens of both modalities; a learned one stands in for what is absent, (B,) bool."""
+        """Return the tokens of both modalities, with learned tokens for absent ones ((B,) bool)."""
         return self.absent_image(features.image, image_present), self.absent_cloud(features.cloud, cloud_present)
 
     def describe_local(self, features: Features, batch: NetworkInput) -> tuple[LocalMap, LocalMap]:
@@ -148,7 +148,7 @@ class UMF(nn.Module):
         return self.image_local(features.fine_image), cloud
 
     def forward(self, batch: NetworkInput, super_features: bool = False) -> NetworkOutput:
-        """Everything the network says of a batch."""
+        """Return all outputs for a batch."""
         features = self.encode(batch)
         fused = self.fuse(features, batch.image_present, batch.coarse_mask.any(1))
         image, cloud = self.describe_local(features, batch)
@@ -164,7 +164,7 @@ def count_parameters(network: nn.Module) -> int:
 
 
 def channels_last(network: nn.Module) -> None:
-    """Order the weights of the convolutions as a CPU likes them (twice as fast in half precision)."""
+    """Store the weights of convolutions channels last, which is faster on CPUs (twice in half precision)."""
     for module in network.modules():
         if isinstance(module, nn.Conv2d):
             module.weight.data = module.weight.data.contiguous(memory_format=torch.channels_last)

@@ -13,18 +13,18 @@ from umf_ros.networks.config import NetworkConfig, open_weights, parse_architect
 from umf_ros.networks.umf import UMF, channels_last
 
 SCALE = ".scale"
-"""End of the name of what the eight bits of another tensor are to be multiplied with."""
+"""Suffix of the scale of an 8-bit tensor."""
 
 
 def load_weights(path: Path) -> UMF:
-    """The network of a weights file, in single precision and ready to evaluate.
+    """Return the network of a weights file, in single precision and evaluation mode.
 
     Raises:
         WeightsError: missing, truncated or foreign file, not finite, or of another architecture.
     """
     architecture, tensors = read_weights(path)
     config = NetworkConfig.from_dict(architecture)
-    with torch.device("meta"):  # takes no memory: the file itself says how much there may be
+    with torch.device("meta"):  # checks the shapes without allocating memory
         _check(UMF(config).state_dict(), tensors, path)
     network = UMF(config)
     fill(network, tensors, path)
@@ -33,7 +33,7 @@ def load_weights(path: Path) -> UMF:
 
 
 def fill(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
-    """Put tensors into a network of the same architecture.
+    """Load tensors into a network of the same architecture.
 
     Raises:
         WeightsError: a tensor is missing, surplus, of another shape or not finite.
@@ -56,7 +56,7 @@ def _check(wanted: dict[str, Tensor], tensors: dict[str, Tensor], path: Path) ->
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """What a file says of the architecture, and its tensors.
+    """Return the architecture that a file states, and its tensors.
 
     Raises:
         WeightsError: missing, truncated or foreign file.
@@ -67,7 +67,7 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 
 def _restore(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The weights without their scales, which are multiplied in."""
+    """Return the weights multiplied by their scales."""
     scales = {name: value for name, value in tensors.items() if name.endswith(SCALE)}
     return {
         name: value * scales[name + SCALE] if name + SCALE in scales else value

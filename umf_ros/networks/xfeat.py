@@ -1,4 +1,4 @@
-"""XFeat, a small network for key points and local descriptors of images [Potje 2024]."""
+"""XFeat [Potje 2024]: key points and local descriptors of images."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ DESCRIPTOR = 64
 class XFeat(nn.Module):
     """Descriptors, key points and reliability of a grey image [Potje 2024, fig. 3].
 
-    A thin convolutional pyramid whose three deepest levels are fused at an eighth of the resolution gives descriptors;
-    key points are found by a branch of their own that sees nothing but squares of eight by eight pixels. Batch
-    normalisation is folded into the convolutions.
+    A convolutional pyramid with its three deepest levels fused at an eighth of the resolution gives descriptors. A
+    separate branch on squares of eight by eight pixels gives key points. Batch normalisation is folded into the
+    convolutions.
     """
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ class XFeat(nn.Module):
         )
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Maps of an image.
+        """Return the maps of an image.
 
         Args:
             image: (1, 1, H, W) grey values of any scale; H and W are multiples of 32.
@@ -57,7 +57,7 @@ class XFeat(nn.Module):
         deep = [sixteenth, self.thirtysecond(sixteenth)]
         raised = [functional.interpolate(level, eighth.shape[-2:], mode="bilinear") for level in deep]
         features = self.fusion(eighth + raised[0] + raised[1])
-        # the last of the 65 says that there is no key point in the square
+        # the last of the 65 classes is a square without key point
         corners = self.corners(functional.pixel_unshuffle(image, XFEAT_CELL)).softmax(1)[:, : XFEAT_CELL**2]
         return (
             functional.normalize(features, dim=1),
@@ -67,7 +67,7 @@ class XFeat(nn.Module):
 
 
 def load_xfeat(path: Path) -> XFeat:
-    """The network with the weights of a file, in single precision and ready to evaluate.
+    """Return the network with the weights of a file, in single precision and evaluation mode.
 
     Raises:
         WeightsError: missing, truncated or foreign file.

@@ -141,8 +141,8 @@ class RunFile:
             rows = connection.execute("SELECT stamp_ns, data FROM descriptor ORDER BY rowid")
             return {int(stamp): np.frombuffer(data, np.float16).astype(np.float32) for stamp, data in rows}
 
-    def export(self) -> None:
-        """Write the CSV tables.
+    def export(self, localizing: bool = False) -> None:
+        """Write the CSV tables; that of the poses in a map also without rows where the run is localising.
 
         Raises:
             UmfError: the file is damaged.
@@ -150,7 +150,7 @@ class RunFile:
         """
         for name, columns in tables.COLUMNS.items():
             rows = self.rows(name)
-            if rows or name in ALWAYS:
+            if rows or name in ALWAYS or (localizing and name == "localization"):
                 tables.write_table(self._folder / f"{name}.csv", columns, rows)
 
     def close(self) -> None:

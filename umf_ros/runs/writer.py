@@ -294,7 +294,7 @@ class RunRecorder:
             OutputError: the folder cannot be written.
         """
         try:
-            self._file.export()
+            self._file.export(self._settings.localizing)
             with self._file.writing():
                 self._file.note(**(self._facts() | {"exported": True}))
         finally:

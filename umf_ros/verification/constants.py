@@ -128,7 +128,7 @@ PASSAGE_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: as RIVAL_NEAR_M
 PASSAGE_FAR_M = np.concatenate([np.arange(-15.0, -0.9, 0.5), np.arange(1.0, 15.1, 0.5)])  # geometry: scans overlap
 PASSAGE_SAMPLE, PASSAGE_SCOUTS, PASSAGE_KEPT = 750, 100, 6  # by hand: points of a half, first of all, of few rivals
 FAN = 0.5  # geometry: length of the mean bearing; .94 of a view of 70 deg, .5 of one of 217 deg
-# measured on `corridors.py` (benchmarks), seeds from 10000 on: of wrong closures 1 in 700 has more, none with a narrow view
+# measured on benchmarks/corridors.py, seeds from 10000 on: of wrong closures 1 in 700 has more, none with a narrow view
 PASSAGE_RIVAL, NARROW_PASSAGE_RIVAL = 0.3, 0.12
 
 HOPELESS = 0.5  # by definition: what is wrong more likely than right, whatever its rivals, is held against none

@@ -151,5 +151,5 @@ def _distance(signs: Signs, medians: Signs) -> Signs:
 def _idf(tree: Vocabulary, images: Sequence[Binary]) -> NDArray[np.float32]:
     known = np.zeros(len(tree.nodes))
     for descriptors in images:
-        known[np.unique(tree.descend(descriptors)[0])] += 1
+        known[np.unique(tree.descend(descriptors))] += 1
     return np.log(len(images) / np.maximum(known, 1)).astype(np.float32)

@@ -19,7 +19,7 @@ from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner
 from umf_ros.lab.simulation.domains.solids import Scene, Solids
 from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, SAME_WAY, DomainScan, Motion
 from umf_ros.lab.simulation.domains.sweeps import stamp_moment, sweep
-from umf_ros.lab.simulation.world import check_seed
+from umf_ros.lab.simulation.seeds import check_seed
 
 HALF_LENGTH_M = 60.0
 STATION_M, STATIONS = 0.6, 25
