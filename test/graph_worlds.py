@@ -13,9 +13,9 @@ from umf_ros.core.geometry import Array, expmap, invert, make_pose, relative
 from umf_ros.lab.datasets.g2o import G2oGraph, GraphRecording
 from umf_ros.lab.datasets.g2o import drive as drive_recording
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, WorldClosure
-from umf_ros.pose_graph.closures import ClosureVerdict, State, TrackedClosure
+from umf_ros.pose_graph.backend import PoseGraph
+from umf_ros.pose_graph.closures import PlacedClosure, State
 from umf_ros.pose_graph.odometry import OdometryChain
-from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.solver import Edge, between
 
 SETTINGS = PoseGraphSettings(keyframe_spacing_m=1e-6, max_gap_s=1.5)
@@ -73,14 +73,9 @@ def chain_of(world: GraphWorld, settings: PoseGraphSettings = SETTINGS, stated: 
     return chain
 
 
-def tracked(world: GraphWorld) -> list[TrackedClosure]:
-    """The world's closures as the graph holds them."""
-    messages = [world.message(row) for row in range(len(world.closures))]
-    covariances = [closure.covariance for closure in world.closures]
-    return [
-        TrackedClosure(0, 0, ClosureVerdict(message, State.UNDECIDED, "new"), covariance)
-        for message, covariance in zip(messages, covariances, strict=True)
-    ]
+def placed(world: GraphWorld) -> list[PlacedClosure]:
+    """The world's closures, all in the first session."""
+    return [PlacedClosure(0, 0, world.message(row)) for row in range(len(world.closures))]
 
 
 def feed_odometry(graph: PoseGraph, world: GraphWorld, poses: Iterable[int], stated: float = 1.0) -> None:

@@ -26,7 +26,7 @@ from umf_ros.core.geometry import (
     rotation_angle,
 )
 from umf_ros.core.trajectory import Trajectory, write_tum
-from umf_ros.pose_graph.closures import ClosureVerdict, State, check_closure, check_pose
+from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State, check_closure, check_pose
 from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
 
 ACCEPTED_ODDS = log(0.999 / 0.001)
@@ -326,7 +326,7 @@ class MapFollower:
         before = Counter(self._localizer.counts)
         self._localizer.add_closure(closure)
         change = Counter(self._localizer.counts) - before
-        state, reason = _STATES.get(next(iter(change), ""), (State.WAITING, "its odometry has not arrived"))
+        state, reason = _STATES.get(next(iter(change), ""), (State.PENDING, ClosureReason.NO_ODOMETRY_YET))
         self._states[state] += 1
         return [ClosureVerdict(closure, state, reason)]
 
@@ -391,9 +391,9 @@ class MapFollower:
 
 
 _STATES = {
-    "agreed": (State.ACCEPTED, "agrees with the pose"),
-    "contradicted": (State.REJECTED, "contradicts the pose"),
-    "searching": (State.UNDECIDED, "the pose is not known yet"),
-    "unusable": (State.REFUSED, "its keyframe is not of the map, or no odometry is at the query"),
+    "agreed": (State.ACCEPTED, ClosureReason.AGREES_WITH_POSE),
+    "contradicted": (State.REJECTED, ClosureReason.CONTRADICTS_POSE),
+    "searching": (State.PENDING, ClosureReason.POSE_UNKNOWN),
+    "unusable": (State.REFUSED, ClosureReason.NOT_OF_MAP),
 }
 """State of a closure by what the localizer counted it as."""

@@ -19,7 +19,7 @@ from umf_ros.core.geometry import to_quaternion
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector
 from umf_ros.localizer import Localization, Localizer, read_poses
-from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.runs.run_file import NAME, RunFile
 from umf_ros.runs.writer import RunRecorder, write_summary
 from umf_ros.sensors.decode import OdometrySample

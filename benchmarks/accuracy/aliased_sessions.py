@@ -22,8 +22,8 @@ from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import expmap
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, Kind, rover_loops, with_wrong_closures
 from umf_ros.lab.simulation.world import TEST
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.runs.truth import absolute_trajectory_error
 
 SESSIONS, LENGTH = 5, 150

@@ -44,9 +44,9 @@ from umf_ros.lab.simulation.pose_graphs import (
     with_lone_end,
     with_wrong_closures,
 )
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.noise_scale import NoiseScale
-from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.solver import Edge, between
 
 FIRST_SEED = 20_000
@@ -54,6 +54,7 @@ MOST_CLOSURES_OF_A_FILE = 1500
 MOST_SOLUTIONS_OF_A_FILE = 150
 SETTINGS = PoseGraphSettings(keyframe_spacing_m=1e-6, max_gap_s=1.5, max_closure_m=1e7)
 BELIEVING = SETTINGS.model_copy(update={"reject_outliers": False})
+STATED = NoiseScale()
 KINDS: tuple[Kind, ...] = ("random", "groups", "near")
 # per metre; a tenth of it is what the stated noise makes of a hundred metres
 BIAS = np.array([0, 0, np.deg2rad(0.1), 0.01, 0, 0])
@@ -244,8 +245,8 @@ def run_peers(world: GraphWorld, reference: Array, stated: float, scale: NoiseSc
     right = np.array([closure.right for closure in world.closures])
     outcomes: dict[str, Outcome] = {}
     for name, solve in PEERS.items():
-        for suffix, factors in (("", NoiseScale()), ("_scaled", scale)):
-            if suffix and scale == NoiseScale():
+        for suffix, factors in (("", STATED), ("_scaled", scale)):
+            if suffix and scale == STATED:
                 outcomes[name + suffix] = outcomes[name]
                 continue
             before = time.process_time()

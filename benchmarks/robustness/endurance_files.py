@@ -23,8 +23,8 @@ from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.networks.weights import load_weights
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import stored_identity, stored_sessions
+from umf_ros.pose_graph.journal import DurableGraph
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.sensors.durable_graph import DurableGraph
 from umf_ros.sensors.scan_files import read_scan
 
 Rng = np.random.Generator

@@ -36,7 +36,7 @@ from umf_ros.bags.reader import Bag, decode, open_bag
 from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.detector import LoopDetector, make_detector_embedder
-from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.sessions import OdometrySessionSplitter

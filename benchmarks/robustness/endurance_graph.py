@@ -18,10 +18,9 @@ from umf_ros.core.config import load_settings
 from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops
 from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, to_pose, to_time
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.pose_graph.journal import JOURNAL, GraphJournal
-from umf_ros.pose_graph.pose_graph import PoseGraph
-from umf_ros.sensors.durable_graph import DurableGraph
+from umf_ros.pose_graph.journal import JOURNAL, DurableGraph, GraphJournal
 
 Figures = dict[str, Any]
 SEED = 10005

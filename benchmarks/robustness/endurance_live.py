@@ -173,7 +173,7 @@ def fuzz_back_end(folder: Path, count: int, rng: np.random.Generator) -> Figures
         ears.wait(5.0)
         fate = ears.values.get(BACK_END, {}).get("pose graph", {})
         graph = {name: float(value) for name, value in fate.items() if value.replace(".", "").isdigit()}
-        states = ("accepted", "rejected", "undecided", "waiting", "refused")
+        states = ("accepted", "rejected", "pending", "refused")
         odometry = sum(value for name, value in graph.items() if name.startswith("odometry"))
         odometry += ears.value(BACK_END, "input odometry", "refused")
         closures = sum(graph.get(name, 0) for name in (*states, "closure twice"))

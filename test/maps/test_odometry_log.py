@@ -7,7 +7,7 @@ from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import make_pose
 from umf_ros.maps.odometry_log import OdometryLog
-from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.sensors.decode import OdometrySample
 
 SECOND_NS = 10**9

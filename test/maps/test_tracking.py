@@ -21,18 +21,18 @@ def drive(count: int) -> tuple[list[Keyframe], list[Array]]:
 
 def test_consecutive_keyframes_are_tracked() -> None:
     keyframes, poses = drive(4)
-    log, tracked = track(keyframes, Verification())
-    assert [one.session for one in tracked] == [0, 0, 0, 0]
-    for found, true in zip(tracked, poses, strict=True):
+    log, placed = track(keyframes, Verification())
+    assert [one.session for one in placed] == [0, 0, 0, 0]
+    for found, true in zip(placed, poses, strict=True):
         assert found.odom_T_body is not None
         assert np.linalg.norm((found.odom_T_body - relative(poses[0], true))[:3, 3]) < 0.15
-    assert np.all(np.diff([one.path_length_m for one in tracked]) > 0.5)
+    assert np.all(np.diff([one.path_length_m for one in placed]) > 0.5)
     assert len(log.trajectory) == 4
 
 
 def test_a_gap_begins_a_session() -> None:
     keyframes, _ = drive(2)
     elsewhere = take(landscape(99), pose_at(landscape(99), -10.0, 5.0, 40.0), 12.0)
-    _, tracked = track([*keyframes, elsewhere], Verification())
-    assert [one.session for one in tracked] == [0, 0, 1]
-    assert tracked[-1].path_length_m == 0 and np.array_equal(tracked[-1].odom_T_body, np.eye(4))
+    _, placed = track([*keyframes, elsewhere], Verification())
+    assert [one.session for one in placed] == [0, 0, 1]
+    assert placed[-1].path_length_m == 0 and np.array_equal(placed[-1].odom_T_body, np.eye(4))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from graph_worlds import SETTINGS, chain_of, closing, lap_pairs, tracked, two_laps
+from graph_worlds import SETTINGS, chain_of, closing, lap_pairs, placed, two_laps
 
 from umf_ros.lab.simulation.pose_graphs import GraphWorld
 from umf_ros.pose_graph.closures import ClosureArrays
@@ -12,7 +12,7 @@ from umf_ros.pose_graph.odometry import OdometryChain
 
 def arrays_of(world: GraphWorld) -> ClosureArrays:
     arrays, chain = ClosureArrays(), chain_of(world)
-    for closure in tracked(world):
+    for closure in placed(world):
         arrays.append([chain], closure)
     return arrays
 
@@ -28,8 +28,8 @@ def test_distances_along_the_path_are_those_driven() -> None:
 
 def test_endpoints_in_different_sessions_are_infinitely_far() -> None:
     arrays, chains = ClosureArrays(), [chain_of(two_laps()), chain_of(two_laps(1))]
-    closures = tracked(closing(two_laps(), lap_pairs(10, 12)))
-    closures[1].query = 1
+    closures = placed(closing(two_laps(), lap_pairs(10, 12)))
+    closures[1] = closures[1]._replace(query=1)
     for closure in closures:
         arrays.append(chains, closure)
     match, query = arrays.match.distances(0), arrays.query.distances(0)
@@ -44,7 +44,7 @@ def test_renewing_follows_odometry_that_came_late() -> None:
         chain.add(k * 10**9, world.odometry[k])
     chain.update()
     arrays = ClosureArrays()
-    for closure in tracked(world):
+    for closure in placed(world):
         arrays.append([chain], closure)
     before = arrays.match.distances(0)[1]
     for k in late:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from graph_worlds import SETTINGS, chain_of, closing, lap_pairs, tracked, two_laps
+from graph_worlds import SETTINGS, chain_of, closing, lap_pairs, placed, two_laps
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.lab.simulation.pose_graphs import GraphWorld
@@ -19,7 +19,7 @@ def compared(world: GraphWorld, settings: PoseGraphSettings = SETTINGS, stated: 
     ends = ClosureArrays()
     graph = ConsistencyGraph(ends, settings)
     chain = chain_of(world, settings, stated)
-    for row, closure in enumerate(tracked(world)):
+    for row, closure in enumerate(placed(world)):
         ends.append([chain], closure)
         graph.add(row, NoiseScale())
     return graph

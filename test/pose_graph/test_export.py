@@ -25,9 +25,9 @@ from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import make_pose
 from umf_ros.lab.datasets.g2o import PERIOD_NS, as_recording, drive, read_g2o
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS
 from umf_ros.pose_graph.g2o import verdict_table, write_g2o
-from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.solver import Edge
 
 WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))

@@ -11,7 +11,7 @@ from umf_ros.core.errors import GraphError
 from umf_ros.core.geometry import Array, expmap, invert
 from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops
 from umf_ros.pose_graph import solver as incremental
-from umf_ros.pose_graph.solver import Edges, Graph, IncrementalOptimizer, Optimizer
+from umf_ros.pose_graph.solver import BatchOptimizer, Edges, Graph, IncrementalOptimizer
 
 WORLD = rover_loops(400, 10002)
 
@@ -50,7 +50,7 @@ def drive(optimizer: IncrementalOptimizer, sizes: range) -> Array:
 
 
 def exact(size: int, without: tuple[int, ...] = ()) -> Array:
-    optimizer, poses = Optimizer(), WORLD.odometry[:size]
+    optimizer, poses = BatchOptimizer(), WORLD.odometry[:size]
     for _ in range(4):
         poses = optimizer.solve(grown(WORLD, size, poses, without))
     return poses
@@ -67,13 +67,13 @@ def test_it_follows_the_optimum_of_a_drive_to_centimetres() -> None:
 
 def test_it_solves_the_whole_only_where_much_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes: list[int] = []
-    whole = Optimizer.solve
+    whole = BatchOptimizer.solve
 
-    def counted(self: Optimizer, graph: Graph) -> Array:
+    def counted(self: BatchOptimizer, graph: Graph, exact: bool = False) -> Array:
         sizes.append(len(graph.vertices))
-        return whole(self, graph)
+        return whole(self, graph, exact)
 
-    monkeypatch.setattr(Optimizer, "solve", counted)
+    monkeypatch.setattr(BatchOptimizer, "solve", counted)
     drive(IncrementalOptimizer(), range(100, 401, 10))
     assert len(sizes) < 10
 
@@ -112,7 +112,7 @@ def test_what_cannot_be_solved_says_so_and_breaks_nothing() -> None:
 
 
 def test_marginals_are_those_of_the_whole() -> None:
-    optimizer, whole = IncrementalOptimizer(), Optimizer()
+    optimizer, whole = IncrementalOptimizer(), BatchOptimizer()
     assert optimizer.marginal(5) is None
     poses = drive(optimizer, range(260, 301, 10))
     whole.solve(grown(WORLD, 300, poses))
@@ -154,7 +154,7 @@ def test_in_a_large_graph_the_covariance_is_that_of_when_the_last_pose_was_seen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(incremental, "_SMALL_ENTRIES", 0)
-    optimizer, whole = IncrementalOptimizer(), Optimizer()
+    optimizer, whole = IncrementalOptimizer(), BatchOptimizer()
     poses = drive(optimizer, range(360, 401, 10))
     whole.solve(grown(WORLD, 400, poses))
     found, expected = optimizer.marginal(399), whole.marginal(399)
@@ -174,5 +174,5 @@ def test_a_graph_in_parts_is_put_in_order() -> None:
     poses = np.concatenate([one.poses, one.poses, np.eye(4)[None]])
     keys = [*one.keys, *(("second", key) for key in one.keys)]
     both = Graph(range(801), poses, [0, 400, 800], keys, edges)
-    for optimizer in (IncrementalOptimizer(), Optimizer()):
+    for optimizer in (IncrementalOptimizer(), BatchOptimizer()):
         assert apart_m(optimizer.solve(both), poses) < 0.02

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from graph_worlds import SETTINGS, chain_of, closing, drive, feed_odometry, lap_pairs, tracked, two_laps
+from graph_worlds import SETTINGS, chain_of, closing, drive, feed_odometry, lap_pairs, placed, two_laps
 
 from umf_ros.core.geometry import Array, expmap
 from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops, with_wrong_closures
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureArrays
 from umf_ros.pose_graph.consistency import squared_mahalanobis
 from umf_ros.pose_graph.noise_scale import LoopResiduals, NoiseScale, NoiseScaleEstimator, loop_residuals
-from umf_ros.pose_graph.pose_graph import PoseGraph
 
 
 def covariances(rng: np.random.Generator, count: int, turn_rad: float, metres: float) -> Array:
@@ -43,7 +43,7 @@ def wrong(count: int, metres: float) -> LoopResiduals:
 
 def loop(world: GraphWorld, one: int = 0, other: int = 1) -> LoopResiduals:
     arrays, chain = ClosureArrays(), chain_of(world)
-    for closure in tracked(world):
+    for closure in placed(world):
         arrays.append([chain], closure)
     return loop_residuals(arrays, np.array([one]), np.array([other]))
 

@@ -11,7 +11,7 @@ from graph_worlds import chain_of, two_laps
 from umf_ros.core.errors import GraphError
 from umf_ros.core.geometry import Array, adjoint, expmap, invert, make_pose, propagate, relative
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS
-from umf_ros.pose_graph.solver import Edges, Graph, Optimizer, odometry_edges
+from umf_ros.pose_graph.solver import BatchOptimizer, Edges, Graph, odometry_edges
 
 COVARIANCE = np.diag([*np.deg2rad([0.5] * 3), 0.05, 0.05, 0.05]) ** 2
 
@@ -47,7 +47,7 @@ def shaken(poses: Array, seed: int = 0) -> Array:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_consistent_measurements_are_met_from_a_bad_start(seed: int) -> None:
-    found = Optimizer().solve(problem(square(), CYCLE, shaken(square(), seed)))
+    found = BatchOptimizer().solve(problem(square(), CYCLE, shaken(square(), seed)))
     np.testing.assert_allclose(found, square(), atol=1e-3)
 
 
@@ -55,23 +55,23 @@ def test_a_contradiction_is_shared_out_equally() -> None:
     along = make_pose(np.eye(3), [0.2, 0, 0])
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = [0, 1, 2]
-    found = Optimizer().solve(problem(poses, [(0, 1), (1, 2), (0, 2)], e2=along))
+    found = BatchOptimizer().solve(problem(poses, [(0, 1), (1, 2), (0, 2)], e2=along))
     # two edges say 1 m each, one says 2.2 m
     np.testing.assert_allclose(found[:, 0, 3], [0, 1 + 0.2 / 3, 2 + 0.4 / 3], atol=1e-4)
 
 
 def test_the_anchored_vertex_stays() -> None:
     gauge = make_pose(np.eye(3), [5.0, -3, 1])
-    found = Optimizer().solve(problem(gauge @ square(), CYCLE, shaken(gauge @ square())))
+    found = BatchOptimizer().solve(problem(gauge @ square(), CYCLE, shaken(gauge @ square())))
     np.testing.assert_allclose(found[0], gauge, atol=1e-6)
 
 
 def test_a_growing_problem_is_solved_as_if_it_were_new() -> None:
-    optimizer, poses = Optimizer(), square()
+    optimizer, poses = BatchOptimizer(), square()
     optimizer.solve(problem(poses[:3], CYCLE[:2], shaken(poses[:3])))
     off = expmap(np.array([[0, 0, 0.05, 0.3, 0, 0]]))[0]
     grown = problem(poses, CYCLE, shaken(poses), e3=off)
-    np.testing.assert_allclose(optimizer.solve(grown), Optimizer().solve(grown), atol=1e-4)
+    np.testing.assert_allclose(optimizer.solve(grown), BatchOptimizer().solve(grown), atol=1e-4)
 
 
 def test_a_long_straight_chain_is_solved() -> None:
@@ -79,13 +79,13 @@ def test_a_long_straight_chain_is_solved() -> None:
     poses = np.tile(np.eye(4), (3000, 1, 1))
     poses[:, 0, 3] = np.arange(3000)
     chain = [(k, k + 1) for k in range(2999)]
-    found = Optimizer().solve(problem(poses, chain))
+    found = BatchOptimizer().solve(problem(poses, chain))
     np.testing.assert_allclose(found, poses, atol=1e-3)
 
 
 @pytest.mark.parametrize("breakage", ["no anchor", "not finite", "no covariance"])
 def test_what_cannot_be_solved_says_so_and_breaks_nothing(breakage: str) -> None:
-    optimizer, good = Optimizer(), problem(square(), CYCLE)
+    optimizer, good = BatchOptimizer(), problem(square(), CYCLE)
     optimizer.solve(good)
     other = replace(good, keys=["a", "b", "c", "d"])
     bad = {
@@ -99,7 +99,7 @@ def test_what_cannot_be_solved_says_so_and_breaks_nothing(breakage: str) -> None
 
 
 def test_the_marginal_grows_along_a_chain() -> None:
-    optimizer = Optimizer()
+    optimizer = BatchOptimizer()
     assert optimizer.marginal(0) is None
     optimizer.solve(problem(square(), CYCLE[:3]))
     marginals = [optimizer.marginal(vertex) for vertex in range(4)]

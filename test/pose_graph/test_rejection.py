@@ -10,8 +10,8 @@ from graph_worlds import SETTINGS, accepted, closing, feed_odometry, lap_pairs, 
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.pose_graph.pose_graph import PoseGraph
 
 TURN = np.array([0, 0, np.deg2rad(0.3), 0.03, 0, 0])
 """What odometry with a bias gets wrong per metre."""
@@ -42,8 +42,8 @@ def test_an_unsure_closure_waits_for_other_places() -> None:
     world = closing(two_laps(), lap_pairs(0, 1, 15, 30, 45))
     graph = driven(world, stated=4.0)
     (first,) = graph.add_closure(world.message(0))
-    assert first.state is State.UNDECIDED and "needs support" in first.reason
-    assert states(graph.add_closure(world.message(1))) == {1: State.UNDECIDED}
+    assert first.state is State.PENDING and "needs support" in first.reason
+    assert states(graph.add_closure(world.message(1))) == {1: State.PENDING}
     later: dict[int, State] = {}
     for row in (2, 3, 4):
         later |= states(graph.add_closure(world.message(row)))
@@ -70,7 +70,7 @@ def test_an_unopposed_closure_is_believed_with_patience() -> None:
     graph = PoseGraph(SETTINGS.model_copy(update={"max_chance": 1e-4, "patience_m": 40.0}))
     feed_odometry(graph, world, range(120))
     (first,) = graph.add_closure(world.message(0))
-    assert first.state is State.UNDECIDED
+    assert first.state is State.PENDING
     feed_odometry(graph, world, range(120, 161))
     graph.add_closure(world.message(1))
     found = {v.closure.match_stamp_ns // PERIOD_NS: v for v in graph.closures()}
@@ -186,7 +186,7 @@ def test_without_support_and_gate_everything_is_accepted_at_once() -> None:
 def test_closures_in_one_call_are_judged_together() -> None:
     world = closing(two_laps(), lap_pairs(0, 12, 24, 36))
     graph = driven(world, stated=2.0)
-    assert states(graph.add_closure(world.message(0))) == {0: State.UNDECIDED}
+    assert states(graph.add_closure(world.message(0))) == {0: State.PENDING}
     together = driven(world, stated=2.0).add_closures([world.message(row) for row in range(4)])
     assert states(together) == dict.fromkeys((0, 12, 24, 36), State.ACCEPTED)
 
@@ -240,7 +240,7 @@ def test_a_closure_before_all_odometry_waits_for_it() -> None:
     (first,) = graph.add_closure(
         replace(late, match_stamp_ns=late.match_stamp_ns + epoch_ns, query_stamp_ns=late.query_stamp_ns + epoch_ns)
     )
-    assert first.state is State.WAITING
+    assert first.state is State.PENDING
     for k, pose in enumerate(world.odometry):
         graph.add_odometry(epoch_ns + k * PERIOD_NS, pose)
         if k == 0:

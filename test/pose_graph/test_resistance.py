@@ -16,8 +16,8 @@ from umf_ros.lab.simulation.pose_graphs import (
     with_lone_end,
     with_wrong_closures,
 )
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.noise_scale import NoiseScale
-from umf_ros.pose_graph.pose_graph import PoseGraph
 
 ROVER = rover_loops(400, 11)
 

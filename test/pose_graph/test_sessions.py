@@ -22,8 +22,8 @@ from graph_worlds import (
 
 from umf_ros.core.geometry import Array, expmap, invert
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.sessions import CorrectedPath
 from umf_ros.pose_graph.solver import Edge, between
 

@@ -15,6 +15,31 @@ MAX_GAP_S = 2.0
 """Nothing is interpolated across a longer gap."""
 
 
+def bracket(
+    known_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Rows (K,) before and after each stamp among sorted known stamps, and its share (K,) of the way between, 0 to 1.
+
+    Both rows are the same where a stamp is known or before the first one.
+    """
+    after = np.clip(np.searchsorted(known_ns, stamps_ns), 0, len(known_ns) - 1)
+    before = np.where(known_ns[after] == stamps_ns, after, np.maximum(after - 1, 0))
+    span = np.maximum(known_ns[after] - known_ns[before], 1)
+    return before, after, np.clip((stamps_ns - known_ns[before]) / span, 0.0, 1.0)
+
+
+def interpolated(known_ns: NDArray[np.int64], poses: Array, stamps_ns: NDArray[np.int64]) -> Array:
+    """Poses (K, 4, 4) at stamps between sorted known ones, of (N, 4, 4) poses; held constant outside.
+
+    Positions are interpolated linearly, rotations along the shortest arc.
+    """
+    before, after, share = bracket(known_ns, stamps_ns)
+    found, between = poses[before], np.flatnonzero(share)
+    if len(between):
+        found[between] = interpolate(found[between], poses[after[between]], share[between])
+    return found
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """Poses over time, in a fixed frame of its own.
@@ -42,15 +67,10 @@ class Trajectory:
         poses = np.tile(np.eye(4), (len(stamps), 1, 1))
         if not len(self):
             return poses, np.zeros(len(stamps), bool)
-        after = np.clip(np.searchsorted(self.stamps_ns, stamps), 0, len(self) - 1)
-        exact = self.stamps_ns[after] == stamps
-        before = np.where(exact, after, after - 1)
-        known = (before >= 0) & (stamps <= self.stamps_ns[-1])
+        before, after, _ = bracket(self.stamps_ns, stamps)
+        known = (self.stamps_ns[0] <= stamps) & (stamps <= self.stamps_ns[-1])
         known &= self.stamps_ns[after] - self.stamps_ns[before] <= MAX_GAP_S * 1e9
-        before, after = before[known], after[known]
-        steps = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
-        fractions = (stamps[known] - self.stamps_ns[before]) / steps
-        poses[known] = interpolate(self.poses[before], self.poses[after], fractions)
+        poses[known] = interpolated(self.stamps_ns, self.poses, stamps[known])
         return poses, known
 
     def of_body(self, body_T_sensor: Array) -> Trajectory:

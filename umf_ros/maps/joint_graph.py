@@ -11,8 +11,8 @@ from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
 from umf_ros.maps.odometry_log import OdometryLog
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.runs.tables import read_closures, read_keyframes
 
 Stamps = NDArray[np.int64]

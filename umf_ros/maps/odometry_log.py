@@ -16,7 +16,7 @@ from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import atomic_write
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.pose_graph.pose_graph import PoseGraph
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
 from umf_ros.verification import Verifier

@@ -41,9 +41,8 @@ from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.pose_graph.journal import JOURNAL
+from umf_ros.pose_graph.journal import JOURNAL, DurableGraph
 from umf_ros.sensors.decode import OdometrySample, decode_odometry
-from umf_ros.sensors.durable_graph import DurableGraph
 from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms
 
 ODOMETRY_DEPTH = 200
@@ -258,8 +257,8 @@ class PoseGraphNode(BaseNode):
         if isinstance(self._durable, MapFollower):
             values["probability"] = self._durable.probability
             text = "in the map" if self._map_T_odom is not None else "the rover is not found in the map yet"
-        if values.get("waiting") and self._durable.feed.newest_ns < 0:
-            trouble, text = True, f"{values['waiting']} closures wait for odometry, of which none has come"
+        if values.get("pending") and self._durable.feed.newest_ns < 0:
+            trouble, text = True, f"{values['pending']} closures wait for odometry, of which none has come"
         level = ERROR if self._cannot_write else WARN if trouble or self._faults else OK
         return status(level, "pose graph", text, values)
 

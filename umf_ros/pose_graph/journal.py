@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -10,11 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.core.errors import writing
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.errors import GraphError, OutputError, writing
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import Schema, SqliteFile
-from umf_ros.pose_graph.closures import ClosureVerdict, Decision, State
+from umf_ros.pose_graph.backend import PoseGraph
+from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, Decision, State
+from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
 
 _TABLES = (
     "CREATE TABLE event (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, first_ns INTEGER, second_ns INTEGER, data BLOB)",
@@ -22,9 +26,9 @@ _TABLES = (
     "residual_m REAL, PRIMARY KEY (match_ns, query_ns))",
 )
 _SCHEMA = Schema("pose graph", (_TABLES,), lambda tables: int({"event", "verdict"} <= tables))
-ODOMETRY, CLOSURE, REVOKED, DECIDED, STARTED = "odometry", "closure", "revoked", "decided", "started"
-UNSETTLED = "unsettled"
-_NUMBERS = {ODOMETRY: 16, CLOSURE: 53, REVOKED: 0, DECIDED: 0, STARTED: 0, UNSETTLED: 0}
+ODOMETRY, CLOSURE, REVOKED, STARTED, UNSETTLED = "odometry", "closure", "revoked", "started", "unsettled"
+# "decided" is of earlier versions
+_NUMBERS = {ODOMETRY: 16, CLOSURE: 53, REVOKED: 0, STARTED: 0, UNSETTLED: 0, "decided": 0}
 JOURNAL = "pose_graph.sqlite"
 """Name of the file in a folder of results."""
 
@@ -34,8 +38,8 @@ class Event:
     """One event of the graph.
 
     Attributes:
-        kind: an odometry message came, a closure came, a pair of keyframes was revoked, what waited was decided, the
-            process was started anew, or it ended before the graph was settled.
+        kind: an odometry message came, a closure came, a pair of keyframes was revoked, the process was started anew,
+            or it ended before the graph was settled.
         first_ns: stamp of the odometry, or of the match.
         second_ns: stamp of the query.
         data: (16,) pose of the odometry; of a closure the pose, the covariance (36,) and the probability.
@@ -100,7 +104,7 @@ class GraphJournal:
         with self._file.reading() as connection:
             rows = connection.execute("SELECT match_ns, query_ns, state, reason, residual, residual_m FROM verdict")
             return {
-                (match, query): (State(state), str(reason), _number(residual), _number(residual_m))
+                (match, query): (State(state), ClosureReason(reason), _number(residual), _number(residual_m))
                 for match, query, state, reason, residual, residual_m in rows
             }
 
@@ -183,3 +187,139 @@ def _event(kind: Any, first_ns: Any, second_ns: Any, data: Any) -> Event:
     if not all(isinstance(stamp, int) for stamp in (first_ns, second_ns)):
         raise ValueError("a stamp that is no number")
     return Event(kind, first_ns, second_ns, numbers)
+
+
+class DurableGraph:
+    """A pose graph with a write-ahead log, and its odometry split into sessions.
+
+    After a restart the closures get their logged verdicts, and the map is solved once; with other settings they are
+    decided anew. When the disk is full, the graph goes on without its log.
+
+    Args:
+        settings: of the graph.
+        path: of the journal; None keeps none.
+        on_fault: called with errors of writing.
+
+    Attributes:
+        graph: the graph.
+        feed: splits odometry into sessions and passes it to the graph.
+        taken_up: number of closures that were found in the journal.
+        changed: of these, how many now have another verdict than was written.
+        unsettled: whether the process before had no time to settle the graph at its end.
+
+    Raises:
+        UmfError: the journal is something else, is damaged, or another process writes it.
+        OutputError: the journal cannot be written.
+    """
+
+    def __init__(self, settings: PoseGraphSettings, path: Path | None, on_fault: Callable[[OutputError], None]) -> None:
+        self._settings = settings
+        self._on_fault = on_fault
+        self._journal = GraphJournal(path) if path is not None else None
+        self.taken_up = self.changed = 0
+        self.unsettled = False
+        self._begin()
+        if self._journal is not None:
+            self._resume(self._journal)
+
+    def take_odometry(self, stamp_ns: int, odom_T_body: Array) -> Reset | None:
+        """Take one message; returns why a new session has begun with it."""
+        self._write(lambda journal: journal.add_odometry(stamp_ns, odom_T_body))
+        return self.feed.take(stamp_ns, odom_T_body)
+
+    def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
+        """Take one closure; returns every verdict that it brought about or changed."""
+        self._write(lambda journal: journal.add_closure(closure))
+        return self._logged(self.graph.add_closure(closure))
+
+    def revoke(self, match_ns: int, query_ns: int) -> list[ClosureVerdict]:
+        """Take every closure between two keyframes out for good.
+
+        Raises:
+            GraphError: there is no such closure, or the graph cannot be solved without it.
+        """
+        verdicts = self.graph.revoke(match_ns, query_ns)
+        self._write(lambda journal: journal.add(REVOKED, match_ns, query_ns))
+        return self._logged(verdicts)
+
+    def update(self) -> list[ClosureVerdict]:
+        """Decide about closures that waited for odometry; returns new verdicts."""
+        return self._logged(self.graph.update())
+
+    def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
+        """Settle the graph and write its results; a graph that is not settled in time is marked so in the journal.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        settled = self.graph.write_results(folder, within_s)
+        if not settled:
+            self._write(lambda journal: journal.add(UNSETTLED))
+        self.unsettled = not settled
+        return settled
+
+    def end(self) -> Path | None:
+        """End this graph and begin another; returns the new name of the old journal."""
+        self._begin()
+        if self._journal is None:
+            return None
+        try:
+            old = self._journal.set_aside()
+            self._journal.mark_settings(self._mark)
+            return old
+        except OutputError as error:
+            self._on_fault(error)
+            return None
+
+    def close(self) -> None:
+        """Close the journal."""
+        if self._journal is not None:
+            self._journal.close()
+
+    @property
+    def _mark(self) -> int:
+        return zlib.crc32(self._settings.model_dump_json().encode()) >> 1
+
+    def _begin(self) -> None:
+        self.graph = PoseGraph(self._settings)
+        self.feed = OdometrySessionSplitter(self.graph)
+
+    def _resume(self, journal: GraphJournal) -> None:
+        verdicts, self.unsettled = journal.verdicts(), journal.is_unsettled()
+        events, revoked = 0, []
+        for events, event in enumerate(journal.events(), 1):  # noqa: B007 (their number)
+            if event.kind == ODOMETRY:
+                self.feed.take(event.first_ns, event.data.reshape(4, 4))
+            elif event.kind == CLOSURE:
+                self.graph.hold(event.closure)
+            elif event.kind == REVOKED:
+                revoked.append((event.first_ns, event.second_ns))
+            elif event.kind == STARTED:
+                self.feed.interrupted()
+        self.graph.resume(verdicts if journal.settings_mark == self._mark else {})
+        for pair in revoked:
+            try:
+                self.graph.revoke(*pair)
+            except GraphError:
+                self.graph.counts["revoked closure not found"] += 1
+        if events:
+            self.feed.interrupted()
+            self._write(lambda journal: journal.add(STARTED))
+        self._write(lambda journal: journal.mark_settings(self._mark))
+        found = self.graph.closures()
+        self.taken_up = len(found)
+        states = {(v.closure.match_stamp_ns, v.closure.query_stamp_ns): v.state for v in found}
+        self.changed = sum(states.get(pair) != state for pair, (state, *_) in verdicts.items())
+
+    def _logged(self, verdicts: list[ClosureVerdict]) -> list[ClosureVerdict]:
+        if verdicts:
+            self._write(lambda journal: journal.put_verdicts(verdicts))
+        return verdicts
+
+    def _write(self, entry: Callable[[GraphJournal], None]) -> None:
+        if self._journal is None:
+            return
+        try:
+            entry(self._journal)
+        except OutputError as error:
+            self._on_fault(error)

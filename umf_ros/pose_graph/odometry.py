@@ -8,14 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import (
     Array,
     adjoint,
     expmap,
-    interpolate,
     invert,
     logmap,
     orthonormal,
@@ -23,11 +21,11 @@ from umf_ros.core.geometry import (
     relative,
     ros_to_gtsam_covariance,
 )
+from umf_ros.core.odometry_noise import OdometryNoise
+from umf_ros.core.trajectory import bracket, interpolated
 
 Stamps = NDArray[np.int64]
 Rows = NDArray[np.int64]
-_TURN_M_PER_RAD = 0.5
-_DRIFT_M_PER_S = 1e-4
 
 
 class Table:
@@ -87,6 +85,7 @@ class OdometryChain:
 
     def __init__(self, settings: PoseGraphSettings) -> None:
         self._settings = settings
+        self._noise = OdometryNoise.stated(settings)
         self._arrived: list[tuple[int, Array]] = []
         self._covariances: dict[int, Array] = {}
         stamps, poses = np.empty(0, np.int64), np.empty((0, 4, 4))
@@ -132,16 +131,12 @@ class OdometryChain:
         known = self._messages["stamp"]
         if not len(known) or not known[0] <= stamp_ns <= known[-1]:
             return False
-        lower, upper, _ = _neighbours(known, np.array([stamp_ns]))
+        lower, upper, _ = bracket(known, np.array([stamp_ns]))
         return bool(known[upper] - known[lower] <= self._settings.max_gap_s * 1e9)
 
     def poses_at(self, stamps: Stamps) -> Array:
         """(N, 4, 4) odometry poses interpolated at the stamps, held constant outside the messages."""
-        lower, upper, share = _neighbours(self._messages["stamp"], stamps)
-        poses, between = self._messages["pose"][lower], np.flatnonzero(share)
-        if len(between):
-            poses[between] = interpolate(poses[between], self._messages["pose"][upper[between]], share[between])
-        return poses
+        return interpolated(self._messages["stamp"], self._messages["pose"], stamps)
 
     def travel_at(self, stamps: Stamps) -> Array:
         """(N,) metres driven since the start of the session, turns on the spot included."""
@@ -150,13 +145,14 @@ class OdometryChain:
     def at(self, stamps: Stamps) -> PathPoints:
         """The path at stamps the odometry covers."""
         poses, collected = self.poses_at(stamps), self._keyframes["noise"]
-        lower, upper, share = _neighbours(self.stamps, stamps)
+        lower, upper, share = bracket(self.stamps, stamps)
         shares = share[:, None, None]
         noise = (1 - shares) * collected[lower] + shares * collected[upper]
         beyond = stamps > self.stamps[-1]
         if beyond.any():
             last = np.broadcast_to(self.poses[-1], poses[beyond].shape)
-            steps = self._model(_path_steps(last, poses[beyond], stamps[beyond] - self.stamps[-1]))
+            elapsed_s = (stamps[beyond] - self.stamps[-1]) / 1e9
+            steps = self._noise.covariances(self._noise.path_lengths(last, poses[beyond], elapsed_s))
             noise[beyond] += propagate(adjoint(self._from_origin(poses[beyond])), steps)
         return PathPoints(self._from_origin(poses), noise)
 
@@ -164,11 +160,6 @@ class OdometryChain:
         shifted = poses.copy()
         shifted[:, :3, 3] -= self._messages["pose"][0, :3, 3]
         return shifted
-
-    def _model(self, travel: Array) -> Array:
-        turn = np.deg2rad(self._settings.odometry_sigma_deg) ** 2
-        shift = self._settings.odometry_sigma_m**2
-        return travel[:, None, None] * np.diag([turn] * 3 + [shift] * 3)
 
     def _sort_in(self) -> int | None:
         """Sort the new messages in, the first of each stamp; returns the earliest stamp that is new."""
@@ -200,7 +191,7 @@ class OdometryChain:
         # what is known ends with the first row: it begins the way
         rows = np.flatnonzero(given | (np.diff(cells, prepend=cells[0] - 1) > 0))
         stamps, poses = messages[rows], self._messages["pose"][start + rows]
-        steps = _path_steps(poses[:-1], poses[1:], np.diff(stamps))
+        steps = self._noise.path_lengths(poses[:-1], poses[1:], np.diff(stamps) / 1e9)
         travel = np.cumsum([0.0, *steps]) + (self._keyframes["travel"][-1] if known else 0.0)
         keep = given[rows] | (np.diff(np.floor(travel / self._settings.keyframe_spacing_m), prepend=-1) > 0)
         keep[0] = not known
@@ -209,7 +200,7 @@ class OdometryChain:
 
     def _add_keyframes(self, stamps: Stamps, poses: Array, travel: Array, start: float) -> None:
         """Add N keyframes; poses begins with the one before the first, `start` is the way up to that."""
-        steps = self._model(np.diff(travel, prepend=start))
+        steps = self._noise.covariances(np.diff(travel, prepend=start))
         for row in np.flatnonzero(self._has_covariance(stamps)):
             step = relative(poses[row], poses[row + 1])
             steps[row] = ros_to_gtsam_covariance(self._covariances[int(stamps[row])], step)
@@ -221,21 +212,6 @@ class OdometryChain:
         if not self._covariances:
             return np.zeros(len(stamps), bool)
         return np.fromiter((stamp in self._covariances for stamp in stamps.tolist()), bool, len(stamps))
-
-
-def _neighbours(known: Stamps, stamps: Stamps) -> tuple[Rows, Rows, Array]:
-    """(N,) rows before and after each stamp among sorted known ones, and where between them it lies, 0 to 1."""
-    upper = np.clip(np.searchsorted(known, stamps), 0, len(known) - 1)
-    lower = np.where(known[upper] == stamps, upper, np.maximum(upper - 1, 0))
-    span = np.maximum(known[upper] - known[lower], 1)
-    return lower, upper, np.clip((stamps - known[lower]) / span, 0.0, 1.0)
-
-
-def _path_steps(a: Array, b: Array, elapsed_ns: Stamps) -> Array:
-    """(N,) lengths of the steps from `a` to `b` in metres, counting turns and, barely, time."""
-    turns = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], -1, -2) @ b[:, :3, :3]).magnitude()
-    moved = np.linalg.norm(b[:, :3, 3] - a[:, :3, 3], axis=1)
-    return moved + _TURN_M_PER_RAD * turns + _DRIFT_M_PER_S * np.asarray(elapsed_ns) / 1e9
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,14 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.errors import GraphError
+from umf_ros.core.errors import GraphError, one_line
 from umf_ros.core.geometry import Array, adjoint, invert, propagate
 from umf_ros.pose_graph.odometry import PathPoints
 
 _ANCHOR = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
 _MAX_STEPS = 30
+_EXACT_STEPS = 10
+_EXACT_M = 1e-6
 _FEW_VERTICES = 300
 # a step this small leaves an error of about the product of both, which the next solution removes
 SMALL_TURN_RAD = 0.02
@@ -113,88 +115,51 @@ class Graph:
     edges: Edges
 
 
-class Optimizer:
-    """Solves graphs that differ little from one to the next.
-
-    Vertices and edges go by lasting keys, so that values and factors are made once: an edge whose
-    measurement or covariance changes needs a new optimiser.
-    """
+class BatchOptimizer:
+    """Solve a graph as a whole; keeps the last solution for its marginals."""
 
     def __init__(self) -> None:
-        self._factors: dict[Hashable, gtsam.BetweenFactorPose3] = {}
-        self._numbers: dict[Hashable, int] = {}
-        self._values = gtsam.Values()
-        self._poses: Array = np.empty((0, 4, 4))
-        self._solved = gtsam.NonlinearFactorGraph()
-        self._ordering: gtsam.Ordering | None = None
-        self._edges: Sequence[Hashable] = []
-        self._anchors: tuple[NDArray[np.int64], Array] = np.empty(0, np.int64), np.empty((0, 4, 4))
-        self._marginals: dict[Hashable, Array | None] = {}
+        self._factors, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._rows: dict[Hashable, int] = {}
 
-    def solve(self, graph: Graph) -> Array:
-        """(N, 4, 4) poses of the vertices at the minimum near those to start from.
+    def solve(self, graph: Graph, exact: bool = False) -> Array:
+        """(N, 4, 4) poses of the vertices at the minimum near the initial poses.
+
+        Args:
+            graph: the graph.
+            exact: iterate until no pose moves by a micrometre, not only until the steps are small.
 
         Raises:
             GraphError: the system is indeterminate or does not converge to finite poses.
         """
         if not graph.anchors:  # QR would not notice
             raise GraphError("the pose graph cannot be solved: no vertex stays where it is")
-        numbers = np.array([self._numbers.setdefault(key, len(self._numbers)) for key in graph.vertices])
-        self._start_from(numbers, graph.poses)
-        if not self._has_factors_of(graph, numbers):
-            self._solved = self._factor_graph(graph, numbers)
-            self._edges, self._anchors = list(graph.keys), (numbers[graph.anchors], graph.poses[graph.anchors])
-            self._ordering = dissection(self._solved, self._anchors[0].tolist(), len(numbers))
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for row, pose in enumerate(graph.poses):
+            values.insert(row, gtsam.Pose3(pose))
+        for row in graph.anchors:
+            factors.add(prior(row, graph.poses[row]))
+        for row in range(len(graph.edges)):
+            factors.add(between(graph.edges[row]))
+        ordering = dissection(factors, graph.anchors, len(graph.poses))
         try:
-            values = _descend(self._solved, self._values, self._ordering)
+            values = _descend(factors, values, ordering, exact)
         except (RuntimeError, IndexError, ValueError) as error:
-            raise GraphError(f"the pose graph cannot be solved: {_first_line(error)}") from None
+            raise GraphError(f"the pose graph cannot be solved: {one_line(error)}") from None
         poses = extracted(values)
         if not np.isfinite(poses).all():
             raise GraphError("the pose graph cannot be solved: the result is not finite")
-        self._values, self._poses, self._marginals = values, poses, {}
-        return poses[numbers]
+        self._factors, self._values = factors, values
+        self._rows = {key: row for row, key in enumerate(graph.vertices)}
+        return poses
 
     def marginal(self, vertex: Hashable) -> Array | None:
         """(6, 6) covariance of a vertex of the last solved graph in its tangent space; None where it is unknown."""
-        if vertex not in self._marginals:
-            try:
-                found = gtsam.Marginals(self._solved, self._values).marginalCovariance(self._numbers.get(vertex, -1))
-            except (RuntimeError, IndexError, TypeError):
-                found = None
-            self._marginals[vertex] = found
-        return self._marginals[vertex]
-
-    def _start_from(self, numbers: NDArray[np.int64], initial: Array) -> None:
-        known = len(self._poses)
-        moved = np.zeros(len(numbers), bool)
-        old = numbers < known
-        moved[old] = np.abs(self._poses[numbers[old]] - initial[old]).max(axis=(1, 2), initial=0.0) > 1e-12
-        for row in np.flatnonzero(moved):
-            self._values.update(int(numbers[row]), gtsam.Pose3(initial[row]))
-        for row in np.flatnonzero(~old):
-            self._values.insert(int(numbers[row]), gtsam.Pose3(initial[row]))
-        self._poses = np.concatenate([self._poses, np.tile(np.eye(4), (len(self._numbers) - known, 1, 1))])
-        self._poses[numbers] = initial
-
-    def _has_factors_of(self, graph: Graph, numbers: NDArray[np.int64]) -> bool:
-        """Whether a graph has the edges and the anchors of the last one, where they were."""
-        anchors, places = self._anchors
-        same = np.array_equal(anchors, numbers[graph.anchors]) and self._edges == list(graph.keys)
-        return same and np.allclose(places, graph.poses[graph.anchors], rtol=0.0, atol=1e-9)
-
-    def _factor_graph(self, graph: Graph, numbers: NDArray[np.int64]) -> gtsam.NonlinearFactorGraph:
-        factors = gtsam.NonlinearFactorGraph()
-        for vertex in graph.anchors:
-            factors.add(prior(int(numbers[vertex]), graph.poses[vertex]))
-        edges, first, second = graph.edges, numbers[graph.edges.first], numbers[graph.edges.second]
-        for row, key in enumerate(graph.keys):
-            factor = self._factors.get(key)
-            if factor is None:
-                edge = Edge(int(first[row]), int(second[row]), edges.poses[row], edges.covariances[row])
-                factor = self._factors[key] = between(edge)
-            factors.add(factor)
-        return factors
+        try:
+            found: Array = gtsam.Marginals(self._factors, self._values).marginalCovariance(self._rows[vertex])
+        except (RuntimeError, IndexError, KeyError):
+            return None
+        return found
 
 
 def dissection(factors: gtsam.NonlinearFactorGraph, anchors: Sequence[int], vertices: int) -> gtsam.Ordering | None:
@@ -214,22 +179,28 @@ def dissection(factors: gtsam.NonlinearFactorGraph, anchors: Sequence[int], vert
 
 
 def _descend(
-    factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering | None
+    factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering | None, exact: bool
 ) -> gtsam.Values:
-    """Gauss-Newton; a step that is not small has to pay, else Levenberg and Marquardt take over."""
+    """Gauss-Newton; Levenberg-Marquardt takes over when a large step raises the error."""
     error: float | None = None
-    for _ in range(_MAX_STEPS):
+    for _ in range(_EXACT_STEPS if exact else _MAX_STEPS):
         trial, delta = _step(factors, values, ordering)
         steps = np.abs(delta).max(axis=0)
-        if max(steps[:3]) < SMALL_TURN_RAD and max(steps[3:]) < SMALL_STEP_M:
+        small = max(steps[:3]) < SMALL_TURN_RAD and max(steps[3:]) < SMALL_STEP_M
+        if steps.max() < _EXACT_M or (small and not exact):
             return trial
-        error = factors.error(values) if error is None else error
-        trial_error = factors.error(trial)
-        if not trial_error <= error * (1 + 1e-9) + 1e-9:
-            return _descend_carefully(factors, values)
-        if error - trial_error <= 1e-6 * error + 1e-9:
-            return trial
-        values, error = trial, trial_error
+        if not small:
+            error = factors.error(values) if error is None else error
+            trial_error = factors.error(trial)
+            if not trial_error <= error * (1 + 1e-9) + 1e-9:
+                values, error = _descend_carefully(factors, values), None
+                if not exact:
+                    return values
+                continue
+            if not exact and error - trial_error <= 1e-6 * error + 1e-9:
+                return trial
+            error = trial_error
+        values = trial
     return values
 
 
@@ -257,10 +228,6 @@ def _descend_carefully(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
     return gtsam.LevenbergMarquardtOptimizer(factors, values, parameters).optimize()
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
-
-
 # one step from this far leaves centimetres, which the next event removes; what moves further is solved as a whole
 _LARGE_TURN_RAD = 0.03
 _LARGE_STEP_M = 0.5
@@ -275,20 +242,19 @@ _SMALL_ENTRIES = 300_000
 
 
 class IncrementalOptimizer:
-    """Solves graphs that grow from one to the next, as `Optimizer` does, at the cost of what is new.
+    """Solve graphs that grow from one to the next at the cost of the new part.
 
-    A vertex is linearised anew once it has moved by what `Optimizer` calls a small step. Where an event moves the map
-    far, takes vertices away or moves their start, and where Cholesky's factorisation fails, `Optimizer` solves the
-    whole, and what is kept begins anew from there. So it does, by nested dissection, where one event after the other
-    has put ever more vertices among those that every further event touches.
+    Vertices and edges have lasting keys; an edge whose measurement or covariance changes needs a new optimiser. A
+    vertex is linearised anew once it has moved by a small step. Where an event moves the map far, removes vertices or
+    changes their initial poses, and where Cholesky's factorisation fails, the graph is solved as a whole.
     """
 
     def __init__(self) -> None:
-        self._whole = Optimizer()
+        self._batch = BatchOptimizer()
         self._tree: _Tree | None = None
 
     def solve(self, graph: Graph) -> Array:
-        """(N, 4, 4) poses of the vertices near the minimum near those to start from.
+        """(N, 4, 4) poses of the vertices near the minimum near the initial poses.
 
         Raises:
             GraphError: the system is indeterminate or does not converge to finite poses.
@@ -296,15 +262,15 @@ class IncrementalOptimizer:
         poses = self._grown(graph) if graph.anchors else None
         if poses is None:
             self._tree = None
-            poses = self._whole.solve(graph)
+            poses = self._batch.solve(graph)
         return poses
 
     def marginal(self, vertex: Hashable) -> Array | None:
         """(6, 6) covariance of a vertex of the last solved graph in its tangent space; None where it is unknown."""
-        return self._whole.marginal(vertex) if self._tree is None else self._tree.marginal(vertex)
+        return self._batch.marginal(vertex) if self._tree is None else self._tree.marginal(vertex)
 
     def _grown(self, graph: Graph) -> Array | None:
-        """The poses after some steps from where the graph starts; None where these do not lead to a minimum."""
+        """The poses after some steps from the initial ones; None where these do not lead to a minimum."""
         if self._tree is None or not self._tree.reaches(graph):
             self._tree = _Tree()
         start = graph.poses

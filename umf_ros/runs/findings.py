@@ -136,7 +136,7 @@ def _turn(mounting_deg: np.ndarray) -> str:
     return f"{np.linalg.norm(mounting_deg):.0f} deg, mostly about {'xyz'[axis]} ({mounting_deg[axis]:+.0f} deg)"
 
 
-PENDING = (State.UNDECIDED, State.WAITING)
+PENDING = (State.PENDING,)
 MUCH_MISSED, MUCH_REJECTED, WELL_COVERED = 0.3, 0.2, 0.5
 """Shares, by hand: of revisits, of closures, of keyframes."""
 SLOW = 1.0

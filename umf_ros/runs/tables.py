@@ -15,7 +15,7 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.core.io import atomic_write
-from umf_ros.pose_graph.closures import VERDICT_COLUMNS
+from umf_ros.pose_graph.closures import VERDICT_COLUMNS, State
 
 if TYPE_CHECKING:
     from umf_ros.verification import Verdict
@@ -206,7 +206,7 @@ def _candidate(row: dict[str, str]) -> TestedCandidate:
 
 def _graph_verdict(row: dict[str, str]) -> tuple[Endpoints, GraphVerdict]:
     match, query, state, reason, sigma, misfit_m = (row[name] for name in VERDICT_COLUMNS)
-    return (int(query), int(match)), GraphVerdict(state, reason, float(sigma), float(misfit_m))
+    return (int(query), int(match)), GraphVerdict(State(state), reason, float(sigma), float(misfit_m))
 
 
 def read_closures(path: Path) -> list[LoopClosure]:

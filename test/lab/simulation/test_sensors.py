@@ -57,14 +57,14 @@ def test_lidar_points_land_on_the_rendered_depth(drive, stereo):
 
 
 def test_disparity_agrees_with_depth(drive, stereo):
-    """Corners tracked from the left into the right image move by what their depth says."""
+    """Corners placed from the left into the right image move by what their depth says."""
     left, right, _ = stereo
     camera = drive.calibration.camera
     corners = cv2.goodFeaturesToTrack(left.image, 800, 0.01, 8, mask=(left.depth > 0).astype(np.uint8))
-    tracked, found, _ = cv2.calcOpticalFlowPyrLK(left.image, right.image, corners, None, winSize=(13, 13), maxLevel=4)
+    placed, found, _ = cv2.calcOpticalFlowPyrLK(left.image, right.image, corners, None, winSize=(13, 13), maxLevel=4)
     column, row = np.round(corners[:, 0]).astype(int).T
     expected = camera.fx * camera.baseline / left.depth[row, column]
-    moved = (corners - tracked)[:, 0]
+    moved = (corners - placed)[:, 0]
     error = (moved[:, 0] - expected)[found[:, 0] == 1]
     assert len(error) > 300
     assert np.median(np.abs(error)) < 0.3

@@ -124,7 +124,7 @@ def test_frozen_encoders_stay(folder, tmp_path):
 
 def test_fixed_statistics_stay_while_the_encoders_learn(folder, tmp_path):
     _, moved = learned_by(folder, tmp_path, fixed_statistics=True)
-    assert not [name for name in moved if "running" in name or "tracked" in name]
+    assert not [name for name in moved if "running" in name or "placed" in name]
     assert {"image_encoder", "voxel_encoder"} <= {name.split(".")[0] for name in moved}
 
 

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from umf_ros.lab.datasets.g2o import GraphRecording
+    from umf_ros.pose_graph.backend import PoseGraph
     from umf_ros.pose_graph.closures import ClosureVerdict
-    from umf_ros.pose_graph.pose_graph import PoseGraph
 
 MOST_ROWS = 20
 
@@ -40,8 +40,8 @@ def optimize(
 
     from umf_ros.core.config import PoseGraphSettings
     from umf_ros.lab.datasets.g2o import as_recording, drive, read_g2o
+    from umf_ros.pose_graph.backend import PoseGraph
     from umf_ros.pose_graph.g2o import verdict_table
-    from umf_ros.pose_graph.pose_graph import PoseGraph
 
     console, content = Console(), read_g2o(file)
     for problem in content.problems[:MOST_ROWS]:

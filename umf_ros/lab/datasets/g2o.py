@@ -28,8 +28,8 @@ from umf_ros.core.geometry import (
     make_pose,
     propagate,
 )
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import check_covariance
-from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.pose_graph.solver import Edge
 
 PERIOD_NS = 1_000_000_000

@@ -17,8 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from umf_ros.core.config import load_settings
 from umf_ros.core.errors import UmfError
-from umf_ros.pose_graph.journal import JOURNAL, GraphJournal
-from umf_ros.sensors.durable_graph import DurableGraph
+from umf_ros.pose_graph.journal import JOURNAL, DurableGraph, GraphJournal
 
 START_TIMEOUT_S = 180.0
 STOP_TIMEOUT_S = 60.0

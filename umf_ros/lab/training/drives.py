@@ -26,8 +26,8 @@ from umf_ros.embedding.inputs import read_frame
 from umf_ros.embedding.torch_runtimes import to_tensors
 from umf_ros.lab.datasets.sample import distances, places_of
 from umf_ros.networks.umf import UMF
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.pose_graph import PoseGraph
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
 

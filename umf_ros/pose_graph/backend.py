@@ -1,10 +1,12 @@
-"""PoseGraph: odometry and loop closures in, one trustworthy trajectory out."""
+"""Pose-graph back-end: optimise the trajectory from odometry and loop closures."""
 
 from __future__ import annotations
 
 import logging
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +18,11 @@ from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, gtsam_to_ros_covariance, invert
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.pose_graph.closures import (
+    ClosureReason,
     ClosureVerdict,
     Decision,
+    PlacedClosure,
     State,
-    TrackedClosure,
-    WaitingClosure,
     check_closure,
     check_covariance,
     check_pose,
@@ -29,27 +31,24 @@ from umf_ros.pose_graph.g2o import verdict_table, write_g2o, write_vertex_table
 from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.odometry import OdometryChain, Stamps
 from umf_ros.pose_graph.rejection import OutlierRejection
-from umf_ros.pose_graph.reprocess import Reprocessing, in_order
 from umf_ros.pose_graph.sessions import Sessions
 
 logger = logging.getLogger(__name__)
-_NO_ODOMETRY_YET = "its odometry has not arrived"
-_BEFORE_ODOMETRY = "no odometry at its keyframes: it began later"
 
 
 class PoseGraph:
-    """Takes odometry and loop closures in any order and keeps the best trajectory they allow.
+    """Keep the optimal trajectory from odometry and loop closures that arrive in any order.
 
-    Nothing that arrives can break it: what is unusable is refused with a reason and counted.
+    Unusable messages are refused with a reason and counted.
     """
 
     def __init__(self, settings: PoseGraphSettings | None = None) -> None:
         self._settings = settings or PoseGraphSettings()
         self._sessions = Sessions(self._settings)
         self._rejection = OutlierRejection(self._settings, self._sessions)
-        self._retrial: Reprocessing | None = None
-        self._waiting: list[WaitingClosure] = []
-        self._held: list[TrackedClosure] = []
+        self._reprocessing: _Reprocessing | None = None
+        self._waiting: list[tuple[LoopClosure, int | None]] = []  # with the newest stamp when the closure came
+        self._held: list[PlacedClosure] = []
         self._settled = False
         self._seen: set[tuple[int, int, bytes]] = set()
         self._placed: set[tuple[int, int, int, int, bytes]] = set()
@@ -57,8 +56,8 @@ class PoseGraph:
         self.counts: Counter[str] = Counter()
 
     def retune(self, settings: PoseGraphSettings) -> None:
-        """Judge by other gates from now on; the model of the odometry's noise stays."""
-        self._settings, self._retrial, self._settled = settings, None, False
+        """Use other gates from now on; the model of the odometry's noise stays."""
+        self._settings, self._reprocessing, self._settled = settings, None, False
         self._rejection.retune(settings)
 
     def begin_session(self) -> None:
@@ -97,95 +96,96 @@ class PoseGraph:
     def add_closures(self, closures: list[LoopClosure]) -> list[ClosureVerdict]:
         """Take several closures with a single optimisation; see `add_closure`."""
         self._refresh()
-        verdicts = [verdict for closure in closures if (verdict := self._receive(closure))]
-        return verdicts + self.update()
+        refused = [verdict for closure in closures if (verdict := self._receive(closure))]
+        decided, known = self.update(), {id(closure) for closure in closures}
+        waiting = [closure for closure, _ in self._waiting if id(closure) in known]
+        return refused + [_waits(closure) for closure in waiting] + decided
 
     def hold(self, closure: LoopClosure) -> None:
-        """Take one closure that was decided about before; `resume` puts it where it was."""
+        """Take one closure that was decided about before; `resume` gives it its verdict."""
         self._refresh()
         self._receive(closure)
         self._held += self._take_waiting()[1]
 
-    def resume(self, verdicts: Mapping[tuple[int, int], Decision]) -> bool:
-        """Give the closures that are held the verdicts that they had, and decide about those that had none.
+    def resume(self, verdicts: Mapping[tuple[int, int], Decision]) -> None:
+        """Give the closures that are held their earlier verdicts, and decide about those without.
 
         Args:
-            verdicts: by the stamps of match and query.
-
-        Returns:
-            False when two closures go by the same stamps, so that the verdicts do not tell: nothing is done.
+            verdicts: by the stamps of match and query; closures that share both stamps are decided anew.
         """
         self._refresh()
         held, self._held = self._held + self._take_waiting()[1], []
-        stamps = [(tracked.closure.match_stamp_ns, tracked.closure.query_stamp_ns) for tracked in held]
-        if len(set(stamps)) < len(stamps):
-            return False
-        decided, new = [], []
-        for pair, tracked in zip(stamps, held, strict=True):
-            decision = verdicts.get(pair)
-            if decision is None or decision[0] not in (State.ACCEPTED, State.REJECTED, State.UNDECIDED):
-                new.append(tracked)
+        pairs = [(placed.closure.match_stamp_ns, placed.closure.query_stamp_ns) for placed in held]
+        times, decided, new = Counter(pairs), [], []
+        for pair, placed in zip(pairs, held, strict=True):
+            decision = verdicts.get(pair) if times[pair] == 1 else None
+            if decision is None or decision[0] is State.REFUSED or decision[1] is ClosureReason.NO_ODOMETRY_YET:
+                new.append(placed)
             else:
-                tracked.decide(*decision)
-                decided.append(tracked)
-        self._attempt(lambda: self._rejection.resume(decided))
-        if new:
-            self._attempt(lambda: self._rejection.consider(new))
-        return True
+                decided.append((placed, decision))
+        if decided:
+            self._attempt(lambda: self._rejection.resume(decided))
+        for placed in new:
+            self._attempt(lambda: self._rejection.consider([placed]))  # noqa: B023 (called at once)
 
     def update(self) -> list[ClosureVerdict]:
-        """Take in odometry that has arrived and decide about closures that waited for it; returns new verdicts."""
+        """Decide about closures whose odometry has arrived; returns new verdicts."""
         self._refresh()
-        verdicts, arrived = self._take_waiting()
-        return verdicts + self._attempt(lambda: self._rejection.consider(arrived))
+        refused, arrived = self._take_waiting()
+        return refused + self._attempt(lambda: self._rejection.consider(arrived))
 
     def prepare(self, within_s: float) -> None:
-        """Do a part of what `settle` will have to do, for so long at most."""
+        """Do a part of the work of `settle`, for so long at most."""
         self._refresh()
-        order = in_order(self._rejection.closures)
-        trial = self._trial(order)
-        trial.go_on(trial.ripe(order), self._attempt, within_s)
+        work = self._reprocess()
+        work.advance(work.passed(self._in_order()), self._attempt, within_s)
 
     def settle(self, within_s: float = float("inf")) -> list[ClosureVerdict] | None:
-        """Come to the final decision and the exact optimum, as at the end of a mission.
+        """Decide finally and solve for the exact optimum, as at the end of a mission.
 
-        All closures are decided anew in order of their stamps, so that the time of arrival leaves no trace: a
-        live run and a replay end with the same verdicts. Closures that could not be judged are accepted if
-        nothing speaks against them.
+        All closures are decided anew in the order of their stamps, so that the order of arrival has no influence: a
+        live run and a replay end with the same verdicts. Pending closures are accepted if nothing contradicts them.
 
         Returns:
-            The verdicts that changed; None when the time was up first, and all is as it was.
+            The verdicts that changed; None when the time was up first, and nothing has changed.
         """
         verdicts = self.update()
         if self._settled:  # nothing has come since
             return verdicts
-        order = in_order(self._rejection.closures)
-        trial, revoked = self._trial(order), self._rejection.revoked
-        if not trial.go_on(order, self._attempt, within_s):
+        before, revoked, work = self._rejection, self._rejection.revoked, self._reprocess()
+        if not work.advance(self._in_order(), self._attempt, within_s):
             return None
-        self._sessions, self._rejection, self._retrial = trial.sessions, trial.rejection, None
+        self._sessions, self._rejection, self._reprocessing = work.sessions, work.rejection, None
         for closure in revoked:
             self.revoke(closure.match_stamp_ns, closure.query_stamp_ns)
-        verdicts += trial.changed() + self._attempt(self._rejection.settle)
+        states = {id(placed): verdict.state for placed, verdict in zip(before.placed, before.verdicts, strict=True)}
+        after = zip(self._rejection.placed, self._rejection.verdicts, strict=True)
+        verdicts += [verdict for placed, verdict in after if verdict.state is not states[id(placed)]]
+        verdicts += self._attempt(self._rejection.settle)
         self._settled = True
         return verdicts
 
-    def _trial(self, order: list[TrackedClosure]) -> Reprocessing:
-        """The trial anew of closures, as far as it has come."""
-        if self._retrial is None or not self._retrial.holds(order, self._sessions):
-            self._retrial = Reprocessing(self._settings, self._sessions)
-        return self._retrial
+    def _in_order(self) -> list[PlacedClosure]:
+        stamps = [(one.closure.query_stamp_ns, one.closure.match_stamp_ns) for one in self._rejection.placed]
+        return [self._rejection.placed[row] for row in sorted(range(len(stamps)), key=stamps.__getitem__)]
+
+    def _reprocess(self) -> _Reprocessing:
+        """The decisions in order of stamps as far as they have come."""
+        work = self._reprocessing
+        if work is None or not work.holds(self._in_order(), self._sessions):
+            work = self._reprocessing = _Reprocessing(self._settings, self._sessions)
+        return work
 
     def _refresh(self) -> None:
         if self._sessions.update():
             self.counts["odometry out of order"] += 1
-            self._retrial = None
+            self._reprocessing = None
             self._attempt(self._rejection.renew)
 
-    def _attempt(self, step: Callable[[], list[ClosureVerdict]]) -> list[ClosureVerdict]:
+    def _attempt(self, step: Callable[[], list[ClosureVerdict] | None]) -> list[ClosureVerdict]:
         """Run a step that solves; a failure of the optimiser is counted and the last trajectory stays."""
         try:
-            return step()
+            return step() or []
         except GraphError as error:
             self.counts[f"optimiser: {error}"] += 1
             logger.warning("%s; the last trajectory stays", error)
@@ -198,86 +198,78 @@ class PoseGraph:
             GraphError: there is no such closure, or the graph cannot be solved without it.
         """
         endpoints = (match_stamp_ns, query_stamp_ns)
-        closures = enumerate(tracked.closure for tracked in self._rejection.closures)
-        rows = [row for row, closure in closures if (closure.match_stamp_ns, closure.query_stamp_ns) == endpoints]
+        closures = enumerate(placed.closure for placed in self._rejection.placed)
+        rows = [row for row, one in closures if (one.match_stamp_ns, one.query_stamp_ns) == endpoints]
         self._settled = False
         if not rows:
             raise GraphError(f"no closure between keyframes {match_stamp_ns} and {query_stamp_ns}")
         return [verdict for row in rows for verdict in self._rejection.revoke(row)]
 
     def _receive(self, closure: LoopClosure) -> ClosureVerdict | None:
+        """Queue a closure; returns the verdict of an unusable one."""
         try:
-            covariance = check_closure(closure, self._settings.max_closure_m)
+            check_closure(closure, self._settings.max_closure_m)
         except GraphError as error:
-            return self._refuse(closure, str(error))
-        # two measurements of one pair are two closures; the same one again is a message sent twice
+            return self._refuse(closure, error.args[0])
+        # two measurements of one pair are two closures; the same measurement again is a message sent twice
         message = (closure.match_stamp_ns, closure.query_stamp_ns, closure.match_T_query.tobytes())
         if message in self._seen:
             self.counts["closure twice"] += 1
             return None
         self._seen.add(message)
         self._settled = False
-        self._waiting.append(WaitingClosure(closure, covariance, self._sessions.newest_ns))
+        self._waiting.append((closure, self._sessions.newest_ns))
         return None
 
-    def _refuse(self, closure: LoopClosure, reason: str) -> ClosureVerdict:
+    def _refuse(self, closure: LoopClosure, reason: ClosureReason) -> ClosureVerdict:
         self.counts[f"closure refused: {reason}"] += 1
         self._refused.append(ClosureVerdict(closure, State.REFUSED, reason))
         return self._refused[-1]
 
-    def _take_waiting(self) -> tuple[list[ClosureVerdict], list[TrackedClosure]]:
-        """Closures whose odometry is there, and verdicts about the others."""
-        verdicts, arrived, waiting = [], [], []
-        newest_ns = self._sessions.newest_ns
-        for entry in self._waiting:
-            tracked = self._locate(entry)
-            waited_ns = entry.waited_ns(newest_ns)
-            if tracked is not None:
-                if self._is_new(tracked):
-                    arrived.append(tracked)
-            elif waited_ns > self._settings.max_gap_s * 1e9 and self._precedes_all(entry.closure):
-                verdicts.append(self._refuse(entry.closure, _BEFORE_ODOMETRY))
+    def _take_waiting(self) -> tuple[list[ClosureVerdict], list[PlacedClosure]]:
+        """Refusals of closures that waited too long for odometry, and closures whose odometry has arrived."""
+        refused, arrived, waiting = [], [], []
+        newest_ns, oldest_ns = self._sessions.newest_ns, self._sessions.oldest_ns
+        for closure, known_ns in self._waiting:
+            since_ns = newest_ns if known_ns is None else known_ns
+            waited_ns = 0 if newest_ns is None or since_ns is None else newest_ns - since_ns
+            first_ns = min(closure.match_stamp_ns, closure.query_stamp_ns)
+            placed = self._place(closure)
+            if placed is not None:
+                if self._is_new(placed):
+                    arrived.append(placed)
+            elif waited_ns > self._settings.max_gap_s * 1e9 and oldest_ns is not None and first_ns < oldest_ns:
+                refused.append(self._refuse(closure, ClosureReason.BEFORE_ODOMETRY))
             elif waited_ns > self._settings.max_pending_s * 1e9:
-                verdicts.append(self._refuse(entry.closure, "no odometry at its keyframes"))
+                refused.append(self._refuse(closure, ClosureReason.NO_ODOMETRY))
             else:
-                if not entry.announced:
-                    entry.announced = True
-                    verdicts.append(ClosureVerdict(entry.closure, State.WAITING, _NO_ODOMETRY_YET))
-                waiting.append(entry)
+                waiting.append((closure, since_ns))
         self._waiting = waiting
-        return verdicts, arrived
+        return refused, arrived
 
-    def _is_new(self, tracked: TrackedClosure) -> bool:
-        """Whether no closure like this joins the same sessions: a latched topic tells its history again."""
-        closure = tracked.closure
-        stamps = closure.match_stamp_ns, closure.query_stamp_ns
-        key = tracked.match, tracked.query, *stamps, closure.match_T_query.tobytes()
+    def _is_new(self, placed: PlacedClosure) -> bool:
+        """Whether no closure like this joins the same sessions: a latched topic repeats its history."""
+        stamps = placed.closure.match_stamp_ns, placed.closure.query_stamp_ns
+        key = placed.match, placed.query, *stamps, placed.closure.match_T_query.tobytes()
         if key in self._placed:
             self.counts["closure twice"] += 1
             return False
         self._placed.add(key)
         return True
 
-    def _precedes_all(self, closure: LoopClosure) -> bool:
-        """Whether a keyframe is older than all odometry: this graph began later, and hears of that no more."""
-        oldest_ns = self._sessions.oldest_ns
-        return oldest_ns is not None and min(closure.match_stamp_ns, closure.query_stamp_ns) < oldest_ns
-
-    def _locate(self, entry: WaitingClosure) -> TrackedClosure | None:
-        query = self._sessions.find(entry.closure.query_stamp_ns)
-        match = self._sessions.find(entry.closure.match_stamp_ns, before=query)
-        if query is None or match is None:
-            return None
-        return TrackedClosure(match, query, ClosureVerdict(entry.closure, State.UNDECIDED, "new"), entry.covariance)
+    def _place(self, closure: LoopClosure) -> PlacedClosure | None:
+        """The closure with its sessions; None before the odometry at its keyframes has arrived."""
+        query = self._sessions.find(closure.query_stamp_ns)
+        match = self._sessions.find(closure.match_stamp_ns, before=query)
+        return None if query is None or match is None else PlacedClosure(match, query, closure)
 
     def closures(self) -> list[ClosureVerdict]:
         """The latest verdict of every closure, in order of arrival."""
-        waiting = [ClosureVerdict(w.closure, State.WAITING, _NO_ODOMETRY_YET) for w in self._waiting]
-        return [tracked.verdict for tracked in self._rejection.closures] + waiting + self._refused
+        return self._rejection.verdicts + [_waits(closure) for closure, _ in self._waiting] + self._refused
 
     @property
     def scale(self) -> NoiseScale:
-        """By how much the true standard deviations are estimated to exceed the stated ones."""
+        """Estimated factors of the true standard deviations over the stated ones."""
         return self._rejection.scale
 
     def verdict_counts(self) -> Counter[State]:
@@ -356,7 +348,7 @@ class PoseGraph:
     def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
         """Verdicts of the N closures with known endpoints, and (N, 2, 3) map positions of match and query."""
         self._refresh()
-        return [tracked.verdict for tracked in self._rejection.closures], self._rejection.endpoint_positions()
+        return list(self._rejection.verdicts), self._rejection.endpoint_positions()
 
     def write_g2o(self, path: str | Path, planar: bool = False, vertex_of: Callable[[int], int] | None = None) -> None:
         """Write keyframes, odometry and accepted closures, with the covariances that the solution used.
@@ -396,3 +388,42 @@ class PoseGraph:
         self.write_tum(folder / "trajectory_optimized.tum")
         self.write_g2o(folder / "graph.g2o")
         return settled
+
+
+class _Reprocessing:
+    """Decide about all closures anew in the order of their stamps, from the odometry alone.
+
+    At the end of a long mission that takes minutes; `PoseGraph.prepare` does it while the graph grows.
+    """
+
+    def __init__(self, settings: PoseGraphSettings, sessions: Sessions) -> None:
+        self.sessions = sessions.anew()
+        self.rejection = OutlierRejection(settings, self.sessions)
+        self._begun = sessions.begun
+
+    def holds(self, order: list[PlacedClosure], sessions: Sessions) -> bool:
+        """Whether the decisions so far stay: no closure has come late, and no session began."""
+        taken = self.rejection.placed
+        same = all(one is other for one, other in zip(taken, order, strict=False))
+        return same and len(taken) <= len(order) and self._begun == sessions.begun
+
+    def passed(self, order: list[PlacedClosure]) -> list[PlacedClosure]:
+        """The first closures of `order` whose odometry is complete."""
+        return list(takewhile(self._is_passed, order))
+
+    def advance(self, order: list[PlacedClosure], attempt: Callable[..., object], within_s: float) -> bool:
+        """Decide about the closures that are still open; False when the time was up first."""
+        until_s = time.monotonic() + within_s
+        for placed in order[len(self.rejection.placed) :]:
+            if time.monotonic() > until_s:
+                return False
+            attempt(lambda: self.rejection.consider([placed]))  # noqa: B023 (called at once)
+        return True
+
+    def _is_passed(self, placed: PlacedClosure) -> bool:
+        ends = (placed.match, placed.closure.match_stamp_ns), (placed.query, placed.closure.query_stamp_ns)
+        return all(self.sessions.chains[session].stamps[-1] > stamp for session, stamp in ends)
+
+
+def _waits(closure: LoopClosure) -> ClosureVerdict:
+    return ClosureVerdict(closure, State.PENDING, ClosureReason.NO_ODOMETRY_YET)
