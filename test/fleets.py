@@ -9,7 +9,7 @@ from conftest import make_keyframe
 
 from umf_ros.core.config import Database
 from umf_ros.core.frames import Keyframe
-from umf_ros.lab.live.postgres import PASSWORD, PostgresServer
+from umf_ros.lab.evaluation.postgres import PASSWORD, PostgresServer
 from umf_ros.places.database import PlaceDatabase
 
 IDENTITY = ("test", 16)

@@ -45,7 +45,7 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatcher
 from umf_ros.fleet.server import FleetServer, add_rover, migrate
 from umf_ros.lab.evaluation.places_bench import bare_keyframe, made_up_drives
-from umf_ros.lab.live.postgres import PASSWORD, CuttableLink, PostgresServer
+from umf_ros.lab.evaluation.postgres import PASSWORD, CuttableLink, PostgresServer
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import open_places
 from umf_ros.places.store import KeyframeStore, stored_identity

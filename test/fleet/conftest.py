@@ -8,7 +8,7 @@ import pytest
 from fleets import IDENTITY, ROVERS, administrator
 
 from umf_ros.fleet.server import add_rover, migrate
-from umf_ros.lab.live.postgres import PASSWORD, PostgresServer
+from umf_ros.lab.evaluation.postgres import PASSWORD, PostgresServer
 
 
 @pytest.fixture(scope="package")

@@ -13,7 +13,7 @@ from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.detector import LoopDetector
 from umf_ros.fleet.inter_robot_closures import UNCONFIRMED, InterRobotClosure, InterRobotMatcher
-from umf_ros.lab.live.postgres import PostgresServer
+from umf_ros.lab.evaluation.postgres import PostgresServer
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 
 GROUND = landscape(20)
