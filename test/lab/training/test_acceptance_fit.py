@@ -30,7 +30,7 @@ def examples(count: int, rng: np.random.Generator) -> list[Example]:
         right = number % 2 == 0
         share = np.clip(rng.normal(0.8 if right else 0.2, 0.15), 0, 1)
         numbers = {name: float(share * good + (1 - share) * BAD.numbers[name]) for name, good in GOOD.numbers.items()}
-        found.append(Example(Measurement(**numbers | {"kind": SCAN, "similarity": float(rng.random())}), right))
+        found.append(Example(Measurement(**numbers | {"kind": SCAN, "support": float(3 * rng.random())}), right))
     return found
 
 
@@ -42,7 +42,7 @@ def test_fit_separates_and_is_calibrated() -> None:
     right = np.array([example.right for example in fresh])
     assert odds[right].mean() > 0.9 and odds[~right].mean() < 0.1
     assert abs(odds.mean() - right.mean()) < 0.05
-    assert model.weights["similarity"] < max(model.weights.values()) / 5  # it was noise
+    assert model.weights["support"] < max(model.weights.values()) / 5  # it was noise
 
 
 def test_fit_needs_both_classes() -> None:
@@ -130,11 +130,8 @@ def test_covariances_of_the_wrong_size_are_scaled_until_95_percent_lie_inside(fa
 def test_a_measure_that_argues_against_itself_is_given_no_weight() -> None:
     rng = np.random.default_rng(3)
     found = examples(200, rng)
-    perverse = [
-        Example(replace(one.measurement, overlap=GOOD.overlap * (0.3 if one.right else 1.0)), one.right)
-        for one in found
-    ]
-    assert fit_logistic(perverse, SCAN).weights["overlap"] == 0
+    perverse = [Example(replace(one.measurement, common=0.2 if one.right else 0.8), one.right) for one in found]
+    assert fit_logistic(perverse, SCAN).weights["common_view"] == 0
 
 
 def test_examples_of_another_kind_are_left_aside() -> None:
