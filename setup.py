@@ -34,7 +34,7 @@ setup(
     name=PACKAGE,
     version=ElementTree.parse("package.xml").findtext("version"),
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: [f"**/*.{suffix}" for suffix in ("j2", "html", "css", "js")]},
+    package_data={PACKAGE: [f"**/*.{suffix}" for suffix in ("j2", "html", "css", "js", "npz")]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml", "NOTICE"]),

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import psycopg
 from conftest import make_keyframe
+from support.postgres import PASSWORD, PostgresServer
 
 from umf_ros.core.config import Database
 from umf_ros.core.frames import Keyframe
-from umf_ros.lab.live.postgres import PASSWORD, PostgresServer
 from umf_ros.places.database import PlaceDatabase
 
 IDENTITY = ("test", 16)

@@ -44,7 +44,7 @@ from umf_ros.lab.simulation.domains.pairs import (
     SAME,
     TURNED,
     Extent,
-    Pair,
+    ScanPair,
     error_vector,
     is_wrong,
     pairs_of,
@@ -69,7 +69,7 @@ class Outcome:
     refine_ms: list[float] = field(default_factory=list)
     left_out: Outcome | None = None
 
-    def judge(self, pair: Pair, closure: LoopClosure | None) -> None:
+    def judge(self, pair: ScanPair, closure: LoopClosure | None) -> None:
         """Count one verdict."""
         self.pairs[pair.kind] += 1
         if closure is None:
@@ -179,7 +179,7 @@ def _without(domain: Domain) -> Verifier:
         return Verifier(Verification(calibration=str(path)))
 
 
-def _closure(verifier: Verifier, pair: Pair) -> LoopClosure | None:
+def _closure(verifier: Verifier, pair: ScanPair) -> LoopClosure | None:
     verifier.reset()
     candidate = Candidate(0, pair.match.keyframe.stamp_ns, pair.similarity)
     return verifier.verify(pair.query.keyframe, [(candidate, pair.match.keyframe)])[0].closure

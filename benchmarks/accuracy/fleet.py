@@ -22,6 +22,7 @@ import argparse
 import json
 import os
 import random
+import sys
 import tempfile
 import threading
 import time
@@ -45,11 +46,13 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatcher
 from umf_ros.fleet.server import FleetServer, add_rover, migrate
 from umf_ros.lab.evaluation.places_bench import bare_keyframe, made_up_drives
-from umf_ros.lab.live.postgres import PASSWORD, CuttableLink, PostgresServer
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import open_places
 from umf_ros.places.store import KeyframeStore, stored_identity
 from umf_ros.runs.truth import judge_closure
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
+from support.postgres import PASSWORD, CuttableLink, PostgresServer
 
 ROVERS = 4
 CUTS, KILLS = 20, 5

@@ -31,7 +31,7 @@ from umf_ros.core.geometry import Array, heading, wrap_angle
 from umf_ros.core.keyframes import is_past
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.fit.acceptance import inside_ellipsoid
-from umf_ros.lab.simulation.drives import Drive, embedded, kept, worlds
+from umf_ros.lab.simulation.drives import SurveyedDrive, embedded, kept, worlds
 from umf_ros.lab.simulation.scenes import TRAPS, spring
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.places.database import PlaceDatabase
@@ -104,7 +104,7 @@ def verify_sample(path: Path) -> str:
     return digest.hexdigest()
 
 
-def replay(drive: Drive, keyframes: list[Keyframe], verifier: Verifier) -> tuple[World, list[Query]]:
+def replay(drive: SurveyedDrive, keyframes: list[Keyframe], verifier: Verifier) -> tuple[World, list[Query]]:
     """Verify along a drive as the loop detector does; also returns some queries with their candidates."""
     result = World(drive.name)
     sample: list[Query] = []
@@ -129,7 +129,7 @@ def replay(drive: Drive, keyframes: list[Keyframe], verifier: Verifier) -> tuple
 
 def _record(
     result: World,
-    drive: Drive,
+    drive: SurveyedDrive,
     query: int,
     found: list[tuple[Candidate, Keyframe]],
     closures: list[LoopClosure],
@@ -149,7 +149,7 @@ def _record(
     result.recalled += bool(revisited) and right
 
 
-def _revisited(drive: Drive, query: int) -> set[int]:
+def _revisited(drive: SurveyedDrive, query: int) -> set[int]:
     """Earlier keyframes within 5 m and 30 deg whose view overlaps by 30 % or more."""
     rules, truth, path_length = Loop(), drive.truth, drive.path_length
     stamps = np.array([frame.stamp_ns for frame in drive.frames[: query + 1]])

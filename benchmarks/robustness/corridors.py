@@ -24,7 +24,7 @@ from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Candidate
 from umf_ros.core.geometry import relative
 from umf_ros.embedding import make_embedder
-from umf_ros.lab.simulation.domains.pairs import SAME, Pair, Place, is_wrong, keyframe_of
+from umf_ros.lab.simulation.domains.pairs import SAME, ScannedPlace, ScanPair, is_wrong, keyframe_of
 from umf_ros.lab.simulation.domains.passages import PASSAGES, Passage, drive
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.verification import Verifier
@@ -72,9 +72,9 @@ def run(passage: Passage, seed: int) -> tuple[str, Counter[str], list[float]]:
     for number, scan in enumerate(drive(passage, seed)):
         # of every second passage the motion within a scan is not removed
         keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, (number + 1) * 10**9, seed % 2 == 0)
-        places.append(Place(keyframe, scan, seed))
+        places.append(ScannedPlace(keyframe, scan, seed))
     verifier, counts, refine_ms = Verifier(Verification()), Counter[str](), []
-    for pair in (Pair(query, match, SAME) for query in places for match in places if query is not match):
+    for pair in (ScanPair(query, match, SAME) for query in places for match in places if query is not match):
         verifier.reset()
         candidate = Candidate(0, pair.match.keyframe.stamp_ns, pair.similarity)
         closure = verifier.verify(pair.query.keyframe, [(candidate, pair.match.keyframe)])[0].closure

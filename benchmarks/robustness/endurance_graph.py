@@ -19,7 +19,7 @@ from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops
 from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, to_pose, to_time
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.pose_graph.closures import ClosureVerdict, State
+from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State
 from umf_ros.pose_graph.journal import JOURNAL, DurableGraph, GraphJournal
 
 Figures = dict[str, Any]
@@ -89,9 +89,7 @@ def keep(world: GraphWorld, last: int, path: Path) -> int:
         journal.add_odometry((k + 1) * PERIOD_NS, world.odometry[k])
     for row in closures:
         journal.add_closure(_later(world, row))
-    journal.put_verdicts(
-        [ClosureVerdict(_later(world, row), State.ACCEPTED, "agrees with the map") for row in closures]
-    )
+    journal.put_verdicts([ClosureVerdict(_later(world, row), State.ACCEPTED, ClosureReason.AGREES) for row in closures])
     journal.close()
     return len(closures)
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.lab.simulation.domains import Domain, DomainScan
-from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, SAME, TURNED, Pair, Place, pairs_of
+from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, SAME, TURNED, ScannedPlace, ScanPair, pairs_of
 from umf_ros.lab.simulation.domains.sweeps import Sweep
 
 OPEN, INDOORS = Domain("spin16", "street", "rover"), Domain("spin16", "corridor", "rover")
@@ -20,7 +20,7 @@ NOTHING = Sweep(np.empty((0, 3), np.float32), None, None)
 
 def place(x, label, heading_deg=0.0, world=1, seed=0):
     pose = make_pose(Rotation.from_euler("z", heading_deg, degrees=True).as_matrix(), [x, 0.0, 1.0])
-    return Place(make_keyframe(x, seed=seed), DomainScan(NOTHING, pose, pose, label), world)
+    return ScannedPlace(make_keyframe(x, seed=seed), DomainScan(NOTHING, pose, pose, label), world)
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_a_revisit_is_paired_with_what_is_near_and_with_what_is_far(places):
 
 def test_the_keyframe_that_looks_most_alike_elsewhere_is_among_the_pairs(places):
     query = next(one for one in places if one.scan.label == "offset")
-    twin = Place(query.keyframe, place(30.0, "first").scan, 2)
+    twin = ScannedPlace(query.keyframe, place(30.0, "first").scan, 2)
     pairs = list(pairs_of([*places, twin], OPEN, np.random.default_rng(0)))
     assert any(pair.match is twin and pair.kind == ELSEWHERE for pair in pairs)
 
@@ -67,8 +67,8 @@ def closure(pose):
 
 
 def test_verdicts_are_counted_by_their_truth():
-    same = Pair(place(10.5, "offset"), place(9.0, "first"), SAME)
-    far = Pair(place(10.5, "offset"), place(40.0, "first"), ELSEWHERE)
+    same = ScanPair(place(10.5, "offset"), place(9.0, "first"), SAME)
+    far = ScanPair(place(10.5, "offset"), place(40.0, "first"), ELSEWHERE)
     true = same.match_T_query
     outcome = Outcome("one")
     outcome.judge(same, closure(true @ make_pose(np.eye(3), [0.05, 0, 0])))

@@ -6,9 +6,9 @@ from pathlib import Path
 import psycopg
 import pytest
 from fleets import IDENTITY, ROVERS, administrator
+from support.postgres import PASSWORD, PostgresServer
 
 from umf_ros.fleet.server import add_rover, migrate
-from umf_ros.lab.live.postgres import PASSWORD, PostgresServer
 
 
 @pytest.fixture(scope="package")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from conftest import unit
 from fleets import IDENTITY, rover_places, settings
+from support.postgres import PostgresServer
 
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import ConfigError
@@ -13,7 +14,6 @@ from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.detector import LoopDetector
 from umf_ros.fleet.inter_robot_closures import UNCONFIRMED, InterRobotClosure, InterRobotMatcher
-from umf_ros.lab.live.postgres import PostgresServer
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 
 GROUND = landscape(20)

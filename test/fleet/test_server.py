@@ -7,11 +7,11 @@ import psycopg
 import pytest
 from conftest import make_keyframe
 from fleets import IDENTITY, administrator, stored
+from support.postgres import PASSWORD, PostgresServer, free_port
 
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Keyframe
 from umf_ros.fleet.server import MIGRATIONS, FleetServer, LinkError, add_rover, migrate
-from umf_ros.lab.live.postgres import PASSWORD, PostgresServer, free_port
 from umf_ros.places.packing import unpack
 
 STORE = uuid4()

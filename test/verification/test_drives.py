@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Frame, StereoCamera
 from umf_ros.core.geometry import Array, make_pose, relative
-from umf_ros.lab.simulation.drives import DEPTH_STRIDE, Drive, kept, path_length, worlds
+from umf_ros.lab.simulation.drives import DEPTH_STRIDE, SurveyedDrive, kept, path_length, worlds
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.scenes import BODY_T_CAMERA
 
@@ -22,11 +22,11 @@ def turned(degrees: float, metres_left: float = 0.0) -> Array:
     return make_pose(Rotation.from_euler("z", degrees, degrees=True).as_matrix(), [0.0, metres_left, 0.0])
 
 
-def before_a_wall(*poses: Array) -> Drive:
+def before_a_wall(*poses: Array) -> SurveyedDrive:
     """Frames that all see a wall at one depth, whatever their pose: enough for small motions."""
     frames = [Frame(n, SQUARE, BODY_T_CAMERA, np.eye(4)) for n in range(len(poses))]
     side = SQUARE.width // DEPTH_STRIDE
-    return Drive(1, "wall", frames, np.array(poses), np.full((len(poses), side, side), WALL_M, np.float16))
+    return SurveyedDrive(1, "wall", frames, np.array(poses), np.full((len(poses), side, side), WALL_M, np.float16))
 
 
 def test_a_view_overlaps_itself_entirely_and_its_back_not_at_all() -> None:
@@ -44,7 +44,7 @@ def test_overlap_shrinks_with_the_sideways_step() -> None:
 
 def test_a_view_of_the_sky_overlaps_nothing() -> None:
     drive = before_a_wall(np.eye(4), np.eye(4))
-    sky = Drive(1, "sky", drive.frames, drive.truth, np.zeros_like(drive.depths))
+    sky = SurveyedDrive(1, "sky", drive.frames, drive.truth, np.zeros_like(drive.depths))
     assert sky.overlap(1, 0) == 0.0
 
 
@@ -73,7 +73,7 @@ def test_worlds_take_turns_in_family_and_aliasing() -> None:
 def test_kept_drives_are_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
 
-    def simulate(seed: int, family: str, aliasing: float, step_m: float) -> Drive:
+    def simulate(seed: int, family: str, aliasing: float, step_m: float) -> SurveyedDrive:
         made.append(seed)
         return before_a_wall(np.eye(4), turned(10.0, step_m))
 

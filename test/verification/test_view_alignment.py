@@ -9,7 +9,7 @@ import pytest
 
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, expmap, make_pose, relative, rotation_angle
-from umf_ros.lab.simulation.scenes import CAMERA, Landscape, landscape, pose_at, take, without_image
+from umf_ros.lab.simulation.scenes import CAMERA, BumpyGround, landscape, pose_at, take, without_image
 from umf_ros.verification.view_alignment import PairedViews, ViewAlignment
 
 GROUND = landscape(20, landmarks=2500)
@@ -122,7 +122,7 @@ def test_what_lies_far_away_says_little_about_the_position() -> None:
         rng = np.random.default_rng(3)
         place = rng.normal([distance_m, 0], 2.0, (400, 2))
         looks = rng.standard_normal((400, 64))
-        ground = Landscape(np.empty((0, 4)), place, looks / np.linalg.norm(looks, axis=1, keepdims=True))
+        ground = BumpyGround(np.empty((0, 4)), place, looks / np.linalg.norm(looks, axis=1, keepdims=True))
         poses = pose_at(ground, 0.5, 0.2, 1.0), pose_at(ground, 0.0, 0.0, 0.0)
         return aligned(views(take(ground, poses[0], 100.0), take(ground, poses[1], 10.0)))
 

@@ -22,13 +22,13 @@ from umf_ros.core.errors import OutputError, UmfError, writing
 from umf_ros.core.frames import Frame, LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import atomic_write
-from umf_ros.detector import Detection
 from umf_ros.runs import tables
 from umf_ros.runs.run_file import NAME, RunFile
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
 if TYPE_CHECKING:
+    from umf_ros.detector import Detection
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure
 
 

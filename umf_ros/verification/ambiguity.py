@@ -48,15 +48,27 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
 
 def passage_direction(match: PreparedScan, query: PreparedScan, pose: Array) -> Array | None:
     """(3,) the horizontal direction of the passage about the match that both scans show; None where there is none."""
+    turn = pose[:3, :3].T
+    rough = np.concatenate([match.normals[match.picks], query.normals[query.picks] @ turn])
+    weights, _ = _across(match, rough)
+    if weights[0] > const.ROUGH_PASSAGE_RATIO * weights[1]:  # most places are none: their planes are never asked for
+        return None
     normals = [planes.normals[planes.planar] for planes in match.surfaces]
-    normals += [planes.normals[planes.planar] @ pose[:3, :3].T for planes in query.surfaces]
-    flat = (np.concatenate(normals) @ match.up.T)[:, :2]
-    weights, ways = np.linalg.eigh(flat.T @ flat)
-    points = len(match.points) + len(query.points)
-    if len(flat) < const.PASSAGE_SURFACE * points or weights[0] > const.PASSAGE_RATIO * weights[1]:
+    normals += [planes.normals[planes.planar] @ turn for planes in query.surfaces]
+    flat = np.concatenate(normals)
+    weights, ways = _across(match, flat)
+    few = len(flat) < const.PASSAGE_SURFACE * (len(match.points) + len(query.points))
+    if few or weights[0] > const.PASSAGE_RATIO * weights[1]:
         return None
     way: Array = match.up.T @ np.append(ways[:, 0], 0.0)
     return way
+
+
+def _across(match: PreparedScan, normals: Array) -> tuple[Array, Array]:
+    """Weights (2,) and horizontal directions (2, 2) of normals (N, 3) about the match, the least first."""
+    level = (normals @ match.up.T)[:, :2]
+    weights, ways = np.linalg.eigh(level.T @ level)
+    return weights, ways
 
 
 def _is_fan(scan: PreparedScan) -> bool:

@@ -31,8 +31,8 @@ from umf_ros.lab.fit.acceptance import (
     save_examples,
 )
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
-from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, QUICK, Pair, Place, pairs_of, places_of
-from umf_ros.lab.simulation.drives import Drive, embedded, kept, worlds
+from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, QUICK, ScannedPlace, ScanPair, pairs_of, places_of
+from umf_ros.lab.simulation.drives import SurveyedDrive, embedded, kept, worlds
 from umf_ros.lab.simulation.scenes import TRAPS
 from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.places.database import PlaceDatabase
@@ -56,7 +56,7 @@ class Tried:
 
     query: Keyframe
     match: Keyframe
-    pair: Pair
+    pair: ScanPair
 
     @property
     def true(self) -> Array | None:
@@ -159,11 +159,11 @@ def _aligned(tried: Tried, ranked: RankedCandidate, scans: ScanCache, guess: Arr
     return alignment.pose, measure(aligned, TemporalMemory(), Verification().odometry_drift)
 
 
-def _between_worlds(places: list[Place], rng: np.random.Generator) -> Pair:
+def _between_worlds(places: list[ScannedPlace], rng: np.random.Generator) -> ScanPair:
     """Two keyframes of different worlds; with one world only, of any."""
     query = places[int(rng.integers(len(places)))]
     others = [place for place in places if place.world != query.world] or places
-    return Pair(query, others[int(rng.integers(len(others)))], ELSEWHERE)
+    return ScanPair(query, others[int(rng.integers(len(others)))], ELSEWHERE)
 
 
 def _seen(keyframe: Keyframe, view: str, all_round: bool) -> Keyframe:
@@ -200,7 +200,7 @@ THRESHOLD = Verification().min_probability
 ACCEPTED_ODDS = math.log(THRESHOLD / (1 - THRESHOLD))
 SURVEYS, PAIRS = range(VALIDATION[0], VALIDATION[0] + 3), 60  # in every domain
 ENOUGH = 100  # right examples that a fit needs
-Survey = tuple[Drive, list[Keyframe]]
+Survey = tuple[SurveyedDrive, list[Keyframe]]
 DEFAULT_OUT = Path("config/verification/calibration.json")
 
 
@@ -268,7 +268,7 @@ def fit(examples: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
     return fitted, _judge(SCAN, mine, odds)
 
 
-def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Example]:
+def examine(drive: SurveyedDrive, keyframes: list[Keyframe]) -> Iterator[Example]:
     """Hypotheses about candidates along a drive, and whether their poses are right; its world counts as a domain."""
     rng = np.random.default_rng(drive.seed)
     rules = Loop()
@@ -290,7 +290,7 @@ def examine(drive: Drive, keyframes: list[Keyframe]) -> Iterator[Example]:
     database.close()
 
 
-def _choose(drive: Drive, query: int, candidates: list[Candidate], rng: np.random.Generator) -> list[Candidate]:
+def _choose(drive: SurveyedDrive, query: int, candidates: list[Candidate], rng: np.random.Generator) -> list[Candidate]:
     """The first candidates of the retrieval, and a near and a far one that it may have missed."""
     chosen = candidates[:EXAMINED]
     places = drive.truth[:, :2, 3]

@@ -68,7 +68,7 @@ DEFAULT_OUT = Path("config/verification/submaps.json")
 
 
 @dataclass(frozen=True)
-class Drive:
+class SubmapDrive:
     """Keyframes without a network's help, and their true poses (N, 4, 4)."""
 
     keyframes: list[Keyframe]
@@ -76,7 +76,7 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class Example:
+class SubmapExample:
     """A tested proposal of a drive: what was measured, the error (6,) of its pose, and whether that was right."""
 
     drive: int
@@ -87,11 +87,11 @@ class Example:
     right: bool
 
 
-def drive_of(preset: str, seed: int, family: str, aliasing: float, folder: Path | None) -> Drive:
+def drive_of(preset: str, seed: int, family: str, aliasing: float, folder: Path | None) -> SubmapDrive:
     """A drive with a LiDAR and odometry; kept in a folder, if there is one."""
     path = folder / f"{preset}_{seed}_{family}_{aliasing:g}.pkl" if folder else None
     if path is not None and path.exists():
-        kept: Drive = pickle.loads(path.read_bytes())
+        kept: SubmapDrive = pickle.loads(path.read_bytes())
         return kept
     simulator = Simulator(find_preset(preset), seed, family=family, aliasing=aliasing)
     selector, keyframes = KeyframeSelector(KeyframePolicy()), []
@@ -104,14 +104,14 @@ def drive_of(preset: str, seed: int, family: str, aliasing: float, folder: Path 
             keyframes.append(
                 Keyframe(stamp, blind, NO_CAMERA, np.eye(4), points, where.odom_T_body, metres, 0, frame.body_T_lidar)
             )
-    drive = Drive(keyframes, np.stack([simulator.pose(keyframe.stamp_ns) for keyframe in keyframes]))
+    drive = SubmapDrive(keyframes, np.stack([simulator.pose(keyframe.stamp_ns) for keyframe in keyframes]))
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(pickle.dumps(drive))
     return drive
 
 
-def examples_of(number: int, drive: Drive) -> Iterator[Example]:
+def examples_of(number: int, drive: SubmapDrive) -> Iterator[SubmapExample]:
     """What the finder tests along a drive when all that is right is accepted, and wrong answers on top."""
     database = PlaceDatabase(Database(), "none", 1)
     finder = SubmapFinder(Verification(), Loop(), database)
@@ -134,7 +134,7 @@ def examples_of(number: int, drive: Drive) -> Iterator[Example]:
     database.close()
 
 
-def _found_by_scan(drive: Drive) -> dict[int, list[tuple[Keyframe, Array]]]:
+def _found_by_scan(drive: SubmapDrive) -> dict[int, list[tuple[Keyframe, Array]]]:
     """The nearest earlier keyframe of every revisit in the same direction, with the true pose."""
     stamps = np.array([one.stamp_ns for one in drive.keyframes], np.int64)
     path_length = np.array([one.path_length_m for one in drive.keyframes])
@@ -147,7 +147,7 @@ def _found_by_scan(drive: Drive) -> dict[int, list[tuple[Keyframe, Array]]]:
     return found
 
 
-def _wrong_answers(number: int, truth: Truth, finder: SubmapFinder, query: Keyframe) -> Iterator[Example]:
+def _wrong_answers(number: int, truth: Truth, finder: SubmapFinder, query: Keyframe) -> Iterator[SubmapExample]:
     """What looks alike and is another place, poses beside the right ones, and poses anywhere."""
     if query.path_length_m < const.SUBMAP_BEFORE_M:
         return
@@ -174,23 +174,23 @@ def _beside(rng: np.random.Generator) -> Array:
     return make_pose(turn, [*rng.normal(0, BESIDE_M / 2, 2), 0])
 
 
-def _example(number: int, truth: Truth, tested: Tested) -> Example:
+def _example(number: int, truth: Truth, tested: Tested) -> SubmapExample:
     true = relative(truth[tested.match.keyframe.stamp_ns], truth[tested.query.keyframe.stamp_ns])
     error = pose_error(tested.alignment.pose, true)
     right = np.linalg.norm(error[:3]) <= POSE_TOLERANCE_M and np.linalg.norm(error[3:]) <= np.radians(
         POSE_TOLERANCE_DEG
     )
-    return Example(number, tested.measurement, tested.alignment.information, tested.way_m, error, bool(right))
+    return SubmapExample(number, tested.measurement, tested.alignment.information, tested.way_m, error, bool(right))
 
 
-def fit(examples: list[Example]) -> SubmapAcceptance:
+def fit(examples: list[SubmapExample]) -> SubmapAcceptance:
     """The decision and the covariance that these examples speak for."""
     right = np.array([one.right for one in examples])
     model = fit_weights([scores(one.measurement) for one in examples], right)
     return SubmapAcceptance(model, *fit_covariance([one for one in examples if one.right]))
 
 
-def fit_covariance(examples: list[Example]) -> tuple[float, OdometryError]:
+def fit_covariance(examples: list[SubmapExample]) -> tuple[float, OdometryError]:
     """Inflation and error of the odometry under which the errors are most likely, 95 % of them inside."""
     examples = examples[:: max(len(examples) // MOST, 1)]
     errors = np.stack([one.error for one in examples])
@@ -215,7 +215,7 @@ def fit_covariance(examples: list[Example]) -> tuple[float, OdometryError]:
     return found.inflation, found.odometry
 
 
-def results(examples: list[Example], model: SubmapAcceptance, threshold: float) -> dict[str, float]:
+def results(examples: list[SubmapExample], model: SubmapAcceptance, threshold: float) -> dict[str, float]:
     """What the decision makes of examples."""
     accepted = [one for one in examples if model.probability(one.measurement) >= threshold]
     right = [one for one in accepted if one.right]

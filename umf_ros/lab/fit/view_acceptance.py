@@ -86,7 +86,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Finding:
+class ViewFinding:
     """An examined hypothesis of a recording, and the error (6,) of its pose: without bounds for another recording's."""
 
     recording: str
@@ -134,7 +134,7 @@ def main(
     console.print(f"wrote {out}")
 
 
-def fit(findings: list[Finding]) -> tuple[AcceptanceModel, dict[str, float]]:
+def fit(findings: list[ViewFinding]) -> tuple[AcceptanceModel, dict[str, float]]:
     """The model that explains the findings best, and how it does on recordings it was not fitted to."""
     findings = [finding for finding in findings if finding.right or finding.wrong]
     right = np.array([finding.right for finding in findings])
@@ -160,7 +160,7 @@ def fit(findings: list[Finding]) -> tuple[AcceptanceModel, dict[str, float]]:
     return AcceptanceModel({IMAGE: Logistic(fitted.bias - strictness, fitted.weights)}, {IMAGE: covariance}), results
 
 
-def examine(recordings: list[Recording], number: int) -> Iterator[Finding]:
+def examine(recordings: list[Recording], number: int) -> Iterator[ViewFinding]:
     """Hypotheses about candidates of one recording, with odometry and without, and whether they are right."""
     mine = recordings[number]
     foreign = [one for other in recordings if other is not mine for one in other.keyframes]
@@ -185,7 +185,7 @@ def examine(recordings: list[Recording], number: int) -> Iterator[Finding]:
 
 def _examined(
     mine: Recording, query: int, chosen: list[tuple[int, Keyframe]], verifier: Verifier, tracked: bool
-) -> Iterator[Finding]:
+) -> Iterator[ViewFinding]:
     asked = mine.keyframes[query] if tracked else _untracked(mine.keyframes[query])
     pairs = []
     for row, match in chosen:
@@ -195,7 +195,7 @@ def _examined(
         pairs.append((Candidate(row, match.stamp_ns, similarity), match if tracked else _untracked(match)))
     for one in verifier.examine(asked, pairs):
         row, pose = one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose
-        yield Finding(mine.name, one, mine.error(query, row, pose) if row >= 0 else np.full(6, np.inf), tracked)
+        yield ViewFinding(mine.name, one, mine.error(query, row, pose) if row >= 0 else np.full(6, np.inf), tracked)
 
 
 def _untracked(keyframe: Keyframe) -> Keyframe:
@@ -232,7 +232,7 @@ def read(bag: Path) -> Recording:
     return Recording(bag.stem, [one for one, good in zip(found, known, strict=True) if good], poses[known])
 
 
-def _held_out(findings: list[Finding]) -> Array:
+def _held_out(findings: list[ViewFinding]) -> Array:
     """Log-odds (N,) of each finding, every recording judged by a fit to the others."""
     odds = np.zeros(len(findings))
     names = np.array([finding.recording for finding in findings])

@@ -33,7 +33,7 @@ FAR_M = 40.0
 
 
 @dataclass(frozen=True)
-class Drive:
+class SurveyedDrive:
     """Frames of one world in the order they were taken.
 
     Attributes:
@@ -79,7 +79,7 @@ class Drive:
         return np.concatenate([match_T_query[:3, 3] - true[:3, 3], turn])
 
 
-def kept(folder: Path | None, seed: int, family: str, aliasing: float, step_m: float = STEP_M) -> Drive:
+def kept(folder: Path | None, seed: int, family: str, aliasing: float, step_m: float = STEP_M) -> SurveyedDrive:
     """The same as `simulate`, from a file in the folder where an earlier call left it."""
     if folder is None:
         return simulate(seed, family, aliasing, step_m)
@@ -88,11 +88,11 @@ def kept(folder: Path | None, seed: int, family: str, aliasing: float, step_m: f
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as part:
             part.write_bytes(pickle.dumps(simulate(seed, family, aliasing, step_m)))
-    drive: Drive = pickle.loads(path.read_bytes())
+    drive: SurveyedDrive = pickle.loads(path.read_bytes())
     return drive
 
 
-def simulate(seed: int, family: str, aliasing: float, step_m: float = STEP_M) -> Drive:
+def simulate(seed: int, family: str, aliasing: float, step_m: float = STEP_M) -> SurveyedDrive:
     """Three passes through a fresh world: the second and third with offsets, turned headings and another sun."""
     chosen = replace(SETTINGS["hard"], aliasing=aliasing)
     trail = ground(seed, family, aliasing).trail
@@ -102,10 +102,12 @@ def simulate(seed: int, family: str, aliasing: float, step_m: float = STEP_M) ->
     samples = list(Survey(world, passes, calibration))
     truth = np.array([sample.world_T_body for sample in samples], float)
     frames = _frames([sample.image for sample in samples], [s.points for s in samples], truth, calibration, seed)
-    return Drive(seed, f"{seed} {family} {aliasing:g}", frames, truth, np.array([sample.depth for sample in samples]))
+    return SurveyedDrive(
+        seed, f"{seed} {family} {aliasing:g}", frames, truth, np.array([sample.depth for sample in samples])
+    )
 
 
-def embedded(drive: Drive, embedder: Embedder) -> list[Keyframe]:
+def embedded(drive: SurveyedDrive, embedder: Embedder) -> list[Keyframe]:
     """A keyframe for every frame of a drive."""
     frames = track(drive.frames, f"embedding {drive.name}", transient=True)
     return [make_keyframe(frame, embedder, metres) for frame, metres in zip(frames, drive.path_length, strict=True)]

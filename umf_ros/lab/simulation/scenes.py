@@ -18,7 +18,7 @@ LIDAR_HEIGHT_M = 1.3
 
 
 @dataclass(frozen=True)
-class Landscape:
+class BumpyGround:
     """Bumps on a plane, and landmarks that a camera recognises.
 
     Attributes:
@@ -41,21 +41,23 @@ class Landscape:
         return (self.bumps[:, 3] * np.exp(-away / (2 * self.bumps[:, 2] ** 2))).sum(axis=1)
 
 
-def landscape(seed: int, bumps: int = 500, landmarks: int = 800, height_m: float = 0.35) -> Landscape:
+def landscape(seed: int, bumps: int = 500, landmarks: int = 800, height_m: float = 0.35) -> BumpyGround:
     """A square of 80 m around the origin, different for every seed."""
     rng = np.random.default_rng(seed)
     shape = [rng.uniform(-40, 40, (bumps, 2)), rng.uniform(0.4, 1.5, (bumps, 1)), rng.normal(0, height_m, (bumps, 1))]
     descriptors = rng.standard_normal((landmarks, 64))
-    return Landscape(np.hstack(shape), rng.uniform(-40, 40, (landmarks, 2)), _unit(descriptors))
+    return BumpyGround(np.hstack(shape), rng.uniform(-40, 40, (landmarks, 2)), _unit(descriptors))
 
 
-def pose_at(ground: Landscape, x: float, y: float, heading_deg: float, tilt_deg: float = 0.0) -> Array:
+def pose_at(ground: BumpyGround, x: float, y: float, heading_deg: float, tilt_deg: float = 0.0) -> Array:
     """`world_T_body` of a rover standing on the ground."""
     turn = Rotation.from_euler("ZYX", [heading_deg, tilt_deg, -tilt_deg / 2], degrees=True)
     return make_pose(turn.as_matrix(), [x, y, float(ground.height(np.array([[x, y]]))[0])])
 
 
-def take(ground: Landscape, world_T_body: Array, stamp_s: float, seed: int = 0, odom: Array | None = None) -> Keyframe:
+def take(
+    ground: BumpyGround, world_T_body: Array, stamp_s: float, seed: int = 0, odom: Array | None = None
+) -> Keyframe:
     """A keyframe with scan, image features and scan features."""
     rng = np.random.default_rng([seed, int(10 * stamp_s)])
     descriptor = rng.standard_normal(16).astype(np.float32)
@@ -99,7 +101,7 @@ def yard_scan(seed: int, world_T_body: Array, boxes: int = 25) -> Array:
     return thin_scan(transform(invert(world_T_body), points).astype(np.float32))
 
 
-def _scan(ground: Landscape, world_T_body: Array, rng: np.random.Generator) -> Array:
+def _scan(ground: BumpyGround, world_T_body: Array, rng: np.random.Generator) -> Array:
     """Returns on a fan of bearings and depressions: the ground where a level ray at that angle would meet it."""
     bearing = np.radians(rng.uniform(-35, 35, 9000))
     distance = LIDAR_HEIGHT_M / np.tan(np.radians(rng.uniform(2.5, 25, 9000)))
@@ -107,13 +109,13 @@ def _scan(ground: Landscape, world_T_body: Array, rng: np.random.Generator) -> A
     return thin_scan(_on_ground(ground, world_T_body, planar, rng).astype(np.float32))
 
 
-def _on_ground(ground: Landscape, world_T_body: Array, planar: Array, rng: np.random.Generator) -> Array:
+def _on_ground(ground: BumpyGround, world_T_body: Array, planar: Array, rng: np.random.Generator) -> Array:
     world = transform(world_T_body, planar)
     world[:, 2] = ground.height(world[:, :2]) + rng.normal(0, ground.roughness_m, len(world))
     return transform(invert(world_T_body), world)
 
 
-def _image_features(ground: Landscape, world_T_body: Array, rng: np.random.Generator) -> LocalFeatures:
+def _image_features(ground: BumpyGround, world_T_body: Array, rng: np.random.Generator) -> LocalFeatures:
     world = np.column_stack([ground.landmarks, ground.height(ground.landmarks)])
     points = transform(invert(world_T_body), world)
     pixels, depth = CAMERA.project(points, BODY_T_CAMERA)
@@ -121,7 +123,7 @@ def _image_features(ground: Landscape, world_T_body: Array, rng: np.random.Gener
     return _features(pixels[seen] + rng.normal(0, 2, (seen.sum(), 2)), points[seen], ground.descriptors[seen], rng)
 
 
-def _cloud_features(ground: Landscape, world_T_body: Array, rng: np.random.Generator) -> LocalFeatures:
+def _cloud_features(ground: BumpyGround, world_T_body: Array, rng: np.random.Generator) -> LocalFeatures:
     world = np.column_stack([ground.landmarks, ground.height(ground.landmarks)])
     points = transform(invert(world_T_body), world)
     bearing, distance = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
@@ -167,9 +169,9 @@ def same_rocks_elsewhere(seed: int) -> Pair:
     marks = np.repeat(rocks[:, :2], 10, axis=0) + rng.normal(0, 0.3, (80, 2))
     looks = landscape(seed, 1, 80).descriptors
 
-    def ground(number: int) -> Landscape:
+    def ground(number: int) -> BumpyGround:
         around = landscape(number, 400, 10, height_m=0.15).bumps
-        return Landscape(np.vstack([around, rocks]), marks, looks)
+        return BumpyGround(np.vstack([around, rocks]), marks, looks)
 
     here, there = ground(1000 + seed), ground(5000 + seed)
     return take(here, pose_at(here, 0, 0, 3), 100, seed), take(there, pose_at(there, 0.4, 0.3, 0), 10, seed)

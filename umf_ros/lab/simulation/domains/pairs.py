@@ -46,7 +46,7 @@ QUICK, FULL = Extent(2, 4.0, 60.0), Extent(3, 3.0, 120.0)
 
 
 @dataclass(frozen=True)
-class Place:
+class ScannedPlace:
     """A keyframe, where it was taken and what it was made from."""
 
     keyframe: Keyframe
@@ -60,11 +60,11 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Pair:
+class ScanPair:
     """Two keyframes and what is true of them: `kind` is one of SAME, TURNED and ELSEWHERE."""
 
-    query: Place
-    match: Place
+    query: ScannedPlace
+    match: ScannedPlace
     kind: str
 
     @property
@@ -102,20 +102,22 @@ def keyframe_of(
     return make_keyframe(frame, embedder)
 
 
-def places_of(domain: Domain, seeds: range, extent: Extent, folder: Path | None, embedder: Embedder) -> list[Place]:
+def places_of(
+    domain: Domain, seeds: range, extent: Extent, folder: Path | None, embedder: Embedder
+) -> list[ScannedPlace]:
     """Keyframes of all worlds of a domain."""
-    places: list[Place] = []
+    places: list[ScannedPlace] = []
     for seed in seeds:
         for scan in surveyed(domain, seed, extent, folder):
             stamp_ns = (len(places) + 1) * 10**9
             steady = scan.sweep.offset_s is not None
             keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, stamp_ns, steady)
             seen_from = relative(scan.world_T_body, scan.world_T_lidar)
-            places.append(Place(replace(keyframe, body_T_lidar=seen_from), scan, seed))
+            places.append(ScannedPlace(replace(keyframe, body_T_lidar=seen_from), scan, seed))
     return places
 
 
-def pairs_of(places: list[Place], domain: Domain, rng: np.random.Generator) -> Iterator[Pair]:
+def pairs_of(places: list[ScannedPlace], domain: Domain, rng: np.random.Generator) -> Iterator[ScanPair]:
     """For every revisiting keyframe the nearest and another near one, one elsewhere and the one there most alike."""
     first = [place for place in places if place.scan.label == FIRST]
     for query in places:
@@ -129,21 +131,21 @@ def pairs_of(places: list[Place], domain: Domain, rng: np.random.Generator) -> I
         near = np.flatnonzero(fits & (away < SAME_M * domain.scale))
         if len(near):
             nearest = int(near[away[near].argmin()])
-            yield from (Pair(query, first[index], kind) for index in {nearest, int(rng.choice(near))})
+            yield from (ScanPair(query, first[index], kind) for index in {nearest, int(rng.choice(near))})
         if query.scan.label == SAME_WAY:
             far = np.flatnonzero(away > ELSEWHERE_M)
-            elsewhere = [Pair(query, first[index], ELSEWHERE) for index in far]
+            elsewhere = [ScanPair(query, first[index], ELSEWHERE) for index in far]
             if elsewhere:  # one world of small rooms has no place that far
                 yield max(elsewhere, key=lambda pair: pair.similarity)
                 yield elsewhere[int(rng.integers(len(elsewhere)))]
 
 
-def _distance(query: Place, match: Place) -> float:
+def _distance(query: ScannedPlace, match: ScannedPlace) -> float:
     """Metres between two keyframes; infinite between worlds."""
     return float(np.linalg.norm(query.position - match.position)) if query.world == match.world else float("inf")
 
 
-def _turn_deg(query: Place, match: Place) -> float:
+def _turn_deg(query: ScannedPlace, match: ScannedPlace) -> float:
     return float(np.degrees(rotation_angle(relative(match.scan.world_T_lidar, query.scan.world_T_lidar))))
 
 

@@ -17,9 +17,9 @@ from umf_ros.core.geometry import Array, make_pose
 from umf_ros.lab.simulation.domains.mounts import Mount
 from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner
 from umf_ros.lab.simulation.domains.solids import Scene, Solids
-from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, SAME_WAY, DomainScan, Motion
+from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, SAME_WAY, DomainScan, SweepMotion
 from umf_ros.lab.simulation.domains.sweeps import stamp_moment, sweep
-from umf_ros.lab.simulation.seeds import check_seed
+from umf_ros.lab.simulation.world import check_seed
 
 HALF_LENGTH_M = 60.0
 STATION_M, STATIONS = 0.6, 25
@@ -227,7 +227,7 @@ def drive(passage: Passage, seed: int) -> list[DomainScan]:
         place = [start + (number - STATIONS / 2) * STATION_M + chance.normal(0, 0.05), aside[visit], 0.0]
         place[1] += chance.normal(0, 0.04)
         begin = make_pose(_turned(yaw), place)
-        motion = Motion(
+        motion = SweepMotion(
             begin, mount, passage.scanner, (chance.random(), chance.random(), chance.normal(0, 0.03)), body_T_lidar
         )
         found = sweep(passage.scanner, scenes[visit], motion.world_T_lidar, chance)

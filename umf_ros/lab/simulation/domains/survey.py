@@ -115,7 +115,9 @@ def survey(domain: Domain, seed: int, step_m: float, longest_m: float, place: Pl
         scene = place.scene(visit)
         for world_T_body in _drive(place, label, (step_m * domain.scale, longest_m * domain.scale), rng):
             phase, start_s = rng.random(), rng.random()
-            motion = Motion(world_T_body, mount, scanner, (phase, start_s, float(rng.normal(0, 0.15))), body_T_lidar)
+            motion = SweepMotion(
+                world_T_body, mount, scanner, (phase, start_s, float(rng.normal(0, 0.15))), body_T_lidar
+            )
             found = sweep(scanner, scene, motion.world_T_lidar, rng)
             stamp = stamp_moment(scanner)
             lidar = motion.world_T_lidar(stamp)
@@ -128,7 +130,7 @@ def survey(domain: Domain, seed: int, step_m: float, longest_m: float, place: Pl
     return scans
 
 
-class Motion:
+class SweepMotion:
     """The carrier drives, turns and sways during a scan."""
 
     def __init__(
