@@ -94,6 +94,7 @@ class OutlierRejection:
         self._unjoined: set[int] = set()
         self._ratios: dict[int, float] = {}
         self._brought_close: list[int] = []
+        self._compared: set[int] = set()  # rows, with the map as it was last solved
         self.scale = NoiseScale()
         self.placed: list[PlacedClosure] = []
         self.verdicts: list[ClosureVerdict] = []
@@ -102,6 +103,7 @@ class OutlierRejection:
         """Judge by other gates from now on."""
         self._settings = settings
         self._consistency.retune(settings)
+        self._compared = set()
 
     def consider(self, arrived: Sequence[PlacedClosure]) -> list[ClosureVerdict]:
         """Take closures in; returns the verdicts that are new or changed.
@@ -235,6 +237,7 @@ class OutlierRejection:
         if not open_rows:
             return []
         found = self._compare(open_rows)
+        self._compared.update(open_rows)
         self._unjoined -= set(open_rows)
         self._unjoined |= {row for row, joined in zip(open_rows, found.joined, strict=True) if not joined}
         numbers = zip(open_rows, *(column.tolist() for column in found[:4]), strict=True)
@@ -348,7 +351,7 @@ class OutlierRejection:
         companions[list(self._revoked)] = False
         others = self._consistency.companions(waiting, companions)
         places = [[row, *known] for row, known in zip(waiting, others, strict=True)]
-        self._gate(sorted({member for place in places for member in place}))
+        self._gate(sorted({member for place in places for member in place} - self._compared))
         against = self._credible()
         best: list[int] = []
         most_odds, waited = _MOST_ODDS_AT_LAST if at_last else _MOST_ODDS, set(waiting)
@@ -404,7 +407,7 @@ class OutlierRejection:
     def _solve(self, without: Sequence[int] = ()) -> None:
         rows = [row for row in np.flatnonzero(self._table["state"] == State.ACCEPTED).tolist() if row not in without]
         self._sessions.solve(ChosenClosures.of(self._arrays, rows), self.scale)
-        self._map = RelativePoses(self._sessions, self.scale)
+        self._map, self._compared = RelativePoses(self._sessions, self.scale), set()
 
     def _worth_another_look(self) -> list[int]:
         """Closures not accepted that the moved map comes close to."""
