@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,9 @@ def test_the_stream_is_handed_on_unchanged_and_each_keyframe_is_embedded_once(se
     detector = LoopDetector(settings, slow)
     handed = list(detector.prefetch(items))
     assert [id(one) for one in handed] == [id(one) for one in items]
+    deadline = time.monotonic() + 10.0
+    while len(slow.seen) < 6 and time.monotonic() < deadline:
+        time.sleep(0.01)
     detector.close()
     # 0.6 m apart, and the second session begins with a keyframe of its own
     assert [stamp // 10**9 for stamp, _ in slow.seen] == [0, 2, 4, 6, 8, 10]

@@ -106,7 +106,7 @@ NO_BAG = "there is no recording nowhere.mcap"
         (["demo", "--bag", "nowhere.mcap"], NO_BAG),
         (["demo", "--out", "/proc/results"], "cannot write to /proc/results"),
         (["replay", "nowhere.mcap"], NO_BAG),
-        (["report", "nowhere", "nowhere.mcap"], "nowhere holds no finished run"),
+        (["report", "nowhere", "nowhere.mcap"], NO_BAG),
         (["evaluate", "nowhere.mcap"], NO_BAG),
         (["explain", "nowhere.mcap", "1", "0"], NO_BAG),
         (["simulate"], "say where to write: OUT.mcap, --shards DIR or --contact-sheet OUT.png"),

@@ -102,7 +102,7 @@ def test_a_truth_of_another_clock_is_named_and_judges_nothing(tmp_path: Path) ->
 
 
 def test_closures_that_the_graph_did_not_use_are_pending_not_rejected(tmp_path: Path) -> None:
-    waiting = accepted("waiting", "its odometry has not arrived")
+    waiting = accepted("pending", "its odometry has not arrived")
     mark, _, sentence = verdict(examined(tmp_path, [closure(50, 10)], verdict=waiting, truth=trajectory()))
     assert mark == "bad" and sentence.startswith("All closures are pending: the graph used none of 1 (its odometry has")
     assert "the graph used none of them (1 pending)" in sentence and "rejected" not in sentence

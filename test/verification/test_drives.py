@@ -77,7 +77,7 @@ def test_kept_drives_are_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         made.append(seed)
         return before_a_wall(np.eye(4), turned(10.0, step_m))
 
-    monkeypatch.setattr("drives.simulate", simulate)
+    monkeypatch.setattr("umf_ros.lab.simulation.drives.simulate", simulate)
     first, again = (kept(tmp_path / "drives", 20_000, "etna", 1.0) for _ in range(2))
     kept(tmp_path / "drives", 20_001, "etna", 1.0)
     kept(None, 20_000, "etna", 1.0)

@@ -223,7 +223,6 @@ def test_a_run_without_closures_and_trajectories(bag: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("summary.json", None, "holds no finished run: summary.json is missing"),
         ("summary.json", '{"frames": 3, ', "summary.json is not the summary of a run"),
         ("summary.json", "[]", "summary.json is not the summary of a run"),
         ("summary.json", '{"hello": 1}', "summary.json is not the summary of a run"),

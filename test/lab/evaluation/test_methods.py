@@ -126,7 +126,7 @@ def test_searching_takes_longer_in_longer_descriptors() -> None:
 
 
 def test_listed_sequences_by_all_methods(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(methods_run, "EMBEDDERS", ("umf", "thumbnail", "gradients", "netvlad"))
+    monkeypatch.setattr(methods_run, "find_methods", lambda: ("umf", "thumbnail", "gradients", "netvlad"))
     (tmp_path / "data").mkdir()
     np.savez(tmp_path / "data" / "world_00001.npz", **world_arrays())
     (tmp_path / "data" / "list.yaml").write_text("- worlds: .\n")
