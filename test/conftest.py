@@ -35,7 +35,7 @@ MARKED = {
     "slow": (
         *("lab", "benchmarks", "maps", "submaps", "commands", "comparison", "verification", "pose_graph", "embedding"),
         *("baselines", "runs", "pose_graph/test_journal.py", "bags/test_hostile.py"),
-        *("test_packaging.py", "test_replay.py", "test_tasks.py", "test_mapping.py", "test_imports.py"),
+        *("test_packaging.py", "test_replay.py", "test_tasks.py", "test_imports.py"),
     ),
 }
 """Markers by folders and files of tests; `make check` leaves all of them out."""

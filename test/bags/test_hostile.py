@@ -23,6 +23,7 @@ from recordings import small_settings, traverse, write_db3, write_mcap, write_ro
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
+from umf_ros.bags import storages
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.storages import unpack_bz2, unpack_lz4
@@ -150,6 +151,17 @@ def test_no_packing_hides_how_large_a_chunk_is(broken: bool, tmp_path: Path, mon
         for packing in CompressionType:  # what they claim is looked at before
             with pytest.raises(BagError, match="holds no message"):
                 open_bag(tmp_path / f"{packing}.mcap")
+    really = storages.unpack_lz4
+
+    def unpack(data: bytes) -> bytes:  # as if the file had claimed less than it holds
+        with monkeypatch.context() as limited:
+            limited.setattr(storages, "LARGEST_CHUNK", 2500)
+            return really(data)
+
+    monkeypatch.setattr(storages, "unpack_lz4", unpack)
+    path = tmp_path / f"{CompressionType.LZ4}.mcap"
+    with pytest.raises(BagError, match="holds no message" if broken else "holds more than"):
+        list(open_bag(path).raw_messages())
 
 
 def test_a_chunk_of_ros_1_in_lz4_is_unpacked_to_a_limit_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

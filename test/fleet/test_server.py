@@ -34,7 +34,7 @@ def test_one_rover_finds_and_reads_keyframes_of_another(server: PostgresServer) 
     assert similarity == pytest.approx(1, abs=2e-3)
     data = bea.data(key)
     assert data is not None and unpack(data).stamp_ns == 7 * 10**9
-    assert ada.nearest(place(7).embedding.descriptor, 3) == []  # nobody else has been there
+    assert ada.nearest(place(7).embedding.descriptor, 3) == []  # the only rover there
     assert ada.robot == "ada"
 
 

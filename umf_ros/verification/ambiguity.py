@@ -36,7 +36,7 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
     if way is None:
         return float("nan")
     needed = const.NARROW_PASSAGE_RIVAL if _is_fan(match) or _is_fan(query) else const.PASSAGE_RIVAL
-    near = _rival(match, query, np.stack([pose, *_shifted(pose, way, const.PASSAGE_NEAR_M)]), const.PASSAGE_SAMPLE)
+    near = _rival(match, query, np.stack([pose, *_shifted(pose, way, const.RIVAL_NEAR_M)]), const.PASSAGE_SAMPLE)
     if near.min() < needed:
         return float(near.min()) / needed
     others = [one for one in alternatives(match, query, pose) if np.linalg.norm((one - pose)[:3, 3]) > const.DISTINCT_M]

@@ -125,7 +125,6 @@ PASSAGE_RATIO = 0.2  # measured: of surfaces along to surfaces across; passages 
 ROUGH_PASSAGE_RATIO = 0.35  # measured: the same of all normals; passages have up to .30
 PASSAGE_SURFACE = 0.1  # measured: share of points on planes; woods and orchards have less, passages from .2
 PASSAGE_COMMON = 0.25  # by hand: of the compared points that a rival needs
-PASSAGE_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: as RIVAL_NEAR_M
 PASSAGE_FAR_M = np.concatenate([np.arange(-15.0, -0.9, 0.5), np.arange(1.0, 15.1, 0.5)])  # geometry: scans overlap
 PASSAGE_SAMPLE, PASSAGE_SCOUTS, PASSAGE_KEPT = 750, 100, 6  # by hand: points of a half, first of all, of few rivals
 FAN = 0.5  # geometry: length of the mean bearing; .94 of a view of 70 deg, .5 of one of 217 deg
