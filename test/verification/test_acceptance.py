@@ -19,7 +19,7 @@ from umf_ros.verification.acceptance import (
     load_acceptance,
     scores,
 )
-from umf_ros.verification.measurement import SCAN
+from umf_ros.verification.hypothesis import SCAN
 
 
 @pytest.fixture(scope="module")

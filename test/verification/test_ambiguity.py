@@ -11,7 +11,7 @@ from umf_ros.core.geometry import Array, make_pose
 from umf_ros.verification import Measurement
 from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.ambiguity import passage_direction, passage_rival
-from umf_ros.verification.measurement import SCAN
+from umf_ros.verification.hypothesis import SCAN
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import align_scans
 from umf_ros.verification.scan_consistency import rivalry

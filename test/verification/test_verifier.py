@@ -15,8 +15,8 @@ from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
 from umf_ros.verification import NO_DEPTH, Verdict, Verifier
 from umf_ros.verification.constants import SAME_M, SAME_RAD
-from umf_ros.verification.hypotheses import near
-from umf_ros.verification.measurement import SCAN
+from umf_ros.verification.hypothesis import SCAN
+from umf_ros.verification.pose_search import near
 from umf_ros.verification.verifier import FOUND_BEFORE, LESS_SURE
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)

@@ -33,7 +33,7 @@ from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
 from umf_ros.runs.tables import CLOSURES, closure_row, write_table
 from umf_ros.runs.writer import PLACES, count_drops
-from umf_ros.verification import Verdict, Verifier
+from umf_ros.verification import Hypothesis, Verifier
 
 OnFrame = Callable[[float, Detection], None]
 """Called for every frame with the share of the recording that is done, 0 to 1, and the detection."""
@@ -184,7 +184,7 @@ def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
     return session
 
 
-def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Verdict]]:
+def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Hypothesis]]:
     """Match a recording against the earlier ones; yields the verdicts of every keyframe, accepted ones first.
 
     Writes `closures_between.csv`, complete or not at all. The map's store is only read: several sessions may be

@@ -28,7 +28,7 @@ from umf_ros.detector import Detection
 from umf_ros.nodes.diagnostics import OK, WARN, status
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose
-from umf_ros.verification import Verdict
+from umf_ros.verification import Hypothesis
 
 if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure
@@ -285,7 +285,7 @@ class ClosurePublisher:
             return to_pose_stamped(keyframe.stamp_ns, self.odom, keyframe.odom_T_body)
         return to_pose_stamped(keyframe.stamp_ns, keyframe_frame(keyframe.stamp_ns), np.eye(4))
 
-    def _draw(self, keyframe: Keyframe, verdicts: list[Verdict], matches: dict[int, Keyframe]) -> None:
+    def _draw(self, keyframe: Keyframe, verdicts: list[Hypothesis], matches: dict[int, Keyframe]) -> None:
         if keyframe.odom_T_body is None:
             return
         here = to_point(keyframe.odom_T_body[:3, 3])
@@ -300,8 +300,8 @@ class ClosurePublisher:
         self._markers.publish(MarkerArray(markers=[to_lines(*item, header) for item in chosen.items()]))
 
 
-def _describe(keyframe: Keyframe, verdict: Verdict, robot: str = "") -> DiagnosticStatus:
+def _describe(keyframe: Keyframe, verdict: Hypothesis, robot: str = "") -> DiagnosticStatus:
     accepted = verdict.closure is not None
     name = f"{keyframe_frame(verdict.candidate.stamp_ns, robot)} -> {keyframe.stamp_ns}"
     numbers = {"similarity": verdict.candidate.similarity, **verdict.numbers}
-    return status(OK if accepted else WARN, name, verdict.reason, numbers)
+    return status(OK if accepted else WARN, name, verdict.outcome, numbers)

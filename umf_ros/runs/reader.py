@@ -23,6 +23,7 @@ from umf_ros.runs.writer import read_summary, write_summary
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.decode import TYPES
 from umf_ros.sensors.sessions import Input
+from umf_ros.verification.hypothesis import Hypothesis
 
 Severity = Literal["fault", "warning", "note"]
 _ABSENT = {
@@ -148,7 +149,7 @@ class FinishedRun:
     settings: Settings
     closures: list[LoopClosure]
     keyframes: list[tables.KeyframeRow]
-    candidates: list[tables.TestedCandidate]
+    candidates: list[Hypothesis]
     verdicts: dict[tables.Endpoints, tables.GraphVerdict]
     odometry: Trajectory | None
     optimized: Trajectory | None

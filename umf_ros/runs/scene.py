@@ -17,8 +17,9 @@ from umf_ros.runs.diagnosis import ClosureDiagnosis
 from umf_ros.runs.findings import PENDING, ExaminedRun
 from umf_ros.runs.gallery import SCAN_UNIT_M, Gallery, encode_scans
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.tables import Endpoints, TestedCandidate
+from umf_ros.runs.tables import Endpoints
 from umf_ros.runs.truth import JudgedClosure, positions_in_truth
+from umf_ros.verification.hypothesis import Hypothesis
 
 Kind = Literal["accepted", "pending", "rejected", "false", "missed", "tested"]
 ORDER: tuple[Kind, ...] = ("false", "missed", "rejected", "pending", "tested", "accepted")
@@ -46,7 +47,7 @@ class Pair:
     pose_source: str
     closure: LoopClosure | None = None
     judged: JudgedClosure | None = None
-    candidate: TestedCandidate | None = None
+    candidate: Hypothesis | None = None
     why: ClosureDiagnosis | None = None
 
 
@@ -90,7 +91,7 @@ def _kind(about: ExaminedRun, key: Endpoints, judged: JudgedClosure | None) -> K
     return "pending" if verdict.state in PENDING else "rejected"
 
 
-def _missed(about: ExaminedRun, tested: dict[Endpoints, TestedCandidate]) -> list[Pair]:
+def _missed(about: ExaminedRun, tested: dict[Endpoints, Hypothesis]) -> list[Pair]:
     pairs = []
     for why in about.missed():
         if why.match_stamp_ns is None:
@@ -103,7 +104,7 @@ def _missed(about: ExaminedRun, tested: dict[Endpoints, TestedCandidate]) -> lis
 
 def _nearly(about: ExaminedRun, shown: set[Endpoints], found: set[int]) -> list[Pair]:
     """The most probable candidates of keyframes without a closure."""
-    best: dict[int, TestedCandidate] = {}
+    best: dict[int, Hypothesis] = {}
     for one in about.run.candidates:
         if one.query_stamp_ns in found or one.endpoints in shown or one.probability is None:
             continue
@@ -139,7 +140,7 @@ def describe(about: ExaminedRun, pair: Pair, full: bool) -> dict[str, Any]:
     told: dict[str, Any] = {"kind": pair.kind, "number": pair.number, "q": rows[0], "m": rows[1]}
     told["stamps"] = [str(stamp) for stamp in pair.endpoints]  # no number of a browser holds nanoseconds
     told["p"] = _finite(_probability(pair))
-    told["s"] = _finite(pair.candidate.similarity if pair.candidate else None)
+    told["s"] = _finite(pair.candidate.candidate.similarity if pair.candidate else None)
     told["graph"] = _graph_words(about, pair)
     told["truth"] = _truth_words(pair)
     if pair.why is not None:
@@ -275,7 +276,7 @@ def _keyframes(about: ExaminedRun) -> dict[str, Any]:
     start = int(places.stamps[0]) if len(places.stamps) else 0
     best: dict[int, float] = {}
     for one in run.candidates:
-        best[one.query_stamp_ns] = max(best.get(one.query_stamp_ns, -1.0), one.similarity)
+        best[one.query_stamp_ns] = max(best.get(one.query_stamp_ns, -1.0), one.candidate.similarity)
     return {
         "t": [round((int(stamp) - start) * 1e-9, 3) for stamp in places.stamps],
         "xy": _rounded(_positions(about)).tolist(),
@@ -320,7 +321,7 @@ def _sweep(about: ExaminedRun) -> list[list[float | int]]:
                 rows.append([0, 0, 1])
             continue
         same = about.places.is_same_place(stamp, best.match_stamp_ns)
-        if best.reason == "accepted" and stamp in right:
+        if best.accepted and stamp in right:
             same = right[stamp]
         rows.append([round(best.probability or 0, 4), -1 if same is None else int(same), revisit])
     return rows

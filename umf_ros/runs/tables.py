@@ -7,25 +7,23 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from umf_ros.core.errors import UmfError
-from umf_ros.core.frames import LoopClosure
+from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.core.io import atomic_write
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, State
-
-if TYPE_CHECKING:
-    from umf_ros.verification import Verdict
+from umf_ros.verification.hypothesis import ACCEPTED, Hypothesis, Measurement, RejectReason
 
 POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
 SIGMA = ["sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"]
 COVARIANCE = "covariance"
 CLOSURES = ["query_stamp_ns", "match_stamp_ns", *POSE, *SIGMA, "probability", "similarity", COVARIANCE]
 CLOSURES_BETWEEN = ["match_robot", *CLOSURES]
-CANDIDATES = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "numbers"]
+CANDIDATES = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "detail", "numbers"]
 KEYFRAMES = ["stamp_ns", "session", "travelled_m"]
 STAGES = ("embed", "query", "verify", "submaps", "total")
 LATENCIES = ["stamp_ns", *STAGES]
@@ -42,38 +40,11 @@ COLUMNS = {
     "localization": LOCALIZATION,
 }
 """Columns of each table, which is exported as `<name>.csv`."""
+_REASONS = {reason.value for reason in RejectReason}
 Row = TypeVar("Row")
 
 Endpoints = tuple[int, int]
 """Stamps in ns of a closure's query and match."""
-
-
-@dataclass(frozen=True, slots=True)
-class TestedCandidate:
-    """A row of `candidates.csv`.
-
-    Attributes:
-        query_stamp_ns, match_stamp_ns: keys of both keyframes.
-        similarity: of the global descriptors.
-        reason: "accepted", or what stopped it.
-        numbers: what was measured, by name.
-    """
-
-    query_stamp_ns: int
-    match_stamp_ns: int
-    similarity: float
-    reason: str
-    numbers: dict[str, float]
-
-    @property
-    def endpoints(self) -> Endpoints:
-        """Stamps of query and match."""
-        return self.query_stamp_ns, self.match_stamp_ns
-
-    @property
-    def probability(self) -> float | None:
-        """That the pose found is right; None where no pose was found or tried."""
-        return self.numbers.get("probability")
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,18 +97,18 @@ def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:
     return [closure.query_stamp_ns, closure.match_stamp_ns, *(f"{number:.9g}" for number in numbers), triangle]
 
 
-def candidate_row(query_stamp_ns: int, verdict: Verdict) -> list[Any]:
-    """Row of `candidates.csv`: everything that was measured, as JSON."""
-    numbers = json.dumps({name: float(f"{value:.6g}") for name, value in verdict.numbers.items()})
-    candidate = verdict.candidate
-    return [query_stamp_ns, candidate.stamp_ns, f"{candidate.similarity:.6f}", verdict.reason, numbers]
+def candidate_row(hypothesis: Hypothesis) -> list[Any]:
+    """Row of `candidates.csv`: the reason with its figures, and all measurements as JSON."""
+    numbers = json.dumps({name: float(f"{value:.6g}") for name, value in hypothesis.numbers.items()})
+    reason = hypothesis.reason.value if hypothesis.reason else ACCEPTED
+    similarity = f"{hypothesis.candidate.similarity:.6f}"
+    return [*hypothesis.endpoints, similarity, reason, hypothesis.detail, numbers]
 
 
-def inlier_rows(query_stamp_ns: int, verdict: Verdict) -> list[list[Any]]:
+def inlier_rows(hypothesis: Hypothesis) -> list[list[Any]]:
     """Rows of `inliers.csv`: pixels of both left images that see the same point."""
     return [
-        [query_stamp_ns, verdict.candidate.stamp_ns, *(f"{value:.1f}" for value in pixels)]
-        for pixels in verdict.inlier_pixels.tolist()
+        [*hypothesis.endpoints, *(f"{value:.1f}" for value in pixels)] for pixels in hypothesis.inlier_pixels.tolist()
     ]
 
 
@@ -160,7 +131,7 @@ def read_table(path: Path, parse: Callable[[dict[str, str]], Row]) -> list[Row]:
     return rows
 
 
-def read_candidates(path: Path) -> list[TestedCandidate]:
+def read_candidates(path: Path) -> list[Hypothesis]:
     """Everything that was tested.
 
     Raises:
@@ -198,10 +169,18 @@ def read_graph_verdicts(path: Path) -> dict[Endpoints, GraphVerdict]:
     return dict(read_table(path, _graph_verdict)) if path.is_file() else {}
 
 
-def _candidate(row: dict[str, str]) -> TestedCandidate:
+def _candidate(row: dict[str, str]) -> Hypothesis:
     numbers = {name: float(value) for name, value in json.loads(row["numbers"]).items()}
-    stamps = int(row["query_stamp_ns"]), int(row["match_stamp_ns"])
-    return TestedCandidate(*stamps, float(row["similarity"]), row["reason"], numbers)
+    candidate = Candidate(-1, int(row["match_stamp_ns"]), float(row["similarity"]))
+    probability, measurement = numbers.pop("probability", None), Measurement.read(candidate.similarity, numbers)
+    reason, detail = row["reason"], row.get("detail") or ""
+    if reason == ACCEPTED:
+        return Hypothesis(int(row["query_stamp_ns"]), candidate, measurement, probability=probability)
+    if reason not in _REASONS:
+        reason, detail = RejectReason.UNKNOWN.value, reason
+    return Hypothesis(
+        int(row["query_stamp_ns"]), candidate, measurement, RejectReason(reason), detail, probability=probability
+    )
 
 
 def _graph_verdict(row: dict[str, str]) -> tuple[Endpoints, GraphVerdict]:

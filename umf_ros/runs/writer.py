@@ -229,9 +229,9 @@ class RunRecorder:
             self._file.append("keyframes", [[stamp_ns, keyframe.session, f"{keyframe.path_length_m:.4f}"]])
             self._file.append("latencies", [[stamp_ns, *times]])
             self._file.append_descriptor(stamp_ns, keyframe.embedding.descriptor)
-            self._file.append("candidates", [tables.candidate_row(stamp_ns, one) for one in detection.verdicts])
+            self._file.append("candidates", [tables.candidate_row(one) for one in detection.verdicts])
             self._file.append("closures", closures, odometry_before=self._odometry)
-            self._file.append("inliers", [row for one in new for row in tables.inlier_rows(stamp_ns, one)])
+            self._file.append("inliers", [row for one in new for row in tables.inlier_rows(one)])
             self._file.note(**self._facts())
         self._counts["keyframes"] += 1
         self._counts["queries"] += bool(detection.verdicts)

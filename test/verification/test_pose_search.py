@@ -9,7 +9,7 @@ from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan
-from umf_ros.verification.hypotheses import pose_from_points
+from umf_ros.verification.pose_search import pose_from_points
 from umf_ros.verification.rerank import RankedCandidate, rerank
 
 GROUND = landscape(20)
