@@ -16,6 +16,7 @@ from umf_ros.runs.findings import conclude, look_first
 from umf_ros.runs.gallery import Gallery, photograph
 from umf_ros.runs.report import write_page
 from umf_ros.runs.scene import build_scene, pairs_of
+from umf_ros.verification import RejectReason
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
@@ -26,9 +27,9 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("page")
     closures = [closure(50, 10), closure(52, 12, error_m=0.9)]
     tested = [
-        candidate(50, 10, "accepted", **(BELOW | {"probability": 0.97})),
-        candidate(52, 12, "accepted", **(BELOW | {"probability": 0.93})),
-        candidate(54, 14, "probability 0.60 is below 0.9", **BELOW),
+        candidate(50, 10, None, **(BELOW | {"probability": 0.97})),
+        candidate(52, 12, None, **(BELOW | {"probability": 0.93})),
+        candidate(54, 14, RejectReason.IMPROBABLE, **BELOW),
     ]
     about = examined(folder, closures, tested, accepted(), trajectory(), missed=[54], ate=(1.0, 0.2))
     gallery = Gallery([], [], None)
