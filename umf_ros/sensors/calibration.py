@@ -68,7 +68,11 @@ class StereoRectifier:
         right_T_left = invert(left_T_right)
         matrices = [camera.matrix(size) for camera in (left, right)]
         distortions = [np.array(camera.distortion or (0.0,) * 4) for camera in (left, right)]
-        turns, projections = _rectify(matrices, distortions, size, right_T_left)
+        both = matrices[0], distortions[0], matrices[1], distortions[1]
+        turn, shift = right_T_left[:3, :3], right_T_left[:3, 3:]
+        # Bouguet's method, without black borders
+        result = cv2.stereoRectify(*both, size, turn, shift, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)
+        turns, projections = result[:2], result[2:4]
         self._maps = [
             cv2.initUndistortRectifyMap(matrix, distortion, turn, projection[:, :3], size, cv2.CV_16SC2)
             for matrix, distortion, turn, projection in zip(matrices, distortions, turns, projections, strict=True)
@@ -78,36 +82,11 @@ class StereoRectifier:
         baseline = -float(projections[1][0, 3]) / fx
         self.camera = StereoCamera(*size, fx, fy, cx, cy, baseline)
 
-    def left(self, raw: Image) -> Image:
-        """Rectified left image, (H, W) uint8, of a raw one."""
-        return self._apply(raw, 0)
-
-    def right(self, raw: Image) -> Image:
-        """Rectified right image, (H, W) uint8, of a raw one."""
-        return self._apply(raw, 1)
-
-    def _apply(self, raw: Image, side: int) -> Image:
+    def apply(self, raw: Image, side: int) -> Image:
+        """Rectified image, (H, W) uint8, of a raw one; `side` 0: left, 1: right."""
         # area averaging first: the remap below takes four pixels only and would alias
         small = cv2.resize(raw, self._size, interpolation=cv2.INTER_AREA)
         return np.asarray(cv2.remap(small, *self._maps[side], interpolation=cv2.INTER_LINEAR), np.uint8)
-
-
-def _rectify(
-    matrices: list[Array], distortions: list[Array], size: tuple[int, int], right_T_left: Array
-) -> tuple[list[Array], list[Array]]:
-    """Rotations raw to rectified and (3, 4) projections of both cameras (Bouguet), without black borders."""
-    result = cv2.stereoRectify(
-        matrices[0],
-        distortions[0],
-        matrices[1],
-        distortions[1],
-        size,
-        right_T_left[:3, :3],
-        right_T_left[:3, 3:],
-        flags=cv2.CALIB_ZERO_DISPARITY,
-        alpha=0,
-    )
-    return [np.asarray(turn) for turn in result[:2]], [np.asarray(projection) for projection in result[2:4]]
 
 
 @dataclass(frozen=True, slots=True)

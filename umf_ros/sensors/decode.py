@@ -101,13 +101,16 @@ def stamp_ns(message: Any) -> int:
 
 
 def decode_image(message: Any) -> Image:
-    """Grey image of a sensor_msgs/Image: (H, W) uint8, which may share the message's memory.
+    """Grey image (H, W) uint8 of a sensor_msgs/Image, which may share its memory, or of a CompressedImage.
 
     16-bit images are taken as full scale: the upper byte is kept.
 
     Raises:
-        MessageError: of kind "encoding", "size", "step" or "truncated".
+        MessageError: of kind "encoding", "size", "step" or "truncated"; of kind "compressed" when the content is no
+            picture, or one of depths.
     """
+    if not hasattr(message, "encoding"):
+        return _decode_compressed(message)
     if message.encoding not in _ENCODINGS:
         raise MessageError("encoding", f"image encoding {message.encoding!r} is not supported")
     channels, size, conversion = _ENCODINGS[message.encoding]
@@ -135,14 +138,13 @@ def _image_rows(message: Any, row_bytes: int) -> Image:
 
 
 def decode_cloud(message: Any) -> Cloud:
-    """Real returns of a sensor_msgs/PointCloud2; fields are found by name and read by data type.
-
-    Points that are not finite and dummies for pulses without a return are left out, so the result may
-    be empty. `intensity` and `point_time_offset` (ns) may be missing.
+    """Real returns, possibly none, of a Livox CustomMsg or a PointCloud2, its fields found by name and data type.
 
     Raises:
         MessageError: of kind "fields", "datatype", "step" or "truncated".
     """
+    if not hasattr(message, "fields"):
+        return _decode_livox(message)
     records = _cloud_records(message)
     names = records.dtype.names or ()
     points = np.stack([records[axis] for axis in "xyz"], axis=1, dtype=np.float32, casting="unsafe")
@@ -210,19 +212,13 @@ def _record_type(fields: list[Any], point_step: int, order: str) -> np.dtype[Any
     formats = []
     for field in fields:
         if field.datatype not in _DATATYPES or field.count > 1:
-            raise MessageError(
-                "datatype", f"cloud field {field.name} has datatype {field.datatype} and count {field.count}"
-            )
+            text = f"cloud field {field.name} has datatype {field.datatype} and count {field.count}"
+            raise MessageError("datatype", text)
         formats.append(np.dtype(order + _DATATYPES[field.datatype]))
         if field.offset + formats[-1].itemsize > point_step:
             raise MessageError("step", f"cloud field {field.name} lies outside the point step of {point_step} bytes")
-    layout = {
-        "names": [field.name for field in fields],
-        "formats": formats,
-        "offsets": [field.offset for field in fields],
-        "itemsize": point_step,
-    }
-    return np.dtype(layout)  # type: ignore[call-overload]
+    names, offsets = [field.name for field in fields], [field.offset for field in fields]
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": point_step})
 
 
 def decode_odometry(message: Any) -> OdometrySample:
@@ -323,33 +319,24 @@ uint8 line
 """As the drivers of Livox define it; recordings of them carry it too."""
 
 
-def decode_any_image(message: Any) -> Image:
-    """Grey image (H, W) uint8 of a sensor_msgs/Image or a sensor_msgs/CompressedImage.
-
-    Raises:
-        MessageError: as of `decode_image`; of kind "compressed" when the content is no picture, or one of depths.
-    """
-    if hasattr(message, "encoding"):
-        return decode_image(message)
+def _decode_compressed(message: Any) -> Image:
     if "compressedDepth" in message.format:
         raise MessageError("compressed", "compressed depth image: name the topic of the camera")
-    content = np.frombuffer(message.data, np.uint8)
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(content, flags) if len(content) else None
+    image = decode_picture(message.data)
     if image is None:
         raise MessageError("compressed", f"compressed image of format {message.format!r} cannot be read")
     if "bayer" in message.format:  # the mosaic was compressed as it lies: smooth it as a demosaicing would
-        image = cv2.resize(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), image.shape[::-1])
-    return np.asarray(image, np.uint8)
+        half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        image = np.asarray(cv2.resize(half, image.shape[::-1]), np.uint8)
+    return image
 
 
-def decode_any_cloud(message: Any) -> Cloud:
-    """Real returns of a sensor_msgs/PointCloud2 or a Livox CustomMsg.
-
-    Raises:
-        MessageError: as of `decode_cloud`.
-    """
-    return decode_cloud(message) if hasattr(message, "fields") else _decode_livox(message)
+def decode_picture(content: bytes) -> Image | None:
+    """(H, W) uint8 grey image of a compressed file, its pixels as the camera sees them; None where it is none."""
+    data = np.frombuffer(content, np.uint8)
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # a photograph that was turned for people is another
+    image = cv2.imdecode(data, flags) if len(data) else None
+    return None if image is None else np.asarray(image, np.uint8)
 
 
 def _decode_livox(message: Any) -> Cloud:

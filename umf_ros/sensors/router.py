@@ -11,9 +11,9 @@ from umf_ros.core.config import Topics
 from umf_ros.core.errors import MessageError
 from umf_ros.sensors.decode import (
     OdometrySample,
-    decode_any_cloud,
-    decode_any_image,
     decode_camera_info,
+    decode_cloud,
+    decode_image,
     decode_odometry,
     stamp_ns,
 )
@@ -85,7 +85,7 @@ class MessageRouter:
                 self._use_info(entry, message)
             else:
                 self._mount(entry, message)
-                decode = decode_any_cloud if entry == "cloud" else decode_any_image
+                decode = decode_cloud if entry == "cloud" else decode_image
                 self._synchronizer.add(_INPUTS[entry], stamp_ns(message), decode(message))
         except MessageError as error:
             self.refuse(topic, error)
