@@ -17,6 +17,7 @@ from umf_ros.sensors.buffers import OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
 
+Mask = NDArray[np.bool_]
 Path = tuple[NDArray[np.int64], list[Array]]
 """Stamps and poses `odom_T_body`."""
 
@@ -94,8 +95,7 @@ class ScanLimits:
     """
 
     def __init__(self, calibration: Calibration, warn: Callable[[str], None]) -> None:
-        self._min_intensity = calibration.min_intensity
-        self._max_height_m = calibration.max_height_m
+        self._min_intensity, self._max_height_m = calibration.min_intensity, calibration.max_height_m
         self._warn = warn
         self._warned: set[str] = set()
         self._dropped, self._seen = Counter[str](), Counter[str]()
@@ -103,48 +103,36 @@ class ScanLimits:
 
     def apply(self, cloud: Cloud) -> Cloud:
         """Return the returns to use; those of the next scan in time."""
-        keep = self._within_height(cloud) & self._strong_enough(cloud)
+        keep = np.ones(len(cloud.points), bool)
+        if math.isfinite(self._max_height_m):
+            near = np.abs(cloud.points[:, 2]) <= self._max_height_m
+            name = f"max_height_m {self._max_height_m:g}"
+            keep = self._limited(name, near, keep, "is the LiDAR's z axis up?")
+        if self._min_intensity and cloud.intensity is not None:
+            strong = cloud.intensity > self._min_intensity
+            self._strongest = max(self._strongest, float(np.nanmax(cloud.intensity, initial=0.0)))
+            hint = f"intensities reach {self._strongest:.3g}"
+            # where there is no intensity at all, drivers send 0: neither for nor against the limit
+            keep = keep & self._limited(f"min_intensity {self._min_intensity:g}", strong, cloud.intensity > 0, hint)
         if not keep.any():
-            self._warn_once(
-                "empty", f"a scan of {len(keep)} returns, none of which can be used; such scans are skipped"
-            )
+            self._warn_once("empty", f"a scan of {len(keep)} returns, none of which can be used; such are skipped")
         return Cloud(
             cloud.points[keep],
             None if cloud.intensity is None else cloud.intensity[keep],
             None if cloud.time_offset_ns is None else cloud.time_offset_ns[keep],
         )
 
-    def _within_height(self, cloud: Cloud) -> NDArray[np.bool_]:
-        near: NDArray[np.bool_] = np.abs(cloud.points[:, 2]) <= self._max_height_m
-        if math.isinf(self._max_height_m) or not len(near) or self._fits("max_height_m", ~near):
-            return near
-        text = f"max_height_m {self._max_height_m:g} of the calibration would drop {self._share('max_height_m')}"
-        self._warn_once("max_height_m", f"{text} so far: it is not applied; is the LiDAR's z axis up?")
-        return np.ones_like(near)
-
-    def _strong_enough(self, cloud: Cloud) -> NDArray[np.bool_]:
-        everything = np.ones(len(cloud.points), bool)
-        if cloud.intensity is None or not self._min_intensity or not len(everything):
-            return everything
-        strong = cloud.intensity > self._min_intensity
-        self._strongest = max(self._strongest, float(np.nanmax(cloud.intensity, initial=0.0)))
-        # where there is no intensity at all, drivers send 0: neither for nor against the limit
-        if self._fits("min_intensity", ~strong[cloud.intensity > 0]):
-            return strong
-        if self._strongest > 0:
-            text = f"min_intensity {self._min_intensity:g} of the calibration would drop {self._share('min_intensity')}"
-            reach = f"whose intensities reach {self._strongest:.3g}: it is not applied"
-            self._warn_once("min_intensity", f"{text} so far, {reach}")
-        return everything
-
-    def _fits(self, limit: str, dropped: NDArray[np.bool_]) -> bool:
-        """Count the returns (N,) that a limit would drop; returns whether it can be meant for this sensor."""
-        self._dropped[limit] += int(np.count_nonzero(dropped))
-        self._seen[limit] += len(dropped)
-        return self._dropped[limit] < MOST * self._seen[limit]
-
-    def _share(self, limit: str) -> str:
-        return f"{100 * self._dropped[limit] / max(1, self._seen[limit]):.0f} % of the returns"
+    def _limited(self, limit: str, kept: Mask, counted: Mask, hint: str) -> Mask:
+        """Which returns (N,) a limit keeps: all, if it would drop too many of those counted to be for this sensor."""
+        self._dropped[limit] += int(np.count_nonzero(counted & ~kept))
+        self._seen[limit] += int(np.count_nonzero(counted))
+        dropped, seen = self._dropped[limit], self._seen[limit]
+        if dropped < MOST * seen or not len(kept):
+            return kept
+        if seen:
+            share = f"{100 * dropped / seen:.0f} % of the returns so far"
+            self._warn_once(limit, f"{limit} of the calibration would drop {share}: it is not applied; {hint}")
+        return np.ones_like(kept)
 
     def _warn_once(self, kind: str, text: str) -> None:
         if kind not in self._warned:
@@ -242,15 +230,5 @@ def deskew(
     times = (stamps - stamps[0]).astype(float)
     at = (point_stamps_ns - stamps[0]).astype(float)
     motion = np.hstack([turns, moved[:, :3, 3]])
-    each = np.stack([np.interp(at, times, column) for column in motion.T], axis=1).astype(np.float32)
-    return _rotate(points, each[:, :3]) + each[:, 3:]
-
-
-def _rotate(points: Points, turns: Points) -> Points:
-    """Rodrigues' formula, point by point; `turns` are (N, 3) rotation vectors below half a turn."""
-    angle = np.linalg.norm(turns, axis=1, keepdims=True)
-    sine = np.sinc(angle / np.pi)  # sin(a) / a, also at 0
-    half = np.sinc(angle / (2 * np.pi))
-    cosine = half * half / 2  # (1 - cos(a)) / a^2
-    once = np.cross(turns, points)
-    return np.asarray(points + sine * once + cosine * np.cross(turns, once), np.float32)
+    each = np.stack([np.interp(at, times, column) for column in motion.T], axis=1)
+    return np.asarray(Rotation.from_rotvec(each[:, :3]).apply(points) + each[:, 3:], np.float32)

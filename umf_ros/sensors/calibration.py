@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,7 +22,7 @@ LARGEST_IMAGE = 20_000
 
 
 class Pinhole(Group):
-    """Pixels."""
+    """Intrinsics in pixels."""
 
     width: int = Field(gt=0, le=LARGEST_IMAGE)
     height: int = Field(gt=0, le=LARGEST_IMAGE)
@@ -118,22 +117,9 @@ class Calibration:
         """Width and height of the images that arrive."""
         return self.rectifier.raw_size if self.rectifier else (self.camera.width, self.camera.height)
 
-    def with_poses(self, poses: Mapping[str, Array]) -> Calibration:
-        """Return this calibration with other poses of the sensors, `body_T_camera` or `body_T_lidar` by name."""
-        camera, lidar = (poses.get(f"body_T_{name}") for name in ("camera", "lidar"))
-        return replace(
-            self,
-            body_T_camera=self.body_T_camera if camera is None else camera,
-            body_T_lidar=self.body_T_lidar if lidar is None else lidar,
-        )
-
     def with_camera(self, camera: StereoCamera) -> Calibration:
-        """Return this calibration with the intrinsics of a camera_info.
-
-        A baseline of 0 (no right camera_info) keeps the one known here. The camera_info of raw images
-        describes other pixels than `camera` and is not used.
-        """
-        if self.rectifier is not None:
+        """Return this calibration with the intrinsics of a camera_info; a baseline of 0 keeps the one known here."""
+        if self.rectifier is not None:  # the camera_info of raw images describes other pixels
             return self
         return replace(self, camera=replace(camera, baseline=camera.baseline or self.camera.baseline))
 
@@ -142,7 +128,7 @@ def load_calibration(source: str | Path) -> Calibration:
     """Calibration from a YAML file, or of a data set by its name, as in `s3li-etna`.
 
     Raises:
-        CalibrationError: the file cannot be read, or a key is missing, unknown or wrong; names the key.
+        CalibrationError: the file cannot be read, or a key, which is named, is missing, unknown or wrong.
     """
     path = load_preset(str(source)).calibration if source in dataset_names() else Path(source)
     try:
@@ -186,12 +172,9 @@ class _RawPair(Group):
     width: int = Field(gt=0, le=LARGEST_IMAGE)
     height: int = Field(gt=0, le=LARGEST_IMAGE)
 
-    def rectifier(self) -> StereoRectifier:
-        return StereoRectifier(self.left, self.right, self.left_T_right.matrix(), size=(self.width, self.height))
-
 
 class _File(Group):
-    """What a calibration file holds."""
+    """Contents of a calibration file."""
 
     camera: _Camera | None = None
     raw_camera: _RawPair | None = None
@@ -210,12 +193,13 @@ class _File(Group):
 
     def calibration(self) -> Calibration:
         body_T_camera = self.body_T_camera.matrix()
-        rectifier = self.raw_camera.rectifier() if self.raw_camera else None
-        if rectifier is not None:
-            camera, body_T_camera = rectifier.camera, body_T_camera @ rectifier.raw_T_rectified
+        if self.camera is not None:
+            rectifier, camera = None, StereoCamera(**self.camera.model_dump())
         else:
-            assert self.camera is not None
-            camera = StereoCamera(**self.camera.model_dump())
+            raw = self.raw_camera
+            assert raw is not None
+            rectifier = StereoRectifier(raw.left, raw.right, raw.left_T_right.matrix(), size=(raw.width, raw.height))
+            camera, body_T_camera = rectifier.camera, body_T_camera @ rectifier.raw_T_rectified
         return Calibration(
             camera,
             body_T_camera,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,29 +16,26 @@ from umf_ros.sensors.calibration import LARGEST_IMAGE
 
 # encoding -> channels, bytes per channel, OpenCV's conversion to grey
 _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
-    "mono8": (1, 1, None),
-    "8UC1": (1, 1, None),
+    **dict.fromkeys(("mono8", "8UC1"), (1, 1, None)),
     "mono16": (1, 2, None),
-    "rgb8": (3, 1, cv2.COLOR_RGB2GRAY),
-    "bgr8": (3, 1, cv2.COLOR_BGR2GRAY),
-    "rgba8": (4, 1, cv2.COLOR_RGBA2GRAY),
-    "bgra8": (4, 1, cv2.COLOR_BGRA2GRAY),
+    **{
+        f"{name}8": (len(name), 1, getattr(cv2, f"COLOR_{name.upper()}2GRAY"))
+        for name in ("rgb", "bgr", "rgba", "bgra")
+    },
     # ROS names the upper left 2x2 pixels; the names of OpenCV's older constants start one pixel further
-    "bayer_rggb8": (1, 1, cv2.COLOR_BayerRGGB2GRAY),
-    "bayer_bggr8": (1, 1, cv2.COLOR_BayerBGGR2GRAY),
-    "bayer_gbrg8": (1, 1, cv2.COLOR_BayerGBRG2GRAY),
-    "bayer_grbg8": (1, 1, cv2.COLOR_BayerGRBG2GRAY),
-    "yuv422": (2, 1, cv2.COLOR_YUV2GRAY_UYVY),
-    "uyvy": (2, 1, cv2.COLOR_YUV2GRAY_UYVY),
-    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2GRAY_YUY2),
-    "yuyv": (2, 1, cv2.COLOR_YUV2GRAY_YUY2),
+    **{
+        f"bayer_{name}8": (1, 1, getattr(cv2, f"COLOR_Bayer{name.upper()}2GRAY"))
+        for name in ("rggb", "bggr", "gbrg", "grbg")
+    },
+    **dict.fromkeys(("yuv422", "uyvy"), (2, 1, cv2.COLOR_YUV2GRAY_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, 1, cv2.COLOR_YUV2GRAY_YUY2)),
 }
 
 # sensor_msgs/PointField.datatype
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 LAST_STAMP_NS = 2**31 * 10**9
-"""What a stamp with seconds of 32 bits stays below."""
+"""Stamps with seconds of 32 bits stay below."""
 FURTHEST_M = 1e7
 """No odometry is further from its origin: a quarter of the earth."""
 NARROWEST_RAD, WIDEST_RAD = 0.02, 3.1
@@ -46,7 +43,7 @@ NARROWEST_RAD, WIDEST_RAD = 0.02, 3.1
 LARGEST_RECORD = 4096
 """Bytes of a point; drivers have some dozens."""
 INTENSITY_NAMES = ("intensity", "reflectivity", "reflectance", "i")
-"""Fields of the strength of a return, by whoever's driver."""
+"""Fields of the strength of a return, by driver."""
 TIME_NAMES = ("point_time_offset", "offset_time", "t", "time", "time_offset", "timestamp")
 """Fields of the time of a point: whole numbers are ns, others s; Blickfeld, Livox, Ouster, Velodyne, Hesai."""
 FURTHEST_RETURN_M = 1e4
@@ -71,14 +68,8 @@ class Cloud:
     time_offset_ns: NDArray[np.int64] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class OdometrySample:
-    """One pose of the odometry.
-
-    Attributes:
-        stamp_ns: when.
-        odom_T_body: (4, 4) pose.
-    """
+class OdometrySample(NamedTuple):
+    """One pose (4, 4) of the odometry and its stamp."""
 
     stamp_ns: int
     odom_T_body: Array
@@ -88,8 +79,7 @@ def stamp_ns(message: Any) -> int:
     """Stamp of the message's header in nanoseconds.
 
     Raises:
-        MessageError: of kind "stamp" when the driver has not set it, for it would look like a restart of the recording,
-            or when there is no such time.
+        MessageError: of kind "stamp" when there is no such time, or none is set: that looks like a restart.
     """
     stamp = message.header.stamp
     nanoseconds = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
@@ -204,8 +194,8 @@ def _cloud_records(message: Any) -> NDArray[Any]:
     data = np.frombuffer(message.data, np.uint8)
     if data.size < row_step * (message.height - 1) + row_bytes:
         raise MessageError("truncated", f"cloud holds {data.size} bytes of {row_step * message.height}")
-    rows = [data[start : start + row_bytes] for start in range(0, row_step * message.height, row_step)]
-    return (rows[0] if len(rows) == 1 else np.concatenate(rows)).view(dtype)
+    shape, strides = (message.height, message.width), (row_step, message.point_step)
+    return np.ndarray(shape, dtype, data, strides=strides).reshape(-1)
 
 
 def _record_type(fields: list[Any], point_step: int, order: str) -> np.dtype[Any]:
@@ -222,11 +212,7 @@ def _record_type(fields: list[Any], point_step: int, order: str) -> np.dtype[Any
 
 
 def decode_odometry(message: Any) -> OdometrySample:
-    """Pose of a nav_msgs/Odometry.
-
-    Raises:
-        MessageError: of kind "pose" when it is not finite or its quaternion is not of unit length.
-    """
+    """Pose of a nav_msgs/Odometry; raises as `decode_pose`."""
     return OdometrySample(stamp_ns(message), decode_pose(message.pose.pose))
 
 
@@ -272,20 +258,15 @@ def _projection(info: Any, name: str) -> Array:
     matrix = np.array(info.p, dtype=float).reshape(3, 4)
     if not matrix.any():
         matrix[:, :3] = np.array(info.k, dtype=float).reshape(3, 3)
-    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0 and info.width > 0 and info.height > 0):
-        raise MessageError("camera_info", f"{name} camera_info is not calibrated")
-    _check_pinhole(matrix, info, name)
-    return matrix
-
-
-def _check_pinhole(matrix: Array, info: Any, name: str) -> None:
-    """Refuse a camera that nobody can build."""
     width, height, fx, fy = float(info.width), float(info.height), matrix[0, 0], matrix[1, 1]
+    if not (np.isfinite(matrix).all() and min(width, height, fx, fy) > 0):
+        raise MessageError("camera_info", f"{name} camera_info is not calibrated")
     views = [2 * np.arctan2(size / 2, focal) for size, focal in ((width, fx), (height, fy))]
     centre = 0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height
     if not (all(NARROWEST_RAD < view < WIDEST_RAD for view in views) and 0.5 < fx / fy < 2 and centre):
         numbers = f"{width:.0f} x {height:.0f} pixels, fx {fx:.3g}, fy {fy:.3g}, centre {matrix[0, 2]:.3g}"
         raise MessageError("camera_info", f"{name} camera_info of no real camera: {numbers}, {matrix[1, 2]:.3g}")
+    return matrix
 
 
 IMAGE, COMPRESSED, CLOUD = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2"
