@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from umf_ros.bags.presets import calibration_of, topics_of, uses_transforms
 from umf_ros.bags.reader import Bag, decode
 from umf_ros.bags.storages import RawMessage
 from umf_ros.core import watchdog
-from umf_ros.core.config import Settings, Topics
+from umf_ros.core.config import Settings, Topics, topics_of
 from umf_ros.core.errors import BagError, MessageError, either
 from umf_ros.core.frames import Frame, Image
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.buffers import InputCounter
+from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import TYPES, OdometrySample, stamp_ns
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.sessions import Input
@@ -66,7 +66,7 @@ class FrameReader:
         self._odometry = odometry
         self._synchronizer = Synchronizer(settings.sync, calibration, inputs, warn)
         self._samples: list[OdometrySample] = []
-        transforms = read_transforms(bag) if uses_transforms(settings) else None
+        transforms = read_transforms(bag) if settings.uses_transforms else None
         mounting, frames = None, None
         if transforms is not None and transforms.version:
             mounting = TfExtrinsics(calibration, transforms, settings.frames.base, warn)

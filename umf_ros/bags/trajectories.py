@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.bags.presets import GROUND_TRUTH_TOPIC, calibration_of
+from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.reader import Bag
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import BagError, MessageError
 from umf_ros.core.geometry import Array, make_pose
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose, stamp_ns
 
 GPS_EPOCH_S = 315_964_800

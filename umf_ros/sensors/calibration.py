@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from umf_ros.core.config import Group, load_preset, problems
+from umf_ros.core.config import Group, Settings, load_preset, problems
 from umf_ros.core.errors import CalibrationError, ConfigError, one_line
 from umf_ros.core.frames import Image, StereoCamera
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose
@@ -122,6 +122,11 @@ class Calibration:
         if self.rectifier is not None:  # the camera_info of raw images describes other pixels
             return self
         return replace(self, camera=replace(camera, baseline=camera.baseline or self.camera.baseline))
+
+
+def calibration_of(settings: Settings) -> Calibration:
+    """The calibration that the settings name, else that of the data set; raises as `load_calibration`."""
+    return load_calibration(settings.calibration or settings.dataset)
 
 
 def load_calibration(source: str | Path) -> Calibration:
