@@ -13,8 +13,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
-from umf_ros.bags.presets import calibration_of, topics_of, uses_transforms
-from umf_ros.core.config import Settings
+from umf_ros.core.config import Settings, topics_of
 from umf_ros.core.frames import Frame, LoopClosure
 from umf_ros.core.geometry import rotation_angle
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
@@ -24,6 +23,7 @@ from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.runs.writer import RunRecorder, count_drops
+from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms, TfExtrinsics
@@ -62,7 +62,7 @@ class LoopClosureNode(BaseNode):
         transforms = StaticTransforms()
         self._odometry_frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
         mounting = (
-            TfExtrinsics(calibration, transforms, settings.frames.base, warn) if uses_transforms(settings) else None
+            TfExtrinsics(calibration, transforms, settings.frames.base, warn) if settings.uses_transforms else None
         )
         frames = self._odometry_frames
         self._intake = MessageRouter(self._synchronizer, topics, warn, mounting=mounting, odometry_frames=frames)

@@ -21,9 +21,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from umf_ros.bags.presets import topics_of
 from umf_ros.core import watchdog
-from umf_ros.core.config import Settings
+from umf_ros.core.config import Settings, topics_of
 from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import Array
 from umf_ros.localizer import MapFollower

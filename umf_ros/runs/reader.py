@@ -10,10 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
-from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.config import Settings, load_settings, topics_of
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure, Points
 from umf_ros.core.trajectory import Trajectory

@@ -43,11 +43,9 @@ class InputCounter:
 
 @dataclass(slots=True)
 class StampedImage:
-    """An image of the stream.
+    """An image (H, W) uint8 of the stream and the stamp of its exposure.
 
     Attributes:
-        stamp_ns: exposure.
-        image: (H, W) uint8.
         late: whether a scan that might have wanted it was given up before it came.
         used: whether a frame has taken it.
     """
@@ -96,8 +94,7 @@ class ImageBuffer:
 
     def clear(self) -> None:
         """Let go of everything."""
-        while self._images:
-            self._forget(SURPLUS)
+        self.forget_before(2**63)
         self.newest_ns = None
 
     def _forget(self, reason: str) -> None:
@@ -107,12 +104,7 @@ class ImageBuffer:
 
 
 class OdometryBuffer:
-    """The latest poses of the odometry, interpolated.
-
-    Args:
-        length_ns: how far back poses are kept.
-        max_gap_ns: no pose is interpolated across a longer gap.
-    """
+    """The poses of the odometry in the latest `length_ns`, interpolated across gaps up to `max_gap_ns`."""
 
     def __init__(self, length_ns: int, max_gap_ns: int) -> None:
         self._length_ns = length_ns
