@@ -28,11 +28,11 @@ from umf_ros.nodes.conversions import (
     CLOSURES_QOS,
     LATCHED_QOS,
     MAX_LINES,
-    ClosurePublisher,
     closure_to_message,
     from_time,
     is_between_rovers,
 )
+from umf_ros.nodes.loop_closure_node import ClosurePublisher
 from umf_ros.verification import Hypothesis, Measurement, RejectReason
 
 TOPICS: dict[str, tuple[type, Any]] = {

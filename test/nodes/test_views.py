@@ -12,7 +12,7 @@ from rclpy.qos import QoSDurabilityPolicy
 from sources import ROOT
 
 from umf_ros.core.config import FrameIds, Topics
-from umf_ros.nodes.conversions import ClosurePublisher
+from umf_ros.nodes.loop_closure_node import ClosurePublisher
 from umf_ros.nodes.pose_graph_node import PoseGraphNode
 
 LATCHED = QoSDurabilityPolicy.TRANSIENT_LOCAL

@@ -14,9 +14,9 @@ from umf_ros.runs.truth import normalised_errors, pose_error
 from umf_ros.verification.scan_alignment import (
     Alignment,
     CovarianceModel,
-    scan_covariance,
     covariance_of,
     motion_covariance,
+    scan_covariance,
 )
 
 MODEL = CovarianceModel(4.0, 0.001, 0.005, unknown_motion_m=0.04, unknown_motion_deg=0.1)

@@ -13,13 +13,25 @@ from typing import Any
 
 import yaml
 
-from umf_ros.core.errors import ConfigError, UmfError, one_line, shortened, writing
+from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, shortened, writing
 
 Migration = tuple[str, ...] | Callable[[sqlite3.Connection], None]
 Check = Callable[[sqlite3.Connection], None]
 _DAMAGE = (sqlite3.Error, ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
 """Exceptions that the values of a damaged file raise where rows are read and parsed."""
 _VERSIONS = "CREATE TABLE IF NOT EXISTS schema_version (name TEXT PRIMARY KEY, version INTEGER NOT NULL)"
+
+
+def check_writable(out: Path) -> None:
+    """Find out before hours of work whether the results will have a place.
+
+    Raises:
+        OutputError: `out` cannot be written.
+    """
+    with writing(f"to {out}"):
+        out.mkdir(parents=True, exist_ok=True)
+    if not os.access(out, os.W_OK):
+        raise OutputError(f"cannot write to {out}: permission denied")
 
 
 @contextmanager

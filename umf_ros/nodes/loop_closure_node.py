@@ -3,22 +3,39 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
+from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray
 
-from umf_ros.core.config import Settings, topics_of
-from umf_ros.core.frames import Frame, LoopClosure
+from umf_ros.core.config import FrameIds, Settings, topics_of
+from umf_ros.core.frames import Frame, Keyframe, LoopClosure
 from umf_ros.core.geometry import rotation_angle
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.nodes.base_node import BaseNode
-from umf_ros.nodes.conversions import ClosurePublisher, sensor_qos
+from umf_ros.nodes.conversions import (
+    CLOSURES_QOS,
+    LATCHED_QOS,
+    MAX_LINES,
+    closure_to_message,
+    keyframe_frame,
+    sensor_qos,
+    to_header,
+    to_lines,
+    to_point,
+    to_pose_stamped,
+    to_time,
+)
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.nodes.transforms import hear_static_transforms
@@ -27,6 +44,7 @@ from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms, TfExtrinsics
+from umf_ros.verification import Hypothesis
 
 if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure
@@ -204,6 +222,86 @@ class LoopClosureNode(BaseNode):
     def _pause(self, request: Any) -> str:
         self._paused = request.data
         return "paused" if request.data else "running"
+
+
+class ClosurePublisher:
+    """Loop closures, keyframes, tested candidates and markers of one node.
+
+    `loop_closures` carries verified closures only; `~/candidates` everything that was tested.
+
+    Attributes:
+        odom: name of the odometry's frame.
+    """
+
+    def __init__(self, node: Node, frames: FrameIds) -> None:
+        self._node = node
+        self.odom = frames.odom
+        self._closures = node.create_publisher(Odometry, "loop_closures", CLOSURES_QOS)
+        self._keyframes = node.create_publisher(PoseStamped, "~/keyframes", CLOSURES_QOS)
+        self._candidates = node.create_publisher(DiagnosticArray, "~/candidates", 10)
+        self._markers = node.create_publisher(MarkerArray, "~/markers", LATCHED_QOS)
+        self._accepted: deque[list] = deque(maxlen=MAX_LINES)
+        self._rejected: deque[list] = deque(maxlen=MAX_LINES)
+
+    def announce(self, detection: Detection, matches: dict[int, Keyframe]) -> None:
+        """Publish one detection.
+
+        Args:
+            detection: what became of a frame.
+            matches: the matched keyframes by stamp, for the markers.
+        """
+        keyframe = detection.keyframe
+        if keyframe is None:
+            return
+        for closure in detection.closures:
+            self._closures.publish(closure_to_message(closure))
+        self._keyframes.publish(self._pose_of(keyframe))
+        if detection.verdicts:
+            report = DiagnosticArray(status=[_describe(keyframe, verdict) for verdict in detection.verdicts])
+            report.header.stamp = to_time(keyframe.stamp_ns)
+            self._candidates.publish(report)
+            self._draw(keyframe, detection.verdicts, matches)
+
+    def announce_encounter(self, inter_closure: InterRobotClosure) -> None:
+        """Publish what was found of another rover's places: closures like any other, with the names of both rovers."""
+        for closure in inter_closure.closures:
+            self._closures.publish(closure_to_message(closure, inter_closure.own, inter_closure.robot))
+        report = DiagnosticArray(
+            status=[_describe(inter_closure.keyframe, one, inter_closure.robot) for one in inter_closure.verdicts]
+        )
+        report.header.stamp = to_time(inter_closure.keyframe.stamp_ns)
+        self._candidates.publish(report)
+
+    def wait_until_heard(self) -> None:
+        """Wait until whoever listens has the last closures, as far as they answer soon."""
+        self._closures.wait_for_all_acked(Duration(seconds=1))
+
+    def _pose_of(self, keyframe: Keyframe) -> PoseStamped:
+        """The keyframe's odometry; without one it is where it is: at the origin of its own frame."""
+        if keyframe.odom_T_body is not None:
+            return to_pose_stamped(keyframe.stamp_ns, self.odom, keyframe.odom_T_body)
+        return to_pose_stamped(keyframe.stamp_ns, keyframe_frame(keyframe.stamp_ns), np.eye(4))
+
+    def _draw(self, keyframe: Keyframe, verdicts: list[Hypothesis], matches: dict[int, Keyframe]) -> None:
+        if keyframe.odom_T_body is None:
+            return
+        here = to_point(keyframe.odom_T_body[:3, 3])
+        for verdict in verdicts:
+            match = matches.get(verdict.candidate.stamp_ns)
+            if match is None or match.odom_T_body is None or match.session != keyframe.session:
+                continue
+            lines = self._rejected if verdict.closure is None else self._accepted
+            lines.append([to_point(match.odom_T_body[:3, 3]), here])
+        header = to_header(keyframe.stamp_ns, self.odom)
+        chosen = {"accepted": self._accepted, "rejected": self._rejected}
+        self._markers.publish(MarkerArray(markers=[to_lines(*item, header) for item in chosen.items()]))
+
+
+def _describe(keyframe: Keyframe, verdict: Hypothesis, robot: str = "") -> DiagnosticStatus:
+    accepted = verdict.closure is not None
+    name = f"{keyframe_frame(verdict.candidate.stamp_ns, robot)} -> {keyframe.stamp_ns}"
+    numbers = {"similarity": verdict.candidate.similarity, **verdict.numbers}
+    return status(OK if accepted else WARN, name, verdict.outcome, numbers)
 
 
 def describe(number: int, closure: LoopClosure) -> str:

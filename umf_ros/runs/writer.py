@@ -53,18 +53,6 @@ def create_run_folder(out: Path, latest: bool = True) -> Path:
     return folder
 
 
-def check_writable(out: Path) -> None:
-    """Find out before hours of work whether the results will have a place.
-
-    Raises:
-        OutputError: `out` cannot be written.
-    """
-    with writing(f"to {out}"):
-        out.mkdir(parents=True, exist_ok=True)
-    if not os.access(out, os.W_OK):
-        raise OutputError(f"cannot write to {out}: permission denied")
-
-
 def _make_unique(out: Path, name: str) -> Path:
     for suffix in ["", *(f"_{i}" for i in range(2, 1000))]:
         with suppress(FileExistsError):
