@@ -59,11 +59,11 @@ def command(
 
     from rich.console import Console
 
+    from umf_ros.core.io import check_writable
     from umf_ros.core.tasks import spread
     from umf_ros.maps.joint_graph import solve
     from umf_ros.maps.mapping import Opening, find_recordings, unmatched
     from umf_ros.maps.outputs import write_results
-    from umf_ros.runs.writer import check_writable
 
     console = Console()
     check_writable(out)

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from umf_ros.core.errors import ConfigError, UmfError, one_line, shortened, writing
+from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, shortened, writing
 
 Migration = tuple[str, ...] | Callable[[sqlite3.Connection], None]
 Check = Callable[[sqlite3.Connection], None]
@@ -43,6 +43,18 @@ def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
+
+
+def check_writable(folder: Path) -> None:
+    """Make a folder and check that results can be written into it, before hours of work.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with writing(f"to {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise OutputError(f"cannot write to {folder}: permission denied")
 
 
 class FileLock:

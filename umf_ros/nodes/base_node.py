@@ -21,10 +21,10 @@ from rclpy.qos import QoSProfile
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics
 from umf_ros.core.errors import MessageError, OutputError, UmfError
+from umf_ros.core.io import check_writable
 from umf_ros.nodes.conversions import from_time
 from umf_ros.nodes.diagnostics import WARN, Heartbeat, InputWatch, Throttle
 from umf_ros.nodes.parameters import changed_settings, declare
-from umf_ros.runs.writer import check_writable
 
 WATCH_S = 1.0
 HEARTBEAT_S = 0.05

@@ -17,10 +17,10 @@ def command(
     from rich.console import Console
 
     from umf_ros.core.errors import ConfigError
+    from umf_ros.core.io import check_writable
     from umf_ros.embedding.embedder import FeatureRequest
     from umf_ros.embedding.runtimes import convert_umf, outputs_of, save_model
     from umf_ros.networks.config import locate_weights
-    from umf_ros.runs.writer import check_writable
 
     if out.suffix != ".xml":
         raise ConfigError(f"{out}: OpenVINO's files end in .xml")
