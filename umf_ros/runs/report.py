@@ -348,7 +348,7 @@ def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> Examin
     """
     judged = JudgedRun()
     if run.truth is not None:
-        judged = judge_run(run.folder, run.truth, run.closures, run.settings.loop, run.odometry, run.optimized)
+        judged = judge_run(run.keyframes, run.truth, run.closures, run.settings.loop, run.odometry, run.optimized)
         covered, total = judged.covered
         if not covered and total and run.summary["ground_truth"]:
             raise UmfError(
