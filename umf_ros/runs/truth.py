@@ -22,9 +22,9 @@ from umf_ros.runs.tables import Endpoints, KeyframeRow
 
 CONFIDENCE = 0.95
 MEDIAN_EXPECTED = float(chdtri(6, 0.5))
-"""Half of honest normalised errors squared are less than this, 5.35: chi square with six degrees of freedom."""
-HONEST_MEDIAN = (3.0, 8.0)
-HONEST_INSIDE = 0.9
+"""Half of consistent normalised errors squared are less than this, 5.35: chi square with six degrees of freedom."""
+CONSISTENT_MEDIAN = (3.0, 8.0)
+CONSISTENT_INSIDE = 0.9
 
 
 def pose_error(estimated: Array, true: Array) -> Array:
@@ -50,13 +50,13 @@ def share_inside(squared: Array, confidence: float = CONFIDENCE) -> float:
 
 def in_words(nees_median: float, inside_95: float) -> str:
     """Say in a plain word how stated errors compare with true ones."""
-    low, high = HONEST_MEDIAN
+    low, high = CONSISTENT_MEDIAN
     factor = (nees_median / MEDIAN_EXPECTED) ** 0.5
     if nees_median > high:
         return f"too small by a factor of {factor:.2g}"
     if nees_median < low:
         return f"too large by a factor of {1 / max(factor, 1e-9):.2g}"
-    return "honest" if inside_95 >= HONEST_INSIDE else "honest for most, too small for the worst"
+    return "consistent" if inside_95 >= CONSISTENT_INSIDE else "consistent for most, too small for the worst"
 
 
 PLACE_RADIUS_M = 12.0
@@ -249,7 +249,7 @@ def positions_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Arra
     Without a truth, or one that covers fewer than three poses, they stay in the frame of the trajectory.
     """
     positions: Array = trajectory.poses[:, :3, 3]
-    if truth is None:
+    if truth is None or trajectory is truth:
         return positions
     poses, known = truth.at(trajectory.stamps_ns)
     if np.count_nonzero(known) < 3:
