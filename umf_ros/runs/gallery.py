@@ -110,7 +110,7 @@ class Gallery:
             self._lay_into_map(frame.stamp_ns, frame.points)
 
     def map_picture(self) -> dict[str, Any] | None:
-        """The map so far: `data:` address, (x, y) in m of `lower` left and `upper` right corner; None if it is empty."""
+        """The map so far: `data:` address, (x, y) in m of `lower` left and `upper` right corner; None if empty."""
         png = self._heights.png() if self._heights is not None else None
         if self._heights is None or png is None:
             return None
