@@ -121,16 +121,16 @@ def test_the_terminal_gets_the_same_facts_and_no_line_twice(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("honesty", "said"),
+    ("errors", "said"),
     [
         ({}, "not judged"),
         ({"nees_median": None, "inside_95": None}, "not judged"),
-        ({"nees_median": 5.3, "inside_95": 0.95}, "honest; 95% of the closures inside their 95 % ellipsoid"),
+        ({"nees_median": 5.3, "inside_95": 0.95}, "consistent; 95% of the closures inside their 95 % ellipsoid"),
         ({"nees_median": 135.0, "inside_95": 0.0}, "too small by a factor of 5; 0% of the closures"),
     ],
 )
-def test_stated_errors_are_judged_in_a_plain_word(tmp_path: Path, honesty: dict[str, Any], said: str) -> None:
-    read = Read(written(examined(tmp_path, ground_truth=TRUTH | honesty)))
+def test_stated_errors_are_judged_in_a_plain_word(tmp_path: Path, errors: dict[str, Any], said: str) -> None:
+    read = Read(written(examined(tmp_path, ground_truth=TRUTH | errors)))
     assert any(text.startswith(said) for text in read.text)
 
 

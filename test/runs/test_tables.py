@@ -20,7 +20,7 @@ from umf_ros.runs.tables import (
     candidate_row,
     closure_row,
     inlier_rows,
-    read_candidates,
+    parse_candidate,
     read_closures,
     read_table,
     write_table,
@@ -95,7 +95,8 @@ def test_figures_of_a_reason_may_hold_anything(tmp_path: Path) -> None:
 def test_a_candidate_reads_back_as_it_was_written(tmp_path: Path, reason: RejectReason | None) -> None:
     measurement = Measurement(kind=SCAN, similarity=0.5, noise_m=0.25, rival_far=0.125)
     put = Hypothesis(QUERY_NS, Candidate(3, MATCH_NS, 0.5), measurement, reason, "0.5 m", probability=0.75)
-    (got,) = read_candidates(written(tmp_path / "candidates.csv", [candidate_row(put)], CANDIDATES))
+    path = written(tmp_path / "candidates.csv", [candidate_row(put)], CANDIDATES)
+    (got,) = read_table(path, parse_candidate)
     assert (got.endpoints, got.reason, got.probability) == (put.endpoints, reason, 0.75)
     assert got.numbers == pytest.approx(put.numbers, nan_ok=True) and got.measurement.kind == SCAN
     assert reason is None or got.outcome == put.outcome
@@ -104,7 +105,7 @@ def test_a_candidate_reads_back_as_it_was_written(tmp_path: Path, reason: Reject
 def test_a_reason_of_another_version_is_kept_as_text(tmp_path: Path) -> None:
     row = [QUERY_NS, MATCH_NS, 0.5, "a riddle", "{}"]
     columns = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "numbers"]
-    (got,) = read_candidates(written(tmp_path / "candidates.csv", [row], columns))
+    (got,) = read_table(written(tmp_path / "candidates.csv", [row], columns), parse_candidate)
     assert (got.reason, got.detail) == (RejectReason.UNKNOWN, "a riddle")
 
 

@@ -22,18 +22,6 @@ _DAMAGE = (sqlite3.Error, ArithmeticError, LookupError, RecursionError, TypeErro
 _VERSIONS = "CREATE TABLE IF NOT EXISTS schema_version (name TEXT PRIMARY KEY, version INTEGER NOT NULL)"
 
 
-def check_writable(out: Path) -> None:
-    """Find out before hours of work whether the results will have a place.
-
-    Raises:
-        OutputError: `out` cannot be written.
-    """
-    with writing(f"to {out}"):
-        out.mkdir(parents=True, exist_ok=True)
-    if not os.access(out, os.W_OK):
-        raise OutputError(f"cannot write to {out}: permission denied")
-
-
 @contextmanager
 def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
     """Write a file in one step: it appears under its name complete, or not at all.
@@ -55,6 +43,18 @@ def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
+
+
+def check_writable(folder: Path) -> None:
+    """Make a folder and check that results can be written into it, before hours of work.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with writing(f"to {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise OutputError(f"cannot write to {folder}: permission denied")
 
 
 class FileLock:

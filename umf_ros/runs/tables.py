@@ -1,4 +1,7 @@
-"""Columns and rows of the CSV tables of a run."""
+"""Columns and rows of the CSV tables of a run.
+
+A table that cannot be read raises an `UmfError`, which names the file and the damaged line.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,6 @@ CANDIDATES = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "detai
 KEYFRAMES = ["stamp_ns", "session", "travelled_m"]
 STAGES = ("embed", "query", "verify", "submaps", "total")
 LATENCIES = ["stamp_ns", *STAGES]
-_KEYFRAME = tuple(zip((int, int, float), KEYFRAMES, strict=True))
 INLIERS = ["query_stamp_ns", "match_stamp_ns", "query_u", "query_v", "match_u", "match_v"]
 LOCALIZATION = ["stamp_ns", *POSE, *SIGMA, "probability"]
 COLUMNS = {
@@ -63,14 +65,30 @@ class GraphVerdict:
     sigma: float
     misfit_m: float
 
+    @property
+    def figures(self) -> str:
+        """Distances to the map in brackets; empty where they are unknown."""
+        return f" ({self.sigma:.1f} sigma, {self.misfit_m:.2f} m)" if np.isfinite(self.sigma) else ""
+
+    @classmethod
+    def parse(cls, row: dict[str, str]) -> tuple[Endpoints, GraphVerdict]:
+        """Endpoints and verdict in a row by column."""
+        match, query, state, reason, sigma, misfit_m = (row[name] for name in VERDICT_COLUMNS)
+        return (int(query), int(match)), cls(State(state), reason, float(sigma), float(misfit_m))
+
 
 @dataclass(frozen=True, slots=True)
 class KeyframeRow:
-    """A row of `keyframes.csv`: stamp in ns, session, and way in m, NaN without odometry."""
+    """A row of `keyframes.csv`: stamp in ns, session, and path length in m, NaN without odometry."""
 
     stamp_ns: int
     session: int
     path_length_m: float
+
+    @classmethod
+    def parse(cls, row: dict[str, str]) -> KeyframeRow:
+        """The keyframe in a row by column."""
+        return cls(int(row["stamp_ns"]), int(row["session"]), float(row["travelled_m"]))
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -113,63 +131,19 @@ def inlier_rows(hypothesis: Hypothesis) -> list[list[Any]]:
 
 
 def read_table(path: Path, parse: Callable[[dict[str, str]], Row]) -> list[Row]:
-    """What `parse` makes of every row, given by column.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
-    rows: list[Row] = []
+    """Return the result of `parse` for every row, which is given by column."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
-            for row in reader:
-                rows.append(parse(row))
+            return [parse(row) for row in reader]
     except OSError as error:
         raise UmfError(f"cannot read {path}: {error.strerror}") from None
     except (KeyError, TypeError, ValueError, csv.Error):
         raise UmfError(f"{path}, line {reader.line_num}: not a row of this table") from None
-    return rows
 
 
-def read_candidates(path: Path) -> list[Hypothesis]:
-    """Everything that was tested.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
-    return read_table(path, _candidate)
-
-
-def read_keyframes(path: Path) -> list[KeyframeRow]:
-    """The keyframes in the order of their stamps.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
-    return read_table(path, lambda row: KeyframeRow(*(kind(row[name]) for kind, name in _KEYFRAME)))
-
-
-def read_latencies(path: Path) -> dict[int, float]:
-    """Milliseconds that each keyframe took, by its stamp; none where an older version wrote none.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
-    if not path.is_file():
-        return {}
-    return dict(read_table(path, lambda row: (int(row["stamp_ns"]), float(row["total"]))))
-
-
-def read_graph_verdicts(path: Path) -> dict[Endpoints, GraphVerdict]:
-    """The graph's verdicts by the stamps of query and match; none where there was no graph.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
-    return dict(read_table(path, _graph_verdict)) if path.is_file() else {}
-
-
-def _candidate(row: dict[str, str]) -> Hypothesis:
+def parse_candidate(row: dict[str, str]) -> Hypothesis:
+    """The hypothesis in a row of `candidates.csv`; a reason of another version is kept as its detail."""
     numbers = {name: float(value) for name, value in json.loads(row["numbers"]).items()}
     candidate = Candidate(-1, int(row["match_stamp_ns"]), float(row["similarity"]))
     probability, measurement = numbers.pop("probability", None), Measurement.read(candidate.similarity, numbers)
@@ -183,17 +157,13 @@ def _candidate(row: dict[str, str]) -> Hypothesis:
     )
 
 
-def _graph_verdict(row: dict[str, str]) -> tuple[Endpoints, GraphVerdict]:
-    match, query, state, reason, sigma, misfit_m = (row[name] for name in VERDICT_COLUMNS)
-    return (int(query), int(match)), GraphVerdict(State(state), reason, float(sigma), float(misfit_m))
+def read_keyframes(path: Path) -> list[KeyframeRow]:
+    """The keyframes in the order of their stamps."""
+    return read_table(path, KeyframeRow.parse)
 
 
 def read_closures(path: Path) -> list[LoopClosure]:
-    """The closures of a `closures.csv`; with a diagonal covariance where an older version wrote no other.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
+    """The closures of a `closures.csv`; with a diagonal covariance where an older version wrote no other."""
     return read_table(path, parse_closure)
 
 
