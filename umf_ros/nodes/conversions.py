@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, Pose, PoseStamped, PoseWithCovarianceStamped, Quaternion, TransformStamped, Vector3
 from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
@@ -34,14 +34,16 @@ if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure
 
 
-# with their history: a SLAM system that joins late gets every closure and verdict of the run
-CLOSURES_QOS = QoSProfile(
-    depth=5000, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
-)
-# maps and markers: whoever joins late gets the last one (REP-2003)
-LATCHED_QOS = QoSProfile(
-    depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
-)
+def latched(depth: int) -> QoSProfile:
+    """Profile of a topic whose last messages reach late subscribers too (REP-2003)."""
+    return QoSProfile(
+        depth=depth, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+    )
+
+
+CLOSURES_QOS = latched(5000)
+"""With their history: a SLAM system that joins late gets every closure and verdict of the run."""
+LATCHED_QOS = latched(1)
 
 
 def sensor_qos(settings: Qos, min_depth: int = 1) -> QoSProfile:
@@ -89,17 +91,6 @@ def to_poses(poses: Array) -> list[Pose]:
 def to_header(stamp_ns: int, frame: str) -> Header:
     """Stamp and frame of a message."""
     return Header(stamp=to_time(stamp_ns), frame_id=frame)
-
-
-def to_pose_stamped(stamp_ns: int, frame: str, pose: Array) -> PoseStamped:
-    """Pose in `frame` with its stamp."""
-    return PoseStamped(header=to_header(stamp_ns, frame), pose=to_pose(pose))
-
-
-def to_poses_stamped(stamps_ns: Sequence[int], frame: str, poses: Array) -> list[PoseStamped]:
-    """(N, 4, 4) poses in `frame` with their stamps."""
-    both = zip(stamps_ns, to_poses(poses), strict=True)
-    return [PoseStamped(header=to_header(stamp_ns, frame), pose=pose) for stamp_ns, pose in both]
 
 
 def to_lines(name: str, lines: Iterable[Iterable[Point]], header: Header) -> Marker:
@@ -184,9 +175,8 @@ def _keyframe_stamp(frame: str) -> int:
     return stamp_ns
 
 
-# RViz draws no more of a path than this, and messages stay small on long drives
-MAX_POSES = 2000
-MAX_LINES = 500
+MAX_POSES, MAX_LINES = 2000, 500
+"""RViz draws no more of a path and redraws every line; messages stay small on long drives."""
 
 
 def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: FrameIds) -> Path:
@@ -194,7 +184,8 @@ def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: FrameIds) -> P
     if not len(stamps_ns):
         return Path(header=Header(frame_id=frames.map))
     rows = np.unique(np.linspace(0, len(stamps_ns) - 1, MAX_POSES).astype(int))
-    poses = to_poses_stamped(stamps_ns[rows].tolist(), frames.map, map_T_body[rows])
+    both = zip(stamps_ns[rows].tolist(), to_poses(map_T_body[rows]), strict=True)
+    poses = [PoseStamped(header=to_header(stamp, frames.map), pose=pose) for stamp, pose in both]
     return Path(header=to_header(int(stamps_ns[-1]), frames.map), poses=poses)
 
 
@@ -224,9 +215,6 @@ def markers(verdicts: list[ClosureVerdict], lines: Array, stamp_ns: int, frames:
     return MarkerArray(markers=[to_lines(name, some, header) for name, some in points.items()])
 
 
-# RViz redraws every line it is sent: a rover that runs for days shows its latest ones
-
-
 class ClosurePublisher:
     """Loop closures, keyframes, tested candidates and markers of one node.
 
@@ -247,43 +235,40 @@ class ClosurePublisher:
         self._rejected: deque[list] = deque(maxlen=MAX_LINES)
 
     def announce(self, detection: Detection, matches: dict[int, Keyframe]) -> None:
-        """Publish one detection.
-
-        Args:
-            detection: what became of a frame.
-            matches: the matched keyframes by stamp, for the markers.
-        """
+        """Publish one detection; `matches` are the matched keyframes by stamp, for the markers."""
         keyframe = detection.keyframe
         if keyframe is None:
             return
         for closure in detection.closures:
             self._closures.publish(closure_to_message(closure))
-        self._keyframes.publish(self._pose_of(keyframe))
+        # without odometry a keyframe is at the origin of its own frame
+        known = keyframe.odom_T_body is not None
+        header = to_header(keyframe.stamp_ns, self.odom if known else keyframe_frame(keyframe.stamp_ns))
+        pose = to_pose(np.eye(4) if keyframe.odom_T_body is None else keyframe.odom_T_body)
+        self._keyframes.publish(PoseStamped(header=header, pose=pose))
         if detection.verdicts:
-            report = DiagnosticArray(status=[_describe(keyframe, verdict) for verdict in detection.verdicts])
-            report.header.stamp = to_time(keyframe.stamp_ns)
-            self._candidates.publish(report)
+            self._report(keyframe, detection.verdicts)
             self._draw(keyframe, detection.verdicts, matches)
 
     def announce_encounter(self, inter_closure: InterRobotClosure) -> None:
-        """Publish what was found of another rover's places: closures like any other, with the names of both rovers."""
+        """Publish closures with another rover's places: like any other, with the names of both rovers."""
         for closure in inter_closure.closures:
             self._closures.publish(closure_to_message(closure, inter_closure.own, inter_closure.robot))
-        report = DiagnosticArray(
-            status=[_describe(inter_closure.keyframe, one, inter_closure.robot) for one in inter_closure.verdicts]
-        )
-        report.header.stamp = to_time(inter_closure.keyframe.stamp_ns)
-        self._candidates.publish(report)
+        self._report(inter_closure.keyframe, inter_closure.verdicts, inter_closure.robot)
 
     def wait_until_heard(self) -> None:
-        """Wait until whoever listens has the last closures, as far as they answer soon."""
+        """Wait for subscribers to acknowledge the last closures, a second at most."""
         self._closures.wait_for_all_acked(Duration(seconds=1))
 
-    def _pose_of(self, keyframe: Keyframe) -> PoseStamped:
-        """The keyframe's odometry; without one it is where it is: at the origin of its own frame."""
-        if keyframe.odom_T_body is not None:
-            return to_pose_stamped(keyframe.stamp_ns, self.odom, keyframe.odom_T_body)
-        return to_pose_stamped(keyframe.stamp_ns, keyframe_frame(keyframe.stamp_ns), np.eye(4))
+    def _report(self, keyframe: Keyframe, verdicts: list[Verdict], robot: str = "") -> None:
+        """Publish the tested candidates of a keyframe."""
+        report = DiagnosticArray(header=Header(stamp=to_time(keyframe.stamp_ns)))
+        for verdict in verdicts:
+            name = f"{keyframe_frame(verdict.candidate.stamp_ns, robot)} -> {keyframe.stamp_ns}"
+            level = WARN if verdict.closure is None else OK
+            numbers = {"similarity": verdict.candidate.similarity, **verdict.numbers}
+            report.status.append(status(level, name, verdict.reason, numbers))
+        self._candidates.publish(report)
 
     def _draw(self, keyframe: Keyframe, verdicts: list[Verdict], matches: dict[int, Keyframe]) -> None:
         if keyframe.odom_T_body is None:
@@ -298,10 +283,3 @@ class ClosurePublisher:
         header = to_header(keyframe.stamp_ns, self.odom)
         chosen = {"accepted": self._accepted, "rejected": self._rejected}
         self._markers.publish(MarkerArray(markers=[to_lines(*item, header) for item in chosen.items()]))
-
-
-def _describe(keyframe: Keyframe, verdict: Verdict, robot: str = "") -> DiagnosticStatus:
-    accepted = verdict.closure is not None
-    name = f"{keyframe_frame(verdict.candidate.stamp_ns, robot)} -> {keyframe.stamp_ns}"
-    numbers = {"similarity": verdict.candidate.similarity, **verdict.numbers}
-    return status(OK if accepted else WARN, name, verdict.reason, numbers)

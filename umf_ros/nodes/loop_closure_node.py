@@ -21,7 +21,6 @@ from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import ClosurePublisher, sensor_qos
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
 from umf_ros.nodes.process import Worker, leave, run
-from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.runs.writer import RunRecorder, count_drops
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
@@ -78,7 +77,7 @@ class LoopClosureNode(BaseNode):
         self._worker: Worker[Frame] = Worker(self._detect, self._complain, settings.worker.queue_size)
         self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._complain, 1)
         self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._complain, INTAKE_QUEUE)
-        hear_static_transforms(self, transforms, self._guarded, self._settings.frames.extrinsics)
+        self._hear_transforms(transforms)
         for name, topic in topics.model_dump().items():
             if topic:
                 take = partial(self._enqueue, topic)
