@@ -218,7 +218,7 @@ class ChangedBag(Bag):
     """A recording whose messages are changed as they are read."""
 
     def __init__(self, bag: Bag, change: Change) -> None:
-        super().__init__(bag.path, bag._storage)
+        super().__init__(bag.path, bag._files)
         self._change = change
 
     def raw_messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:

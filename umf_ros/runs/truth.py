@@ -172,7 +172,9 @@ def _judge_closures(closures: list[LoopClosure], truth: Trajectory) -> list[Judg
     poses, known = truth.at(stamps.reshape(-1))
     ends = zip(closures, poses.reshape(-1, 2, 4, 4), known.reshape(-1, 2), strict=True)
     return [
-        judge_closure(one, query, match, truth.has_orientation) for one, (query, match), covered in ends if covered.all()
+        judge_closure(one, query, match, truth.has_orientation)
+        for one, (query, match), covered in ends
+        if covered.all()
     ]
 
 

@@ -30,17 +30,13 @@ BINOMIALS = (-1.0, 3.0, -3.0, 1.0)
 STEPS = sum(binomial**2 for binomial in BINOMIALS)
 """The variance of a third difference of independent steps, in variances of one."""
 UNKNOWN_NOISE = np.array([1e-4] * 3 + [2e-5] * 3)
-"""Taken where the history is too short to tell: 1 cm and .25 deg per root of a second; by hand."""
+"""Taken where the history is too short: 1 cm and .25 deg per root of a second; by hand."""
 
 
 def scan_motion(moments_s: Array, span_ns: tuple[int, int], path: Path, odometry: OdometryBuffer) -> ScanMotion:
     """Return the motion during a scan whose points were measured `moments_s` (N,) s after the frame's stamp.
 
-    Args:
-        moments_s: of every point.
-        span_ns: stamps of the first and the last point.
-        path: the odometry over the scan, at least one pose.
-        odometry: its latest poses.
+    `span_ns` are the stamps of the first and the last point, `path` the odometry over the scan, at least one pose.
     """
     stamps, poses = path
     lasted_s = float(stamps[-1] - stamps[0]) * 1e-9
@@ -142,12 +138,9 @@ class ScanLimits:
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """The measurement a frame is built around: a scan, or an image where there is no LiDAR.
+    """The measurement a frame is built around: a scan in the LiDAR frame, or an image where there is no LiDAR.
 
-    Attributes:
-        stamp_ns: key of the frame.
-        measured_ns: stamp of the message; the points' time offsets count from here.
-        cloud: the scan in the LiDAR frame, or None.
+    `stamp_ns` is the key of the frame, `measured_ns` the stamp of the message: time offsets of points count from there.
     """
 
     stamp_ns: int
@@ -155,7 +148,7 @@ class Anchor:
     cloud: Cloud | None = None
 
     def span_ns(self) -> tuple[int, int]:
-        """When the first and the last point were measured; the key where the driver does not tell."""
+        """Stamps of the first and the last point; the key where the driver sends no times."""
         if self.cloud is None or self.cloud.time_offset_ns is None or not len(self.cloud.points):
             return self.stamp_ns, self.stamp_ns
         offsets = self.cloud.time_offset_ns

@@ -13,18 +13,12 @@ from umf_ros.core.frames import Image
 from umf_ros.core.geometry import Array, interpolate
 
 SURPLUS = "surplus"
-"""Reason of the images that lie nearest to no scan: cameras are faster than LiDARs, nothing is wrong."""
+"""Reason of images that lie nearest to no scan: no fault, cameras are faster than LiDARs."""
 
 
 @dataclass(slots=True)
 class InputCounter:
-    """Messages of one input: `received == used + sum(dropped) + waiting` at any time.
-
-    Attributes:
-        received: messages that arrived.
-        used: messages that became part of a frame, or of the odometry.
-        dropped: the others, by reason.
-    """
+    """Messages of one input: `received == used + sum(dropped) + waiting` at any time; dropped ones by reason."""
 
     received: int = 0
     used: int = 0

@@ -93,10 +93,8 @@ class Calibration:
     """How the sensors are built and mounted; poses are in the body frame (REP-103).
 
     Attributes:
-        camera: the rectified stereo pair.
-        body_T_camera: pose of the (rectified) left optical frame.
+        camera: the rectified stereo pair; `body_T_camera` is the pose of its left optical frame.
         body_T_lidar: pose of the LiDAR (Cube-1: x right, y forward, z up).
-        body_T_imu: pose of the IMU.
         lidar_time_offset_s: seconds to add to the stamp of a scan.
         min_intensity: returns up to this intensity, in the sensor's unit, are dropped; 0: none.
         max_height_m: returns further than this from the LiDAR's horizontal plane are dropped; infinite: none.

@@ -55,12 +55,12 @@ NO_RETURN_RANGE_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """The real returns of one scan.
+    """The real returns of one scan, with intensities and times as far as the driver sends them.
 
     Attributes:
         points: (N, 3) float32, metres, LiDAR frame.
-        intensity: (N,) float32, or None when the driver sends none.
-        time_offset_ns: (N,) int64 after the stamp of the message, or None when the driver sends none.
+        intensity: (N,) float32.
+        time_offset_ns: (N,) int64 after the stamp of the message.
     """
 
     points: Points
@@ -157,7 +157,7 @@ def real_returns(points: Points, intensity: Points | None) -> NDArray[np.bool_]:
 
 
 def _time_offsets_ns(records: NDArray[Any], message: Any) -> NDArray[np.int64] | None:
-    """(N,) ns after the message's stamp: drivers count from it, or since the epoch; None where they do not tell."""
+    """(N,) ns after the message's stamp, from which or since the epoch drivers count; None where there are no times."""
     name = next((name for name in TIME_NAMES if name in (records.dtype.names or ())), None)
     if name is None:
         return None

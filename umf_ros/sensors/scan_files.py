@@ -92,8 +92,7 @@ def _cloud_of(columns: Columns) -> Cloud:
 def parse_pcd(content: bytes) -> Columns:
     """Return the fields of the points, (N,) each or (N, count), by name in lower case.
 
-    The number of points is what the data hold where the header says otherwise (WIDTH 0, a recording that breaks
-    off); fields may repeat `_` for padding.
+    The data decide how many there are where the header says otherwise (WIDTH 0, a file that breaks off).
 
     Raises:
         SensorFileError: it is no such file, or the data are not what the header says.
@@ -332,7 +331,7 @@ SUFFIXES = (*_PARSERS, ".bin")
 
 
 def read_image(path: Path) -> Image:
-    """(H, W) uint8 grey image of a file, as its pixels lie there.
+    """(H, W) uint8 grey image of a file.
 
     Raises:
         SensorFileError: it cannot be read, or is no image.
@@ -373,13 +372,8 @@ def make_snapshot(
 ) -> Frame:
     """The frame that these measurements of one moment make, as a synchronizer would.
 
-    Args:
-        cloud: in the LiDAR frame, which without a calibration is the body frame; or None.
-        left: (H, W) uint8, as the camera sends it at the size the calibration is for; or None.
-        right: likewise.
-        calibration: of the sensors.
-        stamp_ns: key of the frame.
-        warn: called when a limit of the calibration is not applied.
+    The scan is in the LiDAR frame, without a calibration that of the body; images are (H, W) uint8, as the camera sends
+    them at the size the calibration is for. `warn` is called when a limit of the calibration is not applied.
     """
     usable = None if cloud is None else ScanLimits(calibration, warn).apply(cloud)
     stamped_left, stamped_right = (None if image is None else StampedImage(stamp_ns, image) for image in (left, right))

@@ -65,11 +65,8 @@ class SessionClock:
 
     A message out of line with the newest of its input (its stamp went back, or the odometry jumped) is held until
     another agrees with it: of its own input one that goes on from it or, where the stamps went back, one of any
-    input. Then a new session begins. When its input goes on as before, the message is dropped.
-
-    Attributes:
-        session: number of resets.
-        start_ns: first stamp on this clock.
+    input. Then a new session begins. When its input goes on as before, the message is dropped. `session` counts the
+    resets; `start_ns` is the first stamp on this clock.
     """
 
     def __init__(self) -> None:

@@ -70,9 +70,7 @@ class TfExtrinsics:
     ) -> None:
         self._poses = {"camera": calibration.body_T_camera, "lidar": calibration.body_T_lidar}
         self._rectifier = calibration.rectifier
-        self._transforms = transforms
-        self._base = base
-        self._warn = warn
+        self._base, self._transforms, self._warn = base, transforms, warn
         self._known: dict[str, tuple[str, int]] = {}
 
     def update(self, sensor: str, frame_id: str) -> dict[str, Any]:
@@ -105,23 +103,15 @@ class TfExtrinsics:
 class OdometryFrames:
     """Converts odometry of any part of the robot to the body's; another source on the same topic is refused.
 
-    Args:
-        frames: names of the frames.
-        transforms: hold the pose of the body on the part.
-        warn: called with one line when they do not.
-        patience_s: so long the odometry of another part waits for them, by its stamps.
-
-    Attributes:
-        odom: name of the odometry's frame: that of the messages, where they name one.
+    Odometry of another part waits `patience_s` for the transforms, by its stamps; then it is taken as the body's, with
+    a warning. `odom` is the name of the odometry's frame: that of the messages, where they name one.
     """
 
     def __init__(
         self, frames: FrameIds, transforms: StaticTransforms, warn: Callable[[str], None], patience_s: float = 0.0
     ) -> None:
+        self._base, self._transforms, self._warn = frames.base, transforms, warn
         self._patience_ns = int(patience_s * 1e9)
-        self._base = frames.base
-        self._transforms = transforms
-        self._warn = warn
         self._names: tuple[str, str] | None = None
         self._part_T_body: Array | None = None
         self._first_ns = 0
@@ -131,8 +121,7 @@ class OdometryFrames:
         """(4, 4) `odom_T_body` of a nav_msgs/Odometry whose pose is `odom_T_part`.
 
         Raises:
-            MessageError: of kind "frame" when its frames are not those of the first message; of kind "transforms" while
-                these may still come.
+            MessageError: of kind "frame": another source than the first message's; of kind "transforms": not yet known.
         """
         names = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
         if self._names is None:
@@ -146,8 +135,7 @@ class OdometryFrames:
             self._part_T_body = self._look_up(names[1], stamp_ns(message) - self._first_ns)
         if self._part_T_body is None:
             raise MessageError("transforms", f"odometry of {names[1]} waits for {TOPIC} to say where that is")
-        found: Array = odom_T_part @ self._part_T_body
-        return found
+        return np.asarray(odom_T_part @ self._part_T_body)
 
     def _look_up(self, part: str, waited_ns: int) -> Array | None:
         """`part_T_body`; None while it is worth waiting."""
