@@ -40,16 +40,25 @@ from umf_ros.lab.datasets.sample import label, places_of
 from umf_ros.lab.evaluation.results import score
 from umf_ros.lab.evaluation.retrieval import THESIS_RULE, place_recognition, rank
 from umf_ros.lab.evaluation.worlds import FIRST, FULL, QUICK, REVISIT, Sampling, TestWorld
-from umf_ros.lab.fit.adaptation import GAINED, PARTS, Adaptation, Lesson, adapt, measure
+from umf_ros.lab.fit.adaptation import (
+    GAINED,
+    PARTS,
+    Adaptation,
+    Drive,
+    DriveReader,
+    Lesson,
+    adapt,
+    label_drive,
+    measure,
+    pool,
+)
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.lidar import ETNA
 from umf_ros.lab.simulation.presets import Preset, gentle_loop
-from umf_ros.lab.simulation.recording import record
 from umf_ros.lab.simulation.relief import Relief
 from umf_ros.lab.simulation.route import Walker
-from umf_ros.lab.simulation.simulator import Simulator
+from umf_ros.lab.simulation.simulator import Simulator, record
 from umf_ros.lab.simulation.world import TEST
-from umf_ros.lab.training.drives import Drive, DriveReader, label_drive, pool
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights

@@ -12,7 +12,7 @@ from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.lab.simulation.domains import Domain, DomainScan
 from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, SAME, TURNED, ScannedPlace, ScanPair, pairs_of
-from umf_ros.lab.simulation.domains.sweeps import Sweep
+from umf_ros.lab.simulation.domains.scanners import Sweep
 
 OPEN, INDOORS = Domain("spin16", "street", "rover"), Domain("spin16", "corridor", "rover")
 NOTHING = Sweep(np.empty((0, 3), np.float32), None, None)

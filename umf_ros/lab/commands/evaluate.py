@@ -379,7 +379,7 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     from umf_ros.lab.datasets.listed import SequenceList
     from umf_ros.lab.evaluation.results import EvaluationReport
     from umf_ros.lab.evaluation.retrieval import RULES
-    from umf_ros.lab.training.validation import answerable, means, table, validate
+    from umf_ros.lab.training.metric_objective import answerable, means, table, validate
     from umf_ros.networks.config import locate_weights
     from umf_ros.networks.weights import load_weights
     from umf_ros.runs.writer import create_run_folder

@@ -100,11 +100,11 @@ OBJECTIVES = {
     "masked_images": ("masked_objectives", "MaskedImagesObjective"),
     "masked_scans": ("masked_objectives", "MaskedScansObjective"),
     "netvlad": ("baseline_objectives", "NetVladObjective"),
-    "pointnet2": ("baseline_objectives", "PointNet2Objective"),
-    "minkloc_visual": ("baseline_objectives", "MinkLocVisualObjective"),
-    "minkloc_lidar": ("baseline_objectives", "MinkLocLidarObjective"),
-    "minkloc_fusion": ("baseline_objectives", "MinkLocFusionObjective"),
-    "adafusion": ("baseline_objectives", "AdaFusionObjective"),
+    "pointnet2": ("baseline_objectives", "DescriptorObjective"),
+    "minkloc_visual": ("baseline_objectives", "DescriptorObjective"),
+    "minkloc_lidar": ("baseline_objectives", "DescriptorObjective"),
+    "minkloc_fusion": ("baseline_objectives", "DescriptorObjective"),
+    "adafusion": ("baseline_objectives", "DescriptorObjective"),
 }
 """Module and class of every way of training."""
 
