@@ -1,4 +1,4 @@
-"""What tests share: frames and keyframes made of noise, a small recording, and a DDS domain of their own."""
+"""Shared fixtures: frames and keyframes made of noise, a small recording, and a DDS domain of their own."""
 
 from __future__ import annotations
 

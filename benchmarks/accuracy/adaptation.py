@@ -1,4 +1,4 @@
-"""What `umf adapt` gains on rovers of kinds the network has never seen, in another world.
+"""Gain of `umf adapt` on rovers of kinds the network has never seen, in another world.
 
     python benchmarks/accuracy/adaptation.py --json adaptation.json  # three rovers, about an hour on one core
     python benchmarks/accuracy/adaptation.py --quick --seed 10101 --json F        # one rover, shorter drives
@@ -7,7 +7,7 @@ Each rover has a camera of another height, tilt, angle of view and response, and
 Cube-1's pulses and speaks of intensity in another unit. It learns from one drive of a recording with odometry that
 drifts. Then it drives two passes through a world of another seed and family, in the hard setting of `umf evaluate`
 (offset to 4.5 m, yaw to 16 degrees, sun moved by 70, aliasing), and the second asks the first.
-What the network pools of the frames stays in `--work` and is taken up again.
+Pooled features of the frames stay in `--work` and are used again.
 
 Prints and writes, per rover and as means: recall@1 of the second pass before and after of `fused`, `image` and
 `lidar`, and their `_gain`; `kept`: whether the revisits held out of the drive found that anything was gained (where
@@ -86,7 +86,7 @@ def twice(loop_m: float) -> Preset:
 
 @dataclass(frozen=True)
 class Rover:
-    """What differs from the rover that the network was trained on.
+    """Differences from the rover that the network was trained on.
 
     Attributes:
         family: the worlds it drives in.
@@ -181,7 +181,7 @@ def recorded(path: Path, rover: Rover, seed: int, preset: Preset) -> Path:
 
 
 def read_drive(recording: Path, rover: Rover, seed: int, network: UMF) -> tuple[Drive, Array, float]:
-    """What the drive teaches, true poses (N, 4, 4) of its keyframes, and the minutes it took to read."""
+    """Labelled keyframes of a drive, true poses (N, 4, 4) of its keyframes, and the minutes it took to read."""
     bag = open_bag(recording)
     kept, settings = recording.with_suffix(".npz"), settings_for(bag, None, "simulated")
     settings = settings.model_copy(update={"calibration": str(recording.with_suffix(".yaml"))})
@@ -197,7 +197,7 @@ def read_drive(recording: Path, rover: Rover, seed: int, network: UMF) -> tuple[
 
 
 def read_passes(world: TestWorld, kept: Path, rover: Rover, network: UMF) -> Drive:
-    """What the network pools of both passes, as sessions of one drive, at their true poses."""
+    """Pooled features of both passes, as sessions of one drive, at their true poses."""
     if not kept.exists():
         sensors = StrangeSensors(rover, world.seed)
         visits, pooled = [], []

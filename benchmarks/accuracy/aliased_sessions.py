@@ -54,7 +54,7 @@ def solve(world: GraphWorld) -> PoseGraph:
 
 
 def judge(seed: int, kind: Kind, share: float) -> dict[str, Any]:
-    """What the joint graph of one world believes."""
+    """The joint graph of one world."""
     world = cut(with_wrong_closures(rover_loops(SESSIONS * LENGTH, seed), share, kind, seed), seed)
     graph = solve(world)
     between = {

@@ -58,7 +58,7 @@ from umf_ros.verification.measurement import SCAN
 
 @dataclass
 class Outcome:
-    """What the verifier made of one domain's pairs; `left_out`: what one does that never saw the domain."""
+    """Decisions on one domain's pairs; `left_out`: those of a model that was fitted without the domain."""
 
     name: str
     pairs: dict[str, int] = field(default_factory=lambda: dict.fromkeys((SAME, TURNED, ELSEWHERE), 0))

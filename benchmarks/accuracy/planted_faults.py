@@ -207,7 +207,7 @@ def first_sentences(path: Path, out: Path, base: dict[str, Any], only: str = "")
 
 
 def first_sentence(page: str) -> str:
-    """What stands in the verdict up to its first full stop."""
+    """The verdict up to its first full stop."""
     from html import unescape
 
     verdict = page.split('<p class="verdict', 1)[1].split(">", 1)[1].split("</p>", 1)[0]
@@ -230,7 +230,7 @@ class ChangedBag(Bag):
 
 
 def check_sensors(bag: Bag, settings: Settings) -> SensorReport:
-    """What the measurements of a recording say of each other."""
+    """Return the check of a recording's measurements against each other."""
     check, stamps, poses = SensorCheck(), [], []
     for item in FrameReader(bag, settings, warn=lambda text: None).stream():
         if isinstance(item, OdometrySample):

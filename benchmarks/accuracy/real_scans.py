@@ -92,7 +92,7 @@ def main(
 
 
 def cropped(cloud: Cloud, half_width_deg: float) -> Cloud:
-    """What a LiDAR that looks forward and no further than this to either side would have seen."""
+    """The part of a scan that a LiDAR sees which looks forward and no further than this to either side."""
     ahead = np.abs(np.degrees(np.arctan2(cloud.points[:, 1], cloud.points[:, 0]))) <= half_width_deg
     return Cloud(cloud.points[ahead], None if cloud.intensity is None else cloud.intensity[ahead])
 

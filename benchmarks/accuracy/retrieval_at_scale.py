@@ -58,7 +58,7 @@ class Method:
     lidar: bool = True
 
     def seen(self, frame: Frame) -> Frame:
-        """What is embedded of a frame; all of it is still verified."""
+        """The part of a frame that is embedded; all of it is still verified."""
         if not self.camera:
             frame = replace(frame, left=None, right=None)
         return frame if self.lidar else replace(frame, points=None, intensity=None, motion=None)

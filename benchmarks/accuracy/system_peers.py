@@ -40,7 +40,7 @@ class Scans:
         return self._points[self._first[row] : self._first[row + 1]].astype(np.float64)
 
     def windows(self, length_m: float) -> Iterator[range]:
-        """Scans of so many metres of way, one after another."""
+        """Consecutive scans over so many metres of path length."""
         steps = np.linalg.norm(np.diff(self.odom_T_body[:, :3, 3], axis=0), axis=1)
         number = (np.concatenate([[0], np.cumsum(steps)]) // length_m).astype(int)
         for one in np.unique(number):

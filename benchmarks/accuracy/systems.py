@@ -5,7 +5,7 @@
 Peers are installed into an environment of their own (`--peers`, made if it is not there), as their authors publish
 them. Each runs at its defaults and at its best setting of those that `--systems grid` tries on validation drives. Bags
 carry their truth.
-What is counted is the same for all: the drive is cut into windows of 25 m; one that saw a place again is closed when a
+The count is the same for all: the drive is cut into windows of 25 m; one that saw a place again is closed when a
 true closure's query lies in it or in a window of its system that meets it. A closure is true within `TRUE_M` and
 `TRUE_DEG` of the truth: as coarse as the coarsest peer's edges are, and the median error is told beside it.
 """
@@ -68,7 +68,7 @@ GRID: dict[str, tuple[str, dict[str, Any]]] = {
     f"map_closures {' '.join(map(str, values))}": ("map_closures", dict(zip(MAPS, values, strict=True)))
     for values in product(*MAPS.values())
 }
-"""What was tried on validation drives."""
+"""Settings tried on validation drives."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class FoundClosure:
 
 @dataclass(frozen=True)
 class SystemRun:
-    """What a system left behind.
+    """Results of one system.
 
     Attributes:
         closures: found.

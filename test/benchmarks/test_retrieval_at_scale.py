@@ -14,7 +14,7 @@ DIMENSION = 16
 
 
 class Silent:
-    """An embedder nobody asks: the descriptors are given."""
+    """An embedder that is never called: the descriptors are given."""
 
     name, dimension = "silent", DIMENSION
 

@@ -14,7 +14,7 @@ GROUND = landscape(20)
 
 
 def drive(count: int) -> tuple[list[Keyframe], list[Array]]:
-    """Keyframes 0.8 m apart that nobody told an odometry, and where they were."""
+    """Keyframes 0.8 m apart without odometry, and their true poses."""
     poses = [pose_at(GROUND, -15.0 + 0.8 * step, 0.3 * step, 2.0 * step) for step in range(1, count + 1)]
     return [take(GROUND, pose, 10.0 + step) for step, pose in enumerate(poses)], poses
 

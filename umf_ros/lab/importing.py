@@ -44,7 +44,7 @@ class Imported:
         left, right: stamps in ns and image files, in order.
         scans: stamps in ns and what reads each scan, in order.
         truth: poses of the body, or None.
-        guessed: what nobody told and is a guess, in words.
+        guessed: values that the data set does not give, in words.
     """
 
     camera: dict[str, Any]

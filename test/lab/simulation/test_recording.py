@@ -1,4 +1,4 @@
-"""What a bag holds, byte for byte."""
+"""Contents of a bag, byte for byte."""
 
 from __future__ import annotations
 

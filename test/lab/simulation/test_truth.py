@@ -1,4 +1,4 @@
-"""What camera and LiDAR measure, against the ground they stand on."""
+"""Measurements of camera and LiDAR, against the ground they stand on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a drive says of places, and what it leaves open."""
+"""Labels of a drive: same place, different places, unknown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What surrounds a run: settings, schedule, log, checkpoints, judgement and the command."""
+"""Parts of a run: settings, schedule, log, checkpoints, judgement and the command."""
 
 from __future__ import annotations
 

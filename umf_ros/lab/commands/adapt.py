@@ -69,7 +69,7 @@ def command(
 def _drive(
     bag: Path, network: UMF, weights: Path, config: Path | None, dataset: str, kept_in: Path, console: Console
 ) -> Drive:
-    """What one recording teaches, from the folder where it is there."""
+    """The labels of one recording, from the folder if they are there."""
     from umf_ros.commands.console import WARNING, FrameProgress
     from umf_ros.core.errors import writing
     from umf_ros.lab.fit.adaptation import Drive, DriveReader

@@ -88,7 +88,7 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """What is known of pairs of keyframes, (N, N), the first of a pair being asked for; what is neither is unknown."""
+    """Labels (N, N) of pairs of keyframes, the first of a pair being the query; a pair with neither is unknown."""
 
     same: Mask
     other: Mask
@@ -100,7 +100,7 @@ class Labels:
 
 
 def label_drive(drive: Drive) -> Labels:
-    """What the map of a drive says of its pairs."""
+    """Label the pairs of a drive by its map."""
     places = places_of(0, drive.map_T_body)
     metres, turn = distances(places, places)
     along = _along(drive)
@@ -199,7 +199,7 @@ class DriveReader:
 
 
 def pool(network: UMF, frame: Frame) -> tuple[NDArray, ...]:
-    """What the heads see of a frame: the first five fields of a drive after the stamps, of one keyframe."""
+    """Input of the heads for a frame: the first five fields of a drive after the stamps, of one keyframe."""
     assert network.scene is not None
     batch = to_tensors(read_frame(frame, network.config))
     with torch.inference_mode():
@@ -218,7 +218,7 @@ FEWEST = 20
 GAINED = 0.01
 """Mean gain of recall@1 from which the result is kept."""
 LOST = 0.01
-"""What no modality may lose."""
+"""Largest loss of a single modality."""
 SURE = 1.64
 """Standard deviations of chance by which what is found now must outweigh what is found no more (a sign test)."""
 PARTS = ("descriptor", "image", "cloud")

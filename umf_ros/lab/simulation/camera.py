@@ -74,7 +74,7 @@ class Sun:
         )
 
     def set_for(self, metres: float) -> Sun:
-        """The light that is left so many metres of way after sunset: soon no more than the Moon's."""
+        """The light after so many metres of driving after sunset: soon no more than the Moon's."""
         return replace(self, strength=max(MOONLIGHT, 10.0 ** -max(metres, 0.0)))
 
 
@@ -85,7 +85,7 @@ _LARGE_PX = 400
 
 @dataclass(slots=True)
 class RayHits:
-    """What the rays of one picture met; all arrays have one entry per ray.
+    """Hits of the rays of one picture; all arrays have one entry per ray.
 
     Attributes:
         distance: (N,) float32 along the ray, m; infinite for sky.

@@ -21,7 +21,7 @@ from umf_ros.sensors.calibration import Calibration, load_calibration
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What a data set's cameras publish.
+    """Topics and encoding of a data set's cameras.
 
     Attributes:
         calibration: file of the sensors, relative to the share folder.

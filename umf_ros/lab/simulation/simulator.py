@@ -285,7 +285,7 @@ def write_side_files(simulator: Simulator, bag: Path) -> None:
 
 
 def describe(simulator: Simulator) -> dict[str, str]:
-    """What was simulated, as text; the legs are labels with first and last metre and stamp."""
+    """Facts about the simulated drive, as text; the legs are labels with first and last metre and stamp."""
     legs = [
         {
             "label": label,

@@ -81,7 +81,7 @@ class Survey:
         return self._take(index, step)[0].image
 
     def _take(self, index: int, step: int) -> tuple[Rendering, np.random.Generator]:
-        """What the camera sees, and what draws everything random that comes after it."""
+        """The camera's picture, and the generator for everything random that comes after it."""
         drive = self.passes[index]
         rng = np.random.default_rng([self.world.seed, 4, index, step])
         world_T_camera = self.pose(index, step) @ self.calibration.body_T_camera
@@ -242,7 +242,7 @@ def _scan(survey: Survey, index: int) -> Image:
 
 
 def _ahead(points: Field) -> Image:
-    """What the LiDAR sees, near in red and far in blue."""
+    """The LiDAR's view, near in red and far in blue."""
     canvas = np.zeros((160, _TILE[0], 3), np.uint8)
     distance = np.linalg.norm(points, axis=1)
     azimuth = np.degrees(np.arctan2(points[:, 0], points[:, 1]))

@@ -80,7 +80,7 @@ class DescriptorObjective(Objective):
         save_tensors(self.network, path, card, {"method": self._settings.method}, precision)
 
     def batch_maker(self, sequences: Sequence[SampleSequence], rank: int) -> Callable[[int], PlaceBatch]:
-        """What makes the batch of a step: pairs of views.
+        """Return the function that makes the batch of a step: pairs of views.
 
         Raises:
             ConfigError: no place of these sequences is visited twice.

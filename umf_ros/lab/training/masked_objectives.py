@@ -90,10 +90,10 @@ class Pretraining(Objective):
 
     @abstractmethod
     def draw(self, batch: MaskedBatch) -> list[Column]:
-        """What is given, what of it the encoder sees, and what it makes of it."""
+        """The input, the visible part of it, and the prediction."""
 
     def batch_maker(self, sequences: Sequence[SampleSequence], rank: int) -> Callable[[int], MaskedBatch]:
-        """What makes the batch of a step from samples drawn from everywhere."""
+        """Return the function that makes the batch of a step, from samples of all sequences."""
         self._sequences = sequences
         return lambda step: self._batch(self._settings.batch, generator(self._settings.seed, step, rank))
 

@@ -148,7 +148,7 @@ class MetricObjective(Objective):
             _slow_statistics(network)
 
     def batch_maker(self, sequences: Sequence[SampleSequence], rank: int) -> Callable[[int], TrainingBatch]:
-        """What makes the batch of a step: pairs of views, and which of their modalities get lost.
+        """Return the function that makes the batch of a step: pairs of views, and which of their modalities get lost.
 
         Raises:
             ConfigError: no place of these sequences is visited twice.
@@ -242,7 +242,7 @@ def dropped(batch: NetworkInput, chance: float, rng: np.random.Generator) -> tup
 
 
 def rule_of(settings: MetricSettings) -> Rule:
-    """What is the same place, and what is not."""
+    """The rule of the same place and of different places."""
     rule = ROBOTCAR_RULE if settings.rule == "robotcar" else Rule()
     if settings.loss != "neighbourhood":
         return rule

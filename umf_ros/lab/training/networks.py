@@ -25,7 +25,7 @@ Precision = Literal["half", "int8"]
 
 
 class RunSettings(Group):
-    """What every run has, whatever it learns; an objective's own settings are a subclass of these."""
+    """Settings of every run; an objective's own settings are a subclass of these."""
 
     weights_suffix: ClassVar[str] = ""
     """Follows the network's name in the name of the weights file."""
@@ -195,7 +195,7 @@ PRESETS: dict[str, NetworkConfig] = {
 
 
 def branch_layers(network: UMF, branch: Literal["image", "cloud"]) -> list[nn.Module]:
-    """What belongs to one modality alone on the way to the descriptor."""
+    """Layers of one modality alone that lead to the descriptor."""
     names = ["image_encoder" if branch == "image" else "voxel_encoder", f"{branch}_tokens"]
     names += [f"fusion.layers.{layer}.{branch}_self" for layer in range(network.config.layers)]
     names += [f"fusion.{branch}_{part}" for part in ("norm", "pool", "head")]
@@ -205,7 +205,7 @@ def branch_layers(network: UMF, branch: Literal["image", "cloud"]) -> list[nn.Mo
 
 
 def fine_layers(network: UMF) -> list[nn.Module]:
-    """What of both encoders only the fine maps need: without local features nothing teaches it."""
+    """Layers of both encoders that only the fine maps need: without local features no loss reaches them."""
     pyramid, voxels = network.image_encoder.pyramid, network.voxel_encoder
     return [pyramid.fine, pyramid.laterals[0], pyramid.laterals[1], voxels.fine, voxels.up_fine]
 

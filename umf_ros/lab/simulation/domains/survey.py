@@ -83,7 +83,7 @@ class Place(Protocol):
         """Height of the ground under points, m."""
 
     def scene(self, visit: int) -> Scene:
-        """What there is to see during one visit: cars and chairs move between visits."""
+        """The scene of one visit: cars and chairs move between visits."""
 
 
 @dataclass(frozen=True, slots=True)
