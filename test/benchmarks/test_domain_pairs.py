@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import make_keyframe
-from domains import Outcome, summary
 from scipy.spatial.transform import Rotation
+from support.domain_outcomes import Outcome, summary
 
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import make_pose
