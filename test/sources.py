@@ -1,4 +1,4 @@
-"""What the package's own files say, read and not run."""
+"""Sources of the package, read and not run."""
 
 from __future__ import annotations
 

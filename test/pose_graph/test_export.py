@@ -1,4 +1,4 @@
-"""What leaves the pose graph: results and graph files."""
+"""Exports of the pose graph: results and graph files."""
 
 from __future__ import annotations
 

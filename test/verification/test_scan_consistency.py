@@ -31,7 +31,7 @@ def box(x: tuple[float, float], y: tuple[float, float], height: float, pillars: 
 
 
 def seen(world: Array, world_T_body: Array, limit_m: float = 40.0) -> PreparedScan:
-    """What a LiDAR 1.5 m above the body sees; pillars hide nothing, which is forgivable."""
+    """The view of a LiDAR 1.5 m above the body; pillars hide nothing, which is forgivable."""
     points = transform(invert(world_T_body), world)
     near = np.linalg.norm(points, axis=1) < limit_m
     noisy = points[near] + RNG.normal(0, 0.01, (int(near.sum()), 3))

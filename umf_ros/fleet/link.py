@@ -12,8 +12,7 @@ from typing import NamedTuple
 from umf_ros.core.config import Database
 from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.fleet.server import FleetKey, FleetServer, LinkError
-from umf_ros.places.packing import unpack
-from umf_ros.places.store import KeyframeStore
+from umf_ros.places.store import KeyframeStore, unpack
 
 logger = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from psycopg import Connection, sql
 
 from umf_ros.core.errors import UmfError, one_line
 from umf_ros.core.frames import Keyframe
-from umf_ros.places.packing import pack
+from umf_ros.places.store import pack
 
 ROVERS = "umf_rover"
 """Role of all rovers: its members read every row and add rows of their own name."""

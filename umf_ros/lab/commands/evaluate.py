@@ -49,7 +49,7 @@ class OpenRecording:
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """What the command line says of a recording."""
+    """Options of the command line for a recording."""
 
     bag: Path
     config: Path | None
@@ -97,7 +97,7 @@ def choose_worlds(name: str, seed: int | None, quick: bool, count: int) -> list[
 
 
 def note_on_worlds(worlds: Sequence[TestWorld], quick: bool) -> str:
-    """What a report says of the worlds."""
+    """Figures of the worlds, for the report."""
     names = ", ".join(world.name for world in worlds)
     return (
         f"Worlds: {names}; hard setting (offset path up to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing)"
@@ -252,7 +252,7 @@ def command(
     odometry: OdometryPath = None,
     odometry_frame: OdometryFrame = "",
     ground_truth: TruthPath = None,
-    rule: Annotated[str, Optional(help="What is the same place in listed sequences: s3li or robotcar.")] = "s3li",
+    rule: Annotated[str, Optional(help="Rule of the same place in listed sequences: s3li or robotcar.")] = "s3li",
 ) -> None:
     """Recall, precision, rerankers, lost modalities and cost.
 
@@ -297,7 +297,7 @@ def command(
 
 
 def _check(data: Path | None, worlds: str | None, methods: str, trained: Path | None) -> None:
-    """What cannot be is said before anything that takes time to import."""
+    """Refuse wrong arguments before the slow imports."""
     if (data is None) == (worlds is None):
         raise ConfigError("expected either a recording or --worlds test|validation")
     if methods not in ("umf", "all"):
@@ -379,7 +379,7 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     from umf_ros.lab.datasets.listed import SequenceList
     from umf_ros.lab.evaluation.results import EvaluationReport
     from umf_ros.lab.evaluation.retrieval import RULES
-    from umf_ros.lab.training.validation import answerable, means, table, validate
+    from umf_ros.lab.training.metric_objective import answerable, means, table, validate
     from umf_ros.networks.config import locate_weights
     from umf_ros.networks.weights import load_weights
     from umf_ros.runs.writer import create_run_folder
