@@ -49,7 +49,7 @@ def fit_homography(a: Array, b: Array, threshold: float, iterations: int, seed: 
     model, mask = cv2.findHomography(a, b, options)
     if model is None or not np.linalg.det(model) > 0 or mask.sum() < 4:
         return None
-    return Consensus(model, mask.ravel().astype(bool))
+    return Consensus(np.asarray(model, float), mask.ravel().astype(bool))
 
 
 def fit_rigid(a: Array, b: Array, threshold: float, iterations: int, seed: int) -> Consensus | None:
