@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 
 from umf_ros.core.config import Settings, load_settings
-from umf_ros.core.frames import LoopClosure
+from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.diagnosis import GateDiagnosis
 from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.sensor_check import SensorReport
-from umf_ros.runs.tables import GraphVerdict, KeyframeRow, TestedCandidate
+from umf_ros.runs.tables import GraphVerdict, KeyframeRow
 from umf_ros.runs.truth import JudgedRun, TruePlaces, judge_closure
+from umf_ros.verification import Hypothesis, Measurement, RejectReason
 
 START_NS = 1_600_000_000 * 10**9
 LAP_S = 40
@@ -76,8 +77,16 @@ def closure(query_s: float, match_s: float, error_m: float = 0.0, probability: f
     return LoopClosure(stamp(query_s), stamp(match_s), pose, np.eye(6) * 0.01, probability)
 
 
-def candidate(query_s: float, match_s: float, reason: str, looks: float = 0.8, **numbers: float) -> TestedCandidate:
-    return TestedCandidate(stamp(query_s), stamp(match_s), looks, reason, numbers)
+def candidate(
+    query_s: float, match_s: float, reason: RejectReason | None, looks: float = 0.8, detail: str = "", **numbers: float
+) -> Hypothesis:
+    """A hypothesis as a run keeps it; accepted without a reason."""
+    probability = numbers.pop("probability", None)
+    if reason is RejectReason.IMPROBABLE and probability is not None:
+        detail = f"{probability:.2f} < 0.9"
+    measurement = Measurement.read(looks, numbers)
+    place = Candidate(-1, stamp(match_s), looks)
+    return Hypothesis(stamp(query_s), place, measurement, reason, detail, probability=probability)
 
 
 def accepted(state: str = "accepted", reason: str = "agrees with the map") -> GraphVerdict:
@@ -87,7 +96,7 @@ def accepted(state: str = "accepted", reason: str = "agrees with the map") -> Gr
 def examined(
     folder: Path,
     closures: list[LoopClosure] | None = None,
-    candidates: list[TestedCandidate] | None = None,
+    candidates: list[Hypothesis] | None = None,
     verdict: GraphVerdict | None = None,
     truth: Trajectory | None = None,
     settings: Settings | None = None,

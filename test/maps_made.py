@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +14,7 @@ from umf_ros.core.config import Settings
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, expmap, make_pose, relative
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
-from umf_ros.maps.odometry_log import OdometryLog
+from umf_ros.runs.run_file import RunFile, StoredOdometry
 from umf_ros.runs.tables import CLOSURES, KEYFRAMES, closure_row, write_table
 
 PERIOD_NS = 10**9
@@ -49,19 +51,15 @@ class MadeSession:
         """Own clock."""
         return START_NS + (metre - self.first_m) * PERIOD_NS
 
-    def log(self, seed: int) -> OdometryLog:
+    def drifting(self, seed: int) -> Iterator[StoredOdometry]:
         """Odometry that drifts, from an origin of its own."""
-        log, pose = OdometryLog(), np.eye(4)
+        pose = np.eye(4)
         steps = relative_steps(self.truth)
         noise = expmap(np.random.default_rng(seed).normal(size=(len(steps), 6)) * SIGMAS)
         for row, stamp in enumerate(range(self.first_m, self.last_m + 1)):
             pose = pose if row == 0 else pose @ steps[row - 1] @ noise[row - 1]
-            if self.odometry:
-                log.stamps.append(self.stamp(stamp))
-                log.poses.append(pose)
-            else:
-                log.append(self.stamp(stamp), pose, None if row == 0 else COVARIANCE)
-        return log
+            spread = np.diag([np.inf] * 6) if row == 0 else COVARIANCE
+            yield StoredOdometry(self.stamp(stamp), pose, None if self.odometry else spread)
 
 
 def relative_steps(poses: Array) -> Array:
@@ -74,7 +72,9 @@ def made_map(path: Path, sessions: list[MadeSession], settings: Settings | None 
     for number, made in enumerate(sessions):
         run = folder.folder_of(made.name)
         run.mkdir(parents=True)
-        made.log(number).save(run)
+        with closing(RunFile(run)) as file:
+            for row, one in enumerate(made.drifting(number)):
+                file.append_odometry(row, one)
         metres = range(made.first_m, made.last_m + 1)
         keyframes = [[made.stamp(metre), number, metre - made.first_m] for metre in metres]
         write_table(run / "keyframes.csv", KEYFRAMES, keyframes)

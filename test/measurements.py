@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from umf_ros.verification import Measurement
-from umf_ros.verification.measurement import SCAN
+from umf_ros.verification.hypothesis import SCAN
 
 GOOD = Measurement(
     kind=SCAN,

@@ -15,7 +15,7 @@ from umf_ros.core.errors import OutputError
 from umf_ros.core.frames import Embedding, Frame
 from umf_ros.core.geometry import heading, invert, make_pose, relative, rotation_angle, transform
 from umf_ros.detector import NOTHING_METRIC, Detection, LoopDetector
-from umf_ros.verification import NO_DEPTH
+from umf_ros.verification import RejectReason
 
 LAP_S = 40
 RADIUS_M = 8.0
@@ -125,7 +125,7 @@ def test_the_first_lap_has_nothing_to_close(detections: list[Detection]) -> None
 def test_every_verdict_has_a_reason_and_every_stage_a_time(detections: list[Detection]) -> None:
     last = detections[-1]
     assert last.keyframe is not None and last.verdicts
-    assert all(verdict.reason for verdict in last.verdicts)
+    assert all(verdict.accepted or verdict.reason for verdict in last.verdicts)
     stages = "embed", "query", "verify", "submaps"
     assert set(last.latency_ms) == {*stages, "total"}
     assert last.latency_ms["total"] == pytest.approx(sum(last.latency_ms[stage] for stage in stages))
@@ -251,5 +251,5 @@ def test_one_camera_without_a_scan_says_once_why_nothing_becomes_metric(
     detections = [found.process(frame) for frame in mono]
     verdicts = [verdict for detection in detections for verdict in detection.verdicts]
     assert len(verdicts) > 10 and not any(detection.closures for detection in detections)
-    assert {verdict.reason for verdict in verdicts} <= {NO_DEPTH, "less promising than others"}
-    assert [record.message for record in caplog.records].count(f"{NOTHING_METRIC}: {NO_DEPTH}") == 1
+    assert {verdict.reason for verdict in verdicts} <= {RejectReason.NO_DEPTH, RejectReason.NOT_SELECTED}
+    assert [record.message for record in caplog.records].count(f"{NOTHING_METRIC}: {RejectReason.NO_DEPTH.value}") == 1

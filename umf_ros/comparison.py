@@ -22,7 +22,7 @@ from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.scan_files import OUT_OF_REACH, UNCALIBRATED, fit_image, make_snapshot, read_image, read_scan
-from umf_ros.verification import Verdict, Verifier
+from umf_ros.verification import Hypothesis, Verifier
 
 NO_CALIBRATION = "no calibration: images alone give no pose without one"
 NO_DEPTH = "no depth: images without a scan or a right image give no metric pose"
@@ -251,7 +251,7 @@ class Comparer:
         verdict = judge(self._verifier, *keyframes)
         blind = verdict.closure is None and not any(keyframe.has_depth for keyframe in keyframes)
         return Comparison(
-            reason=NO_DEPTH if blind else verdict.reason,
+            reason=NO_DEPTH if blind else verdict.outcome,
             similarity=similarity,
             probability=verdict.probability,
             closure=verdict.closure,
@@ -265,7 +265,7 @@ class Comparer:
             raise SensorFileError(f"{role}: {error}") from None
 
 
-def judge(verifier: Verifier, match: Keyframe, query: Keyframe) -> Verdict:
+def judge(verifier: Verifier, match: Keyframe, query: Keyframe) -> Hypothesis:
     """Verify one pair of keyframes without odometry and without the support of earlier pairs."""
     match, query = (
         replace(keyframe, stamp_ns=stamp_ns, odom_T_body=None, path_length_m=float("nan"), session=0)

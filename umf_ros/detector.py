@@ -25,7 +25,7 @@ from umf_ros.embedding.depth import lift
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
-from umf_ros.verification import NO_DEPTH, Verdict, Verifier, thin_frame
+from umf_ros.verification import Hypothesis, RejectReason, Verifier, thin_frame
 
 if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatcher
@@ -50,7 +50,7 @@ class Detection:
 
     frame_stamp_ns: int
     keyframe: Keyframe | None = None
-    verdicts: list[Verdict] = field(default_factory=list)
+    verdicts: list[Hypothesis] = field(default_factory=list)
     latency_ms: dict[str, float] = field(default_factory=dict)
     fault: OutputError | None = None
 
@@ -202,13 +202,13 @@ class LoopDetector:
         """Remembered places that look like a keyframe, best first."""
         return self.database.query(keyframe, self._rules, self._map)
 
-    def verify(self, keyframe: Keyframe, candidates: Sequence[Candidate]) -> list[Verdict]:
+    def verify(self, keyframe: Keyframe, candidates: Sequence[Candidate]) -> list[Hypothesis]:
         """Test the candidates geometrically."""
         verdicts = self._verifier.verify(keyframe, [(found, self.database[found.index]) for found in candidates])
         self._tell_depthless(verdicts)
         return verdicts
 
-    def match_submaps(self, keyframe: Keyframe, verdicts: list[Verdict]) -> list[Verdict]:
+    def match_submaps(self, keyframe: Keyframe, verdicts: list[Hypothesis]) -> list[Hypothesis]:
         """The verdicts, accepted ones first, with those about what a narrow sensor saw before from another side."""
         accepted = [
             (self.database[verdict.candidate.index], verdict.closure.match_T_query)
@@ -259,11 +259,11 @@ class LoopDetector:
         self._session = None
         self._selector.reset()
 
-    def _tell_depthless(self, verdicts: Sequence[Verdict]) -> None:
+    def _tell_depthless(self, verdicts: Sequence[Hypothesis]) -> None:
         """Say, once, why nothing becomes metric: one camera without a LiDAR recognises places, no more."""
-        if not self._depth_told and any(verdict.reason == NO_DEPTH for verdict in verdicts):
+        if not self._depth_told and any(verdict.reason is RejectReason.NO_DEPTH for verdict in verdicts):
             self._depth_told = True
-            logger.warning("%s: %s", NOTHING_METRIC, NO_DEPTH)
+            logger.warning("%s: %s", NOTHING_METRIC, RejectReason.NO_DEPTH.value)
 
     def _start_session(self, frame: Frame) -> None:
         """A new way begins; where the clock was set back, what was stored later than now waits for its time."""

@@ -20,7 +20,7 @@ from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector
 from umf_ros.localizer import Localization, Localizer, read_poses
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.runs.run_file import NAME, RunFile
+from umf_ros.runs.run_file import NAME, RunFile, StoredOdometry
 from umf_ros.runs.writer import RunRecorder, write_summary
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
@@ -87,7 +87,7 @@ class Replay:
         self._has_odometry = False
         self._done = len(self._recorder.recorded) if resume else 0
         self._earlier: dict[int, list[LoopClosure]] = defaultdict(list)
-        for closure in self._recorder.earlier_closures() if resume else ():
+        for closure in self._recorder.earlier_closures if resume else ():
             self._earlier[closure.query_stamp_ns].append(closure)
 
     def run(self, stream: Iterable[Frame | OdometrySample]) -> Iterator[Detection]:
@@ -213,10 +213,7 @@ class Replay:
 
 
 def recover_run(folder: Path) -> bool:
-    """Export the files of a run whose process was killed.
-
-    Returns:
-        Whether there was such a run in the folder.
+    """Export the files of a run whose process was killed; returns whether there was such a run in the folder.
 
     Raises:
         UmfError: the file of the run is damaged, or another process writes it.
@@ -233,12 +230,34 @@ def recover_run(folder: Path) -> bool:
     write_summary(folder, recorder.summary({}) | {"interrupted": True})
     recorder.close()
     graph = PoseGraph(settings.pose_graph)
-    feed = OdometrySessionSplitter(graph)
+    if feed(graph, inputs):
+        graph.write_results(folder)
+    return True
+
+
+def feed(graph: PoseGraph, inputs: Iterable[LoopClosure | StoredOdometry], shift_ns: int = 0) -> bool:
+    """Pass the stored odometry and closures of a run to a graph whose newest session is empty.
+
+    Args:
+        graph: to be filled.
+        inputs: in the order in which they came.
+        shift_ns: added to the stamps of the odometry.
+
+    Returns:
+        Whether there was odometry.
+    """
+    splitter, begun = OdometrySessionSplitter(graph), False
     for item in inputs:
         if isinstance(item, LoopClosure):
             graph.add_closure(item)
+            continue
+        stamp_ns, pose, covariance = item.stamp_ns + shift_ns, item.odom_T_body, item.covariance
+        if covariance is None:
+            splitter.take(stamp_ns, pose)
         else:
-            feed.take(*item)
-    if not all(isinstance(item, LoopClosure) for item in inputs):
-        graph.write_results(folder)
-    return True
+            unknown = bool(np.isinf(covariance).any())
+            if unknown and begun:
+                graph.begin_session()
+            graph.add_odometry(stamp_ns, pose, None if unknown else covariance)
+        begun = True
+    return begun

@@ -53,7 +53,7 @@ from umf_ros.lab.simulation.domains.pairs import (
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
-from umf_ros.verification.measurement import SCAN
+from umf_ros.verification.hypothesis import SCAN
 
 
 @dataclass

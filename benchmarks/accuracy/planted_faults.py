@@ -22,11 +22,11 @@ import numpy as np
 import yaml
 
 from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.presets import settings_for, topics_of
+from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.storages import RawMessage, message_types
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.core.config import Settings, load_preset
+from umf_ros.core.config import Settings, load_preset, topics_of
 from umf_ros.core.geometry import from_quaternion, to_quaternion
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.lab.simulation.bag_writer import BagWriter
@@ -218,7 +218,7 @@ class ChangedBag(Bag):
     """A recording whose messages are changed as they are read."""
 
     def __init__(self, bag: Bag, change: Change) -> None:
-        super().__init__(bag.path, bag._storage)
+        super().__init__(bag.path, bag._files)
         self._change = change
 
     def raw_messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:

@@ -35,7 +35,7 @@ from umf_ros.lab.fit.acceptance import inside_ellipsoid
 from umf_ros.lab.simulation.domains.pairs import error_vector, is_wrong
 from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.scan_files import make_snapshot, read_scan
-from umf_ros.verification import Verdict, Verifier
+from umf_ros.verification import Hypothesis, Verifier
 
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 KEPT = 1000  # keyframes in memory
@@ -124,7 +124,7 @@ def draw_pairs(
         yield RealPair(names[int(similarity[query].argmax())], names[query], False)
 
 
-def summary(verdicts: list[tuple[RealPair, Verdict]]) -> dict[str, float]:
+def summary(verdicts: list[tuple[RealPair, Hypothesis]]) -> dict[str, float]:
     """Counts, and for true pairs with a known pose how far off and how honest the closures are."""
     accepted = [(pair, verdict) for pair, verdict in verdicts if verdict.closure is not None]
     true = [pair for pair, _ in verdicts if pair.same_place]
@@ -146,7 +146,7 @@ def summary(verdicts: list[tuple[RealPair, Verdict]]) -> dict[str, float]:
     }
 
 
-def _misplaced(pair: RealPair, verdict: Verdict) -> bool:
+def _misplaced(pair: RealPair, verdict: Hypothesis) -> bool:
     if pair.match_T_query is None or verdict.closure is None:
         return False
     return is_wrong(verdict.closure.match_T_query, pair.match_T_query)

@@ -31,12 +31,12 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.presets import calibration_of, topics_of
 from umf_ros.bags.reader import Bag, decode, open_bag
-from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.config import Settings, load_settings, topics_of
 from umf_ros.core.errors import UmfError
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.pose_graph.backend import PoseGraph
+from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.sessions import OdometrySessionSplitter

@@ -22,7 +22,7 @@ from recordings import (
 )
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.bags.frames import FrameReader, read_left_images
+from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import detect_dataset
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import load_preset, load_settings
@@ -132,15 +132,6 @@ def test_a_recording_without_sensors_is_refused(tmp_path: Path) -> None:
     bag = open_bag(write_mcap(tmp_path / "a.mcap", [entry for entry in ENTRIES if entry[0] == ODOMETRY]))
     with pytest.raises(BagError, match="neither images nor scans"):
         FrameReader(bag, small_settings(tmp_path))
-
-
-def test_images_of_chosen_frames(tmp_path: Path) -> None:
-    settings = small_settings(tmp_path)
-    bag = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES))
-    frames = list(FrameReader(bag, settings))
-    images = read_left_images(bag, settings, {frames[2].stamp_ns, frames[9].stamp_ns, 17})
-    assert set(images) == {frames[2].stamp_ns, frames[9].stamp_ns}
-    assert np.array_equal(images[frames[9].stamp_ns], frames[9].left)
 
 
 def test_a_topic_of_another_type_is_refused(tmp_path: Path) -> None:

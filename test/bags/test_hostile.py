@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 from umf_ros.bags import storages
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.storages import unpack_bz2, unpack_lz4
+from umf_ros.bags.storages import unpack
 from umf_ros.core.errors import BagError
 
 ENTRIES = traverse(0.4)
@@ -93,10 +93,10 @@ def test_a_chunk_that_claims_gigabytes_is_not_unpacked(tmp_path: Path) -> None:
 
 
 def test_a_bzip2_chunk_is_unpacked_to_a_limit_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert unpack_bz2(bz2.compress(b"abc" * 1000)) == b"abc" * 1000
+    assert unpack("bz2", bz2.compress(b"abc" * 1000)) == b"abc" * 1000
     monkeypatch.setattr("umf_ros.bags.storages.LARGEST_CHUNK", 2**16)
     with pytest.raises(ValueError, match="more than"):
-        unpack_bz2(bz2.compress(bytes(2**20)))
+        unpack("bz2", bz2.compress(bytes(2**20)))
 
 
 def zeros_in_lz4(count: int) -> bytes:
@@ -106,10 +106,10 @@ def zeros_in_lz4(count: int) -> bytes:
 
 
 def test_an_lz4_chunk_is_unpacked_to_a_limit_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert unpack_lz4(lz4.frame.compress(b"abc" * 1000)) == b"abc" * 1000
+    assert unpack("lz4", lz4.frame.compress(b"abc" * 1000)) == b"abc" * 1000
     monkeypatch.setattr("umf_ros.bags.storages.LARGEST_CHUNK", 2**16)
     with pytest.raises(ValueError, match="more than"):
-        unpack_lz4(zeros_in_lz4(2**25))
+        unpack("lz4", zeros_in_lz4(2**25))
 
 
 def overlapping(path: Path, packing: CompressionType = CompressionType.NONE) -> Path:
@@ -151,14 +151,14 @@ def test_no_packing_hides_how_large_a_chunk_is(broken: bool, tmp_path: Path, mon
         for packing in CompressionType:  # what they claim is looked at before
             with pytest.raises(BagError, match="holds no message"):
                 open_bag(tmp_path / f"{packing}.mcap")
-    really = storages.unpack_lz4
+    really = storages.unpack
 
-    def unpack(data: bytes) -> bytes:  # as if the file had claimed less than it holds
+    def fooled(compression: str, data: bytes) -> bytes:  # as if the file had claimed less than it holds
         with monkeypatch.context() as limited:
             limited.setattr(storages, "LARGEST_CHUNK", 2500)
-            return really(data)
+            return really(compression, data)
 
-    monkeypatch.setattr(storages, "unpack_lz4", unpack)
+    monkeypatch.setattr(storages, "unpack", fooled)
     path = tmp_path / f"{CompressionType.LZ4}.mcap"
     with pytest.raises(BagError, match="holds no message" if broken else "holds more than"):
         list(open_bag(path).raw_messages())

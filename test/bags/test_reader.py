@@ -21,13 +21,13 @@ from recordings import (
 )
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.bags.presets import calibration_of, detect_dataset, settings_for, topics_of
+from umf_ros.bags.presets import detect_dataset, settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.core import resources
-from umf_ros.core.config import load_preset, load_settings
+from umf_ros.core.config import load_preset, load_settings, topics_of
 from umf_ros.core.errors import BagError, ConfigError
 from umf_ros.core.resources import find, share_folders
-from umf_ros.sensors.calibration import load_calibration
+from umf_ros.sensors.calibration import calibration_of, load_calibration
 from umf_ros.sensors.decode import decode_cloud, decode_image, decode_odometry, stamp_ns
 
 ENTRIES = traverse(1.0)

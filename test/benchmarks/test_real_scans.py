@@ -11,7 +11,7 @@ from real_scans import RealPair, cropped, draw_pairs, read_pairs, summary
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.sensors.decode import Cloud
-from umf_ros.verification import Verdict
+from umf_ros.verification import Hypothesis
 
 
 def test_pairs_are_read_with_their_pose_where_it_is_known(tmp_path):
@@ -53,7 +53,7 @@ def test_true_false_and_misplaced_closures_are_told_apart():
 
     def verdict(estimate):
         closure = None if estimate is None else LoopClosure(2, 1, estimate, np.eye(6) * 0.01)
-        return Verdict(Candidate(0, 1, 0.5), "", GOOD, closure)
+        return Hypothesis(2, Candidate(0, 1, 0.5), GOOD, closure=closure)
 
     true, false = RealPair("a", "b", True, pose), RealPair("a", "c", False)
     unknown = RealPair("a", "d", True)

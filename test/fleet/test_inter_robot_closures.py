@@ -13,8 +13,9 @@ from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.detector import LoopDetector
-from umf_ros.fleet.inter_robot_closures import UNCONFIRMED, InterRobotClosure, InterRobotMatcher
+from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatcher
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take
+from umf_ros.verification import RejectReason
 
 GROUND = landscape(20)
 PLACES_M = (-24.0, -14.0)
@@ -52,7 +53,8 @@ def test_two_rovers_at_two_common_places_get_closures(server: PostgresServer) ->
     first, second = drive(server, "ada")
     assert (first.own, first.robot) == ("ada", "bea")
     # one place alone is not enough: it may only look like another
-    assert first.closures == [] and [v.reason for v in first.verdicts if v.closure is not None] == [UNCONFIRMED]
+    waiting = [one.reason for one in first.verdicts if one.closure is not None]
+    assert first.closures == [] and waiting == [RejectReason.UNCONFIRMED]
     assert len(second.closures) == 2
     for closure, ours, theirs in zip(second.closures, poses_of("ada"), poses_of("bea"), strict=True):
         error = relative(relative(theirs, ours), closure.match_T_query)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,8 @@ from umf_ros.maps.mapping import (
     replay_session,
     unmatched,
 )
-from umf_ros.maps.odometry_log import OdometryLog
 from umf_ros.places.store import stored_sessions
+from umf_ros.runs.run_file import RunFile, StoredOdometry
 
 DAY_NS = 86_400 * 10**9
 
@@ -41,6 +42,11 @@ def opening(tmp_path: Path) -> Opening:
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
     return write_mcap(tmp_path / "a.mcap", traverse(3.0))
+
+
+def odometry_in(folder: Path) -> list[StoredOdometry]:
+    with closing(RunFile(folder, read_only=True)) as file:
+        return list(file.odometry())
 
 
 def new_map(path: Path, opening: Opening, bag: Path) -> MapFolder:
@@ -64,8 +70,8 @@ def test_one_recording_becomes_a_run_with_places_and_all_its_odometry(
     heard: list[float] = []
     replay_session(bag, opening, tmp_path / "run", lambda done, _: heard.append(done))
     assert heard == sorted(heard) and 0.9 < heard[-1] <= 1
-    log = OdometryLog.load(tmp_path / "run")
-    assert len(log) == 60 and log.stamps[0] == START_NS
+    odometry = odometry_in(tmp_path / "run")
+    assert len(odometry) == 60 and odometry[0].stamp_ns == START_NS
     places = open_places(tmp_path / "run" / "places.sqlite")
     assert len(places) > 5
     assert (tmp_path / "run" / "closures.csv").is_file()
@@ -131,10 +137,10 @@ def test_odometry_comes_from_a_file_of_its_name(tmp_path: Path, opening: Opening
     write_tum(tmp_path / "odometry" / "b.odometry.tum", path)
     with_file = Opening(opening.config, embedder="thumbnail", odometry=tmp_path / "odometry")
     replay_session(bag, with_file, tmp_path / "run")
-    log = OdometryLog.load(tmp_path / "run")
-    assert len(log) == len(path) and not log.covariances
+    odometry = odometry_in(tmp_path / "run")
+    assert len(odometry) == len(path) and all(one.covariance is None for one in odometry)
     replay_session(bag, opening, tmp_path / "blind")
-    blind = OdometryLog.load(tmp_path / "blind")
-    # noise is found in no other noise: every keyframe is a way of its own
-    assert len(blind.starts) == len(blind) > 3
+    blind = odometry_in(tmp_path / "blind")
+    # noise is found in no other noise: every keyframe begins a session
+    assert len(blind) > 3 and all(one.covariance is not None and np.isinf(one.covariance[0, 0]) for one in blind)
     assert [one.number for one in stored_sessions(tmp_path / "blind" / "places.sqlite")] == list(range(len(blind)))

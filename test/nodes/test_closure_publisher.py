@@ -33,7 +33,7 @@ from umf_ros.nodes.conversions import (
     is_between_rovers,
 )
 from umf_ros.nodes.loop_closure_node import ClosurePublisher
-from umf_ros.verification import Measurement, Verdict
+from umf_ros.verification import Hypothesis, Measurement, RejectReason
 
 TOPICS: dict[str, tuple[type, Any]] = {
     "/loop_closures": (Odometry, CLOSURES_QOS),
@@ -90,17 +90,17 @@ def at(stamp_ns: int, x: float, y: float, session: int = 0) -> Keyframe:
     return replace(make_keyframe(0, 1.0), stamp_ns=stamp_ns, odom_T_body=pose, session=session)
 
 
-def accepted(match_ns: int = MATCH_NS, pose: Array = POSE) -> Verdict:
+def accepted(match_ns: int = MATCH_NS, pose: Array = POSE) -> Hypothesis:
     closure = LoopClosure(QUERY_NS, match_ns, pose, COVARIANCE, 0.97)
     measurement = Measurement(similarity=0.8125, inliers_image=41.0)
-    return Verdict(Candidate(0, match_ns, 0.8125), "accepted", measurement, closure, probability=0.9712345678)
+    return Hypothesis(QUERY_NS, Candidate(0, match_ns, 0.8125), measurement, closure=closure, probability=0.9712345678)
 
 
-def rejected(match_ns: int, reason: str = "few inliers") -> Verdict:
-    return Verdict(Candidate(1, match_ns, 0.5), reason, Measurement(similarity=0.5, inliers_image=3.0))
+def rejected(match_ns: int, reason: RejectReason = RejectReason.NO_POSE) -> Hypothesis:
+    return Hypothesis(QUERY_NS, Candidate(1, match_ns, 0.5), Measurement(similarity=0.5, inliers_image=3.0), reason)
 
 
-def detection(verdicts: list[Verdict], keyframe: Keyframe | None = None) -> Detection:
+def detection(verdicts: list[Hypothesis], keyframe: Keyframe | None = None) -> Detection:
     return Detection(QUERY_NS, keyframe or at(QUERY_NS, 4.0, 2.0), verdicts)
 
 

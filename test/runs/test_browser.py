@@ -13,9 +13,10 @@ import pytest
 from finished_runs import BELOW, accepted, candidate, closure, examined, trajectory
 
 from umf_ros.runs.findings import conclude, look_first
-from umf_ros.runs.gallery import Gallery, photograph
+from umf_ros.runs.gallery import Gallery, encode_scan, photograph
 from umf_ros.runs.report import write_page
 from umf_ros.runs.scene import build_scene, pairs_of
+from umf_ros.verification import RejectReason
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
@@ -26,16 +27,16 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("page")
     closures = [closure(50, 10), closure(52, 12, error_m=0.9)]
     tested = [
-        candidate(50, 10, "accepted", **(BELOW | {"probability": 0.97})),
-        candidate(52, 12, "accepted", **(BELOW | {"probability": 0.93})),
-        candidate(54, 14, "probability 0.60 is below 0.9", **BELOW),
+        candidate(50, 10, None, **(BELOW | {"probability": 0.97})),
+        candidate(52, 12, None, **(BELOW | {"probability": 0.93})),
+        candidate(54, 14, RejectReason.IMPROBABLE, **BELOW),
     ]
     about = examined(folder, closures, tested, accepted(), trajectory(), missed=[54], ate=(1.0, 0.2))
     gallery = Gallery([], [], None)
     grey = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
     for stamp in about.run.stamps:
         gallery.photographs[int(stamp)] = photograph(grey)
-        gallery.scans[int(stamp)] = np.random.default_rng(1).integers(-500, 500, (50, 3)).astype(np.int16)
+        gallery.scans[int(stamp)] = encode_scan(np.random.default_rng(1).uniform(-10, 10, (50, 3)).astype(np.float32))
     findings = look_first(about)
     inliers = {(closures[0].query_stamp_ns, closures[0].match_stamp_ns): np.array([[3.0, 4, 30, 20]])}
     write_page(about, conclude(about, findings), findings, build_scene(about, pairs_of(about), gallery, inliers))

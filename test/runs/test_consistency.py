@@ -51,9 +51,9 @@ def test_of_nothing_no_share_is_inside() -> None:
 @pytest.mark.parametrize(
     ("median", "inside", "said"),
     [
-        (5.3, 0.95, "honest"),
-        (3.5, 1.0, "honest"),
-        (7.0, 0.8, "honest for most, too small for the worst"),
+        (5.3, 0.95, "consistent"),
+        (3.5, 1.0, "consistent"),
+        (7.0, 0.8, "consistent for most, too small for the worst"),
         (4 * MEDIAN_EXPECTED, 0.9, "too small by a factor of 2"),
         (MEDIAN_EXPECTED / 4, 1.0, "too large by a factor of 2"),
     ],

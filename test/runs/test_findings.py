@@ -17,6 +17,7 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.findings import USELESS, ExaminedRun, conclude, look_first
 from umf_ros.runs.reader import Advice, useless_inputs
 from umf_ros.runs.sensor_check import Disagreement, SensorReport
+from umf_ros.verification import RejectReason
 
 
 def verdict(about: ExaminedRun) -> tuple[str, int, str]:
@@ -51,19 +52,20 @@ def test_whatever_was_found_a_silent_input_is_not_green(absent: tuple[str, ...],
 
 
 def test_revisits_of_which_none_was_closed_are_not_green(tmp_path: Path) -> None:
-    tested = [candidate(50, 10, "probability 0.60 is below 0.9", **BELOW)]
+    tested = [candidate(50, 10, RejectReason.IMPROBABLE, **BELOW)]
     mark, status, sentence = verdict(examined(tmp_path, candidates=tested, truth=trajectory(), missed=[50]))
     assert (mark, status) == ("bad", USELESS)
     assert sentence.startswith("1 of 1 revisits are missed, 100% of them at the gate 'probability' (at 50.0 s: prob")
 
 
 def test_nothing_to_find_is_green(tmp_path: Path) -> None:
-    mark, status, sentence = verdict(examined(tmp_path, candidates=[candidate(50, 10, "x")], truth=trajectory()))
+    tested = [candidate(50, 10, RejectReason.NO_POSE)]
+    mark, status, sentence = verdict(examined(tmp_path, candidates=tested, truth=trajectory()))
     assert (mark, status) == ("good", 0) and sentence.startswith("No place was seen twice. 0 true and 0 false")
 
 
 def test_nothing_found_without_a_truth_is_not_green(tmp_path: Path) -> None:
-    tested = [candidate(50, 10, "probability 0.60 is below 0.9", **BELOW)]
+    tested = [candidate(50, 10, RejectReason.IMPROBABLE, **BELOW)]
     mark, status, sentence = verdict(examined(tmp_path, candidates=tested))
     assert (mark, status) == ("warn", 0)
     assert sentence.startswith(

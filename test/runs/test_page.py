@@ -19,6 +19,7 @@ from umf_ros.runs.reader import Advice
 from umf_ros.runs.report import closure_rows, describe, final_verdicts, print_summary, write_page
 from umf_ros.runs.scene import build_scene, pairs_of
 from umf_ros.runs.truth import JudgedClosure
+from umf_ros.verification import RejectReason
 
 NASTY = "</script><script>alert('x')</script> & \"quotes\" [red]"
 TRUTH = {"closures_true": 4, "closures_false": 0, "revisits": 3, "ate_odometry_m": 1.5, "ate_optimized_m": 0.25}
@@ -62,7 +63,8 @@ def scene_in(page: str) -> dict[str, Any]:
 
 
 def test_text_stays_text_in_the_page_and_in_its_scripts(tmp_path: Path) -> None:
-    named = examined(tmp_path, [closure(50, 10)], [candidate(50, 10, NASTY)], accepted(reason=NASTY), weights=NASTY)
+    tested = candidate(50, 10, RejectReason.UNKNOWN, detail=NASTY)
+    named = examined(tmp_path, [closure(50, 10)], [tested], accepted(reason=NASTY), weights=NASTY)
     page = written(named, [Advice("warning", NASTY, NASTY)])
     read = Read(page)
     assert read.scripts == 3 and read.text.count(NASTY) >= 2
@@ -96,9 +98,9 @@ def test_pending_is_not_rejected(tmp_path: Path) -> None:
 
 def test_the_sweep_counts_what_a_threshold_would_publish(tmp_path: Path) -> None:
     tested = [
-        candidate(50, 10, "accepted", probability=0.97),
-        candidate(52, 30, "probability 0.80 is below 0.9", probability=0.8),  # 18 m away
-        candidate(54, 14, "turned by 90 deg, more than 28", probability=0.99),
+        candidate(50, 10, None, probability=0.97),
+        candidate(52, 30, RejectReason.IMPROBABLE, probability=0.8),  # 18 m away
+        candidate(54, 14, RejectReason.TURNED, probability=0.99),
     ]
     about = examined(tmp_path, [closure(50, 10)], tested, truth=trajectory())
     sweep = scene_in(written(about))["sweep"]
@@ -119,16 +121,16 @@ def test_the_terminal_gets_the_same_facts_and_no_line_twice(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("honesty", "said"),
+    ("errors", "said"),
     [
         ({}, "not judged"),
         ({"nees_median": None, "inside_95": None}, "not judged"),
-        ({"nees_median": 5.3, "inside_95": 0.95}, "honest; 95% of the closures inside their 95 % ellipsoid"),
+        ({"nees_median": 5.3, "inside_95": 0.95}, "consistent; 95% of the closures inside their 95 % ellipsoid"),
         ({"nees_median": 135.0, "inside_95": 0.0}, "too small by a factor of 5; 0% of the closures"),
     ],
 )
-def test_stated_errors_are_judged_in_a_plain_word(tmp_path: Path, honesty: dict[str, Any], said: str) -> None:
-    read = Read(written(examined(tmp_path, ground_truth=TRUTH | honesty)))
+def test_stated_errors_are_judged_in_a_plain_word(tmp_path: Path, errors: dict[str, Any], said: str) -> None:
+    read = Read(written(examined(tmp_path, ground_truth=TRUTH | errors)))
     assert any(text.startswith(said) for text in read.text)
 
 

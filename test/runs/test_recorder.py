@@ -24,7 +24,7 @@ from umf_ros.runs.tables import read_closures
 from umf_ros.runs.writer import RunRecorder, count_drops, read_summary
 from umf_ros.sensors.buffers import SURPLUS, InputCounter
 from umf_ros.sensors.synchronizer import INPUTS
-from umf_ros.verification import Measurement, Verdict
+from umf_ros.verification import Hypothesis, Measurement, RejectReason
 
 MEASUREMENT = Measurement(similarity=0.4, inliers_image=3.0)
 COUNTS = ["frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected"]
@@ -32,23 +32,23 @@ OTHERS = ["latency_ms", "drops", "realtime_factor", "peak_rss_mb", "seed", "vers
 KEYS = [*COUNTS, "ground_truth", *OTHERS]
 
 
-def accepted(query_ns: int, match_ns: int) -> Verdict:
+def accepted(query_ns: int, match_ns: int) -> Hypothesis:
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     closure = LoopClosure(
         query_ns, match_ns, make_pose(turn, [1.5, -0.25, 0.125]), np.diag([4, 1, 1, 0.25, 1, 1]), 0.97
     )
     pixels = np.array([[1, 2, 3, 4], [5, 6, 7, 8]], np.float32)
-    return Verdict(Candidate(0, match_ns, 0.8), "accepted", MEASUREMENT, closure, pixels)
+    return Hypothesis(query_ns, Candidate(0, match_ns, 0.8), MEASUREMENT, closure=closure, inlier_pixels=pixels)
 
 
-def detection(stamp_s: float, verdicts: list[Verdict]) -> Detection:
+def detection(stamp_s: float, verdicts: list[Hypothesis]) -> Detection:
     latency = {"embed": 10.0, "query": 1.0, "verify": stamp_s, "total": 11 + stamp_s}
     return Detection(round(stamp_s * 1e9), make_keyframe(stamp_s, stamp_s), verdicts, latency)
 
 
 def record_a_little(folder: Path) -> RunRecorder:
     recorder = RunRecorder(folder, Settings(), "some_weights")
-    rejected = Verdict(Candidate(1, 5, 0.4), "few inliers", MEASUREMENT)
+    rejected = Hypothesis(9, Candidate(1, 5, 0.4), MEASUREMENT, RejectReason.NO_POSE)
     recorder.record(make_frame(1), Detection(10**9))
     recorder.record(make_frame(2), detection(2, []))
     recorder.record(
@@ -135,7 +135,7 @@ def test_the_summary_can_be_written_again_as_the_run_goes_on(tmp_path: Path) -> 
 
 def test_a_keyframe_that_was_asked_and_found_nothing_is_no_query(tmp_path: Path) -> None:
     recorder = RunRecorder(tmp_path, Settings(), "w")
-    rejected = Verdict(Candidate(1, 5, 0.4), "few inliers", MEASUREMENT)
+    rejected = Hypothesis(9, Candidate(1, 5, 0.4), MEASUREMENT, RejectReason.NO_POSE)
     recorder.record(make_frame(1), detection(1, []))
     recorder.record(make_frame(2), detection(2, [rejected, rejected]))
     recorder.record(make_frame(60), detection(60, [accepted(60, 2), accepted(60, 3), rejected]))

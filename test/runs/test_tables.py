@@ -20,11 +20,13 @@ from umf_ros.runs.tables import (
     candidate_row,
     closure_row,
     inlier_rows,
+    parse_candidate,
     read_closures,
     read_table,
     write_table,
 )
-from umf_ros.verification import Measurement, Verdict
+from umf_ros.verification import Hypothesis, Measurement, RejectReason
+from umf_ros.verification.hypothesis import SCAN
 
 QUERY_NS, MATCH_NS = 1_667_000_100_123_456_789, 1_667_000_000_000_000_001
 
@@ -76,21 +78,43 @@ def test_a_table_without_rows_holds_no_closure(tmp_path: Path) -> None:
     assert read_closures(written(tmp_path / "closures.csv", [])) == []
 
 
-def test_a_reason_may_hold_anything(tmp_path: Path) -> None:
-    reason = 'turned too far, "31 deg"\n; gave up'
+def test_figures_of_a_reason_may_hold_anything(tmp_path: Path) -> None:
+    detail = 'turned too far, "31 deg"\n; gave up'
     measurement = Measurement(similarity=1 / 3, inliers_image=float("inf"))
-    verdict = Verdict(Candidate(3, MATCH_NS, 0.123456789), reason, measurement, probability=2 / 3)
-    path = written(tmp_path / "candidates.csv", [candidate_row(QUERY_NS, verdict)], CANDIDATES)
+    put = Hypothesis(
+        QUERY_NS, Candidate(3, MATCH_NS, 0.123456789), measurement, RejectReason.TURNED, detail, probability=2 / 3
+    )
+    path = written(tmp_path / "candidates.csv", [candidate_row(put)], CANDIDATES)
     (row,) = read_table(path, dict)
-    assert row["reason"] == reason and row["similarity"] == "0.123457"
+    assert (row["reason"], row["detail"]) == (RejectReason.TURNED.value, detail) and row["similarity"] == "0.123457"
     counts = {"inliers_image": float("inf"), "inliers_cloud": 0.0, "superfeatures": 0.0}
     assert json.loads(row["numbers"]) == {"similarity": 0.333333, **counts, "probability": 0.666667}
 
 
+@pytest.mark.parametrize("reason", [None, *RejectReason])
+def test_a_candidate_reads_back_as_it_was_written(tmp_path: Path, reason: RejectReason | None) -> None:
+    measurement = Measurement(kind=SCAN, similarity=0.5, noise_m=0.25, rival_far=0.125)
+    put = Hypothesis(QUERY_NS, Candidate(3, MATCH_NS, 0.5), measurement, reason, "0.5 m", probability=0.75)
+    path = written(tmp_path / "candidates.csv", [candidate_row(put)], CANDIDATES)
+    (got,) = read_table(path, parse_candidate)
+    assert (got.endpoints, got.reason, got.probability) == (put.endpoints, reason, 0.75)
+    assert got.numbers == pytest.approx(put.numbers, nan_ok=True) and got.measurement.kind == SCAN
+    assert reason is None or got.outcome == put.outcome
+
+
+def test_a_reason_of_another_version_is_kept_as_text(tmp_path: Path) -> None:
+    row = [QUERY_NS, MATCH_NS, 0.5, "a riddle", "{}"]
+    columns = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "numbers"]
+    (got,) = read_table(written(tmp_path / "candidates.csv", [row], columns), parse_candidate)
+    assert (got.reason, got.detail) == (RejectReason.UNKNOWN, "a riddle")
+
+
 def test_inliers_are_pixels_to_a_tenth(tmp_path: Path) -> None:
     pixels = np.array([[1.26, 2, 3, 687.98], [0, 0, 0, 0]], np.float32)
-    verdict = Verdict(Candidate(0, MATCH_NS, 0.5), "accepted", Measurement(similarity=0.5), closure(), pixels)
-    path = written(tmp_path / "inliers.csv", inlier_rows(QUERY_NS, verdict), INLIERS)
+    put = Hypothesis(
+        QUERY_NS, Candidate(0, MATCH_NS, 0.5), Measurement(similarity=0.5), closure=closure(), inlier_pixels=pixels
+    )
+    path = written(tmp_path / "inliers.csv", inlier_rows(put), INLIERS)
     rows = read_table(path, lambda row: (int(row["query_stamp_ns"]), *(float(row[name]) for name in INLIERS[2:])))
     assert rows == [(QUERY_NS, 1.3, 2, 3, 688.0), (QUERY_NS, 0, 0, 0, 0)]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from umf_ros.core.config import Loop
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative, transform
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.runs.tables import KEYFRAMES, write_table
+from umf_ros.runs.tables import KeyframeRow
 from umf_ros.runs.truth import (
     JudgedRun,
     absolute_trajectory_error,
@@ -44,12 +43,8 @@ def truth(first: int = 0, last: int = 80, has_orientation: bool = True) -> Traje
     return Trajectory(stamps, np.stack([at(second) for second in seconds]), has_orientation)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A run with a keyframe every two seconds."""
-    rows = [[stamp(second), 0, f"{second:.4f}"] for second in range(0, 80, 2)]
-    write_table(tmp_path / "keyframes.csv", KEYFRAMES, rows)
-    return tmp_path
+ROWS = [KeyframeRow(stamp(second), 0, float(second)) for second in range(0, 80, 2)]
+"""A run with a keyframe every two seconds."""
 
 
 def closure(query_s: float, match_s: float, error_m: float = 0.0) -> LoopClosure:
@@ -57,13 +52,13 @@ def closure(query_s: float, match_s: float, error_m: float = 0.0) -> LoopClosure
     return LoopClosure(stamp(query_s), stamp(match_s), pose, np.eye(6))
 
 
-def judged(folder: Path, known: Trajectory, closures: list[LoopClosure]) -> JudgedRun:
-    return judge_run(folder, known, closures, RULES, None, None)
+def judged(known: Trajectory, closures: list[LoopClosure]) -> JudgedRun:
+    return judge_run(ROWS, known, closures, RULES, None, None)
 
 
-def test_true_and_false_closures_are_counted(folder: Path) -> None:
+def test_true_and_false_closures_are_counted() -> None:
     closures = [closure(42, 2), closure(44, 5, 0.4), closure(46, 6, 0.6), closure(30, 2)]
-    found = judged(folder, truth(), closures)
+    found = judged(truth(), closures)
     # half a metre is the limit; (30, 2) has the right pose and is 28 m away
     assert [one.is_true for one in found.closures] == [True, True, False, False]
     assert [one.closure for one in found.closures] == closures
@@ -71,39 +66,39 @@ def test_true_and_false_closures_are_counted(folder: Path) -> None:
     assert (found.summary()["closures_true"], found.summary()["closures_false"]) == (2, 2)
 
 
-def test_poses_between_those_of_the_truth_are_interpolated(folder: Path) -> None:
-    (found,) = judged(folder, truth(), [closure(42.25, 2.75)]).closures
+def test_poses_between_those_of_the_truth_are_interpolated() -> None:
+    (found,) = judged(truth(), [closure(42.25, 2.75)]).closures
     assert found.is_true and found.distance_m == pytest.approx(0.5, abs=1e-6)
 
 
 @pytest.mark.parametrize("ends", [(78, 30), (60, 5)])
-def test_a_closure_with_an_end_outside_of_the_truth_is_not_judged(folder: Path, ends: tuple[int, int]) -> None:
-    assert judged(folder, truth(10, 70), [closure(*ends)]).closures == []
+def test_a_closure_with_an_end_outside_of_the_truth_is_not_judged(ends: tuple[int, int]) -> None:
+    assert judged(truth(10, 70), [closure(*ends)]).closures == []
 
 
-def test_revisits_are_those_that_the_truth_covers(folder: Path) -> None:
-    assert judged(folder, truth(), []).revisits == 20
-    assert judged(folder, truth(0, 61), []).revisits == 11
-    assert judged(folder, truth(0, 40), []).revisits == 0
+def test_revisits_are_those_that_the_truth_covers() -> None:
+    assert judged(truth(), []).revisits == 20
+    assert judged(truth(0, 61), []).revisits == 11
+    assert judged(truth(0, 40), []).revisits == 0
 
 
-def test_the_gaps_of_the_settings_decide_what_can_be_a_revisit(folder: Path) -> None:
+def test_the_gaps_of_the_settings_decide_what_can_be_a_revisit() -> None:
     patient = Loop(min_time_gap_s=60, min_travel_m=15)
     # only what was passed at least a minute before: within 12 m of a place 40 s and more ago
-    found = judge_run(folder, truth(), [], patient, None, None).revisits
+    found = judge_run(ROWS, truth(), [], patient, None, None).revisits
     assert found == sum(
         any(second - past >= 60 and abs(second % 40 - past) <= 12 for past in range(0, 40, 2))
         for second in range(40, 80, 2)
     )
 
 
-def test_errors_of_trajectories_are_after_alignment(folder: Path) -> None:
+def test_errors_of_trajectories_are_after_alignment() -> None:
     known = truth()
     turned = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [5, 6, 7])
     moved = Trajectory(known.stamps_ns, turned @ known.poses)
     bent = known.poses.copy()
     bent[40:, 1, 3] += 2.0
-    found = judge_run(folder, known, [], RULES, Trajectory(known.stamps_ns, bent), moved)
+    found = judge_run(ROWS, known, [], RULES, Trajectory(known.stamps_ns, bent), moved)
     assert found.ate_optimized_m == pytest.approx(0, abs=1e-6)
     # two lines 2 m apart against one: a metre each, after the best alignment at most
     assert found.ate_odometry_m is not None and 0.9 < found.ate_odometry_m <= 1.0 + 1e-9
@@ -119,18 +114,18 @@ def test_an_estimate_that_the_truth_hardly_covers_has_no_error() -> None:
     assert trajectory_error(None, known) is None
 
 
-def test_a_truth_without_headings_judges_distances(folder: Path) -> None:
-    found = judged(folder, truth(has_orientation=False), [closure(42, 5), closure(46, 6, 3.0)])
+def test_a_truth_without_headings_judges_distances() -> None:
+    found = judged(truth(has_orientation=False), [closure(42, 5), closure(46, 6, 3.0)])
     assert [one.is_true for one in found.closures] == [True, False]
     assert all(math.isnan(one.rotation_error_deg) for one in found.closures)
 
 
-def test_the_summary_says_whether_stated_errors_are_honest(folder: Path) -> None:
+def test_the_summary_compares_stated_errors_with_true_ones() -> None:
     # a standard deviation of a metre stated everywhere: the normalised error is the error in metres
-    found = judged(folder, truth(), [closure(42, 2, 0.1), closure(44, 5, 2.0), closure(46, 6, 4.0)])
+    found = judged(truth(), [closure(42, 2, 0.1), closure(44, 5, 2.0), closure(46, 6, 4.0)])
     assert [one.nees for one in found.closures] == pytest.approx([0.01, 4.0, 16.0])
     assert found.summary()["nees_median"] == 4.0 and found.summary()["inside_95"] == pytest.approx(2 / 3, abs=1e-4)
-    blind = judged(folder, truth(has_orientation=False), [closure(42, 2, 0.1)])
+    blind = judged(truth(has_orientation=False), [closure(42, 2, 0.1)])
     assert blind.summary()["nees_median"] is None and blind.summary()["inside_95"] is None
 
 
@@ -149,9 +144,8 @@ def test_the_summary_has_its_keys_and_plain_numbers() -> None:
     }
 
 
-def test_a_run_without_keyframes(tmp_path: Path) -> None:
-    write_table(tmp_path / "keyframes.csv", KEYFRAMES, [])
-    assert judged(tmp_path, truth(), []).revisits == 0
+def test_a_run_without_keyframes() -> None:
+    assert judge_run([], truth(), [], RULES, None, None).revisits == 0
 
 
 def random_pose(rng: np.random.Generator) -> np.ndarray:
@@ -171,9 +165,9 @@ def test_scale_is_not_aligned_away() -> None:
     assert absolute_trajectory_error(1.1 * truth, truth) > 0.3
 
 
-def test_closures_are_found_by_their_endpoints(folder: Path) -> None:
+def test_closures_are_found_by_their_endpoints() -> None:
     closures = [closure(42, 2), closure(42, 3, 0.6)]
-    found = judged(folder, truth(), closures).by_endpoints()
+    found = judged(truth(), closures).by_endpoints()
     assert [found[endpoints(one)].closure for one in closures] == closures
     assert (stamp(2), stamp(42)) not in found  # query first
 

@@ -12,7 +12,7 @@ from umf_ros.core.config import load_settings
 from umf_ros.runs.diagnosis import ClosureDiagnosis
 from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.run_file import RunFile
-from umf_ros.verification.verifier import NO_POSE, UNTESTED
+from umf_ros.verification import RejectReason
 
 
 def write_descriptors(folder: Path, descriptors: np.ndarray) -> None:
@@ -40,7 +40,7 @@ def test_a_place_that_was_not_returned_comes_with_its_rank(tmp_path: Path) -> No
     descriptors[5, 0] = 0.7  # the place of 50 s, seen at 10 s
     descriptors[[4, 6, 3, 7, 2, 8, 1, 9, 0, 10], 0] = 0.2  # what else is within 12 m
     write_descriptors(tmp_path, descriptors)
-    about = examined(tmp_path, candidates=[candidate(50, 30, "probability 0.1 is below 0.9")], truth=trajectory())
+    about = examined(tmp_path, candidates=[candidate(50, 30, RejectReason.IMPROBABLE)], truth=trajectory())
     found = why(about, 50)
     assert found.gate == "retrieval" and found.match_stamp_ns == stamp(10) and found.distance_m == 0
     assert found.what.startswith("the database returned 1 candidates, none of them the place 0.0 m away, which is num")
@@ -49,14 +49,14 @@ def test_a_place_that_was_not_returned_comes_with_its_rank(tmp_path: Path) -> No
 
 def test_a_probability_that_is_too_low_says_by_how_much_and_what_the_parameter_costs(tmp_path: Path) -> None:
     tested = [
-        candidate(50, 10, "probability 0.60 is below 0.9", **BELOW),
-        candidate(52, 30, "probability 0.70 is below 0.9", **(BELOW | {"probability": 0.7})),  # another place
-        candidate(54, 14, "accepted", probability=0.95),
+        candidate(50, 10, RejectReason.IMPROBABLE, **BELOW),
+        candidate(52, 30, RejectReason.IMPROBABLE, **(BELOW | {"probability": 0.7})),  # another place
+        candidate(54, 14, None, probability=0.95),
     ]
     about = examined(tmp_path, [closure(54, 14)], tested, truth=trajectory())
     found = why(about, 50)
     assert found.gate == "probability"
-    assert found.what.startswith("probability 0.60 is below 0.9, 1.8 short in log-odds; lost by ")
+    assert found.what.startswith(f"{RejectReason.IMPROBABLE.value}: 0.60 < 0.9, 1.8 short in log-odds; lost by ")
     assert found.parameter == "verification.min_probability: 0.600 adds 2 closures, 1 of all 3 between different places"
     assert found.contributions["bias"] < 0
     missing = about.gates.missing(tested[0])
@@ -64,22 +64,22 @@ def test_a_probability_that_is_too_low_says_by_how_much_and_what_the_parameter_c
 
 
 def test_the_right_place_is_explained_not_the_most_probable_wrong_one(tmp_path: Path) -> None:
-    tested = [candidate(50, 30, "probability 0.80 is below 0.9", probability=0.8), candidate(50, 10, UNTESTED)]
+    tested = [candidate(50, 30, RejectReason.IMPROBABLE, probability=0.8), candidate(50, 10, RejectReason.NOT_SELECTED)]
     found = why(examined(tmp_path, candidates=tested, truth=trajectory()), 50)
     assert (found.gate, found.match_stamp_ns) == ("selection", stamp(10))
     assert "1 others were more promising" in found.what and found.parameter.startswith("verification.refine_best")
 
 
 def test_without_a_truth_the_most_promising_candidate_is_explained(tmp_path: Path) -> None:
-    turned = candidate(50, 10, "turned by 90 deg, more than 28", 0.3, probability=0.95)
-    tested = [candidate(50, 30, NO_POSE, 0.9), turned]
+    turned = candidate(50, 10, RejectReason.TURNED, 0.3, probability=0.95)
+    tested = [candidate(50, 30, RejectReason.NO_POSE, 0.9), turned]
     found = why(examined(tmp_path, candidates=tested), 50)
     assert (found.gate, found.parameter) == ("objection", "verification.max_turn_deg: a wider limit")
     assert why(examined(tmp_path, candidates=tested[:1]), 50).gate == "pose"
 
 
 def test_what_was_found_is_said_to_be_found(tmp_path: Path) -> None:
-    about = examined(tmp_path, [closure(50, 10)], [candidate(50, 10, "accepted", probability=0.97)], truth=trajectory())
+    about = examined(tmp_path, [closure(50, 10)], [candidate(50, 10, None, probability=0.97)], truth=trajectory())
     assert why(about, 50).gate == "found"
 
 

@@ -147,8 +147,8 @@ def test_rectified_pair_sees_points_where_an_ideal_pair_would() -> None:
     camera, rectified_T_left = rectifier.camera, np.linalg.inv(rectifier.raw_T_rectified)
     assert camera.baseline == pytest.approx(np.linalg.norm(left_T_right[:3, 3]), rel=1e-6)
     for point in np.array([[0.3, -0.2, 4.0], [-1.0, 0.8, 6.0], [1.5, 0.9, 9.0]]):
-        seen_left = centre(rectifier.left(blob(left, point, np.eye(4))))
-        seen_right = centre(rectifier.right(blob(right, point, np.linalg.inv(left_T_right))))
+        seen_left = centre(rectifier.apply(blob(left, point, np.eye(4)), 0))
+        seen_right = centre(rectifier.apply(blob(right, point, np.linalg.inv(left_T_right)), 1))
         x, y, z = transform(rectified_T_left, point[None])[0]
         assert np.allclose(seen_left, [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], atol=0.15)
         assert seen_left[1] - seen_right[1] == pytest.approx(0, abs=0.15)

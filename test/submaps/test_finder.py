@@ -12,11 +12,11 @@ from umf_ros.core.geometry import invert, relative, rotation_angle
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
 from umf_ros.submaps.submap_index import Proposal
-from umf_ros.verification import Verdict
+from umf_ros.verification import Hypothesis, RejectReason
 from umf_ros.verification.constants import SUBMAP_NEAR_M
 
 
-def replay(outing: Drive, database: PlaceDatabase, **settings: float) -> Iterator[tuple[int, list[Verdict]]]:
+def replay(outing: Drive, database: PlaceDatabase, **settings: float) -> Iterator[tuple[int, list[Hypothesis]]]:
     finder = SubmapFinder(Verification(**settings), Loop(), database)
     for i, keyframe in enumerate(outing.keyframes):
         yield i, finder.find(keyframe, [])
@@ -52,7 +52,7 @@ def test_stops_far_apart_are_not_joined_however_well_they_fit(outing: Drive, dat
         tested = finder.test(query, Proposal(row, pose))
         if tested is not None and np.linalg.norm(pose[:3, 3]) < 8:
             verdict = finder._judge(tested)
-            (accepted if verdict.closure else refused).append((np.linalg.norm(pose[:3, 3]), verdict.reason))
+            (accepted if verdict.closure else refused).append((np.linalg.norm(pose[:3, 3]), verdict.outcome))
     assert accepted and max(metres for metres, _ in accepted) <= SUBMAP_NEAR_M
     far = [reason for metres, reason in refused if metres > SUBMAP_NEAR_M + 0.5]
     assert far and all("m apart, more than 5" in reason or "probability" in reason for reason in far)
@@ -62,7 +62,7 @@ def test_stops_far_apart_are_not_joined_however_well_they_fit(outing: Drive, dat
 def test_a_limit_on_the_turn_is_kept(outing: Drive, database: PlaceDatabase) -> None:
     verdicts = [verdict for _, found in replay(outing, database, max_turn_deg=90.0) for verdict in found]
     assert not any(verdict.closure for verdict in verdicts)
-    assert any(verdict.reason.startswith("turned by 1") for verdict in verdicts)
+    assert any(verdict.reason is RejectReason.TURNED for verdict in verdicts)
 
 
 def test_what_never_was_seen_is_not_recognised(outing: Drive, database: PlaceDatabase) -> None:

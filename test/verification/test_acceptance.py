@@ -19,7 +19,7 @@ from umf_ros.verification.acceptance import (
     load_acceptance,
     scores,
 )
-from umf_ros.verification.measurement import SCAN
+from umf_ros.verification.hypothesis import SCAN
 
 
 @pytest.fixture(scope="module")
@@ -114,10 +114,10 @@ def test_a_criterion_younger_than_the_model_has_no_weight(shipped: AcceptanceMod
 
 def test_what_no_right_pose_ever_measured_is_named(shipped: AcceptanceModel, tmp_path: Path) -> None:
     bounded = replace(shipped, bounds={"scan": {"noise_m": (0.001, 0.1), "common": (0.2, 1.0)}})
-    assert bounded.unlike(GOOD) == ""
-    assert bounded.unlike(replace(GOOD, noise_m=0.3)) == "noise_m 0.3"
-    assert bounded.unlike(replace(GOOD, common=0.05)) == "common 0.05"
-    assert bounded.unlike(replace(GOOD, kind="image", noise_m=0.3)) == ""
+    assert bounded.out_of_range(GOOD) == ""
+    assert bounded.out_of_range(replace(GOOD, noise_m=0.3)) == "noise_m 0.3"
+    assert bounded.out_of_range(replace(GOOD, common=0.05)) == "common 0.05"
+    assert bounded.out_of_range(replace(GOOD, kind="image", noise_m=0.3)) == ""
     assert load_acceptance(str(saved(bounded, tmp_path))) == bounded
 
 
@@ -125,8 +125,8 @@ def test_what_no_right_pose_ever_measured_is_named(shipped: AcceptanceModel, tmp
 def test_one_strong_contradiction_sinks_a_closure_however_well_the_rest_fits(
     shipped: AcceptanceModel, name: str, value: float
 ) -> None:
-    assert shipped.unlike(GOOD) == ""
-    assert shipped.unlike(replace(GOOD, **{name: value})).startswith(name)
+    assert shipped.out_of_range(GOOD) == ""
+    assert shipped.out_of_range(replace(GOOD, **{name: value})).startswith(name)
 
 
 @pytest.mark.parametrize("name", ["residual_m", "position_std_m", "prior_sigmas", "unexplained", "contradiction"])

@@ -15,7 +15,8 @@ from umf_ros.core.geometry import make_pose, relative
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan
 from umf_ros.verification import Measurement, Verifier
 from umf_ros.verification.constants import BLUR_M
-from umf_ros.verification.measurement import IMAGE, SCAN, cloud_agreement, image_agreement
+from umf_ros.verification.hypothesis import IMAGE, SCAN
+from umf_ros.verification.measurement import cloud_agreement, image_agreement
 from umf_ros.verification.rerank import strongest
 
 GROUND = landscape(20)

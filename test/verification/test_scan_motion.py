@@ -14,9 +14,9 @@ from umf_ros.runs.truth import normalised_errors, pose_error
 from umf_ros.verification.scan_alignment import (
     Alignment,
     CovarianceModel,
-    closure_covariance,
     covariance_of,
     motion_covariance,
+    scan_covariance,
 )
 
 MODEL = CovarianceModel(4.0, 0.001, 0.005, unknown_motion_m=0.04, unknown_motion_deg=0.1)
@@ -83,7 +83,7 @@ def test_motion_that_was_not_removed_is_unknown() -> None:
     still = keyframe(ScanMotion.none(COUNT))
     for pair in ((still, keyframe(None)), (keyframe(None), still)):
         np.testing.assert_array_equal(motion_covariance(*pair, alignment, MODEL), MODEL.unknown_motion)
-    added = closure_covariance(still, keyframe(None), alignment, MODEL) - covariance_of(alignment.information, MODEL)
+    added = scan_covariance(still, keyframe(None), alignment, MODEL) - covariance_of(alignment.information, MODEL)
     np.testing.assert_allclose(added, MODEL.unknown_motion, atol=1e-12)
 
 

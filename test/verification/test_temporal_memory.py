@@ -10,7 +10,7 @@ from umf_ros.core.frames import Embedding, Keyframe
 from umf_ros.core.geometry import make_pose, relative
 from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA, landscape, pose_at
 from umf_ros.verification.constants import MEMORY_KEYFRAMES
-from umf_ros.verification.hypotheses import TemporalMemory, prior_sigmas
+from umf_ros.verification.pose_search import TemporalMemory, prior_sigmas
 
 GROUND = landscape(0, bumps=1)
 

@@ -13,11 +13,10 @@ from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
-from umf_ros.verification import NO_DEPTH, Verdict, Verifier
+from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification.constants import SAME_M, SAME_RAD
-from umf_ros.verification.hypotheses import near
-from umf_ros.verification.measurement import SCAN
-from umf_ros.verification.verifier import FOUND_BEFORE, LESS_SURE
+from umf_ros.verification.hypothesis import SCAN
+from umf_ros.verification.pose_search import near
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
@@ -34,7 +33,7 @@ def others(count: int) -> list[tuple[Candidate, Keyframe]]:
     return [candidate(take(ELSEWHERE, pose, 20.0 + n), n + 1, 0.75) for n, pose in enumerate(poses)]
 
 
-def gap(verdict: Verdict) -> tuple[float, float]:
+def gap(verdict: Hypothesis) -> tuple[float, float]:
     assert verdict.closure is not None
     error = relative(TRUE, verdict.closure.match_T_query)
     return float(np.linalg.norm(error[:3, 3])), float(np.degrees(rotation_angle(error)))
@@ -45,7 +44,7 @@ def test_revisit_among_others_is_found_with_its_pose(verifier: Verifier) -> None
     verdicts = verifier.verify(query, [*others(5), candidate(match)])
     assert len(verdicts) == 6
     best = verdicts[0]
-    assert best.reason == "accepted"
+    assert best.accepted and best.outcome == "accepted"
     assert best.candidate.stamp_ns == match.stamp_ns
     assert gap(best)[0] < 0.05 and gap(best)[1] < 0.3
     assert best.closure is not None and best.closure.query_stamp_ns == query.stamp_ns
@@ -55,7 +54,7 @@ def test_revisit_among_others_is_found_with_its_pose(verifier: Verifier) -> None
 
 def test_every_verdict_has_numbers_and_a_reason(verifier: Verifier) -> None:
     verdicts = verifier.verify(take(GROUND, HERE, 100.0), [*others(7), candidate(take(GROUND, THERE, 10.0))])
-    assert all(verdict.reason and verdict.measurement.similarity > 0 for verdict in verdicts)
+    assert all((verdict.accepted or verdict.reason) and verdict.measurement.similarity > 0 for verdict in verdicts)
     assert {"residual_m", "overlap", "probability", "inliers_image", "support"} <= set(verdicts[0].numbers)
     pixels = verdicts[0].inlier_pixels
     assert pixels.shape[1] == 4 and len(pixels) > 10
@@ -69,7 +68,7 @@ def test_the_most_probable_closures_are_published_and_no_more_than_asked_for() -
     for most in (1, 2):
         found = Verifier(Verification(max_closures=most, refine_best=4)).verify(query, places)
         assert sum(verdict.closure is not None for verdict in found) == most
-        left = [verdict for verdict in found if verdict.reason == LESS_SURE]
+        left = [verdict for verdict in found if verdict.reason is RejectReason.LESS_PROBABLE]
         least = min(verdict.closure.probability for verdict in found if verdict.closure is not None)
         assert left and all(verdict.probability is not None and verdict.probability <= least for verdict in left)
 
@@ -79,7 +78,8 @@ def test_rejected_candidate_says_how_far_it_fell_short(verifier: Verifier) -> No
     assert all(verdict.closure is None for verdict in verdicts)
     for verdict in verdicts:
         judged = verdict.probability is not None
-        assert verdict.reason.startswith("probability 0." if judged else ("no pose", "less promising"))
+        assert (verdict.reason is RejectReason.IMPROBABLE) == judged
+        assert judged == ("< 0.9" in verdict.outcome) and not verdict.accepted
 
 
 def test_covariance_covers_the_error(verifier: Verifier) -> None:
@@ -115,8 +115,8 @@ def test_without_depths_on_either_side_the_reason_says_so(verifier: Verifier) ->
         return replace(without_scan(keyframe), embedding=replace(keyframe.embedding, image=unknown, cloud=None))
 
     query, match = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
-    assert verifier.verify(flat(query), [candidate(flat(match))])[0].reason == NO_DEPTH
-    assert verifier.verify(flat(query), [candidate(without_scan(match))])[0].reason != NO_DEPTH
+    assert verifier.verify(flat(query), [candidate(flat(match))])[0].reason is RejectReason.NO_DEPTH
+    assert verifier.verify(flat(query), [candidate(without_scan(match))])[0].reason is not RejectReason.NO_DEPTH
 
 
 def test_no_candidates_no_verdicts(verifier: Verifier) -> None:
@@ -184,7 +184,7 @@ for step in range(2):
     query = take(ground, pose_at(ground, -14.0 + step, 1.2, 6.0), 100.0 + step)
     matches = [take(ground, pose_at(ground, -15.0 + 3 * n, 4.0 * n, 20.0 * n), 10.0 + n) for n in range(4)]
     for verdict in verifier.verify(query, [(Candidate(n, m.stamp_ns, 0.5), m) for n, m in enumerate(matches)]):
-        print(verdict.reason, sorted(verdict.numbers.items()))
+        print(verdict.outcome, sorted(verdict.numbers.items()))
         found = verdict.closure
         if found: print(found.match_T_query.tobytes().hex(), found.covariance.tobytes().hex())
 """
@@ -204,20 +204,20 @@ def test_same_bits_whatever_the_number_of_threads() -> None:
 
 
 @pytest.mark.parametrize(
-    ("limits", "word"), [({"max_turn_deg": 3.0}, "turned by 6 deg"), ({"max_shift_m": 0.5}, "apart")]
+    ("limits", "word"), [({"max_turn_deg": 3.0}, "max_turn_deg: 6 deg > 3"), ({"max_shift_m": 0.5}, "m > 0.5")]
 )
 def test_right_pose_of_another_view_is_no_closure(limits: dict[str, float], word: str) -> None:
     verdict = Verifier(Verification(**limits)).verify(
         take(GROUND, HERE, 100.0), [candidate(take(GROUND, THERE, 10.0))]
     )[0]
-    assert verdict.closure is None and word in verdict.reason
+    assert verdict.closure is None and word in verdict.outcome
     assert verdict.probability is not None and verdict.probability > 0.9
 
 
 def test_a_view_that_shares_too_little_is_no_closure() -> None:
     far = take(GROUND, pose_at(GROUND, -15.0, 0.4, 34.0), 100.0)
     verdict = Verifier(Verification(min_probability=0.0)).verify(far, [candidate(take(GROUND, THERE, 10.0))])[0]
-    assert verdict.closure is None and "the views share only" in verdict.reason
+    assert verdict.closure is None and verdict.reason is RejectReason.LITTLE_SHARED_VIEW
 
 
 def test_a_view_all_around_may_be_turned_as_far_as_the_user_lets_it() -> None:
@@ -228,8 +228,8 @@ def test_a_view_all_around_may_be_turned_as_far_as_the_user_lets_it() -> None:
     for limit, accepted in ((0.0, True), (90.0, False), (180.0, True)):
         settings = Verification(min_probability=0.0, max_turn_deg=limit)
         verdict = Verifier(settings).verify(query, [candidate(match)])[0]
-        assert (verdict.closure is not None) == accepted, verdict.reason
-        assert accepted or "turned by 180 deg, more than 90" in verdict.reason
+        assert (verdict.closure is not None) == accepted, verdict.outcome
+        assert accepted or verdict.outcome.endswith("180 deg > 90")
 
 
 def steady(keyframe: Keyframe) -> Keyframe:
@@ -244,7 +244,7 @@ def test_surfaces_that_do_not_coincide_are_no_closure_however_probable() -> None
     ).astype(np.float32)
     pair = [candidate(match)]
     verdict = Verifier(Verification(min_probability=0.0)).verify(replace(query, points=bent), pair)[0]
-    assert verdict.closure is None and "times their noise apart" in verdict.reason
+    assert verdict.closure is None and verdict.reason is RejectReason.MISFIT
     assert Verifier(Verification(min_probability=0.0)).verify(query, pair)[0].closure is not None
 
 
@@ -254,24 +254,24 @@ def test_what_is_expected_and_found_needs_no_comparison_of_the_others(verifier: 
         assert verifier.verify(query, [*others(4), candidate(match)])[0].closure is not None
     found, *rest = verifier.verify(pairs[2][0], [*others(4), candidate(pairs[2][1])])
     assert found.closure is not None and found.closure.match_stamp_ns == pairs[2][1].stamp_ns
-    assert {verdict.reason for verdict in rest} == {FOUND_BEFORE} and len(rest) == 4
+    assert {verdict.reason for verdict in rest} == {RejectReason.NOT_COMPARED} and len(rest) == 4
     assert all(np.isnan(verdict.measurement.inliers_image) for verdict in rest)
     several = Verifier(Verification(max_closures=3))
     for query, match in pairs:
         last = several.verify(query, [*others(4), candidate(match)])
-    assert FOUND_BEFORE not in {verdict.reason for verdict in last}  # more were asked for
+    assert RejectReason.NOT_COMPARED not in {verdict.reason for verdict in last}  # more were asked for
 
 
 def test_hypotheses_that_end_at_one_pose_are_judged_once(verifier: Verifier) -> None:
     query, match = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
     judged = verifier.examine(query, [candidate(match)])
-    poses = [one.aligned.pose for one in judged]
+    poses = [one.pose for one in judged]
     assert poses
     for number, pose in enumerate(poses):
         assert not any(near(pose, other, SAME_M, SAME_RAD) for other in poses[:number])
 
 
-def rivals_known(verdicts: list[Verdict]) -> list[bool]:
+def rivals_known(verdicts: list[Hypothesis]) -> list[bool]:
     return [bool(np.isfinite(one.measurement.rival_far)) for one in verdicts if one.measurement.kind == SCAN]
 
 

@@ -3,31 +3,35 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from umf_ros.bags.presets import calibration_of, topics_of, uses_transforms
+import numpy as np
+
 from umf_ros.bags.reader import Bag, decode
-from umf_ros.bags.storages import RawMessage
 from umf_ros.core import watchdog
-from umf_ros.core.config import Settings, Topics
+from umf_ros.core.config import Settings, Topics, topics_of
 from umf_ros.core.errors import BagError, MessageError, either
-from umf_ros.core.frames import Frame, Image
+from umf_ros.core.frames import Frame
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.buffers import InputCounter
+from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import TYPES, OdometrySample, stamp_ns
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
-from umf_ros.sensors.sessions import Input
+from umf_ros.sensors.sessions import ODOMETRY, Input
 from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.sensors.tf import TOPIC, OdometryFrames, StaticTransforms, TfExtrinsics
 
 _log = logging.getLogger(__name__)
 
+IMU_HINT = "; an IMU is no odometry: run one (KISS-ICP, Basalt, FAST-LIO) and give its poses with --odometry FILE.tum"
+
 
 class FrameReader:
-    """The frames of a recording, read once, and what became of its messages.
+    """The frames of a recording, read once, and the fate of its messages.
 
     Messages that cannot be used are counted and skipped, the first of each kind with a warning. Inputs
     for which the recording has no topic are not waited for.
@@ -51,33 +55,27 @@ class FrameReader:
             CalibrationError: the calibration cannot be read.
         """
         topics = _present(topics_of(settings), bag)
-        if not topics.left_image and not topics.cloud:
-            raise BagError(
-                f"{bag.path} has neither images nor scans on the expected topics; see --dataset and --config"
-            )
-        inputs = wanted_inputs(topics)
         if odometry is not None:
             _check_overlap(odometry, bag)
             topics = topics.model_copy(update={"odometry": ""})
-            inputs.add("odometry")
+        inputs = wanted_inputs(topics) | ({ODOMETRY} if odometry is not None else set())
         calibration = calibration_of(settings)
         self.progress = 0.0
-        self._bag = bag
-        self._odometry = odometry
+        self._bag, self._odometry, self._rows_taken = bag, odometry, 0
         self._synchronizer = Synchronizer(settings.sync, calibration, inputs, warn)
         self._samples: list[OdometrySample] = []
-        transforms = read_transforms(bag) if uses_transforms(settings) else None
+        transforms = read_transforms(bag) if settings.uses_transforms else None
         mounting, frames = None, None
         if transforms is not None and transforms.version:
             mounting = TfExtrinsics(calibration, transforms, settings.frames.base, warn)
             frames = OdometryFrames(settings.frames, transforms, warn)
-        self._intake = MessageRouter(self._synchronizer, topics, warn, self._samples.append, mounting, frames)
+        self._router = MessageRouter(self._synchronizer, topics, warn, self._samples.append, mounting, frames)
         if bag.warning:
             warn(bag.warning)
 
     @property
     def counters(self) -> dict[Input, InputCounter]:
-        """What became of the messages of each input."""
+        """The fate of the messages of each input."""
         return self._synchronizer.counters
 
     def __iter__(self) -> Iterator[Frame]:
@@ -86,44 +84,31 @@ class FrameReader:
 
     def stream(self) -> Iterator[Frame | OdometrySample]:
         """Every message of the odometry as it comes, and the frames as they are complete."""
-        odometry = _Cursor(self._odometry) if self._odometry is not None else None
-        for raw in self._bag.raw_messages(self._intake.topics):
+        for raw in self._bag.raw_messages(self._router.topics):
             watchdog.feed()
-            self._take(raw, odometry)
+            try:
+                message = decode(raw)
+            except MessageError as error:
+                self._router.refuse(raw.topic, error)
+            else:
+                self._add_odometry(message)
+                self._router.take(raw.topic, message)
             self.progress = (raw.log_ns - self._bag.start_ns) / max(1, self._bag.end_ns - self._bag.start_ns)
             yield from self._samples
             self._samples.clear()
             yield from self._synchronizer.pop()
         yield from self._synchronizer.flush()
 
-    def _take(self, raw: RawMessage, odometry: _Cursor | None) -> None:
-        try:
-            message = decode(raw)
-        except MessageError as error:
-            self._intake.refuse(raw.topic, error)
+    def _add_odometry(self, message: Any) -> None:
+        """Add the poses of the trajectory up to the message's stamp that were not added before."""
+        if self._odometry is None:
             return
-        if odometry is not None:
-            odometry.feed(self._intake, message)
-        self._intake.take(raw.topic, message)
-
-
-class _Cursor:
-    """A trajectory, handed out in step with the recording."""
-
-    def __init__(self, trajectory: Trajectory) -> None:
-        self._trajectory = trajectory
-        self._next = 0
-
-    def feed(self, intake: MessageRouter, message: Any) -> None:
-        """Add the poses up to the message's stamp that were not added before."""
-        try:
-            end_ns = stamp_ns(message)
-        except MessageError:
-            return  # the intake says what is wrong with it
-        stamps = self._trajectory.stamps_ns
-        while self._next < len(stamps) and stamps[self._next] <= end_ns:
-            intake.take_odometry(OdometrySample(int(stamps[self._next]), self._trajectory.poses[self._next]))
-            self._next += 1
+        with suppress(MessageError):  # the router reports it
+            end = int(np.searchsorted(self._odometry.stamps_ns, stamp_ns(message), side="right"))
+            for row in range(self._rows_taken, end):
+                sample = OdometrySample(int(self._odometry.stamps_ns[row]), self._odometry.poses[row])
+                self._router.take_odometry(sample)
+            self._rows_taken = max(self._rows_taken, end)
 
 
 def read_transforms(bag: Bag) -> StaticTransforms:
@@ -135,41 +120,24 @@ def read_transforms(bag: Bag) -> StaticTransforms:
     return transforms
 
 
-def read_left_images(bag: Bag, settings: Settings, stamps_ns: Collection[int]) -> dict[int, Image]:
-    """Left images, (H, W) uint8, of the frames with these keys, as far as they have one."""
-    wanted = set(stamps_ns)
-    images: dict[int, Image] = {}
-    if not wanted:
-        return images
-    for frame in FrameReader(bag, settings, warn=lambda _: None):
-        if frame.stamp_ns in wanted and frame.left is not None:
-            images[frame.stamp_ns] = frame.left
-        if len(images) == len(wanted):
-            break
-    return images
-
-
 def _present(topics: Topics, bag: Bag) -> Topics:
     """The topics that the recording has messages of; the others empty.
 
     Raises:
-        BagError: a topic is of another type than expected, as with compressed images.
+        BagError: a topic is of another type than expected, or there are neither images nor scans.
     """
+    missing = []
     for name, topic in topics.model_dump().items():
-        if topic in bag.topics and bag.topics[topic].type not in TYPES[name]:
-            found, expected = bag.topics[topic].type, either(TYPES[name])
-            raise BagError(f"{bag.path}: {topic} is of type {found}, expected {expected}{_instead(found)}")
-    missing = [
-        name for name, topic in topics.model_dump().items() if topic not in bag.topics or not bag.topics[topic].count
-    ]
-    return topics.model_copy(update=dict.fromkeys(missing, ""))
-
-
-def _instead(found: str) -> str:
-    """What to run where the odometry is named as what it is made of."""
-    if found != "sensor_msgs/msg/Imu":
-        return ""
-    return "; an IMU is no odometry: run one (KISS-ICP, Basalt, FAST-LIO) and give its poses with --odometry FILE.tum"
+        info = bag.topics.get(topic)
+        if info is not None and info.type not in TYPES[name]:
+            text = f"{bag.path}: {topic} is of type {info.type}, expected {either(TYPES[name])}"
+            raise BagError(text + (IMU_HINT if info.type == "sensor_msgs/msg/Imu" else ""))
+        if info is None or not info.count:
+            missing.append(name)
+    present = topics.model_copy(update=dict.fromkeys(missing, ""))
+    if not present.left_image and not present.cloud:
+        raise BagError(f"{bag.path} has neither images nor scans on the expected topics; see --dataset and --config")
+    return present
 
 
 def _check_overlap(odometry: Trajectory, bag: Bag) -> None:
@@ -180,9 +148,9 @@ def _check_overlap(odometry: Trajectory, bag: Bag) -> None:
 
 
 REACH_NS = 10**9
-"""A frame further than this from a moment is none of it."""
+"""A frame further than this from a moment does not stand for it."""
 EPOCH_S = 10**9
-"""So many seconds are no time from the start of a recording but one since the epoch."""
+"""From so many seconds on, a moment counts since the epoch and not from the start of a recording."""
 
 Moment = int | float
 """Nanoseconds since the epoch, or seconds from the start of the recording."""
@@ -190,7 +158,7 @@ Moment = int | float
 
 @dataclass(frozen=True, slots=True)
 class FoundFrame:
-    """The frame nearest to a moment, and by how much it misses it."""
+    """The frame nearest to a moment, and its distance in time."""
 
     frame: Frame
     moment: Moment

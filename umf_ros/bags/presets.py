@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from umf_ros.bags.reader import Bag
-from umf_ros.core.config import DatasetPreset, Settings, Topics, load_preset, load_settings
+from umf_ros.core.config import DatasetPreset, Settings, load_preset, load_settings
 from umf_ros.core.errors import BagError
-from umf_ros.core.resources import DEFAULT_DATASET, dataset_names
-from umf_ros.sensors.calibration import Calibration, load_calibration
+from umf_ros.core.resources import dataset_names
 
 GROUND_TRUTH_TOPIC = "/ground_truth/pose"
 
@@ -55,24 +54,3 @@ def settings_for(bag: Bag, config: Path | None, dataset: str, **overrides: Any) 
     if named is None and not settings.model_fields_set & {"dataset", "topics"}:
         settings = settings.model_copy(update={"dataset": detect_dataset(bag)})
     return settings
-
-
-def topics_of(settings: Settings) -> Topics:
-    """Input topics: those of the data set, except where the settings differ from the defaults."""
-    defaults = Topics().model_dump()
-    own = {name: topic for name, topic in settings.topics.model_dump().items() if topic != defaults[name]}
-    return load_preset(settings.dataset).topics.model_copy(update=own)
-
-
-def calibration_of(settings: Settings) -> Calibration:
-    """The calibration the settings name, else that of the data set.
-
-    Raises:
-        CalibrationError: the file cannot be read, or a key is missing, unknown or wrong.
-    """
-    return load_calibration(settings.calibration or settings.dataset)
-
-
-def uses_transforms(settings: Settings) -> bool:
-    """Whether `/tf_static` says where the sensors are: a data set that was chosen has a calibration of its own."""
-    return settings.frames.extrinsics == "tf" and settings.dataset == DEFAULT_DATASET

@@ -7,26 +7,28 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from umf_ros.bags.storages import RawMessage, Storage, message_types, open_storage
+from umf_ros.bags.storages import RawMessage, RecordedFile, TopicInfo, message_types, open_files
 from umf_ros.core.errors import BagError, MessageError, one_line, shortened
 
 
 class Bag:
-    """A recording: what it holds, and its messages as often as wanted.
+    """A recording: its topics by name, and its messages as often as wanted.
 
     Attributes:
         path: file or folder.
-        topics: what it holds, by topic.
-        start_ns, end_ns: when the first and the last message were recorded.
+        start_ns, end_ns: stamps of the recording of the first and the last message.
         warning: one line when a part of the recording is unreadable, else empty.
     """
 
-    def __init__(self, path: Path, storage: Storage) -> None:
-        self.path = path
-        self.topics = storage.topics
-        self.start_ns, self.end_ns = storage.start_ns, storage.end_ns
-        self.warning = storage.warning
-        self._storage = storage
+    def __init__(self, path: Path, files: list[RecordedFile]) -> None:
+        self.path, self._files = path, files
+        types = {topic: kind for file in files for topic, kind in file.types.items()}
+        counts = {topic: sum(file.counts[topic] for file in files) for topic in sorted(types)}
+        self.topics = {topic: TopicInfo(types[topic], count) for topic, count in counts.items()}
+        filled = [file for file in files if file.counts.total()]
+        self.start_ns = min((file.start_ns for file in filled), default=0)
+        self.end_ns = max((file.end_ns for file in filled), default=0)
+        self.warning = "; ".join(file.warning for file in files if file.warning)
 
     @property
     def duration_s(self) -> float:
@@ -41,7 +43,8 @@ class Bag:
         """
         wanted = self.topics.keys() if topics is None else self.topics.keys() & set(topics)
         with _one_line(self.path):
-            yield from self._storage.messages(wanted)
+            for file in self._files:
+                yield from file.messages(wanted)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, Any]]:
         """Topic, time of recording in ns and message, in the order of their recording.
@@ -71,15 +74,15 @@ def decode(raw: RawMessage) -> Any:
 
 @contextmanager
 def _one_line(path: Path) -> Iterator[None]:
-    """Tell whatever goes wrong while a recording is read as a `BagError`."""
+    """Report any fault of reading a recording as a `BagError`."""
     try:
         yield
     except BagError:
         raise
     except OSError as error:
         raise BagError(f"cannot read {shortened(path)}: {error.strerror or error}") from None
-    except Exception as error:  # damaged bytes provoke anything
-        raise BagError(f"{shortened(path)} is damaged: {one_line(error)}") from None
+    except Exception as error:  # damaged bytes raise any exception
+        raise BagError(f"{shortened(path)} cannot be read: {one_line(error)}") from None
 
 
 def open_bag(path: str | Path) -> Bag:
@@ -94,7 +97,7 @@ def open_bag(path: str | Path) -> Bag:
     with _one_line(path):
         if not path.exists():
             raise BagError(f"there is no recording {path}")
-        storage = open_storage(path)
-    if not any(topic.count for topic in storage.topics.values()):
-        raise BagError(f"{path} holds no message" + (f" ({storage.warning})" if storage.warning else ""))
-    return Bag(path, storage)
+        bag = Bag(path, open_files(path))
+    if not any(topic.count for topic in bag.topics.values()):
+        raise BagError(f"{path} holds no message" + (f" ({bag.warning})" if bag.warning else ""))
+    return bag

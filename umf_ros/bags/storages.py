@@ -1,4 +1,4 @@
-"""Storages of recordings: mcap files, db3 folders and ROS 1 bags."""
+"""Files of recordings: mcap files, db3 folders and ROS 1 bags."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol
 
-import apsw
 import lz4.frame
-from lz4.frame import LZ4FrameDecompressor
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
@@ -25,15 +22,12 @@ from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Reader1
-from rosbags.rosbag1 import ReaderError as Error1
 from rosbags.rosbag2 import Reader as Reader2
-from rosbags.rosbag2 import ReaderError as Error2
-from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from zstandard import ZstdError, frame_content_size
 
-from umf_ros.core.errors import BagError, one_line
+from umf_ros.core.errors import BagError
 from umf_ros.sensors.decode import LIVOX, LIVOX_DEFINITION
 
 LARGEST_CHUNK = 2**28
@@ -42,12 +36,7 @@ LARGEST_CHUNK = 2**28
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """A topic of a recording.
-
-    Attributes:
-        type: message type, as in `sensor_msgs/msg/Image`.
-        count: number of messages.
-    """
+    """Message type, as in `sensor_msgs/msg/Image`, and number of messages of a topic."""
 
     type: str
     count: int
@@ -55,14 +44,7 @@ class TopicInfo:
 
 @dataclass(frozen=True, slots=True)
 class RawMessage:
-    """A recorded message.
-
-    Attributes:
-        topic: where.
-        log_ns: when it was recorded.
-        type: message type.
-        data: the message as ROS 2 serialises it (CDR), whatever the format of the recording.
-    """
+    """A message recorded at `log_ns`, its data as ROS 2 serialises them (CDR), whatever the format of the recording."""
 
     topic: str
     log_ns: int
@@ -70,10 +52,11 @@ class RawMessage:
     data: bytes
 
 
-class Storage(Protocol):
-    """One recording in one format."""
+class RecordedFile(Protocol):
+    """One file of a recording: number and type of its messages by topic, and the time of the first and the last."""
 
-    topics: dict[str, TopicInfo]
+    counts: Counter[str]
+    types: dict[str, str]
     start_ns: int
     end_ns: int
     warning: str
@@ -93,26 +76,16 @@ def message_types() -> Typestore:
     return store
 
 
-def unpack_bz2(data: bytes) -> bytes:
-    """Contents of a chunk.
+_DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}
+
+
+def unpack(compression: str, data: bytes) -> bytes:
+    """Contents of a chunk packed as "bz2" or "lz4".
 
     Raises:
-        ValueError: there are more than any recorder writes.
+        ValueError: they are larger than any that recorders write.
     """
-    return _limited(bz2.BZ2Decompressor().decompress(data, LARGEST_CHUNK + 1))
-
-
-def unpack_lz4(data: bytes) -> bytes:
-    """Likewise.
-
-    Raises:
-        ValueError: there are more than any recorder writes.
-        RuntimeError: they are damaged.
-    """
-    return _limited(LZ4FrameDecompressor().decompress(data, LARGEST_CHUNK + 1))
-
-
-def _limited(unpacked: bytes) -> bytes:
+    unpacked = _DECOMPRESSORS[compression]().decompress(data, LARGEST_CHUNK + 1)
     if len(unpacked) > LARGEST_CHUNK:
         raise ValueError(f"a chunk holds more than {LARGEST_CHUNK} bytes")
     return unpacked
@@ -130,28 +103,7 @@ MOST_WAITING = 2**28
 """Bytes of messages that wait for earlier ones; those of a recorder's second are some dozens of megabytes."""
 
 
-class McapStorage:
-    """One or more mcap files written one after the other."""
-
-    def __init__(self, paths: list[Path]) -> None:
-        self._files = [_open(path) for path in paths]
-        counts: Counter[str] = Counter()
-        types: dict[str, str] = {}
-        for file in self._files:
-            counts.update(file.counts)
-            types |= file.types
-        self.topics = {topic: TopicInfo(types[topic], counts[topic]) for topic in sorted(types)}
-        filled = [file for file in self._files if file.counts.total()]
-        self.start_ns = min((file.start_ns for file in filled), default=0)
-        self.end_ns = max((file.end_ns for file in filled), default=0)
-        self.warning = "; ".join(file.warning for file in self._files if file.warning)
-
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of some topics in the order of their recording."""
-        return chain.from_iterable(file.messages(topics) for file in self._files)
-
-
-def _open(path: Path) -> _IndexedFile | _BrokenFile:
+def _open_mcap(path: Path) -> RecordedFile:
     try:
         return _IndexedFile(path)
     except (*_DAMAGE, OSError):  # too short to seek in
@@ -161,10 +113,8 @@ def _open(path: Path) -> _IndexedFile | _BrokenFile:
 class _IndexedFile:
     """A complete file."""
 
-    warning = ""
-
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._path, self.warning = path, ""
         with path.open("rb") as stream:
             summary = make_reader(stream).get_summary()
         if summary is None or summary.statistics is None or not summary.chunk_indexes:
@@ -190,22 +140,19 @@ class _IndexedFile:
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         wanted = {key: channel for key, channel in self._channels.items() if channel[0] in topics}
-        row = _Row()
+        buffer = _ReorderBuffer()
         with self._path.open("rb") as stream:
-            try:
-                for index in self._chunks:
-                    if index.message_index_offsets and not wanted.keys() & index.message_index_offsets.keys():
-                        continue
-                    yield from row.until(index.message_start_time)
-                    stream.seek(index.chunk_start_offset + 9)
-                    for number, record in enumerate(_unpacked(Chunk.read(ReadDataStream(stream)))):
-                        if isinstance(record, Message) and record.channel_id in wanted:
-                            topic, kind = wanted[record.channel_id]
-                            message = RawMessage(topic, record.log_time, kind, record.data)
-                            yield from row.take(message, (index.chunk_start_offset, number))
-            except _DAMAGE as error:
-                raise BagError(f"{self._path} is damaged: {one_line(error)}") from None
-        yield from row.rest()
+            for index in self._chunks:
+                if index.message_index_offsets and not wanted.keys() & index.message_index_offsets.keys():
+                    continue
+                yield from buffer.until(index.message_start_time)
+                stream.seek(index.chunk_start_offset + 9)
+                for number, record in enumerate(_unpacked(Chunk.read(ReadDataStream(stream)))):
+                    if isinstance(record, Message) and record.channel_id in wanted:
+                        topic, kind = wanted[record.channel_id]
+                        message = RawMessage(topic, record.log_time, kind, record.data)
+                        yield from buffer.take(message, (index.chunk_start_offset, number))
+        yield from buffer.until()
 
 
 class _BrokenFile:
@@ -228,12 +175,12 @@ class _BrokenFile:
             self.warning = f"{path} breaks off; its first {seconds:.1f} s ({self.counts.total()} messages) are readable"
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        row = _Row()
+        buffer = _ReorderBuffer()
         for number, message in enumerate(self._stream()):
             if message.topic in topics:
-                yield from row.take(message, (0, number))
-                yield from row.until(message.log_ns - SORTING_WINDOW_NS)
-        yield from row.rest()
+                yield from buffer.take(message, (0, number))
+                yield from buffer.until(message.log_ns - SORTING_WINDOW_NS)
+        yield from buffer.until()
 
     def _stream(self) -> Iterator[RawMessage]:
         """Messages as they lie in the file."""
@@ -242,7 +189,10 @@ class _BrokenFile:
         with self._path.open("rb") as stream:
             try:
                 limit = min(self._path.stat().st_size, LARGEST_CHUNK)
-                for record in _records(StreamReader(stream, emit_chunks=True, record_size_limit=limit)):
+                records = StreamReader(stream, emit_chunks=True, record_size_limit=limit).records
+                for record in chain.from_iterable(
+                    _unpacked(one) if isinstance(one, Chunk) else [one] for one in records
+                ):
                     if isinstance(record, Schema):
                         schemas[record.id] = record
                     elif isinstance(record, Channel):
@@ -256,28 +206,23 @@ class _BrokenFile:
                 self._fault = str(error) or type(error).__name__
 
 
-class _Row:
-    """Messages that wait for earlier ones, as many as there is memory for: what is set to burst it comes as it lies."""
+class _ReorderBuffer:
+    """Sorts messages by time within limits of memory: on overflow they pass unsorted."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[int, tuple[int, int], RawMessage]] = []
         self._held = 0
 
     def take(self, message: RawMessage, place: tuple[int, int]) -> Iterator[RawMessage]:
-        """Take one in, whose place in the file decides between equal times; yields those that there is no room for."""
+        """Add one, whose place in the file decides between equal times; yields those that do not fit."""
         heapq.heappush(self._waiting, (message.log_ns, place, message))
         self._held += len(message.data)
         while self._held > MOST_WAITING:
             yield self._first()
 
-    def until(self, log_ns: int) -> Iterator[RawMessage]:
-        """Those before a time."""
+    def until(self, log_ns: int = 2**64) -> Iterator[RawMessage]:
+        """Yield the messages before a time, by default all."""
         while self._waiting and self._waiting[0][0] < log_ns:
-            yield self._first()
-
-    def rest(self) -> Iterator[RawMessage]:
-        """Those that are left."""
-        while self._waiting:
             yield self._first()
 
     def _first(self) -> RawMessage:
@@ -286,29 +231,20 @@ class _Row:
         return message
 
 
-def _records(reader: StreamReader) -> Iterator[McapRecord]:
-    """Records as they lie in the file, those in chunks of a size that can be unpacked among them."""
-    for record in reader.records:
-        if isinstance(record, Chunk):
-            yield from _unpacked(record)
-        else:
-            yield record
-
-
 def _unpacked(chunk: Chunk) -> Iterable[McapRecord]:
     """The records of a chunk of a size that can be unpacked.
 
     Raises:
-        ValueError: it is larger.
+        ValueError: it is larger than any that recorders write.
     """
     _check_chunk(chunk.uncompressed_size, chunk.compression, chunk.data[:18])
     if chunk.compression == "lz4":
-        chunk = replace(chunk, compression="", data=unpack_lz4(chunk.data))
+        chunk = replace(chunk, compression="", data=unpack("lz4", chunk.data))
     return breakup_chunk(chunk)
 
 
 def _check_chunks(path: Path, indexes: Collection[ChunkIndex]) -> None:
-    """Look at what the chunks claim of themselves, and not only at what the index claims of them.
+    """Check the claims of the chunks themselves, and not only those of the index.
 
     Raises:
         ValueError: one lies outside of the file, or would be too large.
@@ -333,85 +269,58 @@ def _check_chunk(claimed: int, compression: str, start: bytes) -> None:
         raise ValueError(f"a chunk claims {claimed} bytes")
 
 
-_LIMITED: dict[Any, Any] = {bz2.decompress: unpack_bz2, lz4.frame.decompress: unpack_lz4}
-"""What unpacks a chunk, and what does so with a limit."""
+_LIMITED: dict[Any, Any] = {bz2.decompress: partial(unpack, "bz2"), lz4.frame.decompress: partial(unpack, "lz4")}
+"""Decompressors of chunks, and those with a limit that replace them."""
 
 
-def _summary(connections: list[Connection]) -> dict[str, TopicInfo]:
-    topics: dict[str, TopicInfo] = {}
-    for connection in sorted(connections, key=lambda connection: connection.topic):
-        count = topics[connection.topic].count if connection.topic in topics else 0
-        topics[connection.topic] = TopicInfo(connection.msgtype, count + connection.msgcount)
-    return topics
-
-
-def _left_behind(paths: list[Path]) -> str:
-    """What to say of messages that a killed recorder left in a log of SQLite, which is not read."""
-    files = [one for path in paths for one in (sorted(path.glob("*.db3")) if path.is_dir() else [path])]
-    logs = [log for one in files if (log := one.with_name(one.name + "-wal")).is_file() and log.stat().st_size]
-    if not logs:
-        return ""
-    return f"{logs[0]} holds messages that are not read: sqlite3 {logs[0].name[:-4]} 'PRAGMA wal_checkpoint' adds them"
-
-
-@contextmanager
-def _faults_of(path: Path) -> Iterator[None]:
-    """Tell the faults of the library in one line."""
-    try:
-        yield
-    except (Error1, Error2, SerdeError, apsw.Error, AssertionError) as error:
-        raise BagError(f"{path} cannot be read: {' '.join(str(error).split()) or type(error).__name__}") from None
-
-
-class RosbagsStorage:
-    """A folder of ROS 2, db3 files written one after the other, or a ROS 1 bag.
+class _RosbagsFile:
+    """A folder of ROS 2, a db3 file, or a ROS 1 bag.
 
     The messages of ROS 1 come out as those of ROS 2; types that ROS 2 does not know are left out.
     """
 
-    def __init__(self, paths: list[Path], ros1: bool = False) -> None:
-        self._paths = paths
-        self.warning = _left_behind(paths)
+    def __init__(self, path: Path, ros1: bool = False) -> None:
+        self._path = path
         self._reader: Any = Reader1 if ros1 else Reader2
         self._to_cdr = message_types().ros1_to_cdr if ros1 else None
-        connections: list[Connection] = []
-        spans: list[tuple[int, int]] = []
-        for path in paths:
-            with _faults_of(path), self._reader(path) as reader:
-                connections += self._readable(reader)
-                if reader.message_count:
-                    spans.append((reader.start_time, reader.end_time - 1))
-        self.topics = _summary(connections)
-        self.start_ns = min((start for start, _ in spans), default=0)
-        self.end_ns = max((end for _, end in spans), default=0)
+        self.warning = _warning_of_log(path)
+        self.counts = Counter[str]()
+        with self._reader(path) as reader:
+            connections = self._readable(reader)
+            self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
+        self.types = {connection.topic: connection.msgtype for connection in connections}
+        for connection in connections:
+            self.counts[connection.topic] += connection.msgcount
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of some topics in the order of their recording."""
-        for path in self._paths:
-            with _faults_of(path), self._reader(path) as reader:
-                wanted = [connection for connection in self._readable(reader) if connection.topic in topics]
-                for connection, log_ns, data in self._limited(reader).messages(wanted) if wanted else ():
-                    cdr = bytes(self._to_cdr(data, connection.msgtype)) if self._to_cdr else data
-                    yield RawMessage(connection.topic, log_ns, connection.msgtype, cdr)
-
-    def _limited(self, reader: Any) -> Any:
-        """The reader, with chunks that unpack to a limit only (ROS 1)."""
-        for place, chunk in getattr(reader, "chunks", {}).items():
-            limited = _LIMITED.get(chunk.decompressor)
-            if limited is not None:
+        with self._reader(self._path) as reader:
+            wanted = [connection for connection in self._readable(reader) if connection.topic in topics]
+            for place, chunk in getattr(reader, "chunks", {}).items():  # of ROS 1
+                limited = _LIMITED.get(chunk.decompressor, chunk.decompressor)
                 reader.chunks[place] = chunk._replace(decompressor=limited)
-        return reader
+            for connection, log_ns, data in reader.messages(wanted) if wanted else ():
+                cdr = bytes(self._to_cdr(data, connection.msgtype)) if self._to_cdr else data
+                yield RawMessage(connection.topic, log_ns, connection.msgtype, cdr)
 
     def _readable(self, reader: Any) -> list[Connection]:
         known = message_types().fielddefs
         return [one for one in reader.connections if self._to_cdr is None or one.msgtype in known]
 
 
+def _warning_of_log(path: Path) -> str:
+    """Warning about messages that a killed recorder left in a log of SQLite, which is not read."""
+    for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
+        log = file.with_name(file.name + "-wal")
+        if log.is_file() and log.stat().st_size:
+            return f"{log} holds messages that are not read: sqlite3 {file.name} 'PRAGMA wal_checkpoint' adds them"
+    return ""
+
+
 _MCAP, _SQLITE, _ROS1 = b"\x89MCAP0\r\n", b"SQLite format 3\x00", b"#ROSBAG V2.0"
 
 
-def open_storage(path: Path) -> Storage:
-    """Open a file or a folder.
+def open_files(path: Path) -> list[RecordedFile]:
+    """Open the files of a recording, a file or a folder, in the order in which they were written.
 
     Raises:
         BagError: it is no recording, or damaged beyond use.
@@ -425,22 +334,20 @@ def open_storage(path: Path) -> Storage:
     if not start:
         raise BagError(f"{path} is empty")
     if start.startswith(_MCAP):
-        return McapStorage([path])
-    if start.startswith(_SQLITE):
-        return RosbagsStorage([path])
-    if start.startswith(_ROS1):
-        return RosbagsStorage([path], ros1=True)
+        return [_open_mcap(path)]
+    if start.startswith((_SQLITE, _ROS1)):
+        return [_RosbagsFile(path, ros1=start.startswith(_ROS1))]
     raise BagError(f"{path} is no recording: neither mcap nor db3 nor a ROS 1 bag")
 
 
-def _open_folder(path: Path) -> Storage:
+def _open_folder(path: Path) -> list[RecordedFile]:
     mcap, db3 = (_in_number_order(one for one in path.glob(f"*.{kind}") if one.is_file()) for kind in ("mcap", "db3"))
     if mcap:
-        return McapStorage(mcap)
+        return [_open_mcap(one) for one in mcap]
     if (path / "metadata.yaml").is_file():
-        return RosbagsStorage([path])
+        return [_RosbagsFile(path)]
     if db3:  # the recorder was killed before it wrote its metadata
-        return RosbagsStorage(db3)
+        return [_RosbagsFile(one) for one in db3]
     raise BagError(f"{path} is no recording: it holds neither metadata.yaml nor mcap or db3 files")
 
 

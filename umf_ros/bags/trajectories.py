@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from umf_ros.bags.presets import GROUND_TRUTH_TOPIC, calibration_of
+from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.reader import Bag
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import BagError, MessageError
-from umf_ros.core.geometry import Array, make_pose
+from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose, stamp_ns
 
 GPS_EPOCH_S = 315_964_800
@@ -54,9 +55,7 @@ def read_tum(path: str | Path) -> Trajectory:
     if not stamps:
         raise BagError(f"{path} holds no pose")
     values = np.array(rows)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
-    poses[:, :3, 3] = values[:, :3]
+    poses = RigidTransform.from_components(values[:, :3], Rotation.from_quat(values[:, 3:])).as_matrix()
     return Trajectory(np.array(stamps, np.int64), poses)
 
 
@@ -80,7 +79,7 @@ def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajector
 
 
 def read_ground_truth(bag: Bag | None, path: str | Path | None = None) -> Trajectory | None:
-    """Ground truth from a file (RTKLIB .pos or TUM), else from the recording, else None.
+    """Ground truth from a file (RTKLIB .pos or TUM), else from the simulator's topic in the recording, else None.
 
     Raises:
         BagError: the file cannot be read or is wrong.
@@ -89,42 +88,38 @@ def read_ground_truth(bag: Bag | None, path: str | Path | None = None) -> Trajec
         if Path(path).suffix.lower() != ".pos":
             return read_tum(path)
         stamps, positions = read_rtklib(path)
-        poses = np.stack([make_pose(np.eye(3), position) for position in positions])
+        poses = RigidTransform.from_translation(positions).as_matrix()
         return Trajectory(stamps, poses, has_orientation=False)
     if bag is None or GROUND_TRUTH_TOPIC not in bag.topics:
         return None
-    return _recorded_truth(bag)
-
-
-def _recorded_truth(bag: Bag) -> Trajectory | None:
-    """The first session of the truth that the simulator records as geometry_msgs/PoseStamped."""
-    stamps: list[int] = []
-    poses: list[Array] = []
+    found: list[tuple[int, Array]] = []
     for _, _, message in bag.messages([GROUND_TRUTH_TOPIC]):
         try:
             stamp, pose = stamp_ns(message), decode_pose(message.pose)
         except MessageError as error:
             raise BagError(f"{bag.path}: ground truth holds a {error}") from None
-        if not stamps or stamp > stamps[-1]:
-            stamps.append(stamp)
-            poses.append(pose)
-    return Trajectory(np.array(stamps, np.int64), np.stack(poses)) if stamps else None
+        if not found or stamp > found[-1][0]:  # the first session
+            found.append((stamp, pose))
+    if not found:
+        return None
+    return Trajectory(np.array([stamp for stamp, _ in found], np.int64), np.stack([pose for _, pose in found]))
 
 
 def _to_ns(seconds: str) -> int:
-    """Nanoseconds of decimal seconds, without the rounding of a float."""
-    if not seconds.replace(".", "", 1).isdigit():  # as 1.6e9, or negative
-        return _a_stamp(round(float(seconds) * 1e9))
-    whole, _, fraction = seconds.partition(".")
-    return _a_stamp(int(whole or 0) * 10**9 + int(fraction[:9].ljust(9, "0")))
-
-
-def _a_stamp(nanoseconds: int) -> int:
-    """The same.
+    """Nanoseconds of decimal seconds, without the rounding of a float.
 
     Raises:
         OverflowError: there is no such time.
     """
+    if seconds.replace(".", "", 1).isdigit():
+        whole, _, fraction = seconds.partition(".")
+        found = int(whole or 0) * 10**9 + int(fraction[:9].ljust(9, "0"))
+    else:  # as 1.6e9, or negative
+        found = round(float(seconds) * 1e9)
+    return _checked(found)
+
+
+def _checked(nanoseconds: int) -> int:
     if abs(nanoseconds) >= LAST_STAMP_NS:
         raise OverflowError("beyond the last stamp")
     return nanoseconds
@@ -133,8 +128,7 @@ def _a_stamp(nanoseconds: int) -> int:
 def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> tuple[NDArray[np.int64], Array]:
     """Stamps (N,) in UTC nanoseconds and (N, 3) positions east, north, up in metres from the first one.
 
-    Reads `date time lat lon height Q ...` and `week seconds lat lon height Q ...`, both in GPS time,
-    degrees and metres; worse qualities are left out.
+    Lines are `date time lat lon height Q ...` or `week seconds lat lon height Q ...`, in GPS time, degrees and metres.
 
     Raises:
         BagError: the file cannot be read or holds no position of that quality; names the line that is wrong.
@@ -161,16 +155,11 @@ def _parse(fields: list[str]) -> tuple[int, float, float, float, int]:
     latitude, longitude, height = (float(field) for field in fields[2:5])
     if not (abs(latitude) <= 90 and abs(longitude) <= 360 and abs(height) < 1e5):
         raise ValueError("not a position on Earth")
-    gps_ns = _date_ns(*fields[:2]) if "/" in fields[0] else _week_ns(*fields[:2])
+    if "/" in fields[0]:
+        gps_ns = int(np.datetime64(f"{fields[0].replace('/', '-')}T{fields[1]}", "ns").astype(np.int64))
+    else:
+        gps_ns = _checked((GPS_EPOCH_S + int(fields[0]) * 604_800) * 10**9 + round(float(fields[1]) * 1e9))
     return gps_ns - LEAP_SECONDS * 10**9, latitude, longitude, height, int(fields[5])
-
-
-def _date_ns(date: str, time: str) -> int:
-    return int(np.datetime64(f"{date.replace('/', '-')}T{time}", "ns").astype(np.int64))
-
-
-def _week_ns(week: str, seconds: str) -> int:
-    return _a_stamp((GPS_EPOCH_S + int(week) * 604_800) * 10**9 + round(float(seconds) * 1e9))
 
 
 def east_north_up(geodetic: Array) -> Array:
@@ -182,11 +171,9 @@ def east_north_up(geodetic: Array) -> Array:
     y = (curvature + height) * np.cos(latitude) * np.sin(longitude)
     z = (curvature * (1 - _ECCENTRICITY_SQUARED) + height) * np.sin(latitude)
     centred = np.stack([x - x[0], y - y[0], z - z[0]], axis=1)
-    (sin_lat, cos_lat), (sin_lon, cos_lon) = ((np.sin(a[0]), np.cos(a[0])) for a in (latitude, longitude))
-    east = [-sin_lon, cos_lon, 0]
-    north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
-    up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
-    return np.asarray(centred @ np.array([east, north, up]).T)
+    # the earth's axes, turned to east, north and up at the first position
+    turn = Rotation.from_euler("ZX", [longitude[0] + np.pi / 2, np.pi / 2 - latitude[0]])
+    return np.asarray(turn.apply(centred, inverse=True))
 
 
 def read_lines(path: str | Path) -> list[str]:

@@ -20,9 +20,9 @@ from umf_ros.sensors.decode import (
     COMPRESSED,
     IMAGE,
     LIVOX,
-    decode_any_cloud,
-    decode_any_image,
     decode_camera_info,
+    decode_cloud,
+    decode_image,
     decode_odometry,
 )
 from umf_ros.sensors.tf import TOPIC, StaticTransforms
@@ -140,14 +140,14 @@ def _read_samples(bag: Bag, found: Inspected) -> None:
 
 
 def _image_words(message: Any, found: Inspected) -> str:
-    image = decode_any_image(message)
+    image = decode_image(message)
     found.image_size = image.shape[1], image.shape[0]
     kind = getattr(message, "encoding", "") or message.format
     return f"{image.shape[1]} x {image.shape[0]}, {kind}, grey values vary by {image.std():.0f}"
 
 
 def _cloud_words(message: Any, _: Inspected) -> str:
-    cloud = decode_any_cloud(message)
+    cloud = decode_cloud(message)
     words = [f"{len(cloud.points)} returns"]
     words.append("no intensity" if cloud.intensity is None else f"intensity up to {cloud.intensity.max(initial=0):.4g}")
     times = cloud.time_offset_ns

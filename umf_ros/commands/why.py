@@ -89,7 +89,9 @@ def _tell(console: Console, about: ExaminedRun, row: int, why: ClosureDiagnosis)
             apart_m = float("inf") if match is None else float(about.places.distances(row)[match])
             probability = "" if one.probability is None else f"{one.probability:.3f}"
             known = f"{apart_m:.1f}" if apart_m < float("inf") else ""
-            table.add_row(at(one.match_stamp_ns), f"{one.similarity:.3f}", probability, known, escape(one.reason))
+            table.add_row(
+                at(one.match_stamp_ns), f"{one.candidate.similarity:.3f}", probability, known, escape(one.outcome)
+            )
         console.print(table)
     for name, value in sorted(why.contributions.items(), key=lambda one: -abs(one[1]))[:SHOWN]:
         console.print(f"  {name.replace('_', ' '):24} {value:+.1f}", **plain)

@@ -264,6 +264,11 @@ class Settings(Group):
         """Whether places are looked for in a map that stays as it is."""
         return self.mode == "localization"
 
+    @property
+    def uses_transforms(self) -> bool:
+        """Whether `/tf_static` says where the sensors are: a data set that was chosen has a calibration of its own."""
+        return self.frames.extrinsics == "tf" and self.dataset == DEFAULT_DATASET
+
 
 def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:
     """Settings from a YAML file, plain or a ROS parameter file (`/**: ros__parameters:`).
@@ -295,6 +300,13 @@ def load_preset(dataset: str) -> DatasetPreset:
     except ValidationError as error:
         raise ConfigError(f"{path}: {problems(error)}") from None
     return preset.model_copy(update={"calibration": path.parent / preset.calibration})
+
+
+def topics_of(settings: Settings) -> Topics:
+    """Input topics: those of the data set, except where the settings differ from the defaults."""
+    defaults = Topics().model_dump()
+    own = {name: topic for name, topic in settings.topics.model_dump().items() if topic != defaults[name]}
+    return load_preset(settings.dataset).topics.model_copy(update=own)
 
 
 def parse_settings(values: dict[str, Any]) -> Settings:

@@ -39,12 +39,7 @@ class StereoCamera:
         return 2 * math.atan(self.width / (2 * self.fx))
 
     def project(self, points: Array, body_T_camera: Array) -> tuple[Array, Array]:
-        """Left pixels (N, 2) and depths (N,) of points (N, 3) of the body frame; a depth <= 0 lies behind the camera.
-
-        Args:
-            points: (N, 3) metres, body frame.
-            body_T_camera: pose of the left camera in the body frame.
-        """
+        """Left pixels (N, 2) and depths (N,) m of points (N, 3), body frame; depths <= 0 lie behind the camera."""
         optical = transform(invert(body_T_camera), points)
         depth = optical[:, 2]
         safe = np.where(depth > 0, depth, 1.0)
@@ -55,11 +50,11 @@ class StereoCamera:
 
 @dataclass(frozen=True, slots=True)
 class ScanMotion:
-    """When the points of a scan were measured, and how far the motion meanwhile, which was removed, is known.
+    """The motion during a scan, which was removed from its points, and its uncertainty.
 
     Attributes:
         moments_s: (N,) float32, s after the frame's stamp, one for every point.
-        rates: (6,) x y z rx ry rz, m/s and rad/s about the body's axes: the motion over the scan.
+        rates: (6,) x y z rx ry rz, m/s and rad/s about the body's axes.
         noise: (6,) m^2/s and rad^2/s: the variance that the odometry's error gains in a second.
     """
 
@@ -69,7 +64,7 @@ class ScanMotion:
 
     @classmethod
     def none(cls, count: int) -> ScanMotion:
-        """Of a scan of so many points that was taken from one place, or whose motion is known exactly."""
+        """Of a scan of `count` points taken from one place, or whose motion is known exactly."""
         return cls(np.zeros(count, np.float32), np.zeros(6), np.zeros(6))
 
 
@@ -79,16 +74,12 @@ class Frame:
 
     Attributes:
         stamp_ns: time of the LiDAR scan (of the image where there is no scan); the frame's key.
-        camera: intrinsics of the left image.
         body_T_camera: pose of the left camera at its exposure in the body frame at `stamp_ns`.
-        body_T_lidar: pose of the LiDAR in the body frame.
-        left: (H, W) uint8, rectified, or None.
-        right: (H, W) uint8, rectified, or None.
-        points: (N, 3) float32, metres, body frame at `stamp_ns` (motion removed), real returns
-            only, or None.
+        left, right: (H, W) uint8, rectified.
+        points: (N, 3) float32, metres, body frame at `stamp_ns` (motion removed), real returns only.
         intensity: (N,) float32, the sensor's unit.
-        odom_T_body: odometry at `stamp_ns`, or None.
-        image_stamp_ns: exposure of the left image, or None.
+        odom_T_body: odometry at `stamp_ns`.
+        image_stamp_ns: exposure of the left image.
         session: counts the resets of the clock or the odometry.
         motion: during the scan; None where it was not removed, for want of odometry or of times per point.
     """
@@ -139,14 +130,9 @@ class SuperFeatures:
 
 @dataclass(frozen=True, slots=True)
 class Embedding:
-    """What the network says of one frame.
+    """The network's description of one frame: a global descriptor and the features of each modality that it has.
 
-    Attributes:
-        descriptor: (D,) float32, L2-normalised; similarity is the dot product.
-        image: local features of the left image, or None without an image.
-        cloud: local features of the scan, or None without a scan.
-        super_image: super-features of the image, or None.
-        super_cloud: super-features of the scan, or None.
+    The descriptor is (D,) float32, L2-normalised; similarity is the dot product.
     """
 
     descriptor: NDArray[np.float32]
@@ -163,13 +149,9 @@ class Keyframe:
     Attributes:
         stamp_ns: the frame's key.
         embedding: descriptor and local features, lifted to 3-D where a depth is known.
-        camera: intrinsics of the left image.
-        body_T_camera: pose of the left camera in the body frame.
         points: (M, 3) float32 metres in the body frame: the scan, thinned for registration; may be empty.
         odom_T_body: odometry at the stamp, or None.
         path_length_m: metres driven since the start of the session, NaN without odometry.
-        session: session of the frame.
-        body_T_lidar: pose of the LiDAR in the body frame: where the scan was seen from.
         motion: during the scan, one moment for every thinned point; None where it was not removed.
     """
 
@@ -199,11 +181,23 @@ class Candidate:
         index: row in the database.
         stamp_ns: key of the candidate keyframe.
         similarity: cosine similarity of the global descriptors.
+        inliers_image: pairs of image features that one homography explains; NaN before the reranking.
+        inliers_cloud: pairs of the scan's features that one rigid motion explains; NaN before the reranking.
+        superfeatures: eligible pairs of super-features of both modalities; NaN before the reranking.
+        image_pairs: (P, 2) mutual neighbours among the image features (query, match).
+        cloud_pairs: (P, 2) mutual neighbours among the scan's features (query, match).
+        score: of the reranking, larger is better.
     """
 
     index: int
     stamp_ns: int
     similarity: float
+    inliers_image: float = math.nan
+    inliers_cloud: float = math.nan
+    superfeatures: float = math.nan
+    image_pairs: NDArray[np.intp] = field(default_factory=lambda: np.empty((0, 2), np.intp), compare=False, repr=False)
+    cloud_pairs: NDArray[np.intp] = field(default_factory=lambda: np.empty((0, 2), np.intp), compare=False, repr=False)
+    score: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

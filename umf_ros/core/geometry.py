@@ -80,14 +80,9 @@ def wrap_angle(angle: Any) -> Any:
 
 
 def interpolate(a: Array, b: Array, fraction: ArrayLike) -> Array:
-    """Pose between `a` (fraction 0) and `b` (1): linear in translation, shortest arc in rotation.
+    """Poses between `a` (fraction 0) and `b` (1), (..., 4, 4) each: linear in translation, shortest arc in rotation.
 
-    Fractions outside [0, 1] extrapolate at the same rate.
-
-    Args:
-        a: (..., 4, 4) poses.
-        b: (..., 4, 4) poses.
-        fraction: (...) one for each pair.
+    Fractions (...) outside [0, 1] extrapolate at the same rate.
     """
     share = np.asarray(fraction, float)[..., None]
     turn = Rotation.from_matrix(np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3]).as_rotvec()
@@ -98,10 +93,9 @@ def interpolate(a: Array, b: Array, fraction: ArrayLike) -> Array:
 
 
 def align(a: Array, b: Array) -> tuple[Array, Array]:
-    """Pose that takes the points `a` (N, 3) to `b` (N, 3) with least squared distance [Kabsch 1976, Horn 1987].
+    """Pose `b_T_a` of points `a` and `b` (N, 3) with least squared distance [Kabsch 1976, Horn 1987].
 
-    Returns:
-        The pose `b_T_a`, and the three spreads of the points, largest first: on a line the second is zero.
+    The three spreads of the points come with it, largest first: on a line the second is zero.
 
     Raises:
         ValueError: fewer than three points, or sets of different size.
@@ -126,9 +120,7 @@ def logmap(poses: Array) -> Array:
 
 def orthonormal(poses: Array) -> Array:
     """(N, 4, 4) poses with the rotation nearest to each: products of many poses drift off it."""
-    result = poses.copy()
-    result[..., :3, :3] = Rotation.from_matrix(poses[..., :3, :3]).as_matrix()
-    return result
+    return RigidTransform.from_matrix(poses).as_matrix()
 
 
 def adjoint(poses: Array) -> Array:
@@ -154,14 +146,10 @@ def skew(vectors: Array) -> Array:
 
 
 def ros_to_gtsam_covariance(covariance: ArrayLike, pose: Array) -> Array:
-    """Covariance of a relative pose, from the ROS to the GTSAM convention.
+    """Covariance (6, 6), or 36 numbers row by row, of the pose `parent_T_child`, from the ROS to the GTSAM convention.
 
     ROS (geometry_msgs/PoseWithCovariance) orders x y z rx ry rz about the *parent* axes; a GTSAM
     `BetweenFactorPose3` wants rx ry rz x y z in the tangent space of the *child*.
-
-    Args:
-        covariance: (6, 6), or the 36 numbers of the message row by row.
-        pose: the pose `parent_T_child` the covariance belongs to.
     """
     turn = np.kron(np.eye(2), pose[:3, :3].T)
     in_child = turn @ np.asarray(covariance, dtype=float).reshape(6, 6) @ turn.T

@@ -22,28 +22,12 @@ _DAMAGE = (sqlite3.Error, ArithmeticError, LookupError, RecursionError, TypeErro
 _VERSIONS = "CREATE TABLE IF NOT EXISTS schema_version (name TEXT PRIMARY KEY, version INTEGER NOT NULL)"
 
 
-def check_writable(out: Path) -> None:
-    """Find out before hours of work whether the results will have a place.
-
-    Raises:
-        OutputError: `out` cannot be written.
-    """
-    with writing(f"to {out}"):
-        out.mkdir(parents=True, exist_ok=True)
-    if not os.access(out, os.W_OK):
-        raise OutputError(f"cannot write to {out}: permission denied")
-
-
 @contextmanager
 def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
     """Write a file in one step: it appears under its name complete, or not at all.
 
-    The block writes the temporary file beside `path` whose path it is given; the file replaces `path` when the block
-    ends without an error and is deleted otherwise.
-
-    Args:
-        path: the file, in a folder that exists.
-        kinds: exceptions of the block, besides `OSError`, that mean that the file cannot be written.
+    The block writes the temporary file whose path it is given. It replaces `path` when the block ends without an error
+    and is deleted otherwise; an `OSError` or one of `kinds` means that the file cannot be written.
 
     Raises:
         OutputError: the file cannot be written.
@@ -57,14 +41,23 @@ def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+def check_writable(folder: Path) -> None:
+    """Make a folder and check that results can be written into it, before hours of work.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with writing(f"to {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise OutputError(f"cannot write to {folder}: permission denied")
+
+
 class FileLock:
     """Exclusive lock of a file against other processes, until `release` or the end of the process.
 
-    The lock lies on `<path>.lock`: SQLite uses locks of its own on `path`, and drops them when any thread of the
-    process closes that file. Readers need no lock.
-
-    Args:
-        path: the file to protect; `<path>.lock` is made beside it and stays.
+    The lock lies on `<path>.lock`, which stays: SQLite uses locks of its own on `path`, and drops them when any thread
+    of the process closes that file. Readers need no lock.
 
     Raises:
         UmfError: another process, which is named, holds the lock.
@@ -92,14 +85,11 @@ class FileLock:
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """The tables of one kind of SQLite file, by version.
-
-    A file may hold several schemas; the table `schema_version` has a row for each.
+    """The tables of one kind of SQLite file, by version; a file may hold several schemas.
 
     Attributes:
-        name: kind of the file, such as "place database"; for errors and `schema_version`.
-        migrations: the n-th leads from version n to n + 1, as statements or as a function of the connection. A released
-            one is never changed, only added to.
+        name: kind of the file, such as "place database"; for errors and the table `schema_version`.
+        migrations: the n-th leads from version n to n + 1; released ones are never changed.
         unversioned: version of a file without `schema_version`, as earlier releases wrote it, by the names of its
             tables; 0 where it is another kind of file.
         readable: oldest version that can be read without migration.
@@ -112,19 +102,16 @@ class Schema:
 
 
 class SqliteFile:
-    """An open SQLite file: checked, migrated, written by one process, safe against its sudden end.
+    """An open SQLite file: checked, migrated, written by one process.
 
-    Writes go to a write-ahead log without a sync per row: a killed process loses nothing that was committed.
+    Writes go to a write-ahead log without a sync per row: a killed process loses nothing that was committed. Any thread
+    may use `connection`; the caller serialises its use.
 
     Args:
         path: the file, made where it is missing; None: a temporary file that disappears with the process.
         schema: its tables.
         read_only: only read the file, which must exist; another process may write it meanwhile.
         check: called before anything is changed in a file that has tables; raises an `UmfError` to refuse it.
-
-    Attributes:
-        connection: for any thread of the process; the caller serialises its use.
-        name: of the file, for messages.
 
     Raises:
         UmfError: the file is missing (`read_only`), another kind of file, damaged, of a later version, or in use.
@@ -301,13 +288,13 @@ def is_yaml(path: Path) -> bool:
 
 
 def read_yaml(path: Path) -> Any:
-    """What a YAML file holds; None where it is empty.
+    """Content of a YAML file; None where it is empty.
 
     Raises:
         ConfigError: the file cannot be read.
     """
     try:
-        with path.open(encoding="utf-8") as file:  # also a pipe, whose size nobody knows
+        with path.open(encoding="utf-8") as file:  # it may be a pipe, whose size is unknown
             text = file.read(LARGEST_YAML + 1)
         if len(text) > LARGEST_YAML:
             raise ConfigError(f"{path} is not valid YAML: larger than {LARGEST_YAML >> 20} MB")

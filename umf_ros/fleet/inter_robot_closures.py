@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,9 +14,8 @@ from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import invert, relative, rotation_angle
 from umf_ros.fleet.link import Answer, FleetLink
 from umf_ros.places.store import KeyframeStore
-from umf_ros.verification import Verdict, Verifier
+from umf_ros.verification import Hypothesis, RejectReason, Verifier
 
-UNCONFIRMED = "pending: no closure of another place agrees yet"
 """Reason of a closure that verification accepted and that is not published yet."""
 APART_M = 8.0
 """Closures nearer to each other show one place and may share one error (*by hand*)."""
@@ -53,7 +52,7 @@ class InterRobotClosure:
     keyframe: Keyframe
     own: str
     robot: str
-    verdicts: list[Verdict]
+    verdicts: list[Hypothesis]
     closures: list[LoopClosure]
 
 
@@ -152,6 +151,7 @@ class InterRobotMatcher:
                 pair = InterRobotPair(answer.keyframe, matches[verdict.candidate.stamp_ns], verdict.closure)
                 confirmed = consensus.confirm(pair)
                 closures += [one.closure for one in confirmed]
-                verdict = verdict if confirmed else replace(verdict, reason=UNCONFIRMED)
+                if not confirmed:
+                    verdict.reason = RejectReason.UNCONFIRMED
             verdicts.append(verdict)
         return InterRobotClosure(answer.keyframe, self.link.robot, robot, verdicts, closures)

@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
-from umf_ros.maps.odometry_log import OdometryLog
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureVerdict, State
+from umf_ros.replay import feed
+from umf_ros.runs.run_file import StoredOdometry
 from umf_ros.runs.tables import read_closures, read_keyframes
 
 Stamps = NDArray[np.int64]
@@ -68,13 +70,11 @@ def solve(folder: MapFolder) -> JointMap:
         UmfError: a file of the map is missing or damaged.
     """
     graph = PoseGraph(folder.settings.pose_graph)
-    logs = {}
+    odometry = {session.name: folder.odometry_of(session.name) for session in folder.sessions}
     for number, session in enumerate(folder.sessions):
-        run = folder.folder_of(session.name)
         if number:
             graph.begin_session()
-        logs[session.name] = OdometryLog.load(run)
-        logs[session.name].feed(graph, session.shift_ns)
+        feed(graph, odometry[session.name], session.shift_ns)
     # after all odometry, as a closure may refer to any session
     for session in folder.sessions:
         run = folder.folder_of(session.name)
@@ -88,17 +88,23 @@ def solve(folder: MapFolder) -> JointMap:
         ends = (verdict.closure.query_stamp_ns, verdict.closure.match_stamp_ns)
         query, match = (folder.session_at(stamp) for stamp in ends)
         verdicts[query is not match].append(verdict)
-    sessions = [_placed(folder, session, graph, logs[session.name]) for session in folder.sessions]
+    sessions = [_placed(folder, session, graph, _trajectory(odometry[session.name])) for session in folder.sessions]
     return JointMap(graph, sessions, *verdicts)
 
 
-def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, log: OdometryLog) -> JointSession:
+def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, own: Trajectory) -> JointSession:
     """A recording with the poses of its keyframes in the solved map."""
     rows = read_keyframes(folder.folder_of(session.name) / "keyframes.csv")
     stamps = np.array([row.stamp_ns for row in rows], np.int64)
     poses, known = graph.poses_at(stamps + session.shift_ns)
-    odometry, _ = log.trajectory.at(stamps[known])
+    odometry, _ = own.at(stamps[known])
     return JointSession(session, bool(known.any()), stamps[known], poses[known], odometry)
+
+
+def _trajectory(odometry: list[StoredOdometry]) -> Trajectory:
+    """The poses in the order of their stamps, the first one of each stamp."""
+    stamps, first = np.unique(np.array([one.stamp_ns for one in odometry], np.int64), return_index=True)
+    return Trajectory(stamps, np.array([odometry[row].odom_T_body for row in first]).reshape(-1, 4, 4))
 
 
 def _shifted(closure: LoopClosure, shift_ns: int) -> LoopClosure:

@@ -1,16 +1,23 @@
-"""The folder of a map: its recordings and the paths of their files."""
+"""The folder of a map: its recordings and the paths of their files.
+
+A map that is missing or damaged raises an `UmfError`, a folder that cannot be written an `OutputError`.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Collection
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError, writing
 from umf_ros.places.database import PLACES_OF_MAP
+from umf_ros.runs.run_file import RunFile, StoredOdometry
 from umf_ros.runs.writer import write_atomically
 
 SCHEMA_VERSION = 1
@@ -64,11 +71,7 @@ class MapFolder:
 
     @classmethod
     def open(cls, path: Path) -> MapFolder:
-        """Open an existing map.
-
-        Raises:
-            UmfError: there is none, or another version wrote it.
-        """
+        """Open an existing map."""
         folder = cls(path)
         if not folder.exists:
             raise UmfError(f"{path} holds no map: map.json is missing (umf map makes one)")
@@ -77,12 +80,7 @@ class MapFolder:
 
     @classmethod
     def open_or_create(cls, path: Path, settings: Settings) -> MapFolder:
-        """Open an existing map, or create one with these settings.
-
-        Raises:
-            UmfError: another version wrote it.
-            OutputError: it cannot be written.
-        """
+        """Open an existing map, or create one with these settings."""
         folder = cls(path)
         if folder.exists:
             folder._read()
@@ -112,6 +110,14 @@ class MapFolder:
         """Run folder of a recording, stamped by its own clock."""
         return self.path / "sessions" / name
 
+    def odometry_of(self, name: str) -> list[StoredOdometry]:
+        """Odometry of a recording, stamped by its own clock."""
+        older = self.folder_of(name) / "odometry.npz"
+        if older.is_file():
+            return _read_older(older)
+        with closing(RunFile(self.folder_of(name), read_only=True)) as file:
+            return list(file.odometry())
+
     def session_at(self, map_ns: int) -> MapSession | None:
         """The recording that covers a stamp of the map's clock."""
         return next((session for session in self.sessions if session.covers(map_ns)), None)
@@ -135,11 +141,7 @@ class MapFolder:
         return 0 if missing <= 0 else -(-missing // _DAY_NS) * _DAY_NS
 
     def add(self, session: MapSession) -> None:
-        """Add a session whose places are in the place database.
-
-        Raises:
-            OutputError: the folder cannot be written.
-        """
+        """Add a session whose places are in the place database."""
         self.sessions.append(session)
         self._write()
 
@@ -155,3 +157,15 @@ class MapFolder:
             self.sessions = [MapSession(**session) for session in content["sessions"]]
         except (OSError, ValueError, KeyError, TypeError):
             raise UmfError(f"{self.path / 'map.json'} is damaged") from None
+
+
+def _read_older(path: Path) -> list[StoredOdometry]:
+    """Read the odometry of a recording as earlier releases kept it, beside its run."""
+    try:
+        with np.load(path) as stored:
+            stamps, poses, covariances = stored["stamps"].tolist(), stored["poses"], stored["covariances"].copy()
+            covariances[stored["starts"]] = np.diag([np.inf] * 6)
+    except (OSError, ValueError, LookupError) as error:
+        raise UmfError(f"{path} cannot be read: {error}") from None
+    tracked = covariances if len(covariances) else [None] * len(stamps)
+    return [StoredOdometry(*one) for one in zip(stamps, poses, tracked, strict=True)]

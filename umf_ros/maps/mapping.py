@@ -26,14 +26,15 @@ from umf_ros.core.frames import Keyframe
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
-from umf_ros.maps.odometry_log import OdometryLog, track
+from umf_ros.maps.tracking import track
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
+from umf_ros.runs.run_file import RunFile
 from umf_ros.runs.tables import CLOSURES, closure_row, write_table
 from umf_ros.runs.writer import PLACES, count_drops
-from umf_ros.verification import Verdict, Verifier
+from umf_ros.verification import Hypothesis, Verifier
 
 OnFrame = Callable[[float, Detection], None]
 """Called for every frame with the share of the recording that is done, 0 to 1, and the detection."""
@@ -104,7 +105,7 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
     Args:
         recording: any that `umf replay` can read.
         opening: options.
-        folder: becomes a run folder with `places.sqlite` and `odometry.npz`, stamped by the recording's own clock.
+        folder: becomes a run folder with `places.sqlite`, stamped by the recording's own clock.
         on_frame: called for every frame.
 
     Raises:
@@ -118,29 +119,30 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
         folder.mkdir(parents=True)
     store = Database(path=str(folder / PLACES), cached_keyframes=settings.database.cached_keyframes)
     settings = settings.model_copy(update={"database": store})
-    reader, log = FrameReader(bag, settings, opening.odometry_of(recording, settings)), OdometryLog()
+    reader = FrameReader(bag, settings, opening.odometry_of(recording, settings))
     replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
-    for detection in replay.run(log.following(reader.stream())):
+    for detection in replay.run(reader.stream()):
         on_frame(reader.progress, detection)
-    replay.finish(count_drops(reader.counters))
+    has_odometry = replay.finish(count_drops(reader.counters))
     remember_recording(folder, bag)
-    if not len(log):
-        log = _track(folder, settings)
-    log.save(folder)
+    if not has_odometry:
+        _track(folder, settings)
     replay.raise_if_frames_failed()
 
 
-def _track(folder: Path, settings: Settings) -> OdometryLog:
+def _track(folder: Path, settings: Settings) -> None:
     """Track a recording without odometry, and store its keyframes with the tracked poses as odometry."""
     old, new = folder / PLACES, folder / f"tracked_{PLACES}"
     with closing(open_places(old)) as places:
-        log, tracked = track((places[row] for row in range(len(places))), settings.verification)
+        odometry, tracked = track((places[row] for row in range(len(places))), settings.verification)
     with closing(_create(new, *stored_identity(old))) as places:
         for keyframe in tracked:
             places.add(keyframe)
     with writing(old):
         new.replace(old)
-    return log
+    with closing(RunFile(folder)) as file:
+        for number, one in enumerate(odometry):
+            file.append_odometry(number, one)
 
 
 def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
@@ -160,8 +162,8 @@ def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
         with closing(open_places(run / PLACES)) as own:
             known = [own[row] for row in range(len(own))]
             stamps = [keyframe.stamp_ns for keyframe in known] or [bag.start_ns]
-            log = OdometryLog.load(run)
-            span = [*stamps, *log.stamps]
+            odometry = target.odometry_of(name)
+            span = [*stamps, *(one.stamp_ns for one in odometry)]
             shift_ns = target.shift_for(min(span))
             for keyframe in known:
                 places.add(_moved(keyframe, shift_ns, first_number))
@@ -175,7 +177,7 @@ def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
             places=len(known),
             first_number=first_number,
             numbers=places.next_session - first_number,
-            odometry=not log.covariances,
+            odometry=not odometry or odometry[0].covariance is None,
         )
     target.add(session)
     with writing(run):
@@ -184,7 +186,7 @@ def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
     return session
 
 
-def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Verdict]]:
+def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Hypothesis]]:
     """Match a recording against the earlier ones; yields the verdicts of every keyframe, accepted ones first.
 
     Writes `closures_between.csv`, complete or not at all. The map's store is only read: several sessions may be

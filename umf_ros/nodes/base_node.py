@@ -1,4 +1,4 @@
-"""What every node of ours does alike: life cycle, parameters, watched inputs, diagnostics, surviving every fault."""
+"""Base of both nodes: life cycle, parameters, watched inputs, diagnostics, faults that never end the node."""
 
 from __future__ import annotations
 
@@ -22,24 +22,26 @@ from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics
 from umf_ros.core.errors import MessageError, OutputError, UmfError
 from umf_ros.core.io import check_writable
-from umf_ros.nodes.conversions import from_time
+from umf_ros.nodes.conversions import from_time, latched
 from umf_ros.nodes.diagnostics import WARN, Heartbeat, InputWatch, Throttle
 from umf_ros.nodes.parameters import changed_settings, declare
+from umf_ros.sensors.tf import TOPIC, StaticTransforms
 
+STATIC_QOS = latched(100)
+"""Every broadcaster of static transforms has its own part of the tree."""
 WATCH_S = 1.0
 HEARTBEAT_S = 0.05
 CLOCK_PATIENCE_S = 10.0
-"""So long a player takes to start beside us, before its silence is worth a word."""
+"""A player that starts beside the node takes so long at most."""
 SIM_TIME_SILENT = "use_sim_time is set, but nothing comes on /clock: stamps of messages count, the pose's age does not"
 
 
 class BaseNode(LifecycleNode, ABC):
     """A managed node with the package's settings as its parameters, and a folder for results.
 
-    What a node does it sets up in `_open` and ends in `_finish`. With `autostart`, the default, it is configured and
-    activated at once; without, it waits for its life cycle's services. While it is inactive it takes no messages.
-
-    No exception in a callback ends it: every one is counted, told, and shows in the diagnostics.
+    Nodes set up their work in `_open` and end it in `_finish`. With `autostart`, the default, they are configured and
+    activated at once; without, they wait for the services of the life cycle. An inactive node takes no messages.
+    No exception in a callback ends a node: every one is counted, logged, and shows in the diagnostics.
 
     Raises:
         ConfigError: a parameter is unknown, of the wrong type or out of range.
@@ -100,11 +102,18 @@ class BaseNode(LifecycleNode, ABC):
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Write the results and let go of everything."""
-        return self._end(super().on_cleanup(state))
+        result = super().on_cleanup(state)
+        try:
+            self._close()
+        except Exception as error:  # rclpy would drop it without a word
+            self._unwritten = error
+            if not self._leaving:
+                self.get_logger().error(f"{type(error).__name__}: {error}")
+            return TransitionCallbackReturn.FAILURE
+        self._let_go()
+        return result
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Write the results and let go of everything."""
-        return self._end(super().on_shutdown(state))
+    on_shutdown = on_cleanup
 
     def close(self) -> None:
         """Finish what is in hand and write the results.
@@ -155,7 +164,7 @@ class BaseNode(LifecycleNode, ABC):
             with watchdog.watching(watchdog.PATIENT_S):
                 self._open()
             self._opened = True
-            # all that is there now stays: to look through it for garbage took .3 s, in which nobody was answered
+            # all that is there now stays: a garbage collection of it blocked the executor for .3 s
             gc.collect()
             gc.freeze()
         finally:
@@ -163,17 +172,6 @@ class BaseNode(LifecycleNode, ABC):
 
     def _entities(self) -> list[Any]:
         return [*self.publishers, *self.subscriptions, *self.services]
-
-    def _end(self, result: TransitionCallbackReturn) -> TransitionCallbackReturn:
-        try:
-            self._close()
-        except Exception as error:  # rclpy would drop it without a word
-            self._unwritten = error
-            if not self._leaving:
-                self.get_logger().error(f"{type(error).__name__}: {error}")
-            return TransitionCallbackReturn.FAILURE
-        self._let_go()
-        return result
 
     def _let_go(self) -> None:
         """Take off the graph what `_open` made, and nothing else: `/clock` is heard in every state."""
@@ -238,6 +236,16 @@ class BaseNode(LifecycleNode, ABC):
         watch = InputWatch(self, name, subscription.topic_name, kind, rare)
         self._watches.append(watch)
 
+    def _hear_transforms(self, transforms: StaticTransforms) -> None:
+        """Fill `transforms` from `/tf_static`; without tf2_msgs, which Jazzy from PyPI lacks, they stay empty."""
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError:
+            if self._settings.frames.extrinsics == "tf":
+                self.get_logger().info("tf2_msgs is not installed: the sensors are where the calibration file says")
+            return
+        self.create_subscription(TFMessage, TOPIC, self._guarded("transforms", transforms.add), STATIC_QOS)
+
     def _offer(self, kind: type, name: str, action: Callable[[Any], str]) -> None:
         """Offer a service that answers what `action` makes of the request; any fault is a refusal."""
 
@@ -266,13 +274,11 @@ class BaseNode(LifecycleNode, ABC):
 
     def _judge(self, own: DiagnosticStatus) -> DiagnosticStatus:
         """The node's own status, worse where an input is silent or a fault came lately."""
-        silent = [watch.warning for watch in self._watches if watch.warning]
-        if silent:
-            own.level, own.message = max(own.level, WARN), f"{own.message}; {'; '.join(silent)}"
-        if self._last_fault:
-            own.level, own.message = max(own.level, WARN), f"{own.message}; last fault: {self._last_fault}"
-        if not self._active:
-            own.level, own.message = max(own.level, WARN), "inactive"
+        troubles = [watch.warning for watch in self._watches if watch.warning]
+        troubles += [f"last fault: {self._last_fault}"] if self._last_fault else []
+        if troubles or not self._active:
+            own.level = max(own.level, WARN)
+            own.message = "; ".join([own.message, *troubles]) if self._active else "inactive"
         return own
 
     def _complain(self, error: Exception, what: str = "") -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -22,14 +22,17 @@ from umf_ros.core.geometry import Array, to_quaternion
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose
 
-# with their history: a SLAM system that joins late gets every closure and verdict of the run
-CLOSURES_QOS = QoSProfile(
-    depth=5000, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
-)
-# maps and markers: whoever joins late gets the last one (REP-2003)
-LATCHED_QOS = QoSProfile(
-    depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
-)
+
+def latched(depth: int) -> QoSProfile:
+    """Profile of a topic whose last messages reach late subscribers too (REP-2003)."""
+    return QoSProfile(
+        depth=depth, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+    )
+
+
+CLOSURES_QOS = latched(5000)
+"""With their history: a SLAM system that joins late gets every closure and verdict of the run."""
+LATCHED_QOS = latched(1)
 
 
 def sensor_qos(settings: Qos, min_depth: int = 1) -> QoSProfile:
@@ -77,17 +80,6 @@ def to_poses(poses: Array) -> list[Pose]:
 def to_header(stamp_ns: int, frame: str) -> Header:
     """Stamp and frame of a message."""
     return Header(stamp=to_time(stamp_ns), frame_id=frame)
-
-
-def to_pose_stamped(stamp_ns: int, frame: str, pose: Array) -> PoseStamped:
-    """Pose in `frame` with its stamp."""
-    return PoseStamped(header=to_header(stamp_ns, frame), pose=to_pose(pose))
-
-
-def to_poses_stamped(stamps_ns: Sequence[int], frame: str, poses: Array) -> list[PoseStamped]:
-    """(N, 4, 4) poses in `frame` with their stamps."""
-    both = zip(stamps_ns, to_poses(poses), strict=True)
-    return [PoseStamped(header=to_header(stamp_ns, frame), pose=pose) for stamp_ns, pose in both]
 
 
 def to_lines(name: str, lines: Iterable[Iterable[Point]], header: Header) -> Marker:
@@ -172,9 +164,8 @@ def _keyframe_stamp(frame: str) -> int:
     return stamp_ns
 
 
-# RViz draws no more of a path than this, and redraws every line that it is sent
-MAX_POSES = 2000
-MAX_LINES = 500
+MAX_POSES, MAX_LINES = 2000, 500
+"""RViz draws no more of a path and redraws every line; messages stay small on long drives."""
 
 
 def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: FrameIds) -> Path:
@@ -182,7 +173,8 @@ def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: FrameIds) -> P
     if not len(stamps_ns):
         return Path(header=Header(frame_id=frames.map))
     rows = np.unique(np.linspace(0, len(stamps_ns) - 1, MAX_POSES).astype(int))
-    poses = to_poses_stamped(stamps_ns[rows].tolist(), frames.map, map_T_body[rows])
+    both = zip(stamps_ns[rows].tolist(), to_poses(map_T_body[rows]), strict=True)
+    poses = [PoseStamped(header=to_header(stamp, frames.map), pose=pose) for stamp, pose in both]
     return Path(header=to_header(int(stamps_ns[-1]), frames.map), poses=poses)
 
 

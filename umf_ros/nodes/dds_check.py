@@ -18,37 +18,28 @@ TIMEOUT_S = 15.0
 TOPIC = "umf_dds_check"
 
 
-class _Participant:
-    """A node in a DDS participant of its own, so that the two have to discover each other."""
-
-    def __init__(self, name: str) -> None:
-        self.context = Context()
-        rclpy.init(context=self.context)
-        self.node = Node(name, context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-
-    def close(self) -> None:
-        self.executor.remove_node(self.node)
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-
 def exchange() -> str:
-    """Send images until one arrives; returns what went wrong, or nothing."""
-    sender, receiver = _Participant("umf_dds_sender"), _Participant("umf_dds_receiver")
+    """Send images from one DDS participant to another until one arrives; returns what went wrong, or nothing."""
+    contexts = Context(), Context()
+    for context in contexts:
+        rclpy.init(context=context)
+    sender, receiver = (Node(f"umf_dds_check_{number}", context=context) for number, context in enumerate(contexts))
+    executor = SingleThreadedExecutor(context=receiver.context)
+    executor.add_node(receiver)
     arrived: list[Image] = []
-    publisher = sender.node.create_publisher(Image, TOPIC, 10)
-    receiver.node.create_subscription(Image, TOPIC, arrived.append, qos_profile_sensor_data)
+    publisher = sender.create_publisher(Image, TOPIC, 10)
+    receiver.create_subscription(Image, TOPIC, arrived.append, qos_profile_sensor_data)
     image = Image(width=688, height=512, step=688, encoding="mono8", data=array("B", bytes(688 * 512)))
     deadline = time.monotonic() + TIMEOUT_S
     while not arrived and time.monotonic() < deadline:
         if publisher.get_subscription_count():
             publisher.publish(image)
-        receiver.executor.spin_once(timeout_sec=0.05)
+        executor.spin_once(timeout_sec=0.05)
     connected = publisher.get_subscription_count() > 0
-    sender.close()
-    receiver.close()
+    executor.remove_node(receiver)
+    for node in (sender, receiver):
+        node.destroy_node()
+        rclpy.try_shutdown(context=node.context)
     if arrived and len(arrived[0].data) == len(image.data):
         return ""
     return "no message arrived" if connected else "publisher and subscriber did not find each other"

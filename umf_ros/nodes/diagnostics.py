@@ -1,4 +1,4 @@
-"""What a node says of its health."""
+"""Health of a node and of its inputs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 
 def status(level: bytes, name: str, message: str, values: Mapping[str, object]) -> DiagnosticStatus:
     """One line of a DiagnosticArray."""
-    pairs = [KeyValue(key=key, value=_text(value)) for key, value in values.items()]
+    texts = {key: f"{value:.6g}" if isinstance(value, float) else str(value) for key, value in values.items()}
+    pairs = [KeyValue(key=key, value=text) for key, text in texts.items()]
     return DiagnosticStatus(level=level, name=name, message=message, values=pairs)
 
 
@@ -29,7 +30,7 @@ def memory_mb() -> float:
 
 
 class Throttle:
-    """Lets each of many lines pass now and then, whoever else speaks."""
+    """Rate-limit log lines per key."""
 
     def __init__(self) -> None:
         self._passed_s: dict[str, float] = {}
@@ -44,35 +45,30 @@ class Throttle:
 
 
 class Heartbeat:
-    """How long the executor was kept from answering.
-
-    Args:
-        period_s: `beat` is due this often.
-    """
+    """Longest delay of the executor: `beat` is due every `period_s`."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
-        self._last_s: float | None = None
+        self._last_s = math.inf
         self.longest_ms = 0.0
 
     def beat(self) -> None:
-        """Answer."""
+        """Take the time."""
         now_s = time.monotonic()
-        if self._last_s is not None:
-            self.longest_ms = max(self.longest_ms, 1e3 * (now_s - self._last_s - self._period_s))
+        self.longest_ms = max(self.longest_ms, 1e3 * (now_s - self._last_s - self._period_s))
         self._last_s = now_s
 
 
 class InputWatch:
-    """Counts the messages of one input topic and says why none arrive.
+    """Counts the messages of one input topic and explains why none arrive.
 
     Args:
-        node: asks who publishes.
+        node: knows the graph of topics.
         name: of the input.
         topic: as it is subscribed, after remapping.
         kind: message class; None where any will do.
-        rare: its silence is no fault as long as somebody could speak.
-        silent_after_s: silence that is worth a word, by the machine's clock.
+        rare: its silence is no fault as long as there is a publisher.
+        silent_after_s: longest silence without a warning, by the machine's clock.
     """
 
     def __init__(
@@ -84,30 +80,24 @@ class InputWatch:
         rare: bool = False,
         silent_after_s: float = 5.0,
     ) -> None:
-        self._rare = rare
-        self._node = node
+        self._node, self._rare, self._silent_after_s = node, rare, silent_after_s
         self._type = type_name(kind) if kind is not None else ""
-        self._silent_after_s = silent_after_s
-        self.name = name
-        self.topic = topic
-        self.received = 0
-        self.refused = 0
-        self.lost = 0
-        self.warning = ""
+        self.name, self.topic, self.warning = name, topic, ""
+        self.received = self.refused = self.lost = 0
         self.last_stamp_ns: int | None = None
         self._last_seen_s: float | None = None
-        self._born_s = self._now_s()
+        self._born_s = time.monotonic()  # not the bag's clock: silence is silence even when /clock stands still
         self._window: tuple[float, int, int] = (self._born_s, 0, 0)
 
     def saw(self, stamp_ns: int) -> None:
         """Count one message."""
         self.received += 1
         self.last_stamp_ns = stamp_ns
-        self._last_seen_s = self._now_s()
+        self._last_seen_s = time.monotonic()
 
     def status(self) -> DiagnosticStatus:
         """Rate since the last call, and the reason when the topic is silent."""
-        now_s = self._now_s()
+        now_s = time.monotonic()
         since_s, count, refused = self._window
         rate = (self.received - count) / max(now_s - since_s, 1e-9)
         all_refused = self.received > count and self.refused - refused == self.received - count
@@ -155,20 +145,12 @@ class InputWatch:
     def _others(self) -> list[str]:
         """Topics of the same type that somebody publishes: the sensor may be there under another name."""
         names = [name for name, types in self._node.get_topic_names_and_types() if self._type in types]
-        # odometry between keyframes, of this robot or of another, is nobody's odometry
+        # closures have the type of odometry
         fit = [name for name in names if name != self.topic and name.rpartition("/")[2] != "loop_closures"]
         return [name for name in fit if self._node.count_publishers(name)][:5]
-
-    def _now_s(self) -> float:
-        # the machine's clock, not the bag's: silence is silence even when /clock stands still
-        return time.monotonic()
 
 
 def type_name(kind: type) -> str:
     """Name of a message class on the graph, as in `sensor_msgs/msg/Image`."""
     package, middle, *_ = kind.__module__.split(".")
     return f"{package}/{middle}/{kind.__name__}"
-
-
-def _text(value: object) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)

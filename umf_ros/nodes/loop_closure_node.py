@@ -15,11 +15,11 @@ from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from umf_ros.bags.presets import calibration_of, topics_of, uses_transforms
-from umf_ros.core.config import FrameIds, Settings
+from umf_ros.core.config import FrameIds, Settings, topics_of
 from umf_ros.core.frames import Frame, Keyframe, LoopClosure
 from umf_ros.core.geometry import rotation_angle
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
@@ -34,17 +34,17 @@ from umf_ros.nodes.conversions import (
     to_header,
     to_lines,
     to_point,
-    to_pose_stamped,
+    to_pose,
     to_time,
 )
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
 from umf_ros.nodes.process import Worker, leave, run
-from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.runs.writer import RunRecorder, count_drops
+from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms, TfExtrinsics
-from umf_ros.verification import Verdict
+from umf_ros.verification import Hypothesis
 
 if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure
@@ -80,7 +80,7 @@ class LoopClosureNode(BaseNode):
         transforms = StaticTransforms()
         self._odometry_frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
         mounting = (
-            TfExtrinsics(calibration, transforms, settings.frames.base, warn) if uses_transforms(settings) else None
+            TfExtrinsics(calibration, transforms, settings.frames.base, warn) if settings.uses_transforms else None
         )
         frames = self._odometry_frames
         self._intake = MessageRouter(self._synchronizer, topics, warn, mounting=mounting, odometry_frames=frames)
@@ -96,7 +96,7 @@ class LoopClosureNode(BaseNode):
         self._worker: Worker[Frame] = Worker(self._detect, self._complain, settings.worker.queue_size)
         self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._complain, 1)
         self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._complain, INTAKE_QUEUE)
-        hear_static_transforms(self, transforms, self._guarded, self._settings.frames.extrinsics)
+        self._hear_transforms(transforms)
         for name, topic in topics.model_dump().items():
             if topic:
                 take = partial(self._enqueue, topic)
@@ -244,45 +244,42 @@ class ClosurePublisher:
         self._rejected: deque[list] = deque(maxlen=MAX_LINES)
 
     def announce(self, detection: Detection, matches: dict[int, Keyframe]) -> None:
-        """Publish one detection.
-
-        Args:
-            detection: what became of a frame.
-            matches: the matched keyframes by stamp, for the markers.
-        """
+        """Publish one detection; `matches` are the matched keyframes by stamp, for the markers."""
         keyframe = detection.keyframe
         if keyframe is None:
             return
         for closure in detection.closures:
             self._closures.publish(closure_to_message(closure))
-        self._keyframes.publish(self._pose_of(keyframe))
+        # without odometry a keyframe is at the origin of its own frame
+        known = keyframe.odom_T_body is not None
+        header = to_header(keyframe.stamp_ns, self.odom if known else keyframe_frame(keyframe.stamp_ns))
+        pose = to_pose(np.eye(4) if keyframe.odom_T_body is None else keyframe.odom_T_body)
+        self._keyframes.publish(PoseStamped(header=header, pose=pose))
         if detection.verdicts:
-            report = DiagnosticArray(status=[_describe(keyframe, verdict) for verdict in detection.verdicts])
-            report.header.stamp = to_time(keyframe.stamp_ns)
-            self._candidates.publish(report)
+            self._report(keyframe, detection.verdicts)
             self._draw(keyframe, detection.verdicts, matches)
 
     def announce_encounter(self, inter_closure: InterRobotClosure) -> None:
-        """Publish what was found of another rover's places: closures like any other, with the names of both rovers."""
+        """Publish closures with another rover's places: like any other, with the names of both rovers."""
         for closure in inter_closure.closures:
             self._closures.publish(closure_to_message(closure, inter_closure.own, inter_closure.robot))
-        report = DiagnosticArray(
-            status=[_describe(inter_closure.keyframe, one, inter_closure.robot) for one in inter_closure.verdicts]
-        )
-        report.header.stamp = to_time(inter_closure.keyframe.stamp_ns)
-        self._candidates.publish(report)
+        self._report(inter_closure.keyframe, inter_closure.verdicts, inter_closure.robot)
 
     def wait_until_heard(self) -> None:
-        """Wait until whoever listens has the last closures, as far as they answer soon."""
+        """Wait for subscribers to acknowledge the last closures, a second at most."""
         self._closures.wait_for_all_acked(Duration(seconds=1))
 
-    def _pose_of(self, keyframe: Keyframe) -> PoseStamped:
-        """The keyframe's odometry; without one it is where it is: at the origin of its own frame."""
-        if keyframe.odom_T_body is not None:
-            return to_pose_stamped(keyframe.stamp_ns, self.odom, keyframe.odom_T_body)
-        return to_pose_stamped(keyframe.stamp_ns, keyframe_frame(keyframe.stamp_ns), np.eye(4))
+    def _report(self, keyframe: Keyframe, verdicts: list[Hypothesis], robot: str = "") -> None:
+        """Publish the tested candidates of a keyframe."""
+        report = DiagnosticArray(header=Header(stamp=to_time(keyframe.stamp_ns)))
+        for verdict in verdicts:
+            name = f"{keyframe_frame(verdict.candidate.stamp_ns, robot)} -> {keyframe.stamp_ns}"
+            level = WARN if verdict.closure is None else OK
+            numbers = {"similarity": verdict.candidate.similarity, **verdict.numbers}
+            report.status.append(status(level, name, verdict.outcome, numbers))
+        self._candidates.publish(report)
 
-    def _draw(self, keyframe: Keyframe, verdicts: list[Verdict], matches: dict[int, Keyframe]) -> None:
+    def _draw(self, keyframe: Keyframe, verdicts: list[Hypothesis], matches: dict[int, Keyframe]) -> None:
         if keyframe.odom_T_body is None:
             return
         here = to_point(keyframe.odom_T_body[:3, 3])
@@ -295,13 +292,6 @@ class ClosurePublisher:
         header = to_header(keyframe.stamp_ns, self.odom)
         chosen = {"accepted": self._accepted, "rejected": self._rejected}
         self._markers.publish(MarkerArray(markers=[to_lines(*item, header) for item in chosen.items()]))
-
-
-def _describe(keyframe: Keyframe, verdict: Verdict, robot: str = "") -> DiagnosticStatus:
-    accepted = verdict.closure is not None
-    name = f"{keyframe_frame(verdict.candidate.stamp_ns, robot)} -> {keyframe.stamp_ns}"
-    numbers = {"similarity": verdict.candidate.similarity, **verdict.numbers}
-    return status(OK if accepted else WARN, name, verdict.reason, numbers)
 
 
 def describe(number: int, closure: LoopClosure) -> str:

@@ -18,6 +18,7 @@ from umf_ros.core.errors import ConfigError
 
 # parameters rclpy itself brings along
 BUILT_IN = ("use_sim_time", "qos_overrides", "start_type_description_service")
+SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
 CHANGEABLE = (
     "loop.",
     "verification.min_probability",
@@ -30,26 +31,22 @@ CHANGEABLE = (
     "pose_graph.min_support",
     "pose_graph.patience_m",
 )
-"""What may change while a node runs: it takes effect with the next keyframe or closure."""
+"""Settings that may change while a node runs: they take effect with the next keyframe or closure."""
 
 
 def declare(node: Node, **own: str) -> tuple[Settings, dict[str, str]]:
-    """Declare all settings on `node` and return them with the overrides of file, launch and command line.
+    """Declare all settings and `autostart` on `node`; returns them with the overrides of file, launch and command line.
 
     The node must have been made with `automatically_declare_parameters_from_overrides=True`: only so
     can an unknown name be told from a known one. Whole numbers are taken where a float is declared.
-
-    Args:
-        node: the node; gets a parameter `autostart` besides.
-        own: further text parameters of this node, by name, with their description; empty by default.
-
-    Returns:
-        The settings, and the values of the node's own parameters.
+    `own` are further text parameters by name, with their description; their values are returned too.
 
     Raises:
         ConfigError: a parameter is unknown, of the wrong type or out of range.
     """
-    given = {name: value for name, value in _overrides(node).items() if not name.startswith(BUILT_IN)}
+    # rclpy annotates plain values here, but hands out Parameter objects
+    overrides: dict[str, Any] = dict(node.get_parameters_by_prefix(""))
+    given = {name: one.value for name, one in overrides.items() if not name.startswith(BUILT_IN)}
     texts = {name: given.pop(name, "") for name in own}
     autostart = given.pop("autostart", True)
     wrong = [f"{name}: expected text, got {value!r}" for name, value in texts.items() if not isinstance(value, str)]
@@ -60,12 +57,14 @@ def declare(node: Node, **own: str) -> tuple[Settings, dict[str, str]]:
     settings = parse_settings(nest(given))
     for name in [*given, *(name for name in (*own, "autostart") if node.has_parameter(name))]:
         node.undeclare_parameter(name)
-    for name, field, value in _leaves(settings):
-        _declare(node, name, value, describe(name, field))
-    for name, description in own.items():
-        _declare(node, name, texts[name], ParameterDescriptor(description=description, read_only=True))
-    text = "configure and activate at once; false: wait for the services of the life cycle"
-    _declare(node, "autostart", autostart, ParameterDescriptor(description=text, read_only=True))
+    declared = [(name, value, describe(name, field)) for name, field, value in _leaves(settings)]
+    own["autostart"] = "configure and activate at once; false: wait for the services of the life cycle"
+    for name, text in own.items():
+        value = texts.get(name, autostart)
+        declared.append((name, value, ParameterDescriptor(description=text, read_only=True)))
+    for name, value, descriptor in declared:
+        # the overrides are in `value` already, with the right type
+        node.declare_parameter(name, value, descriptor, ignore_override=True)
     return settings, texts
 
 
@@ -88,41 +87,18 @@ def describe(name: str, field: FieldInfo) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(description=field.description or "", read_only=not name.startswith(CHANGEABLE))
     if get_origin(field.annotation) is Literal:
         descriptor.additional_constraints = f"one of: {', '.join(map(str, get_args(field.annotation)))}"
-    lower = [item for item in field.metadata if isinstance(item, Ge | Gt)]
-    upper = [item for item in field.metadata if isinstance(item, Le | Lt)]
-    if lower or upper:
-        _limit(descriptor, field, lower, upper)
+    bounds = {type(one): getattr(one, type(one).__name__.lower()) for one in field.metadata if type(one) in SIGNS}
+    if bounds:
+        descriptor.additional_constraints = ", ".join(f"{SIGNS[kind]} {bound:g}" for kind, bound in bounds.items())
+        lower, upper = bounds.get(Ge, bounds.get(Gt)), bounds.get(Le, bounds.get(Lt))
+        if field.annotation is int:
+            low, high = -(2**63) if lower is None else int(lower), 2**63 - 1 if upper is None else int(upper)
+            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+        else:
+            far = sys.float_info.max
+            least, most = -far if lower is None else float(lower), far if upper is None else float(upper)
+            descriptor.floating_point_range = [FloatingPointRange(from_value=least, to_value=most)]
     return descriptor
-
-
-def _limit(descriptor: ParameterDescriptor, field: FieldInfo, lower: list[Any], upper: list[Any]) -> None:
-    bounds = [f"{'>=' if isinstance(item, Ge) else '>'} {_bound(item):g}" for item in lower]
-    bounds += [f"{'<=' if isinstance(item, Le) else '<'} {_bound(item):g}" for item in upper]
-    descriptor.additional_constraints = ", ".join(bounds)
-    if field.annotation is int:
-        limits = [int(_bound(lower[0])) if lower else -(2**63), int(_bound(upper[0])) if upper else 2**63 - 1]
-        descriptor.integer_range = [IntegerRange(from_value=limits[0], to_value=limits[1], step=0)]
-    else:
-        low, high = (
-            _bound(lower[0]) if lower else -sys.float_info.max,
-            _bound(upper[0]) if upper else sys.float_info.max,
-        )
-        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
-
-
-def _bound(item: Any) -> float:
-    return float(next(getattr(item, name) for name in ("ge", "gt", "le", "lt") if hasattr(item, name)))
-
-
-def _declare(node: Node, name: str, value: Any, descriptor: ParameterDescriptor) -> None:
-    # the overrides are in `value` already, with the right type
-    node.declare_parameter(name, value, descriptor, ignore_override=True)
-
-
-def _overrides(node: Node) -> dict[str, Any]:
-    # rclpy annotates plain values here, but hands out Parameter objects
-    parameters: dict[str, Any] = dict(node.get_parameters_by_prefix(""))
-    return {name: parameter.value for name, parameter in parameters.items()}
 
 
 def _leaves(group: BaseModel, prefix: str = "") -> Iterator[tuple[str, FieldInfo, Any]]:

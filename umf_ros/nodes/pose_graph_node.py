@@ -21,9 +21,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from umf_ros.bags.presets import topics_of
 from umf_ros.core import watchdog
-from umf_ros.core.config import Settings
+from umf_ros.core.config import Settings, topics_of
 from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import Array
 from umf_ros.localizer import MapFollower
@@ -39,7 +38,6 @@ from umf_ros.nodes.conversions import (
 )
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
-from umf_ros.nodes.transforms import hear_static_transforms
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.journal import JOURNAL, DurableGraph
 from umf_ros.sensors.decode import OdometrySample, decode_odometry
@@ -92,7 +90,7 @@ class PoseGraphNode(BaseNode):
         topics, transforms = topics_of(settings), StaticTransforms()
         warn = self.get_logger().warning
         self._odometry_frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
-        hear_static_transforms(self, transforms, self._guarded, self._settings.frames.extrinsics)
+        self._hear_transforms(transforms)
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
             self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)

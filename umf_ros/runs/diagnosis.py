@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import log
 from typing import Literal
 
 import numpy as np
 
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.tables import TestedCandidate
 from umf_ros.runs.truth import TruePlaces
-from umf_ros.verification import NO_DEPTH
 from umf_ros.verification.acceptance import load_acceptance
-from umf_ros.verification.measurement import IMAGE, SCAN, SUBMAP, Measurement
-from umf_ros.verification.verifier import NO_POSE, UNTESTED
+from umf_ros.verification.hypothesis import SUBMAP, Hypothesis, RejectReason
 
 Gate = Literal["found", "gap rules", "retrieval", "selection", "depth", "pose", "probability", "objection"]
-BELOW = "probability "
-_FIELDS = {one.name for one in fields(Measurement)} - {"kind"}
+_LIMITS = {
+    RejectReason.TURNED: "verification.max_turn_deg: a wider limit",
+    RejectReason.TOO_FAR: "verification.max_shift_m: a wider limit",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +52,11 @@ class GateDiagnosis:
         self._run = run
         self._places = places
         self._acceptance = load_acceptance(run.settings.verification.calibration)
-        self._tested: dict[int, list[TestedCandidate]] = defaultdict(list)
+        self._tested: dict[int, list[Hypothesis]] = defaultdict(list)
         for candidate in run.candidates:
             self._tested[candidate.query_stamp_ns].append(candidate)
 
-    def tested(self, stamp_ns: int) -> list[TestedCandidate]:
+    def tested(self, stamp_ns: int) -> list[Hypothesis]:
         """The candidates of a keyframe, in the order of the reranking."""
         return self._tested[stamp_ns]
 
@@ -72,22 +71,20 @@ class GateDiagnosis:
         rightly = [one for one in tested if self._places.is_same_place(stamp, one.match_stamp_ns)] if len(right) else []
         if (len(right) and not rightly) or not tested:
             return self._retrieval(row, stamp, allowed, right)
-        best = max(rightly or tested, key=lambda one: (one.reason == "accepted", one.probability or 0, one.similarity))
+        best = max(rightly or tested, key=lambda one: (one.accepted, one.probability or 0, one.candidate.similarity))
         return self._decision(stamp, best)
 
-    def contributions(self, candidate: TestedCandidate) -> dict[str, float]:
+    def contributions(self, candidate: Hypothesis) -> dict[str, float]:
         """Log-odds of each criterion, where a pose was judged by the fitted decision."""
-        measurement = measurement_of(candidate.numbers)
-        if measurement is None or measurement.kind == SUBMAP:
+        if candidate.measurement.kind in ("", SUBMAP):
             return {}
-        return {name: value for name, value in self._acceptance.contributions(measurement).items() if value}
+        return {name: value for name, value in self._acceptance.contributions(candidate.measurement).items() if value}
 
-    def missing(self, candidate: TestedCandidate) -> dict[str, float]:
+    def missing(self, candidate: Hypothesis) -> dict[str, float]:
         """Log-odds that each criterion could have added and did not, the most first."""
-        measurement = measurement_of(candidate.numbers)
-        if measurement is None or measurement.kind == SUBMAP:
+        if candidate.measurement.kind in ("", SUBMAP):
             return {}
-        return dict(sorted(self._acceptance.lost(measurement).items(), key=lambda one: -one[1]))
+        return dict(sorted(self._acceptance.lost(candidate.measurement).items(), key=lambda one: -one[1]))
 
     def at_threshold(self, threshold: float) -> tuple[int, int]:
         """Closures that would be published from this probability on, and how many of them join no same place."""
@@ -99,9 +96,9 @@ class GateDiagnosis:
                 wrong += self._places.is_same_place(best.query_stamp_ns, best.match_stamp_ns) is False
         return count, wrong
 
-    def most_probable(self, stamp_ns: int) -> TestedCandidate | None:
+    def most_probable(self, stamp_ns: int) -> Hypothesis | None:
         """The candidate of a keyframe that nothing but its probability keeps from being a closure, if it does."""
-        tested = [one for one in self._tested[stamp_ns] if one.reason == "accepted" or one.reason.startswith(BELOW)]
+        tested = [one for one in self._tested[stamp_ns] if one.reason in (None, RejectReason.IMPROBABLE)]
         return max(tested, key=lambda one: one.probability or 0, default=None)
 
     def _gaps(self, row: int, stamp: int) -> ClosureDiagnosis:
@@ -143,48 +140,40 @@ class GateDiagnosis:
         best = int(own.argmax())
         return int((similarities > own[best]).sum()) + 1, float(own[best]), int(right[best])
 
-    def _decision(self, stamp: int, best: TestedCandidate) -> ClosureDiagnosis:
+    def _decision(self, stamp: int, best: Hypothesis) -> ClosureDiagnosis:
         gate, what, parameter = self._gate(best)
         row, match = self._places.row(stamp), self._places.row(best.match_stamp_ns)
         distance = float("inf") if row is None or match is None else float(self._places.distances(row)[match])
         return ClosureDiagnosis(stamp, best.match_stamp_ns, distance, gate, what, parameter, self.contributions(best))
 
-    def _gate(self, best: TestedCandidate) -> tuple[Gate, str, str]:
-        chosen, reason = self._run.settings.verification, best.reason
-        if reason == "accepted":
-            return "found", f"a loop closure was published, probability {best.probability or 0:.3f}", ""
-        if reason == UNTESTED:
-            tested = sum(one.reason != UNTESTED for one in self._tested[best.query_stamp_ns])
-            what = f"it was returned (similarity {best.similarity:.2f}) but {tested} others were more promising"
-            return "selection", what, f"verification.refine_best: more than {chosen.refine_best}; time grows with it"
-        if reason == NO_DEPTH:
-            return "depth", "neither a scan nor a stereo pair: no metric pose", "topics.cloud or topics.right_image"
-        if reason == NO_POSE:
-            inliers = best.numbers.get("inliers_image", 0)
-            return "pose", f"no pose fits the two, or others fit better ({inliers:.0f} image inliers)", ""
-        if reason.startswith(BELOW):
-            return self._probability(best)
-        remedies = {"turned": "verification.max_turn_deg", "apart": "verification.max_shift_m"}
-        limits = [name for word, name in remedies.items() if word in reason and "more than" in reason]
-        return "objection", reason, f"{limits[0]}: a wider limit" if limits else ""
+    def _gate(self, best: Hypothesis) -> tuple[Gate, str, str]:
+        match best.reason:
+            case None:
+                return "found", f"a loop closure was published, probability {best.probability or 0:.3f}", ""
+            case RejectReason.NOT_SELECTED:
+                return self._selection(best)
+            case RejectReason.NO_DEPTH:
+                return "depth", best.outcome, "topics.cloud or topics.right_image"
+            case RejectReason.NO_POSE:
+                return "pose", f"{best.outcome} ({best.measurement.inliers_image:.0f} image inliers)", ""
+            case RejectReason.IMPROBABLE:
+                return self._probability(best)
+        return "objection", best.outcome, _LIMITS.get(best.reason, "")
 
-    def _probability(self, best: TestedCandidate) -> tuple[Gate, str, str]:
+    def _selection(self, best: Hypothesis) -> tuple[Gate, str, str]:
+        tested = sum(one.reason is not RejectReason.NOT_SELECTED for one in self._tested[best.query_stamp_ns])
+        similarity, now = best.candidate.similarity, self._run.settings.verification.refine_best
+        what = f"it was returned (similarity {similarity:.2f}) but {tested} others were more promising"
+        return "selection", what, f"verification.refine_best: more than {now}; time grows with it"
+
+    def _probability(self, best: Hypothesis) -> tuple[Gate, str, str]:
         chosen, probability = self._run.settings.verification, best.probability or 0.0
         short = _odds(chosen.min_probability) - _odds(probability)
         lacking = [f"{name.replace('_', ' ')} {lost:.1f}" for name, lost in list(self.missing(best).items())[:3]]
-        what = f"{best.reason}, {short:.1f} short in log-odds" + (f"; lost by {', '.join(lacking)}" if lacking else "")
+        what = f"{best.outcome}, {short:.1f} short in log-odds" + (f"; lost by {', '.join(lacking)}" if lacking else "")
         now, (then, wrong) = self.at_threshold(chosen.min_probability)[0], self.at_threshold(probability)
         cost = f", {wrong} of all {then} between different places" if self._places.known.any() else ", unjudged"
         return "probability", what, f"verification.min_probability: {probability:.3f} adds {then - now} closures{cost}"
-
-
-def measurement_of(numbers: dict[str, float]) -> Measurement | None:
-    """The measurement that a row of `candidates.csv` was written from; None where no pose was judged."""
-    marks = {SCAN: "noise_m", IMAGE: "pose_inliers", SUBMAP: "terrain_rival"}
-    kind = next((kind for kind, name in marks.items() if name in numbers), None)
-    if kind is None:
-        return None
-    return Measurement(kind=kind, **{name: value for name, value in numbers.items() if name in _FIELDS})
 
 
 def _odds(probability: float) -> float:

@@ -311,7 +311,7 @@ def _untrue(about: ExaminedRun) -> Iterator[Advice]:
     best = max(run.candidates, key=lambda one: one.probability or 0)
     yield Advice(
         "warning",
-        f"none of {len(run.candidates)} candidates became a closure; the best ({best.reason}) is at "
+        f"none of {len(run.candidates)} candidates became a closure; the best ({best.outcome}) is at "
         f"{(best.query_stamp_ns - int(run.stamps[0])) * 1e-9:.1f} s",
         f"umf why {run.folder.name} {best.query_stamp_ns}",
     )

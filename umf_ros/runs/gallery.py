@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -17,23 +17,22 @@ from umf_ros.core.frames import Frame, Image, Points
 from umf_ros.core.geometry import Array, transform
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.sensor_check import SensorCheck, SensorReport
-from umf_ros.sensors.decode import OdometrySample
 from umf_ros.verification import thin_scan
 
 MAP_CELLS, MAP_REACH_M = 700, 25.0  # by hand: bounds the picture
 
 
 class HeightMap:
-    """Mean heights around a way.
+    """Mean heights around a path.
 
     Attributes:
         lower, upper: (2,) x and y of its lower left and upper right corner, m.
     """
 
-    def __init__(self, way: Array) -> None:
-        """A map around the (N, 2) places of a way, N > 0."""
-        self.lower = way.min(axis=0) - MAP_REACH_M
-        span = way.max(axis=0) + MAP_REACH_M - self.lower
+    def __init__(self, path: Array) -> None:
+        """A map around the (N, 2) places of a path, N > 0."""
+        self.lower = path.min(axis=0) - MAP_REACH_M
+        span = path.max(axis=0) + MAP_REACH_M - self.lower
         self._cell = max(0.1, float(span.max()) / MAP_CELLS)
         self._shape = tuple(math.ceil(side / self._cell) for side in span)
         self._sum, self._count = np.zeros(self._shape), np.zeros(self._shape, np.int32)
@@ -69,8 +68,7 @@ SCAN_POINTS, SCAN_UNIT_M = 600, 0.02  # by hand: enough to see the ground, and w
 MAP_POINTS = 4000  # by hand: of a scan
 
 
-@dataclass(frozen=True, slots=True)
-class Photograph:
+class Photograph(NamedTuple):
     """A small picture: a `data:` address, and the size in pixels of the image that it was made from."""
 
     address: str
@@ -78,46 +76,55 @@ class Photograph:
     height: int
 
 
-@dataclass(frozen=True, slots=True)
-class MapPicture:
-    """The map from above: a `data:` address, and (x, y) of its lower left and upper right corner, m."""
-
-    address: str
-    lower: tuple[float, float]
-    upper: tuple[float, float]
-
-
 class Gallery:
-    """Collects what the page shows, frame by frame.
+    """Collects the pictures of the page, frame by frame.
+
+    Args:
+        shown: stamps of the frames of which photograph and scan are kept.
+        whole: stamps of the frames whose images are kept whole.
+        drawn: trajectory along which the scans are laid into a map from above; None: no map.
 
     Attributes:
-        photographs, scans: by stamp; scans (N, 3) int16 in `SCAN_UNIT_M`, body frame.
-        images: (H, W) uint8 left images at the stamps that were asked for whole.
+        photographs: by stamp.
+        scans: by stamp, as base64 of little-endian int16 triples in `SCAN_UNIT_M`, body frame.
+        images: (H, W) uint8 left images by stamp.
     """
 
     def __init__(self, shown: Iterable[int], whole: Iterable[int], drawn: Trajectory | None) -> None:
-        """Photograph keyframes at the stamps `shown`, keep images at `whole`, map the scans along `drawn`."""
-        self._shown, self._whole = set(shown), set(whole)
+        self._shown, self._whole, self._drawn = set(shown), set(whole), drawn
         self.photographs: dict[int, Photograph] = {}
-        self.scans: dict[int, Points] = {}
+        self.scans: dict[int, str] = {}
         self.images: dict[int, Image] = {}
-        self._map = _Map(drawn) if drawn is not None and len(drawn) else None
+        self._heights = HeightMap(drawn.poses[:, :2, 3]) if drawn is not None and len(drawn) else None
 
     def take(self, frame: Frame) -> None:
         """Look at one frame."""
-        if frame.stamp_ns in self._whole and frame.left is not None:
-            self.images[frame.stamp_ns] = frame.left
-        if frame.stamp_ns in self._shown:
-            if frame.left is not None:
+        if frame.left is not None:
+            if frame.stamp_ns in self._whole:
+                self.images[frame.stamp_ns] = frame.left
+            if frame.stamp_ns in self._shown:
                 self.photographs[frame.stamp_ns] = photograph(frame.left)
-            if frame.points is not None:
-                self.scans[frame.stamp_ns] = _small_scan(frame.points)
-        if self._map is not None and frame.points is not None:
-            self._map.add(frame)
+        if frame.points is not None:
+            if frame.stamp_ns in self._shown:
+                self.scans[frame.stamp_ns] = encode_scan(thin_scan(frame.points))
+            self._lay_into_map(frame.stamp_ns, frame.points)
 
-    def map_picture(self) -> MapPicture | None:
-        """The map so far; None without scans or trajectory."""
-        return self._map.picture() if self._map is not None else None
+    def map_picture(self) -> dict[str, Any] | None:
+        """The map so far: `data:` address, (x, y) in m of `lower` left and `upper` right corner; None if empty."""
+        png = self._heights.png() if self._heights is not None else None
+        if self._heights is None or png is None:
+            return None
+        corners = {"lower": self._heights.lower.tolist(), "upper": self._heights.upper.tolist()}
+        return {"address": data_address("image/png", png), **corners}
+
+    def _lay_into_map(self, stamp_ns: int, points: Points) -> None:
+        if self._heights is None or self._drawn is None:
+            return
+        poses, known = self._drawn.at(np.array([stamp_ns], np.int64))
+        if known[0]:
+            near = points[:: max(1, len(points) // MAP_POINTS)]
+            near = near[np.linalg.norm(near, axis=1) < MAP_REACH_M]
+            self._heights.add(transform(poses[0], near.astype(float)))
 
 
 def photograph(image: Image) -> Photograph:
@@ -129,9 +136,19 @@ def photograph(image: Image) -> Photograph:
     return Photograph(data_address("image/jpeg", data.tobytes()), width, height)
 
 
+def encode_scan(points: Points) -> str:
+    """Some of the points (N, 3) m as base64 of little-endian int16 triples in `SCAN_UNIT_M`."""
+    chosen = points[np.linspace(0, len(points) - 1, min(len(points), SCAN_POINTS)).astype(int)]
+    return _base64(np.clip(np.rint(chosen / SCAN_UNIT_M), -32767, 32767).astype("<i2").tobytes())
+
+
 def data_address(kind: str, content: bytes) -> str:
     """Content inside an address."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+    return f"data:{kind};base64,{_base64(content)}"
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")
 
 
 def walk(
@@ -146,58 +163,15 @@ def walk(
         odometry: that the run took from a file instead of the recording's.
         known_odometry: at any rate, where the recording has none.
     """
-    check, samples = SensorCheck(), []
+    check = SensorCheck()
+    stamps: list[int] = [-1]
+    poses: list[Array] = [np.eye(4)]
     for item in FrameReader(bag, settings, odometry, warn=lambda _: None).stream():
-        if isinstance(item, OdometrySample):
-            samples.append(item)
-        else:
+        if isinstance(item, Frame):
             check.take(item)
             gallery.take(item)
-    return check.report(_as_trajectory(samples) or known_odometry)
-
-
-def _as_trajectory(samples: list[OdometrySample]) -> Trajectory | None:
-    """Odometry as it was recorded, as far as its stamps grow."""
-    if not samples:
-        return None
-    stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
-    grown = np.flatnonzero(stamps > np.maximum.accumulate(np.concatenate([[-1], stamps[:-1]])))
-    return Trajectory(stamps[grown], np.stack([samples[row].odom_T_body for row in grown]))
-
-
-def encode_scans(scans: Mapping[int, Points]) -> dict[int, str]:
-    """Scans as base64 of little-endian int16 triples."""
-    return {stamp: base64.b64encode(scan.astype("<i2").tobytes()).decode("ascii") for stamp, scan in scans.items()}
-
-
-def _small_scan(points: Points) -> Points:
-    thinned = thin_scan(points)
-    chosen = thinned[np.linspace(0, len(thinned) - 1, min(len(thinned), SCAN_POINTS)).astype(int)]
-    return np.asarray(np.clip(np.rint(chosen / SCAN_UNIT_M), -32767, 32767).astype(np.int16))
-
-
-class _Map:
-    """The ground along a trajectory."""
-
-    def __init__(self, drawn: Trajectory) -> None:
-        self._drawn = drawn
-        self._heights = HeightMap(drawn.poses[:, :2, 3])
-
-    def add(self, frame: Frame) -> None:
-        """Lay one scan into the map."""
-        assert frame.points is not None
-        poses, known = self._drawn.at(np.array([frame.stamp_ns], np.int64))
-        if not known[0]:
-            return
-        near = frame.points[:: max(1, len(frame.points) // MAP_POINTS)]
-        near = near[np.linalg.norm(near, axis=1) < MAP_REACH_M]
-        self._heights.add(transform(poses[0], near.astype(float)))
-
-    def picture(self) -> MapPicture | None:
-        """The map so far; None where nothing was seen."""
-        png = self._heights.png()
-        if png is None:
-            return None
-        corners = (self._heights.lower, self._heights.upper)
-        lower_left, upper_right = (tuple(float(value) for value in corner) for corner in corners)
-        return MapPicture(data_address("image/png", png), lower_left, upper_right)  # type: ignore[arg-type]
+        elif item.stamp_ns > stamps[-1]:  # as far as its stamps grow
+            stamps.append(item.stamp_ns)
+            poses.append(item.odom_T_body)
+    heard = Trajectory(np.array(stamps[1:], np.int64), np.stack(poses)[1:]) if len(stamps) > 1 else known_odometry
+    return check.report(heard)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,10 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
-from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.config import Settings, load_settings, topics_of
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure, Points
 from umf_ros.core.trajectory import Trajectory
@@ -23,15 +23,26 @@ from umf_ros.runs.writer import read_summary, write_summary
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.decode import TYPES
 from umf_ros.sensors.sessions import Input
+from umf_ros.verification.hypothesis import Hypothesis
 
 Severity = Literal["fault", "warning", "note"]
-_ABSENT = {
-    "left_image": ("warning", "no images on {topic}: places are told apart by scans alone"),
-    "right_image": ("note", "no right images on {topic}: depth of images comes from the scans alone"),
-    "cloud": ("warning", "no scans on {topic}: everything rests on the images"),
-    "odometry": ("warning", "no odometry on {topic}: closures only, the pose graph is skipped"),
+_ABSENT: dict[str, tuple[Severity, str]] = {
+    "left_image": ("warning", "no images on {}: places are told apart by scans alone"),
+    "right_image": ("note", "no right images on {}: depth of images comes from the scans alone"),
+    "cloud": ("warning", "no scans on {}: everything rests on the images"),
+    "odometry": ("warning", "no odometry on {}: closures only, the pose graph is skipped"),
 }
 _NAMES: dict[str, str] = {"left": "left images", "right": "right images", "cloud": "scans", "odometry": "odometry"}
+_HELP = {
+    "size": "the calibration is for images of another size: width, height, fx, fy, cx, cy",
+    "encoding": "umf inspect names the encodings that can be read",
+    "fields": "the cloud needs fields x, y and z",
+    "stamp": "the driver must set header.stamp",
+    "pose": "the odometry must send unit quaternions",
+    "late": "sync.max_wait_s waits longer",
+    "queue full": "sync.queue_size keeps more",
+}
+"""Remedy by the reason for which messages are dropped."""
 MUCH_LOST = 0.2
 """Share of an input's messages; more of them lost than this is worth a line."""
 
@@ -58,23 +69,18 @@ class Advice:
 
 def absent_inputs(bag: Bag, settings: Settings, odometry_from_file: bool = False) -> list[Advice]:
     """Inputs that the settings name and the recording lacks."""
-    found: list[Advice] = []
     topics = topics_of(settings).model_dump()
-    for name, (severity, text) in _ABSENT.items():
-        topic = topics[name]
-        if (name == "odometry" and odometry_from_file) or (topic in bag.topics and bag.topics[topic].count):
-            continue
-        if topic:
-            found.append(Advice(_severity(name, severity, found), text.format(topic=topic), _remedy(name, bag)))
-        elif name == "odometry":
-            found.append(Advice("note", "no odometry: closures only, the pose graph is skipped", _remedy(name, bag)))
+    absent = [name for name in _ABSENT if not (topics[name] in bag.topics and bag.topics[topics[name]].count)]
+    found: list[Advice] = []
+    for name in absent:
+        severity, text = _ABSENT[name]
+        if name == "cloud" and topics["right_image"] and "right_image" in absent:
+            severity = "fault"  # neither a scan nor a second image: no depth at all
+        if topics[name] and not (name == "odometry" and odometry_from_file):
+            found.append(Advice(severity, text.format(topics[name]), _remedy(name, bag)))
+        elif name == "odometry" and not odometry_from_file:
+            found.append(Advice("note", text.replace(" on {}", ""), _remedy(name, bag)))
     return found
-
-
-def _severity(name: str, usual: str, others: list[Advice]) -> Severity:
-    if name == "cloud" and any("right images" in other.what for other in others):
-        return "fault"  # neither a scan nor a second image: no depth at all
-    return usual  # type: ignore[return-value]
 
 
 def _remedy(name: str, bag: Bag) -> str:
@@ -98,29 +104,15 @@ def useless_inputs(inputs: Mapping[str, Any]) -> list[Advice]:
     """Inputs whose messages came and could not be used, all or many of them."""
     found = []
     for name, count in inputs.items():
-        lost = {reason: number for reason, number in count["dropped"].items() if reason != "surplus"}
-        total = sum(lost.values())
-        if not count["received"] or total <= MUCH_LOST * count["received"]:
+        lost = Counter({reason: number for reason, number in count["dropped"].items() if reason != "surplus"})
+        if not count["received"] or lost.total() <= MUCH_LOST * count["received"]:
             continue
-        reasons = ", ".join(f"{reason} {number}" for reason, number in sorted(lost.items(), key=lambda one: -one[1]))
-        what = f"{total} of {count['received']} messages of the {_NAMES.get(name, name)} could not be used ({reasons})"
-        found.append(Advice("warning" if count["used"] else "fault", what, _help(lost)))
+        reasons = ", ".join(f"{reason} {number}" for reason, number in lost.most_common())
+        messages = f"{lost.total()} of {count['received']} messages of the {_NAMES.get(name, name)}"
+        remedy = _HELP.get(lost.most_common(1)[0][0], "umf inspect looks closer")
+        what = f"{messages} could not be used ({reasons})"
+        found.append(Advice("warning" if count["used"] else "fault", what, remedy))
     return found
-
-
-_HELP = {
-    "size": "the calibration is for images of another size: width, height, fx, fy, cx, cy",
-    "encoding": "umf inspect names the encodings that can be read",
-    "fields": "the cloud needs fields x, y and z",
-    "stamp": "the driver must set header.stamp",
-    "pose": "the odometry must send unit quaternions",
-    "late": "sync.max_wait_s waits longer",
-    "queue full": "sync.queue_size keeps more",
-}
-
-
-def _help(lost: Mapping[str, int]) -> str:
-    return _HELP.get(max(lost, key=lambda reason: lost[reason]), "umf inspect looks closer")
 
 
 CLOCK_SLACK_NS = 5_000_000_000
@@ -129,7 +121,7 @@ CLOCK_SLACK_NS = 5_000_000_000
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What the nodes or the replay have left in a run folder, and the truth.
+    """Files that the nodes or the replay have left in a run folder, and the truth.
 
     Attributes:
         folder: of the run.
@@ -148,7 +140,7 @@ class FinishedRun:
     settings: Settings
     closures: list[LoopClosure]
     keyframes: list[tables.KeyframeRow]
-    candidates: list[tables.TestedCandidate]
+    candidates: list[Hypothesis]
     verdicts: dict[tables.Endpoints, tables.GraphVerdict]
     odometry: Trajectory | None
     optimized: Trajectory | None
@@ -167,7 +159,8 @@ class FinishedRun:
     @cached_property
     def latencies_ms(self) -> dict[int, float]:
         """Milliseconds that a keyframe took, by its stamp."""
-        return tables.read_latencies(self.folder / "latencies.csv")
+        rows = _optional(self.folder / "latencies.csv", lambda row: (int(row["stamp_ns"]), float(row["total"])))
+        return dict(rows)
 
 
 def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = None) -> FinishedRun:
@@ -182,8 +175,8 @@ def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = N
         settings=load_settings(folder / "config.yaml"),
         closures=tables.read_closures(folder / "closures.csv"),
         keyframes=tables.read_keyframes(folder / "keyframes.csv"),
-        candidates=tables.read_candidates(folder / "candidates.csv"),
-        verdicts=tables.read_graph_verdicts(folder / "graph_verdicts.csv"),
+        candidates=tables.read_table(folder / "candidates.csv", tables.parse_candidate),
+        verdicts=dict(_optional(folder / "graph_verdicts.csv", tables.GraphVerdict.parse)),
         odometry=_trajectory(folder / "trajectory_odometry.tum"),
         optimized=_trajectory(folder / "trajectory_optimized.tum"),
         truth=read_ground_truth(bag, ground_truth),
@@ -194,7 +187,7 @@ def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = N
 
 
 def describe_recording(bag: Bag) -> dict[str, Any]:
-    """The `recording` entry of a summary: what tells a recording from any other."""
+    """The `recording` entry of a summary: its path, and what tells a recording from any other."""
     return {
         "path": str(bag.path.resolve()),
         "start_ns": bag.start_ns,
@@ -204,20 +197,12 @@ def describe_recording(bag: Bag) -> dict[str, Any]:
 
 
 def remember_recording(folder: Path, bag: Bag, **more: Any) -> None:
-    """Write into the summary of a run which recording it was made on, and what else is known of it.
-
-    Raises:
-        UmfError: the folder holds no run.
-    """
+    """Write into the summary of a run which recording it was made on, and what else is known of it."""
     write_summary(folder, read_summary(folder) | {"recording": describe_recording(bag)} | more)
 
 
 def _check_recording(run: FinishedRun, bag: Bag) -> None:
-    """Refuse to judge a run by another recording.
-
-    Raises:
-        UmfError: says what tells the two apart.
-    """
+    """Refuse to judge a run by another recording."""
     known = run.summary.get("recording")
     if known and (known["start_ns"], known["messages"]) != (bag.start_ns, describe_recording(bag)["messages"]):
         raise UmfError(f"{run.folder} was made on another recording, {known['path']}: nothing was written")
@@ -232,3 +217,8 @@ def _check_recording(run: FinishedRun, bag: Bag) -> None:
 
 def _trajectory(path: Path) -> Trajectory | None:
     return read_tum(path) if path.is_file() and path.stat().st_size else None
+
+
+def _optional(path: Path, parse: Callable[[dict[str, str]], tables.Row]) -> list[tables.Row]:
+    """Rows of a table that a run may lack."""
+    return tables.read_table(path, parse) if path.is_file() else []

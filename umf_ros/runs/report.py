@@ -1,4 +1,7 @@
-"""Write report.html, plots and matches of a finished run."""
+"""Write report.html, plots and matches of a finished run.
+
+A file that cannot be written raises an `OutputError`.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,7 +33,7 @@ from umf_ros.runs.diagnosis import GateDiagnosis
 from umf_ros.runs.findings import ExaminedRun, RunVerdict, conclude, look_first
 from umf_ros.runs.gallery import Gallery, walk
 from umf_ros.runs.reader import Advice, FinishedRun, read_run
-from umf_ros.runs.scene import build_scene, by_need, drawn_trajectory, pairs_of
+from umf_ros.runs.scene import build_scene, by_need, drawn_trajectory, named_curves, pairs_of
 from umf_ros.runs.tables import INLIERS, Endpoints, read_table
 from umf_ros.runs.truth import (
     MEDIAN_EXPECTED,
@@ -41,13 +43,12 @@ from umf_ros.runs.truth import (
     endpoints,
     in_words,
     judge_run,
-    positions_in_truth,
 )
 from umf_ros.runs.writer import write_atomically, write_summary
 
 
 def render(template: str, **values: Any) -> str:
-    """A page from one of `runs/templates`; a value that it names and nobody gave is an error, so that it says all."""
+    """A page from one of `runs/templates`; a value that it names and that is not given is an error."""
     environment = Environment(
         loader=PackageLoader("umf_ros.runs"),
         autoescape=True,
@@ -139,7 +140,7 @@ MOST_LINES = 8
 COLOURS = {"good": "green", "warn": "yellow", "bad": "red", "fault": "red", "warning": "yellow", "note": "dim"}
 
 Summary = Mapping[str, Any]
-"""What `summary.json` holds."""
+"""Contents of `summary.json`."""
 
 
 class ClosureRow(NamedTuple):
@@ -151,11 +152,9 @@ class ClosureRow(NamedTuple):
 
 
 def write_page(about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advice], scene: Mapping[str, Any]) -> None:
-    """Write report.html.
+    """Write report.html."""
+    from plotly.offline import get_plotlyjs
 
-    Raises:
-        OutputError: the page cannot be written.
-    """
     run = about.run
     page = render(
         "report.html",
@@ -165,7 +164,7 @@ def write_page(about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advic
         facts=_facts(run.summary),
         closures=closure_rows(about),
         scene=_inside_a_script(scene),
-        plotly=_plotly(),
+        plotly=get_plotlyjs(),
         version=run.summary["version"],
         weights=run.summary["weights"],
         seed=run.summary["seed"],
@@ -176,15 +175,7 @@ def write_page(about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advic
 def print_summary(
     console: Console, about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advice], told: frozenset[str]
 ) -> None:
-    """Print what a person wants to know first: figures, what became of the closures, and the verdict.
-
-    Args:
-        console: where.
-        about: the run.
-        verdict: about it.
-        findings: likewise.
-        told: lines that were printed before, and are not again.
-    """
+    """Print figures, closures that were not accepted, findings that were not `told` before, and the verdict."""
     plain: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
     grid = Grid(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in _facts(about.run.summary):
@@ -207,8 +198,7 @@ def final_verdicts(about: ExaminedRun) -> list[str]:
         if verdict is None or verdict.state == State.ACCEPTED:
             continue
         seconds = (closure.query_stamp_ns - closure.match_stamp_ns) * 1e-9
-        figures = f" ({verdict.sigma:.1f} sigma, {verdict.misfit_m:.2f} m)" if isfinite(verdict.sigma) else ""
-        lines.append(f"closure {number}, {seconds:.1f} s back: {verdict.state}, {verdict.reason}{figures}")
+        lines.append(f"closure {number}, {seconds:.1f} s back: {verdict.state}, {verdict.reason}{verdict.figures}")
     more = len(lines) - MOST_LINES
     return lines if more <= 0 else [*lines[:MOST_LINES], f"... and {more} more in graph_verdicts.csv"]
 
@@ -232,12 +222,11 @@ def closure_rows(about: ExaminedRun) -> list[ClosureRow]:
         shift_m, turn_deg = _size(closure)
         verdict, judged = about.run.verdicts.get(endpoints(closure)), known.get(endpoints(closure))
         figures = [f"{at_s:.1f}", f"{back_s:.1f}", f"{shift_m:.2f}", f"{turn_deg:.1f}", f"{closure.probability:.4f}"]
-        cells = [str(number), *figures, verdict.state if verdict else ""]
-        if judged is None:
-            rows.append(ClosureRow([*cells, "", "", ""], "", ""))
-            continue
-        errors = [f"{value:.3g}" for value in (judged.translation_error_m, judged.rotation_error_deg, judged.nees)]
-        rows.append(ClosureRow([*cells, *errors], *(("yes", "good") if judged.is_true else ("NO", "bad"))))
+        errors, word, mark = ["", "", ""], "", ""
+        if judged is not None:
+            errors = [f"{value:.3g}" for value in (judged.translation_error_m, judged.rotation_error_deg, judged.nees)]
+            word, mark = ("yes", "good") if judged.is_true else ("NO", "bad")
+        rows.append(ClosureRow([str(number), *figures, verdict.state if verdict else "", *errors], word, mark))
     return rows
 
 
@@ -245,13 +234,6 @@ def _inside_a_script(scene: Mapping[str, Any]) -> str:
     """The scene as JSON that no parser of HTML takes for the end of its script."""
     text = json.dumps(scene, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
-
-
-def _plotly() -> str:
-    """The drawing library, as its package brings it."""
-    from plotly.offline import get_plotlyjs
-
-    return str(get_plotlyjs())
 
 
 def _facts(summary: Summary) -> list[tuple[str, str]]:
@@ -263,7 +245,7 @@ def _facts(summary: Summary) -> list[tuple[str, str]]:
     }
     if truth:
         facts["revisits"] = _revisits(truth)
-        facts["stated errors"] = _honesty(truth)
+        facts["stated errors"] = _consistency(truth)
     if latency["total"]["p50"] is not None:
         medians = {stage: times["p50"] for stage, times in latency.items() if stage != "total"}
         stages = ", ".join(f"{stage} {median:.0f}" for stage, median in medians.items() if median is not None)
@@ -281,7 +263,7 @@ def _revisits(truth: Summary) -> str:
     return f"{truth['revisits']} in the same direction; {again} from any side, {closed} of them closed"
 
 
-def _honesty(truth: Summary) -> str:
+def _consistency(truth: Summary) -> str:
     """How the covariances of the closures compare with their errors; older runs do not say."""
     median, inside = truth.get("nees_median"), truth.get("inside_95")
     if median is None or inside is None:
@@ -312,10 +294,10 @@ def finish_run(
     """Judge a run, write its pictures and its report, print its summary, and return the verdict.
 
     Args:
-        folder: a run folder with what the nodes or the replay have written.
+        folder: of the run.
         bag: the recording the run was made on.
         console: where the summary is printed.
-        ground_truth: RTKLIB .pos or TUM file; None takes what the bag carries, if anything.
+        ground_truth: RTKLIB .pos or TUM file; None takes that of the recording, if there is one.
         told: lines that were printed before the run, and are not repeated.
 
     Raises:
@@ -348,7 +330,7 @@ def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> Examin
     """
     judged = JudgedRun()
     if run.truth is not None:
-        judged = judge_run(run.folder, run.truth, run.closures, run.settings.loop, run.odometry, run.optimized)
+        judged = judge_run(run.keyframes, run.truth, run.closures, run.settings.loop, run.odometry, run.optimized)
         covered, total = judged.covered
         if not covered and total and run.summary["ground_truth"]:
             raise UmfError(
@@ -364,12 +346,8 @@ def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> Examin
 
 def draw_trajectory(run: FinishedRun, judged: JudgedRun) -> None:
     """Write trajectory.png: everything in the frame of the truth, or of the odometry without one."""
-    curves: list[tuple[str, str, Array]] = []
-    if run.truth is not None:
-        curves.append(("ground truth", TRUTH, run.truth.poses[:, :3, 3]))
-    for name, colour, trajectory in (("odometry", ODOMETRY, run.odometry), ("optimised", OPTIMISED, run.optimized)):
-        if trajectory is not None:
-            curves.append((name, colour, positions_in_truth(trajectory, run.truth)))
+    colours = {"ground truth": TRUTH, "odometry": ODOMETRY, "optimised": OPTIMISED}
+    curves = [(name, colours[name], positions) for name, positions in named_curves(run).items()]
     plot_trajectories(run.folder / "trajectory.png", curves, *_closure_lines(run, judged))
 
 
@@ -416,12 +394,13 @@ def _closure_lines(run: FinishedRun, judged: JudgedRun) -> tuple[Array, list[boo
 
 
 def _read_inliers(path: Path) -> dict[Endpoints, Array]:
+    """Pixels (K, 4) of the inliers of every closure, in its query and its match."""
+
+    def parse(row: dict[str, str]) -> tuple[Endpoints, list[float]]:
+        query, match, *pixels = (row[name] for name in INLIERS)
+        return (int(query), int(match)), [float(pixel) for pixel in pixels]
+
     lines: dict[Endpoints, list[list[float]]] = defaultdict(list)
-    for key, pixels in read_table(path, _inlier):
+    for key, pixels in read_table(path, parse):
         lines[key].append(pixels)
     return {key: np.array(rows) for key, rows in lines.items()}
-
-
-def _inlier(row: dict[str, str]) -> tuple[Endpoints, list[float]]:
-    query, match, *pixels = (row[name] for name in INLIERS)
-    return (int(query), int(match)), [float(pixel) for pixel in pixels]

@@ -1,4 +1,7 @@
-"""One SQLite file per run, written as it goes; the CSV tables are exported from it."""
+"""One SQLite file per run, written as it goes; the CSV tables are exported from it.
+
+A damaged file raises an `UmfError`, a file that cannot be written an `OutputError`.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,7 +37,22 @@ def _create(connection: sqlite3.Connection) -> None:
     connection.execute("CREATE TABLE about (name TEXT PRIMARY KEY, value)")
 
 
-SCHEMA = Schema("run", migrations=(_create,))
+SCHEMA = Schema("run", migrations=(_create, ("ALTER TABLE odometry ADD COLUMN covariance BLOB",)))
+
+
+class StoredOdometry(NamedTuple):
+    """An odometry message, or the tracked pose of a keyframe of a recording without odometry.
+
+    Attributes:
+        stamp_ns: of the pose.
+        odom_T_body: (4, 4).
+        covariance: None for a message; (6, 6) of the motion since the previous tracked pose in ROS order, axes of the
+            previous body, infinite where the motion is unknown and a session begins.
+    """
+
+    stamp_ns: int
+    odom_T_body: Array
+    covariance: Array | None = None
 
 
 class RunFile:
@@ -55,17 +73,13 @@ class RunFile:
         if not read_only and not self._path.exists():
             _set_aside(folder)
         self._file = SqliteFile(self._path, SCHEMA, read_only=read_only)
-        self._odometry: deque[tuple[int, int, bytes]] = deque()
+        self._odometry: deque[tuple[int, int, bytes, bytes | None]] = deque()
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """One transaction; the odometry that came since the last one is written with it.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """One transaction; the odometry that came since the last one is written with it."""
         with self._file.writing() as connection:
-            connection.executemany("INSERT OR IGNORE INTO odometry VALUES (?, ?, ?)", self._odometry)
+            connection.executemany("INSERT OR IGNORE INTO odometry VALUES (?, ?, ?, ?)", self._odometry)
             yield
         self._odometry.clear()
 
@@ -80,74 +94,59 @@ class RunFile:
         data = np.asarray(descriptor, np.float16).tobytes()
         self._file.connection.execute("INSERT INTO descriptor VALUES (?, ?)", (stamp_ns, data))
 
-    def append_odometry(self, number: int, stamp_ns: int, odom_T_body: Array) -> None:
-        """Add the n-th odometry message of the recording with the next transaction; a known one stays."""
-        self._odometry.append((number, stamp_ns, np.ascontiguousarray(odom_T_body[:3], np.float64).tobytes()))
+    def append_odometry(self, number: int, odometry: StoredOdometry) -> None:
+        """Add the n-th odometry of the recording with the next transaction; a known one stays."""
+        stamp_ns, pose, covariance = odometry
+        spread = None if covariance is None else np.ascontiguousarray(covariance, np.float64).tobytes()
+        self._odometry.append((number, stamp_ns, np.ascontiguousarray(pose[:3], np.float64).tobytes(), spread))
 
     def note(self, **values: Any) -> None:
         """Write facts about the run by name, within a transaction."""
         self._file.connection.executemany("INSERT OR REPLACE INTO about VALUES (?, ?)", values.items())
 
     def facts(self) -> dict[str, Any]:
-        """Facts about the run by name.
-
-        Raises:
-            UmfError: the file is damaged.
-        """
+        """Facts about the run by name."""
         with self._file.reading() as connection:
             return dict(connection.execute("SELECT name, value FROM about"))
 
     def rows(self, table: str) -> list[tuple[Any, ...]]:
-        """Rows of a table in the columns of its CSV file, in the order in which they came.
-
-        Raises:
-            UmfError: the file is damaged.
-        """
+        """Rows of a table in the columns of its CSV file, in the order in which they came."""
         return self._select(f"SELECT {', '.join(tables.COLUMNS[table])} FROM {table} ORDER BY rowid")
 
     def closures(self) -> list[LoopClosure]:
-        """The closures of the run.
-
-        Raises:
-            UmfError: the file is damaged.
-        """
+        """The closures of the run."""
         with self._file.reading():
             rows = self.rows("closures")
             return [tables.parse_closure(dict(zip(tables.CLOSURES, map(str, row), strict=True))) for row in rows]
 
-    def graph_inputs(self) -> Iterator[LoopClosure | tuple[int, Array]]:
-        """Odometry as (stamp in ns, pose (4, 4)) and closures, in the order in which the graph got them.
+    def odometry(self) -> Iterator[StoredOdometry]:
+        """The odometry of the run in the order in which it came."""
+        for _, stamp_ns, data, *spread in self._select("SELECT * FROM odometry ORDER BY number"):
+            with self._file.reading():
+                pose = np.vstack([np.frombuffer(data, np.float64).reshape(3, 4), (0, 0, 0, 1)])
+                # files of an earlier release have no column of covariances
+                tracked = bool(spread) and spread[0] is not None
+                covariance = np.frombuffer(spread[0], np.float64).reshape(6, 6) if tracked else None
+            yield StoredOdometry(int(stamp_ns), pose, covariance)
 
-        Raises:
-            UmfError: the file is damaged.
-        """
+    def graph_inputs(self) -> Iterator[LoopClosure | StoredOdometry]:
+        """Odometry and closures in the order in which the graph got them."""
         before = self._select("SELECT odometry_before FROM closures ORDER BY rowid")
         waiting = deque(zip((number for (number,) in before), self.closures(), strict=True))
-        odometry = self._select("SELECT number, stamp_ns, odom_T_body FROM odometry ORDER BY number")
-        for number, stamp_ns, data in odometry:
+        for number, odometry in enumerate(self.odometry()):
             while waiting and waiting[0][0] <= number:
                 yield waiting.popleft()[1]
-            with self._file.reading():
-                yield stamp_ns, np.vstack([np.frombuffer(data, np.float64).reshape(3, 4), (0, 0, 0, 1)])
+            yield odometry
         yield from (closure for _, closure in waiting)
 
     def descriptors(self) -> dict[int, Points]:
-        """Descriptors (D,) float32 of the keyframes by their stamps, in order.
-
-        Raises:
-            UmfError: the file is damaged.
-        """
+        """Descriptors (D,) float32 of the keyframes by their stamps, in order."""
         with self._file.reading() as connection:
             rows = connection.execute("SELECT stamp_ns, data FROM descriptor ORDER BY rowid")
             return {int(stamp): np.frombuffer(data, np.float16).astype(np.float32) for stamp, data in rows}
 
     def export(self, localizing: bool = False) -> None:
-        """Write the CSV tables; that of the poses in a map also without rows where the run is localising.
-
-        Raises:
-            UmfError: the file is damaged.
-            OutputError: a table cannot be written.
-        """
+        """Write the CSV tables; that of the poses in a map also without rows where the run is localising."""
         for name, columns in tables.COLUMNS.items():
             rows = self.rows(name)
             if rows or name in ALWAYS or (localizing and name == "localization"):
@@ -179,11 +178,7 @@ def _set_aside(folder: Path) -> None:
 
 
 def all_descriptors(folder: Path) -> Points:
-    """Descriptors (N, D) float32 of all keyframes of a run, in order.
-
-    Raises:
-        UmfError: it has none.
-    """
+    """Descriptors (N, D) float32 of all keyframes of a run, in order; an error where it has none."""
     found = _descriptors(folder)
     if not found:
         raise UmfError(f"{folder} holds no descriptors of keyframes")

@@ -9,16 +9,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from umf_ros.core.frames import LoopClosure
+from umf_ros.core.frames import LoopClosure, Points
 from umf_ros.core.geometry import Array, align, relative, rotation_angle
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis
 from umf_ros.runs.findings import PENDING, ExaminedRun
-from umf_ros.runs.gallery import SCAN_UNIT_M, Gallery, encode_scans
+from umf_ros.runs.gallery import SCAN_UNIT_M, Gallery, Photograph
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.tables import Endpoints, TestedCandidate
-from umf_ros.runs.truth import JudgedClosure, positions_in_truth
+from umf_ros.runs.tables import Endpoints
+from umf_ros.runs.truth import JudgedClosure, endpoints, positions_in_truth
+from umf_ros.verification.hypothesis import Hypothesis
 
 Kind = Literal["accepted", "pending", "rejected", "false", "missed", "tested"]
 ORDER: tuple[Kind, ...] = ("false", "missed", "rejected", "pending", "tested", "accepted")
@@ -35,7 +36,7 @@ class Pair:
         kind: how it is drawn.
         number: of the closure, from 1; 0 for what is none.
         pose: (4, 4) `match_T_query`, or None where no source knows it.
-        pose_source: who says so.
+        pose_source: of the pose.
         closure, judged, candidate, why: what is known.
     """
 
@@ -46,7 +47,7 @@ class Pair:
     pose_source: str
     closure: LoopClosure | None = None
     judged: JudgedClosure | None = None
-    candidate: TestedCandidate | None = None
+    candidate: Hypothesis | None = None
     why: ClosureDiagnosis | None = None
 
 
@@ -56,10 +57,11 @@ def pairs_of(about: ExaminedRun) -> list[Pair]:
     tested = {one.endpoints: one for one in run.candidates}
     pairs = []
     for number, closure in enumerate(run.closures, 1):
-        key = closure.query_stamp_ns, closure.match_stamp_ns
-        kind = _kind(about, key, judged.get(key))
-        found = tested.get(key)
-        pairs.append(Pair(kind, key, number, closure.match_T_query, "the closure", closure, judged.get(key), found))
+        key = endpoints(closure)
+        known = closure, judged.get(key), tested.get(key)
+        pairs.append(
+            Pair(_kind(about, key, judged.get(key)), key, number, closure.match_T_query, "the closure", *known)
+        )
     pairs += _missed(about, tested)
     return pairs + _nearly(about, {pair.endpoints for pair in pairs}, {one.query_stamp_ns for one in run.closures})
 
@@ -75,7 +77,7 @@ def by_need(pairs: Sequence[Pair]) -> list[Pair]:
 
 
 def _spread(count: int, most: int) -> Iterable[int]:
-    """Up to `most` of `count`, coarse before fine, so that whoever stops early has seen the whole run."""
+    """Up to `most` of `count`, coarse before fine: the first ones cover the whole run."""
     kept = np.linspace(0, count - 1, min(count, most)).astype(int).tolist() if count else []
     strides = [1 << power for power in range(len(kept).bit_length(), -1, -1)]
     return list(dict.fromkeys(kept[i] for stride in strides for i in range(0, len(kept), stride)))
@@ -90,33 +92,22 @@ def _kind(about: ExaminedRun, key: Endpoints, judged: JudgedClosure | None) -> K
     return "pending" if verdict.state in PENDING else "rejected"
 
 
-def _missed(about: ExaminedRun, tested: dict[Endpoints, TestedCandidate]) -> list[Pair]:
-    pairs = []
-    for why in about.missed():
-        if why.match_stamp_ns is None:
-            continue
-        key = why.stamp_ns, why.match_stamp_ns
-        pose, source = _pose(about, key)
-        pairs.append(Pair("missed", key, 0, pose, source, candidate=tested.get(key), why=why))
-    return pairs
+def _missed(about: ExaminedRun, tested: dict[Endpoints, Hypothesis]) -> list[Pair]:
+    found = [(why, (why.stamp_ns, why.match_stamp_ns)) for why in about.missed() if why.match_stamp_ns is not None]
+    return [Pair("missed", key, 0, *_pose(about, key), candidate=tested.get(key), why=why) for why, key in found]
 
 
 def _nearly(about: ExaminedRun, shown: set[Endpoints], found: set[int]) -> list[Pair]:
     """The most probable candidates of keyframes without a closure."""
-    best: dict[int, TestedCandidate] = {}
-    for one in about.run.candidates:
-        if one.query_stamp_ns in found or one.endpoints in shown or one.probability is None:
-            continue
-        known = best.get(one.query_stamp_ns)
-        if known is None or one.probability > (known.probability or 0):
-            best[one.query_stamp_ns] = one
-    chosen = sorted(best.values(), key=lambda one: -(one.probability or 0))[: MOST["tested"]]
+    best: dict[int, Hypothesis] = {}
+    for one in sorted(about.run.candidates, key=lambda one: -(one.probability or 0)):
+        if one.query_stamp_ns not in found and one.endpoints not in shown and one.probability is not None:
+            best.setdefault(one.query_stamp_ns, one)
     pairs = []
-    for one in chosen:
+    for one in list(best.values())[: MOST["tested"]]:
         row = about.places.row(one.query_stamp_ns)
-        pose, source = _pose(about, one.endpoints)
         why = about.gates.explain(row) if row is not None else None
-        pairs.append(Pair("tested", one.endpoints, 0, pose, source, candidate=one, why=why))
+        pairs.append(Pair("tested", one.endpoints, 0, *_pose(about, one.endpoints), candidate=one, why=why))
     return pairs
 
 
@@ -130,18 +121,24 @@ def _pose(about: ExaminedRun, key: Endpoints) -> tuple[Array | None, str]:
         poses, known = trajectory.at(np.array(key, np.int64))
         if known.all():
             return relative(poses[1], poses[0]), source
-    return None, "no one"
+    return None, ""
 
 
 def describe(about: ExaminedRun, pair: Pair, full: bool) -> dict[str, Any]:
-    """What the page gets of a pair; the bars and the pose only in full."""
-    rows = [about.places.row(stamp) for stamp in pair.endpoints]
-    told: dict[str, Any] = {"kind": pair.kind, "number": pair.number, "q": rows[0], "m": rows[1]}
-    told["stamps"] = [str(stamp) for stamp in pair.endpoints]  # no number of a browser holds nanoseconds
-    told["p"] = _finite(_probability(pair))
-    told["s"] = _finite(pair.candidate.similarity if pair.candidate else None)
-    told["graph"] = _graph_words(about, pair)
-    told["truth"] = _truth_words(pair)
+    """Describe a pair for the page; the bars and the pose only in full."""
+    query, match = (about.places.row(stamp) for stamp in pair.endpoints)
+    known, verdict = pair.closure or pair.candidate, about.run.verdicts.get(pair.endpoints)
+    told: dict[str, Any] = {
+        "kind": pair.kind,
+        "number": pair.number,
+        "q": query,
+        "m": match,
+        "stamps": [str(stamp) for stamp in pair.endpoints],  # no number of a browser holds nanoseconds
+        "p": _number(known.probability if known else None),
+        "s": _number(pair.candidate.candidate.similarity if pair.candidate else None),
+        "graph": f"{verdict.state}: {verdict.reason}{verdict.figures}" if verdict else "",
+        "truth": _truth_words(pair),
+    }
     if pair.why is not None:
         told["why"], told["parameter"] = pair.why.what, pair.why.parameter
     if not full:
@@ -159,20 +156,6 @@ def describe(about: ExaminedRun, pair: Pair, full: bool) -> dict[str, Any]:
     return told
 
 
-def _probability(pair: Pair) -> float | None:
-    if pair.closure is not None:
-        return pair.closure.probability
-    return None if pair.candidate is None else pair.candidate.probability
-
-
-def _graph_words(about: ExaminedRun, pair: Pair) -> str:
-    verdict = about.run.verdicts.get(pair.endpoints)
-    if verdict is None:
-        return ""
-    figures = f" ({verdict.sigma:.1f} sigma, {verdict.misfit_m:.2f} m)" if np.isfinite(verdict.sigma) else ""
-    return f"{verdict.state}: {verdict.reason}{figures}"
-
-
 def _truth_words(pair: Pair) -> str:
     judged = pair.judged
     if judged is None:
@@ -181,7 +164,8 @@ def _truth_words(pair: Pair) -> str:
     return f"{'true' if judged.is_true else 'FALSE'}: {judged.translation_error_m:.2f} m{turned} off"
 
 
-def _finite(value: float | None) -> float | None:
+def _number(value: float | None) -> float | None:
+    """A number for the page; None where it is unknown."""
     return None if value is None or not np.isfinite(value) else round(float(value), 4)
 
 
@@ -200,74 +184,65 @@ def drawn_trajectory(about: ExaminedRun) -> Trajectory | None:
     best = run.optimized or run.odometry
     if best is None:
         return run.truth
-    positions = positions_in_truth(best, run.truth)
-    rigid = _rigid(best.poses, positions)
-    return Trajectory(best.stamps_ns, rigid, best.has_orientation)
-
-
-def _rigid(poses: Array, positions: Array) -> Array:
-    """The poses moved so that their positions are those given: both are rigidly alike."""
-    if len(poses) < 3:
-        return poses
-    return np.asarray(align(poses[:, :3, 3], positions)[0] @ poses)
+    if len(best) < 3:
+        return best
+    # the positions are the trajectory's own, moved rigidly
+    moved = align(best.poses[:, :3, 3], positions_in_truth(best, run.truth))[0]
+    return Trajectory(best.stamps_ns, np.asarray(moved @ best.poses), best.has_orientation)
 
 
 def build_scene(
     about: ExaminedRun, pairs: list[Pair], gallery: Gallery, inliers: dict[Endpoints, Array]
 ) -> dict[str, Any]:
     """The scene: curves, keyframes, pairs with their pictures, matrix, threshold, errors and map."""
-    media = _media(pairs, gallery)
+    photographs, scans = _media(pairs, gallery)
     full = {pair.endpoints for pair in by_need(pairs)}
     told = [describe(about, pair, pair.endpoints in full) for pair in pairs]
     for one, pair in zip(told, pairs, strict=True):
         lines = inliers.get(pair.endpoints)
-        if lines is not None and str(pair.endpoints[0]) in media["photographs"]:
+        if lines is not None and str(pair.endpoints[0]) in photographs:
             chosen = np.linspace(0, len(lines) - 1, min(len(lines), MAX_INLIERS)).astype(int)
             one["inliers"] = np.rint(lines[chosen]).astype(int).tolist() if len(lines) else []
             one["inlier_count"] = len(lines)
     return {
-        "curves": _curves(about),
+        "curves": _curves(about.run),
         "keyframes": _keyframes(about),
         "pairs": told,
-        "photographs": media["photographs"],
-        "scans": media["scans"],
+        "photographs": photographs,
+        "scans": scans,
         "scan_unit_m": SCAN_UNIT_M,
-        "similarity": _similarity(about),
+        "similarity": _similarity(about.run.descriptors),
         "threshold": about.run.settings.verification.min_probability,
         "sweep": _sweep(about),
         "errors": error_curves(about.run) or None,
-        "map": _map(gallery),
+        "map": gallery.map_picture(),
     }
 
 
-def _media(pairs: list[Pair], gallery: Gallery) -> dict[str, dict[str, Any]]:
+def _media(pairs: list[Pair], gallery: Gallery) -> tuple[dict[str, Photograph], dict[str, str]]:
     """Photographs and scans by stamp, of the most telling pairs first, as many as find room."""
     room = MEDIA_BYTES
-    photographs: dict[str, Any] = {}
+    photographs: dict[str, Photograph] = {}
     scans: dict[str, str] = {}
-    encoded = encode_scans(gallery.scans)
-    for pair in by_need(pairs):
-        for stamp in pair.endpoints:
-            photograph, scan = gallery.photographs.get(stamp), encoded.get(stamp, "")
-            size = (len(photograph.address) if photograph else 0) + len(scan)
-            if str(stamp) in scans or size > room:
-                continue
+    for stamp in dict.fromkeys(stamp for pair in by_need(pairs) for stamp in pair.endpoints):
+        photograph, scan = gallery.photographs.get(stamp), gallery.scans.get(stamp, "")
+        size = (len(photograph.address) if photograph else 0) + len(scan)
+        if size <= room:
             room -= size
             scans[str(stamp)] = scan
             if photograph is not None:
-                photographs[str(stamp)] = [photograph.address, photograph.width, photograph.height]
-    return {"photographs": photographs, "scans": scans}
+                photographs[str(stamp)] = photograph
+    return photographs, scans
 
 
-def _curves(about: ExaminedRun) -> list[dict[str, Any]]:
-    run = about.run
-    curves = []
-    if run.truth is not None:
-        curves.append(("ground truth", run.truth.poses[:, :3, 3]))
-    for name, trajectory in (("odometry", run.odometry), ("optimised", run.optimized)):
-        if trajectory is not None:
-            curves.append((name, positions_in_truth(trajectory, run.truth)))
-    return [{"name": name, "xyz": _rounded(_thin(positions)).T.tolist()} for name, positions in curves]
+def named_curves(run: FinishedRun) -> dict[str, Array]:
+    """Positions (N, 3) of truth, odometry and optimised trajectory, as far as there are, in the frame of the truth."""
+    known = {"ground truth": run.truth, "odometry": run.odometry, "optimised": run.optimized}
+    return {name: positions_in_truth(one, run.truth) for name, one in known.items() if one is not None}
+
+
+def _curves(run: FinishedRun) -> list[dict[str, Any]]:
+    return [{"name": name, "xyz": _thin(positions).T.tolist()} for name, positions in named_curves(run).items()]
 
 
 def _keyframes(about: ExaminedRun) -> dict[str, Any]:
@@ -275,18 +250,18 @@ def _keyframes(about: ExaminedRun) -> dict[str, Any]:
     start = int(places.stamps[0]) if len(places.stamps) else 0
     best: dict[int, float] = {}
     for one in run.candidates:
-        best[one.query_stamp_ns] = max(best.get(one.query_stamp_ns, -1.0), one.similarity)
+        best[one.query_stamp_ns] = max(best.get(one.query_stamp_ns, -1.0), one.candidate.similarity)
     return {
         "t": [round((int(stamp) - start) * 1e-9, 3) for stamp in places.stamps],
-        "xy": _rounded(_positions(about)).tolist(),
-        "way": [_or_none(row.path_length_m) for row in run.keyframes],
-        "similarity": [_or_none(best.get(int(stamp), np.nan)) for stamp in places.stamps],
-        "latency": [_or_none(run.latencies_ms.get(int(stamp), np.nan)) for stamp in places.stamps],
+        "xy": np.round(_positions(about), 3).tolist(),
+        "way": [_number(row.path_length_m) for row in run.keyframes],
+        "similarity": [_number(best.get(int(stamp))) for stamp in places.stamps],
+        "latency": [_number(run.latencies_ms.get(int(stamp))) for stamp in places.stamps],
     }
 
 
 def _positions(about: ExaminedRun) -> Array:
-    """(N, 2) of the keyframes where they are drawn; on a circle where no one knows their poses."""
+    """(N, 2) of the keyframes where they are drawn; on a circle where their poses are unknown."""
     stamps, drawn = about.places.stamps, drawn_trajectory(about)
     if drawn is not None:
         poses, known = drawn.at(stamps)
@@ -300,8 +275,7 @@ def _positions(about: ExaminedRun) -> Array:
     return 10 * np.column_stack([np.sin(angle), np.cos(angle)])[: len(stamps)]
 
 
-def _similarity(about: ExaminedRun) -> dict[str, Any] | None:
-    descriptors = about.run.descriptors
+def _similarity(descriptors: Points | None) -> dict[str, Any] | None:
     if descriptors is None or not len(descriptors):
         return None
     rows = np.unique(np.linspace(0, len(descriptors) - 1, MAX_SIDE).astype(int))
@@ -320,14 +294,14 @@ def _sweep(about: ExaminedRun) -> list[list[float | int]]:
                 rows.append([0, 0, 1])
             continue
         same = about.places.is_same_place(stamp, best.match_stamp_ns)
-        if best.reason == "accepted" and stamp in right:
+        if best.accepted and stamp in right:
             same = right[stamp]
         rows.append([round(best.probability or 0, 4), -1 if same is None else int(same), revisit])
     return rows
 
 
 def error_curves(run: FinishedRun) -> dict[str, list[list[float]]]:
-    """Way in m and distance from the truth in m, of odometry and optimised trajectory as far as there are."""
+    """Path length in m and distance from the truth in m, of odometry and optimised trajectory as far as there are."""
     told: dict[str, list[list[float]]] = {}
     for name, trajectory in (("odometry", run.odometry), ("optimised", run.optimized)):
         if trajectory is None or run.truth is None:
@@ -335,25 +309,14 @@ def error_curves(run: FinishedRun) -> dict[str, list[list[float]]]:
         poses, known = run.truth.at(trajectory.stamps_ns)
         if np.count_nonzero(known) < 3:
             continue
-        there = positions_in_truth(trajectory, run.truth)[known]
-        way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(poses[known, :3, 3], axis=0), axis=1))])
-        both = np.column_stack([way, np.linalg.norm(there - poses[known, :3, 3], axis=1)])
-        told[name] = _rounded(_thin(both)).T.tolist()
+        true = poses[known, :3, 3]
+        path_m = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
+        error_m = np.linalg.norm(positions_in_truth(trajectory, run.truth)[known] - true, axis=1)
+        told[name] = _thin(np.column_stack([path_m, error_m])).T.tolist()
     return told
 
 
-def _map(gallery: Gallery) -> dict[str, Any] | None:
-    picture = gallery.map_picture()
-    return {"address": picture.address, "lower": picture.lower, "upper": picture.upper} if picture else None
-
-
 def _thin(rows: Array) -> Array:
-    return rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_POINTS)).astype(int))]
-
-
-def _rounded(values: Array) -> Array:
-    return np.asarray(np.round(np.asarray(values, float), 3))
-
-
-def _or_none(value: float) -> float | None:
-    return round(float(value), 4) if np.isfinite(value) else None
+    """Some of the rows (N, C), to a millimetre."""
+    kept = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_POINTS)).astype(int))]
+    return np.asarray(np.round(kept, 3))

@@ -1,4 +1,7 @@
-"""Columns and rows of the CSV tables of a run."""
+"""Columns and rows of the CSV tables of a run.
+
+A table that cannot be read raises an `UmfError`, which names the file and the damaged line.
+"""
 
 from __future__ import annotations
 
@@ -7,29 +10,26 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from umf_ros.core.errors import UmfError
-from umf_ros.core.frames import LoopClosure
+from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.core.io import atomic_write
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, State
-
-if TYPE_CHECKING:
-    from umf_ros.verification import Verdict
+from umf_ros.verification.hypothesis import ACCEPTED, Hypothesis, Measurement, RejectReason
 
 POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
 SIGMA = ["sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"]
 COVARIANCE = "covariance"
 CLOSURES = ["query_stamp_ns", "match_stamp_ns", *POSE, *SIGMA, "probability", "similarity", COVARIANCE]
 CLOSURES_BETWEEN = ["match_robot", *CLOSURES]
-CANDIDATES = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "numbers"]
+CANDIDATES = ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "detail", "numbers"]
 KEYFRAMES = ["stamp_ns", "session", "travelled_m"]
 STAGES = ("embed", "query", "verify", "submaps", "total")
 LATENCIES = ["stamp_ns", *STAGES]
-_KEYFRAME = tuple(zip((int, int, float), KEYFRAMES, strict=True))
 INLIERS = ["query_stamp_ns", "match_stamp_ns", "query_u", "query_v", "match_u", "match_v"]
 LOCALIZATION = ["stamp_ns", *POSE, *SIGMA, "probability"]
 COLUMNS = {
@@ -42,38 +42,11 @@ COLUMNS = {
     "localization": LOCALIZATION,
 }
 """Columns of each table, which is exported as `<name>.csv`."""
+_REASONS = {reason.value for reason in RejectReason}
 Row = TypeVar("Row")
 
 Endpoints = tuple[int, int]
 """Stamps in ns of a closure's query and match."""
-
-
-@dataclass(frozen=True, slots=True)
-class TestedCandidate:
-    """A row of `candidates.csv`.
-
-    Attributes:
-        query_stamp_ns, match_stamp_ns: keys of both keyframes.
-        similarity: of the global descriptors.
-        reason: "accepted", or what stopped it.
-        numbers: what was measured, by name.
-    """
-
-    query_stamp_ns: int
-    match_stamp_ns: int
-    similarity: float
-    reason: str
-    numbers: dict[str, float]
-
-    @property
-    def endpoints(self) -> Endpoints:
-        """Stamps of query and match."""
-        return self.query_stamp_ns, self.match_stamp_ns
-
-    @property
-    def probability(self) -> float | None:
-        """That the pose found is right; None where no pose was found or tried."""
-        return self.numbers.get("probability")
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,14 +65,30 @@ class GraphVerdict:
     sigma: float
     misfit_m: float
 
+    @property
+    def figures(self) -> str:
+        """Distances to the map in brackets; empty where they are unknown."""
+        return f" ({self.sigma:.1f} sigma, {self.misfit_m:.2f} m)" if np.isfinite(self.sigma) else ""
+
+    @classmethod
+    def parse(cls, row: dict[str, str]) -> tuple[Endpoints, GraphVerdict]:
+        """Endpoints and verdict in a row by column."""
+        match, query, state, reason, sigma, misfit_m = (row[name] for name in VERDICT_COLUMNS)
+        return (int(query), int(match)), cls(State(state), reason, float(sigma), float(misfit_m))
+
 
 @dataclass(frozen=True, slots=True)
 class KeyframeRow:
-    """A row of `keyframes.csv`: stamp in ns, session, and way in m, NaN without odometry."""
+    """A row of `keyframes.csv`: stamp in ns, session, and path length in m, NaN without odometry."""
 
     stamp_ns: int
     session: int
     path_length_m: float
+
+    @classmethod
+    def parse(cls, row: dict[str, str]) -> KeyframeRow:
+        """The keyframe in a row by column."""
+        return cls(int(row["stamp_ns"]), int(row["session"]), float(row["travelled_m"]))
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -126,95 +115,55 @@ def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:
     return [closure.query_stamp_ns, closure.match_stamp_ns, *(f"{number:.9g}" for number in numbers), triangle]
 
 
-def candidate_row(query_stamp_ns: int, verdict: Verdict) -> list[Any]:
-    """Row of `candidates.csv`: everything that was measured, as JSON."""
-    numbers = json.dumps({name: float(f"{value:.6g}") for name, value in verdict.numbers.items()})
-    candidate = verdict.candidate
-    return [query_stamp_ns, candidate.stamp_ns, f"{candidate.similarity:.6f}", verdict.reason, numbers]
+def candidate_row(hypothesis: Hypothesis) -> list[Any]:
+    """Row of `candidates.csv`: the reason with its figures, and all measurements as JSON."""
+    numbers = json.dumps({name: float(f"{value:.6g}") for name, value in hypothesis.numbers.items()})
+    reason = hypothesis.reason.value if hypothesis.reason else ACCEPTED
+    similarity = f"{hypothesis.candidate.similarity:.6f}"
+    return [*hypothesis.endpoints, similarity, reason, hypothesis.detail, numbers]
 
 
-def inlier_rows(query_stamp_ns: int, verdict: Verdict) -> list[list[Any]]:
+def inlier_rows(hypothesis: Hypothesis) -> list[list[Any]]:
     """Rows of `inliers.csv`: pixels of both left images that see the same point."""
     return [
-        [query_stamp_ns, verdict.candidate.stamp_ns, *(f"{value:.1f}" for value in pixels)]
-        for pixels in verdict.inlier_pixels.tolist()
+        [*hypothesis.endpoints, *(f"{value:.1f}" for value in pixels)] for pixels in hypothesis.inlier_pixels.tolist()
     ]
 
 
 def read_table(path: Path, parse: Callable[[dict[str, str]], Row]) -> list[Row]:
-    """What `parse` makes of every row, given by column.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
-    rows: list[Row] = []
+    """Return the result of `parse` for every row, which is given by column."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
-            for row in reader:
-                rows.append(parse(row))
+            return [parse(row) for row in reader]
     except OSError as error:
         raise UmfError(f"cannot read {path}: {error.strerror}") from None
     except (KeyError, TypeError, ValueError, csv.Error):
         raise UmfError(f"{path}, line {reader.line_num}: not a row of this table") from None
-    return rows
 
 
-def read_candidates(path: Path) -> list[TestedCandidate]:
-    """Everything that was tested.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
-    return read_table(path, _candidate)
+def parse_candidate(row: dict[str, str]) -> Hypothesis:
+    """The hypothesis in a row of `candidates.csv`; a reason of another version is kept as its detail."""
+    numbers = {name: float(value) for name, value in json.loads(row["numbers"]).items()}
+    candidate = Candidate(-1, int(row["match_stamp_ns"]), float(row["similarity"]))
+    probability, measurement = numbers.pop("probability", None), Measurement.read(candidate.similarity, numbers)
+    reason, detail = row["reason"], row.get("detail") or ""
+    if reason == ACCEPTED:
+        return Hypothesis(int(row["query_stamp_ns"]), candidate, measurement, probability=probability)
+    if reason not in _REASONS:
+        reason, detail = RejectReason.UNKNOWN.value, reason
+    return Hypothesis(
+        int(row["query_stamp_ns"]), candidate, measurement, RejectReason(reason), detail, probability=probability
+    )
 
 
 def read_keyframes(path: Path) -> list[KeyframeRow]:
-    """The keyframes in the order of their stamps.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
-    return read_table(path, lambda row: KeyframeRow(*(kind(row[name]) for kind, name in _KEYFRAME)))
-
-
-def read_latencies(path: Path) -> dict[int, float]:
-    """Milliseconds that each keyframe took, by its stamp; none where an older version wrote none.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
-    if not path.is_file():
-        return {}
-    return dict(read_table(path, lambda row: (int(row["stamp_ns"]), float(row["total"]))))
-
-
-def read_graph_verdicts(path: Path) -> dict[Endpoints, GraphVerdict]:
-    """The graph's verdicts by the stamps of query and match; none where there was no graph.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
-    return dict(read_table(path, _graph_verdict)) if path.is_file() else {}
-
-
-def _candidate(row: dict[str, str]) -> TestedCandidate:
-    numbers = {name: float(value) for name, value in json.loads(row["numbers"]).items()}
-    stamps = int(row["query_stamp_ns"]), int(row["match_stamp_ns"])
-    return TestedCandidate(*stamps, float(row["similarity"]), row["reason"], numbers)
-
-
-def _graph_verdict(row: dict[str, str]) -> tuple[Endpoints, GraphVerdict]:
-    match, query, state, reason, sigma, misfit_m = (row[name] for name in VERDICT_COLUMNS)
-    return (int(query), int(match)), GraphVerdict(State(state), reason, float(sigma), float(misfit_m))
+    """The keyframes in the order of their stamps."""
+    return read_table(path, KeyframeRow.parse)
 
 
 def read_closures(path: Path) -> list[LoopClosure]:
-    """The closures of a `closures.csv`; with a diagonal covariance where an older version wrote no other.
-
-    Raises:
-        UmfError: the file cannot be read; names the line that is damaged.
-    """
+    """The closures of a `closures.csv`; with a diagonal covariance where an older version wrote no other."""
     return read_table(path, parse_closure)
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import isfinite, nan, radians
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,13 @@ from umf_ros.core.geometry import Array, align, heading, invert, relative, rotat
 from umf_ros.core.keyframes import is_past
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.tables import Endpoints, read_keyframes
+from umf_ros.runs.tables import Endpoints, KeyframeRow
 
 CONFIDENCE = 0.95
 MEDIAN_EXPECTED = float(chdtri(6, 0.5))
-"""Half of honest normalised errors squared are less than this, 5.35: chi square with six degrees of freedom."""
-HONEST_MEDIAN = (3.0, 8.0)
-HONEST_INSIDE = 0.9
+"""Half of consistent normalised errors squared are less than this, 5.35: chi square with six degrees of freedom."""
+CONSISTENT_MEDIAN = (3.0, 8.0)
+CONSISTENT_INSIDE = 0.9
 
 
 def pose_error(estimated: Array, true: Array) -> Array:
@@ -49,14 +49,14 @@ def share_inside(squared: Array, confidence: float = CONFIDENCE) -> float:
 
 
 def in_words(nees_median: float, inside_95: float) -> str:
-    """What a person wants to know of the stated errors."""
-    low, high = HONEST_MEDIAN
+    """Say in a plain word how stated errors compare with true ones."""
+    low, high = CONSISTENT_MEDIAN
     factor = (nees_median / MEDIAN_EXPECTED) ** 0.5
     if nees_median > high:
         return f"too small by a factor of {factor:.2g}"
     if nees_median < low:
         return f"too large by a factor of {1 / max(factor, 1e-9):.2g}"
-    return "honest" if inside_95 >= HONEST_INSIDE else "honest for most, too small for the worst"
+    return "consistent" if inside_95 >= CONSISTENT_INSIDE else "consistent for most, too small for the worst"
 
 
 PLACE_RADIUS_M = 12.0
@@ -90,7 +90,7 @@ class JudgedClosure:
 
 @dataclass(frozen=True, slots=True)
 class JudgedRun:
-    """What the truth says of a run.
+    """A run held against the truth.
 
     Attributes:
         closures: one per closure whose endpoints the truth covers.
@@ -113,6 +113,7 @@ class JudgedRun:
     def summary(self) -> dict[str, Any]:
         """The `ground_truth` entry of `summary.json`."""
         true = sum(judged.is_true for judged in self.closures)
+        squared = np.array([judged.nees for judged in self.closures if isfinite(judged.nees)])
         return {
             "closures_true": true,
             "closures_false": len(self.closures) - true,
@@ -122,15 +123,10 @@ class JudgedRun:
             "keyframes_covered": self.covered[0],
             "ate_odometry_m": _rounded(self.ate_odometry_m),
             "ate_optimized_m": _rounded(self.ate_optimized_m),
-            **self._honesty(),
+            # none where no closure could be judged by the whole pose
+            "nees_median": _rounded(float(np.median(squared)) if len(squared) else None),
+            "inside_95": _rounded(share_inside(squared) if len(squared) else None),
         }
-
-    def _honesty(self) -> dict[str, float | None]:
-        """How the stated covariances do: None where no closure could be judged by the whole pose."""
-        squared = np.array([judged.nees for judged in self.closures if isfinite(judged.nees)])
-        if not len(squared):
-            return {"nees_median": None, "inside_95": None}
-        return {"nees_median": _rounded(float(np.median(squared))), "inside_95": _rounded(share_inside(squared))}
 
     def by_endpoints(self) -> dict[Endpoints, JudgedClosure]:
         """The judged closures, to be found by the stamps of query and match."""
@@ -143,34 +139,43 @@ def endpoints(closure: LoopClosure) -> Endpoints:
 
 
 def judge_run(
-    folder: Path,
+    rows: Sequence[KeyframeRow],
     truth: Trajectory,
     closures: list[LoopClosure],
     rules: Loop,
     odometry: Trajectory | None,
     optimized: Trajectory | None,
 ) -> JudgedRun:
-    """Hold closures, odometry and optimised trajectory of a run folder against the truth."""
-    rows = read_keyframes(folder / "keyframes.csv")
+    """Hold closures, odometry and optimised trajectory of a run with these keyframes against the truth."""
     stamps = np.array([row.stamp_ns for row in rows], np.int64)
-    path_length = np.array([row.path_length_m for row in rows], float)
     poses, known = truth.at(stamps)
-    stamps, poses, path_length = stamps[known], poses[known], path_length[known]
+    stamps, poses = stamps[known], poses[known]
+    path_length = np.array([row.path_length_m for row in rows], float)[known]
     judged = _judge_closures(closures, truth)
     again = find_revisits(stamps, poses, path_length, rules, same_view=False)
     same_view = find_revisits(stamps, poses, path_length, rules, truth.has_orientation)
     published = {closure.query_stamp_ns for closure in closures}
     true_queries = {one.closure.query_stamp_ns for one in judged if one.is_true}
-    closed = np.isin(stamps[again], list(true_queries))
     return JudgedRun(
         closures=judged,
         revisits=int(same_view.sum()),
-        any_heading=(int(again.sum()), int(closed.sum())),
+        any_heading=(int(again.sum()), int(np.isin(stamps[again], list(true_queries)).sum())),
         covered=(len(stamps), len(rows)),
         missed=[int(stamp) for stamp in stamps[same_view] if stamp not in published],
         ate_odometry_m=trajectory_error(odometry, truth),
         ate_optimized_m=trajectory_error(optimized, truth),
     )
+
+
+def _judge_closures(closures: list[LoopClosure], truth: Trajectory) -> list[JudgedClosure]:
+    stamps = np.array([endpoints(closure) for closure in closures], np.int64)
+    poses, known = truth.at(stamps.reshape(-1))
+    ends = zip(closures, poses.reshape(-1, 2, 4, 4), known.reshape(-1, 2), strict=True)
+    return [
+        judge_closure(one, query, match, truth.has_orientation)
+        for one, (query, match), covered in ends
+        if covered.all()
+    ]
 
 
 def judge_closure(
@@ -209,15 +214,20 @@ def find_revisits(
         rules: which earlier keyframes are admissible.
         same_view: whether headings count; without, a place may be seen again from any side.
     """
-    positions, headings = world_T_body[:, :3, 3], heading(world_T_body)
     revisits = np.zeros(len(stamps), bool)
-    for i in range(len(stamps)):
-        near = np.linalg.norm(positions[:i] - positions[i], axis=1) <= PLACE_RADIUS_M
-        if same_view:
-            near &= np.abs(wrap_angle(headings[:i] - headings[i])) <= radians(PLACE_ANGLE_DEG)
-        past = is_past(stamps[i] - stamps[:i], path_length_m[i] - path_length_m[:i], rules)
-        revisits[i] = bool((near & past).any())
+    for row in range(len(stamps)):
+        past = is_past(stamps[row] - stamps[:row], path_length_m[row] - path_length_m[:row], rules)
+        revisits[row] = bool((_near(world_T_body, row, same_view) & past).any())
     return revisits
+
+
+def _near(world_T_body: Array, row: int, same_view: bool) -> NDArray[np.bool_]:
+    """Which earlier poses (row,) of (N, 4, 4) are the same place as one of them."""
+    there, here = world_T_body[:row], world_T_body[row]
+    near = np.linalg.norm(there[:, :3, 3] - here[:3, 3], axis=1) <= PLACE_RADIUS_M
+    if same_view:
+        near &= np.abs(wrap_angle(heading(there) - heading(here))) <= radians(PLACE_ANGLE_DEG)
+    return np.asarray(near)
 
 
 def trajectory_error(estimate: Trajectory | None, truth: Trajectory) -> float | None:
@@ -243,7 +253,7 @@ def positions_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Arra
     Without a truth, or one that covers fewer than three poses, they stay in the frame of the trajectory.
     """
     positions: Array = trajectory.poses[:, :3, 3]
-    if truth is None:
+    if truth is None or trajectory is truth:
         return positions
     poses, known = truth.at(trajectory.stamps_ns)
     if np.count_nonzero(known) < 3:
@@ -254,32 +264,17 @@ def positions_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Arra
     return transform(poses[first] @ invert(trajectory.poses[first]), positions)
 
 
-def _judge_closures(closures: list[LoopClosure], truth: Trajectory) -> list[JudgedClosure]:
-    if not closures:
-        return []
-    queries, query_known = truth.at(np.array([closure.query_stamp_ns for closure in closures], np.int64))
-    matches, match_known = truth.at(np.array([closure.match_stamp_ns for closure in closures], np.int64))
-    return [
-        judge_closure(closure, queries[i], matches[i], truth.has_orientation)
-        for i, closure in enumerate(closures)
-        if query_known[i] and match_known[i]
-    ]
-
-
 def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 4)
 
 
 class TruePlaces:
-    """The keyframes of a run, where they truly were and which of them may be matched with which.
-
-    Without a truth nothing is known to be the same place; what the gap rules allow is known all the same.
-    """
+    """True poses of the keyframes of a run, and the pairs of them that the gap rules admit, with or without a truth."""
 
     def __init__(self, run: FinishedRun) -> None:
         self._rules = run.settings.loop
         self.stamps = run.stamps
-        self._travelled: Array = np.array([row.path_length_m for row in run.keyframes], float)
+        self._path_length: Array = np.array([row.path_length_m for row in run.keyframes], float)
         self._sessions = np.array([row.session for row in run.keyframes], int)
         self._has_orientation = run.truth is not None and run.truth.has_orientation
         self.poses: Array
@@ -287,7 +282,6 @@ class TruePlaces:
             self.poses, self.known = np.tile(np.eye(4), (len(self.stamps), 1, 1)), np.zeros(len(self.stamps), bool)
         else:
             self.poses, self.known = run.truth.at(self.stamps)
-        self._headings = heading(self.poses) if len(self.poses) else np.empty(0)
         self._row = {int(stamp): row for row, stamp in enumerate(self.stamps)}
 
     def row(self, stamp_ns: int) -> int | None:
@@ -302,7 +296,7 @@ class TruePlaces:
         """(row,) which earlier keyframes the gap rules allow."""
         return is_past(
             self.stamps[row] - self.stamps[:row],
-            self._travelled[row] - self._travelled[:row],
+            self._path_length[row] - self._path_length[:row],
             self._rules,
             self._sessions[:row] == self._sessions[row],
         )
@@ -314,13 +308,9 @@ class TruePlaces:
 
     def same_places(self, row: int) -> NDArray[np.int64]:
         """Earlier keyframes that are the same place and may be matched, the nearest first."""
-        apart = self.distances(row)[:row]
-        near = self.admissible(row) & (apart <= PLACE_RADIUS_M)
-        if self._has_orientation:
-            turned = np.abs(wrap_angle(self._headings[:row] - self._headings[row]))
-            near &= turned <= radians(PLACE_ANGLE_DEG)
-        rows = np.flatnonzero(near)
-        return rows[np.argsort(apart[rows])]
+        known = self.known[:row] & self.known[row]
+        rows = np.flatnonzero(self.admissible(row) & known & _near(self.poses, row, self._has_orientation))
+        return rows[np.argsort(self.distances(row)[rows])]
 
     def is_same_place(self, query_ns: int, match_ns: int) -> bool | None:
         """Whether the two are within 12 m in truth, whatever their headings; None where that is unknown."""

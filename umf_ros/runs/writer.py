@@ -1,4 +1,7 @@
-"""Write the folder of a run while it goes."""
+"""Write the folder of a run while it goes.
+
+A folder or file that cannot be written raises an `OutputError`.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from array import array
 from collections.abc import Mapping
 from contextlib import closing, suppress
 from datetime import datetime
+from itertools import count
 from math import isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,12 +22,12 @@ import numpy as np
 
 from umf_ros import __version__
 from umf_ros.core.config import Settings, dump_settings, load_settings
-from umf_ros.core.errors import OutputError, UmfError, writing
-from umf_ros.core.frames import Frame, LoopClosure
+from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import atomic_write
 from umf_ros.runs import tables
-from umf_ros.runs.run_file import NAME, RunFile
+from umf_ros.runs.run_file import NAME, RunFile, StoredOdometry
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
@@ -33,19 +37,12 @@ if TYPE_CHECKING:
 
 
 def create_run_folder(out: Path, latest: bool = True) -> Path:
-    """Make a new folder named after the local time inside `out`.
-
-    Args:
-        out: the folder of all runs.
-        latest: whether `out/latest` leads to it from now on, as it should for runs, whose report it shows.
-
-    Raises:
-        OutputError: `out` cannot be written.
-    """
+    """Make a new folder inside `out`, named after the local time; `out/latest` leads to it unless `latest` is false."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     with writing(f"to {out}"):
         out.mkdir(parents=True, exist_ok=True)
-        folder = _make_unique(out, stamp)
+        names = (stamp if number == 1 else f"{stamp}_{number}" for number in count(1))
+        folder = next(folder for name in names if _is_new(folder := out / name))
         if latest:  # in one step, so that it always leads to a folder
             fresh = out / f".latest-{os.getpid()}"
             fresh.symlink_to(folder.name, target_is_directory=True)
@@ -53,20 +50,17 @@ def create_run_folder(out: Path, latest: bool = True) -> Path:
     return folder
 
 
-def _make_unique(out: Path, name: str) -> Path:
-    for suffix in ["", *(f"_{i}" for i in range(2, 1000))]:
-        with suppress(FileExistsError):
-            (out / (name + suffix)).mkdir()
-            return out / (name + suffix)
-    raise OutputError(f"too many runs named {name} in {out}")
+def _is_new(folder: Path) -> bool:
+    """Make a folder; returns false where there is one of this name."""
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        return False
+    return True
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write a text file that is never seen half-written.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write a text file that is never seen half-written."""
     with atomic_write(path) as part:
         part.write_text(text, encoding="utf-8")
 
@@ -91,11 +85,7 @@ class ReplayFolder:
 
     @classmethod
     def create(cls, out: Path, bag: Path, settings: Settings) -> ReplayFolder:
-        """Make a new folder inside `out` for a replay of `bag`.
-
-        Raises:
-            OutputError: it cannot be written.
-        """
+        """Make a new folder inside `out` for a replay of `bag`."""
         folder = cls(create_run_folder(out), settings)
         _note(folder.path, bag=str(bag.resolve()), finished=False)
         return folder
@@ -106,7 +96,6 @@ class ReplayFolder:
 
         Raises:
             UmfError: it was begun with other settings.
-            OutputError: a new one cannot be written.
         """
         begun = [path.parent for path in sorted(out.glob(f"*/{NAME}"), reverse=True) if not path.parent.is_symlink()]
         for path in begun:
@@ -130,11 +119,7 @@ class ReplayFolder:
         return self._settings.model_copy(update=update)
 
     def finish(self) -> None:
-        """Mark the run as finished, and delete its store of places.
-
-        Raises:
-            OutputError: the folder cannot be written.
-        """
+        """Mark the run as finished, and delete its store of places."""
         for path in self.path.glob(f"{PLACES}*"):
             path.unlink(missing_ok=True)
         _note(self.path, finished=True)
@@ -151,9 +136,6 @@ def _facts(folder: Path) -> dict[str, Any]:
     return {}
 
 
-STAGES = tables.STAGES
-
-
 class RunRecorder:
     """Writes a run: `config.yaml` at once, `run.sqlite` keyframe by keyframe, CSV tables and `summary.json` at the end.
 
@@ -168,6 +150,7 @@ class RunRecorder:
 
     Attributes:
         recorded: stamps and sessions of the keyframes in the folder.
+        earlier_closures: closures that an earlier process wrote.
 
     Raises:
         UmfError: another process writes the folder, or its file is damaged.
@@ -181,12 +164,12 @@ class RunRecorder:
         write_atomically(folder / "config.yaml", dump_settings(settings))
         self._file = RunFile(folder)
         self.recorded = {(int(row[0]), int(row[1])) for row in self._file.rows("keyframes")}
-        self._closures = self._file.closures()
-        self._pairs = {(closure.query_stamp_ns, closure.match_stamp_ns) for closure in self._closures}
+        self.earlier_closures = self._file.closures()
+        self._pairs = {(closure.query_stamp_ns, closure.match_stamp_ns) for closure in self.earlier_closures}
         latencies = self._file.rows("latencies")
         self._latency = {
             stage: array("f", (value for row in latencies if not isnan(value := float(row[place]))))
-            for place, stage in enumerate(STAGES, 1)
+            for place, stage in enumerate(tables.STAGES, 1)
         }
         self._counts = self._earlier_counts(resume)
         self._odometry = 0
@@ -195,11 +178,7 @@ class RunRecorder:
         self._last_stamp_ns: int | None = None
 
     def record(self, frame: Frame, detection: Detection) -> None:
-        """Write the results of one frame, all of them or none.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Write the results of one frame, all of them or none."""
         self.count(frame)
         if self._last_stamp_ns is not None:
             self._recorded_ns += max(0, frame.stamp_ns - self._last_stamp_ns)
@@ -211,15 +190,15 @@ class RunRecorder:
         new = [
             one for one in detection.verdicts if one.closure and (stamp_ns, one.candidate.stamp_ns) not in self._pairs
         ]
-        times = [f"{detection.latency_ms.get(stage, nan):.1f}" for stage in STAGES]
+        times = [f"{detection.latency_ms.get(stage, nan):.1f}" for stage in tables.STAGES]
         closures = [tables.closure_row(one.closure, one.candidate.similarity) for one in new if one.closure]
         with self._file.writing():
             self._file.append("keyframes", [[stamp_ns, keyframe.session, f"{keyframe.path_length_m:.4f}"]])
             self._file.append("latencies", [[stamp_ns, *times]])
             self._file.append_descriptor(stamp_ns, keyframe.embedding.descriptor)
-            self._file.append("candidates", [tables.candidate_row(stamp_ns, one) for one in detection.verdicts])
+            self._file.append("candidates", [tables.candidate_row(one) for one in detection.verdicts])
             self._file.append("closures", closures, odometry_before=self._odometry)
-            self._file.append("inliers", [row for one in new for row in tables.inlier_rows(stamp_ns, one)])
+            self._file.append("inliers", [row for one in new for row in tables.inlier_rows(one)])
             self._file.note(**self._facts())
         self._counts["keyframes"] += 1
         self._counts["queries"] += bool(detection.verdicts)
@@ -232,7 +211,7 @@ class RunRecorder:
 
     def record_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
         """Write the next odometry message of the recording, with the next keyframe."""
-        self._file.append_odometry(self._odometry, stamp_ns, odom_T_body)
+        self._file.append_odometry(self._odometry, StoredOdometry(stamp_ns, odom_T_body))
         self._odometry += 1
 
     def record_encounter(self, inter_closure: InterRobotClosure) -> None:
@@ -252,12 +231,8 @@ class RunRecorder:
         self._counts["frames"] += 1
         self._counts["pairs"] += frame.left is not None and frame.points is not None
 
-    def earlier_closures(self) -> list[LoopClosure]:
-        """Closures that an earlier process wrote."""
-        return self._closures
-
     def summary(self, drops: Mapping[str, int]) -> dict[str, Any]:
-        """What `summary.json` holds; `ground_truth` is filled in by the report."""
+        """Contents of `summary.json`; `ground_truth` is filled in by the report."""
         elapsed_s = time.monotonic() - self._started
         return {
             **self._counts,
@@ -276,11 +251,7 @@ class RunRecorder:
         write_summary(self.folder, self.summary(drops))
 
     def close(self) -> None:
-        """Export the CSV tables, and close the file.
-
-        Raises:
-            OutputError: the folder cannot be written.
-        """
+        """Export the CSV tables, and close the file."""
         try:
             self._file.export(self._settings.localizing)
             with self._file.writing():
@@ -296,7 +267,7 @@ class RunRecorder:
     def _earlier_counts(self, resume: bool) -> dict[str, int]:
         """Count the rows in the file; all frames of a recording that is resumed pass again."""
         facts = self._file.facts() if not resume else {}
-        candidates, closures = self._file.rows("candidates"), len(self._closures)
+        candidates, closures = self._file.rows("candidates"), len(self.earlier_closures)
         return {
             "frames": int(facts.get("frames", 0)),
             "pairs": int(facts.get("pairs", 0)),
@@ -319,11 +290,7 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> None:
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """Read the folder's `summary.json`.
-
-    Raises:
-        UmfError: it is missing, or not what a run writes.
-    """
+    """Read the folder's `summary.json`; an `UmfError` where it is missing, or not what a run writes."""
     path = folder / "summary.json"
     if not path.is_file():
         raise UmfError(f"{folder} holds no finished run: summary.json is missing")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.frames import Frame, Image, Points, ScanMotion
+from umf_ros.core.frames import Frame, Points, ScanMotion
 from umf_ros.core.geometry import Array, invert, relative, transform
 from umf_ros.sensors.buffers import OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
 
+Mask = NDArray[np.bool_]
 Path = tuple[NDArray[np.int64], list[Array]]
 """Stamps and poses `odom_T_body`."""
 
@@ -28,17 +30,13 @@ BINOMIALS = (-1.0, 3.0, -3.0, 1.0)
 STEPS = sum(binomial**2 for binomial in BINOMIALS)
 """The variance of a third difference of independent steps, in variances of one."""
 UNKNOWN_NOISE = np.array([1e-4] * 3 + [2e-5] * 3)
-"""Taken where the history is too short to tell: 1 cm and .25 deg per root of a second; by hand."""
+"""Taken where the history is too short: 1 cm and .25 deg per root of a second; by hand."""
 
 
 def scan_motion(moments_s: Array, span_ns: tuple[int, int], path: Path, odometry: OdometryBuffer) -> ScanMotion:
-    """The motion during a scan.
+    """Return the motion during a scan whose points were measured `moments_s` (N,) s after the frame's stamp.
 
-    Args:
-        moments_s: (N,) when each point was measured, s after the frame's stamp.
-        span_ns: when the first and the last of them was.
-        path: the odometry over the scan, at least one pose.
-        odometry: its latest poses.
+    `span_ns` are the stamps of the first and the last point, `path` the odometry over the scan, at least one pose.
     """
     stamps, poses = path
     lasted_s = float(stamps[-1] - stamps[0]) * 1e-9
@@ -50,13 +48,9 @@ def scan_motion(moments_s: Array, span_ns: tuple[int, int], path: Path, odometry
 def odometry_noise(history: Path, duration_ns: int) -> Array:
     """Variance (6,) that the odometry's error gains in a second: x y z rx ry rz about the body's axes, m^2/s, rad^2/s.
 
-    A rover moves smoothly, and its odometry walks beside it at random or jitters about it. What third differences leave
-    of the steps over the duration of a scan is that noise, as much of it as bends a scan of this duration, whichever
-    of the two it is. Rougher motion counts as noise too: the odometry may not have followed it.
-
-    Args:
-        history: poses before the end of the scan, at about equal distances in time.
-        duration_ns: of the scan.
+    A rover moves smoothly, its odometry beside it at random. Third differences of the steps over the duration of a scan
+    leave this noise, as much of it as bends such a scan. Rougher motion counts as noise too: the odometry may not have
+    followed it. `history` are poses before the end of the scan, at about equal distances in time.
     """
     stamps, poses = history
     if len(stamps) < 2 or duration_ns <= 0:
@@ -84,104 +78,69 @@ MOST = 0.8
 Cube-1's drops a quarter of a scan at most, one written for 0 to 4095 drops all of 0 to 1)."""
 
 
-@dataclass(slots=True)
-class _Tally:
-    """How many returns a limit would have dropped so far."""
-
-    dropped: int = 0
-    seen: int = 0
-
-    def add(self, dropped: NDArray[np.bool_]) -> None:
-        """Count the returns of one scan that the limit is there for."""
-        self.dropped += int(np.count_nonzero(dropped))
-        self.seen += len(dropped)
-
-    @property
-    def fits(self) -> bool:
-        """Whether the limit can be meant for this sensor."""
-        return self.dropped < MOST * self.seen
-
-    @property
-    def share(self) -> str:
-        return f"{100 * self.dropped / max(1, self.seen):.0f} %"
-
-
 class ScanLimits:
     """Drops weak returns and those far above or below the LiDAR.
 
-    A limit of the calibration is applied only as long as it spares enough of what the sensor has seen so far: no
-    scan is lost because its intensities go from 0 to 1, or because its z axis is not the vertical. What was seen is
-    counted from scan to scan, so that one poor scan of the right sensor is filtered like the others. The same scans
-    in the same order are filtered alike.
+    A limit of the calibration is applied only while it spares enough of all that the sensor has seen so far: no scan is
+    lost because its intensities go from 0 to 1, or because its z axis is not the vertical, and one poor scan of the
+    right sensor is filtered like the others. The same scans in the same order are filtered alike.
 
     Args:
         calibration: holds the limits.
-        warn: told once, in one line, when a limit is not applied, and when a scan is empty.
+        warn: called once, with one line, when a limit is not applied, and when a scan is empty.
     """
 
     def __init__(self, calibration: Calibration, warn: Callable[[str], None]) -> None:
-        self._min_intensity = calibration.min_intensity
-        self._max_height_m = calibration.max_height_m
+        self._min_intensity, self._max_height_m = calibration.min_intensity, calibration.max_height_m
         self._warn = warn
-        self._told: set[str] = set()
-        self._weak, self._high = _Tally(), _Tally()
+        self._warned: set[str] = set()
+        self._dropped, self._seen = Counter[str](), Counter[str]()
         self._strongest = 0.0
 
     def apply(self, cloud: Cloud) -> Cloud:
-        """The returns to use; those of the next scan in time."""
-        keep = self._within_height(cloud) & self._strong_enough(cloud)
+        """Return the returns to use; those of the next scan in time."""
+        keep = np.ones(len(cloud.points), bool)
+        if math.isfinite(self._max_height_m):
+            near = np.abs(cloud.points[:, 2]) <= self._max_height_m
+            name = f"max_height_m {self._max_height_m:g}"
+            keep = self._limited(name, near, keep, "is the LiDAR's z axis up?")
+        if self._min_intensity and cloud.intensity is not None:
+            strong = cloud.intensity > self._min_intensity
+            self._strongest = max(self._strongest, float(np.nanmax(cloud.intensity, initial=0.0)))
+            hint = f"intensities reach {self._strongest:.3g}"
+            # where there is no intensity at all, drivers send 0: neither for nor against the limit
+            keep = keep & self._limited(f"min_intensity {self._min_intensity:g}", strong, cloud.intensity > 0, hint)
         if not keep.any():
-            self._tell("empty", f"a scan of {len(keep)} returns, none of which can be used; such scans are skipped")
+            self._warn_once("empty", f"a scan of {len(keep)} returns, none of which can be used; such are skipped")
         return Cloud(
             cloud.points[keep],
             None if cloud.intensity is None else cloud.intensity[keep],
             None if cloud.time_offset_ns is None else cloud.time_offset_ns[keep],
         )
 
-    def _within_height(self, cloud: Cloud) -> NDArray[np.bool_]:
-        near: NDArray[np.bool_] = np.abs(cloud.points[:, 2]) <= self._max_height_m
-        self._high.add(~near)
-        if self._high.fits or math.isinf(self._max_height_m) or not len(near):
-            return near
-        self._tell(
-            "max_height_m",
-            f"max_height_m {self._max_height_m:g} of the calibration would drop {self._high.share} of the returns"
-            " so far: it is not applied; is the LiDAR's z axis up?",
-        )
-        return np.ones_like(near)
+    def _limited(self, limit: str, kept: Mask, counted: Mask, hint: str) -> Mask:
+        """Which returns (N,) a limit keeps: all, if it would drop too many of those counted to be for this sensor."""
+        self._dropped[limit] += int(np.count_nonzero(counted & ~kept))
+        self._seen[limit] += int(np.count_nonzero(counted))
+        dropped, seen = self._dropped[limit], self._seen[limit]
+        if dropped < MOST * seen or not len(kept):
+            return kept
+        if seen:
+            share = f"{100 * dropped / seen:.0f} % of the returns so far"
+            self._warn_once(limit, f"{limit} of the calibration would drop {share}: it is not applied; {hint}")
+        return np.ones_like(kept)
 
-    def _strong_enough(self, cloud: Cloud) -> NDArray[np.bool_]:
-        everything = np.ones(len(cloud.points), bool)
-        if cloud.intensity is None or not self._min_intensity or not len(everything):
-            return everything
-        strong = cloud.intensity > self._min_intensity
-        # where there is no intensity at all, drivers send 0: neither for nor against the limit
-        self._weak.add(~strong[cloud.intensity > 0])
-        self._strongest = max(self._strongest, float(np.nanmax(cloud.intensity, initial=0.0)))
-        if self._weak.fits:
-            return strong
-        if self._strongest > 0:
-            self._tell(
-                "min_intensity",
-                f"min_intensity {self._min_intensity:g} of the calibration would drop {self._weak.share} of the returns"
-                f" so far, whose intensities reach {self._strongest:.3g}: it is not applied",
-            )
-        return everything
-
-    def _tell(self, what: str, text: str) -> None:
-        if what not in self._told:
-            self._told.add(what)
+    def _warn_once(self, kind: str, text: str) -> None:
+        if kind not in self._warned:
+            self._warned.add(kind)
             self._warn(text)
 
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """What a frame is built around: a scan, or an image where there is no LiDAR.
+    """The measurement a frame is built around: a scan in the LiDAR frame, or an image where there is no LiDAR.
 
-    Attributes:
-        stamp_ns: key of the frame.
-        measured_ns: stamp of the message; the points' time offsets count from here.
-        cloud: the scan in the LiDAR frame, or None.
+    `stamp_ns` is the key of the frame, `measured_ns` the stamp of the message: time offsets of points count from there.
     """
 
     stamp_ns: int
@@ -189,7 +148,7 @@ class Anchor:
     cloud: Cloud | None = None
 
     def span_ns(self) -> tuple[int, int]:
-        """When the first and the last point were measured; the key where the driver does not tell."""
+        """Stamps of the first and the last point; the key where the driver sends no times."""
         if self.cloud is None or self.cloud.time_offset_ns is None or not len(self.cloud.points):
             return self.stamp_ns, self.stamp_ns
         offsets = self.cloud.time_offset_ns
@@ -207,14 +166,18 @@ def assemble(
     """Build the frame at `anchor.stamp_ns`: images rectified, motion between the measurements removed."""
     odom_T_body = odometry.at(anchor.stamp_ns)
     points, intensity, motion = _scan(anchor, odometry, calibration, odom_T_body)
-    rectifier = calibration.rectifier
+    exposed = odometry.at(left.stamp_ns) if left else None
+    body_T_camera = calibration.body_T_camera
+    if exposed is not None and odom_T_body is not None:  # at the exposure, in the body frame at the stamp
+        body_T_camera = relative(odom_T_body, exposed) @ body_T_camera
+    rectify = calibration.rectifier.apply if calibration.rectifier else lambda image, side: image
     return Frame(
         stamp_ns=anchor.stamp_ns,
         camera=calibration.camera,
-        body_T_camera=_camera_pose(left, odometry, calibration, odom_T_body),
+        body_T_camera=body_T_camera,
         body_T_lidar=calibration.body_T_lidar,
-        left=_pixels(left, rectifier.left if rectifier else None),
-        right=_pixels(right, rectifier.right if rectifier else None),
+        left=rectify(left.image, 0) if left else None,
+        right=rectify(right.image, 1) if right else None,
         points=points,
         intensity=intensity,
         odom_T_body=odom_T_body,
@@ -222,22 +185,6 @@ def assemble(
         session=session,
         motion=motion,
     )
-
-
-def _pixels(image: StampedImage | None, rectify: Callable[[Image], Image] | None) -> Image | None:
-    if image is None:
-        return None
-    return rectify(image.image) if rectify else image.image
-
-
-def _camera_pose(
-    left: StampedImage | None, odometry: OdometryBuffer, calibration: Calibration, odom_T_body: Array | None
-) -> Array:
-    """Pose of the camera at its exposure in the body frame at the frame's stamp."""
-    exposed = odometry.at(left.stamp_ns) if left else None
-    if exposed is None or odom_T_body is None:
-        return calibration.body_T_camera
-    return relative(odom_T_body, exposed) @ calibration.body_T_camera
 
 
 def _scan(
@@ -264,19 +211,10 @@ def deskew(
     path: tuple[NDArray[np.int64], list[Array]],
     odom_T_body: Array,
 ) -> Points:
-    """Points as they would have been measured from one pose.
+    """Points (N, 3) float32, m, each in the body frame at its own stamp (N,), as measured from the pose `odom_T_body`.
 
-    Between the poses of the path the motion is taken as uniform; before its first and after its last
-    pose the rover is taken to stand.
-
-    Args:
-        points: (N, 3) float32, metres, each in the body frame at its own stamp.
-        point_stamps_ns: (N,) when each point was measured.
-        path: stamps and poses `odom_T_body` of the odometry over the scan, at least one.
-        odom_T_body: the pose to measure from.
-
-    Returns:
-        (N, 3) float32 in the body frame at `odom_T_body`.
+    `path` are stamps and poses of the odometry over the scan, at least one. Between them the motion is taken as
+    uniform; before the first and after the last the rover is taken to stand.
     """
     stamps, poses = path
     moved = np.stack([invert(odom_T_body) @ pose for pose in poses])
@@ -284,20 +222,6 @@ def deskew(
     # relative to the first stamp: nanoseconds since the epoch do not fit a float
     times = (stamps - stamps[0]).astype(float)
     at = (point_stamps_ns - stamps[0]).astype(float)
-    turn = _interpolate(at, times, turns)
-    shift = _interpolate(at, times, moved[:, :3, 3])
-    return _rotate(points, turn) + shift
-
-
-def _interpolate(at: Array, times: Array, values: Array) -> Points:
-    return np.stack([np.interp(at, times, column) for column in values.T], axis=1).astype(np.float32)
-
-
-def _rotate(points: Points, turns: Points) -> Points:
-    """Rodrigues' formula, point by point; `turns` are (N, 3) rotation vectors below half a turn."""
-    angle = np.linalg.norm(turns, axis=1, keepdims=True)
-    sine = np.sinc(angle / np.pi)  # sin(a) / a, also at 0
-    half = np.sinc(angle / (2 * np.pi))
-    cosine = half * half / 2  # (1 - cos(a)) / a^2
-    once = np.cross(turns, points)
-    return np.asarray(points + sine * once + cosine * np.cross(turns, once), np.float32)
+    motion = np.hstack([turns, moved[:, :3, 3]])
+    each = np.stack([np.interp(at, times, column) for column in motion.T], axis=1)
+    return np.asarray(Rotation.from_rotvec(each[:, :3]).apply(points) + each[:, 3:], np.float32)

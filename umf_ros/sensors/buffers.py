@@ -13,18 +13,12 @@ from umf_ros.core.frames import Image
 from umf_ros.core.geometry import Array, interpolate
 
 SURPLUS = "surplus"
-"""Reason of the images that lie nearest to no scan: cameras are faster than LiDARs, nothing is wrong."""
+"""Reason of images that lie nearest to no scan: no fault, cameras are faster than LiDARs."""
 
 
 @dataclass(slots=True)
 class InputCounter:
-    """Messages of one input: `received == used + sum(dropped) + waiting` at any time.
-
-    Attributes:
-        received: messages that arrived.
-        used: messages that became part of a frame, or of the odometry.
-        dropped: the others, by reason.
-    """
+    """Messages of one input: `received == used + sum(dropped) + waiting` at any time; dropped ones by reason."""
 
     received: int = 0
     used: int = 0
@@ -43,11 +37,9 @@ class InputCounter:
 
 @dataclass(slots=True)
 class StampedImage:
-    """An image of the stream.
+    """An image (H, W) uint8 of the stream and the stamp of its exposure.
 
     Attributes:
-        stamp_ns: exposure.
-        image: (H, W) uint8.
         late: whether a scan that might have wanted it was given up before it came.
         used: whether a frame has taken it.
     """
@@ -96,8 +88,7 @@ class ImageBuffer:
 
     def clear(self) -> None:
         """Let go of everything."""
-        while self._images:
-            self._forget(SURPLUS)
+        self.forget_before(2**63)
         self.newest_ns = None
 
     def _forget(self, reason: str) -> None:
@@ -107,12 +98,7 @@ class ImageBuffer:
 
 
 class OdometryBuffer:
-    """The latest poses of the odometry, interpolated.
-
-    Args:
-        length_ns: how far back poses are kept.
-        max_gap_ns: no pose is interpolated across a longer gap.
-    """
+    """The poses of the odometry in the latest `length_ns`, interpolated across gaps up to `max_gap_ns`."""
 
     def __init__(self, length_ns: int, max_gap_ns: int) -> None:
         self._length_ns = length_ns

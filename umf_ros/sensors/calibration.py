@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from umf_ros.core.config import Group, load_preset, problems
+from umf_ros.core.config import Group, Settings, load_preset, problems
 from umf_ros.core.errors import CalibrationError, ConfigError, one_line
 from umf_ros.core.frames import Image, StereoCamera
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose
@@ -23,7 +22,7 @@ LARGEST_IMAGE = 20_000
 
 
 class Pinhole(Group):
-    """Pixels."""
+    """Intrinsics in pixels."""
 
     width: int = Field(gt=0, le=LARGEST_IMAGE)
     height: int = Field(gt=0, le=LARGEST_IMAGE)
@@ -68,7 +67,11 @@ class StereoRectifier:
         right_T_left = invert(left_T_right)
         matrices = [camera.matrix(size) for camera in (left, right)]
         distortions = [np.array(camera.distortion or (0.0,) * 4) for camera in (left, right)]
-        turns, projections = _rectify(matrices, distortions, size, right_T_left)
+        both = matrices[0], distortions[0], matrices[1], distortions[1]
+        turn, shift = right_T_left[:3, :3], right_T_left[:3, 3:]
+        # Bouguet's method, without black borders
+        result = cv2.stereoRectify(*both, size, turn, shift, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)
+        turns, projections = result[:2], result[2:4]
         self._maps = [
             cv2.initUndistortRectifyMap(matrix, distortion, turn, projection[:, :3], size, cv2.CV_16SC2)
             for matrix, distortion, turn, projection in zip(matrices, distortions, turns, projections, strict=True)
@@ -78,36 +81,11 @@ class StereoRectifier:
         baseline = -float(projections[1][0, 3]) / fx
         self.camera = StereoCamera(*size, fx, fy, cx, cy, baseline)
 
-    def left(self, raw: Image) -> Image:
-        """Rectified left image, (H, W) uint8, of a raw one."""
-        return self._apply(raw, 0)
-
-    def right(self, raw: Image) -> Image:
-        """Rectified right image, (H, W) uint8, of a raw one."""
-        return self._apply(raw, 1)
-
-    def _apply(self, raw: Image, side: int) -> Image:
+    def apply(self, raw: Image, side: int) -> Image:
+        """Rectified image, (H, W) uint8, of a raw one; `side` 0: left, 1: right."""
         # area averaging first: the remap below takes four pixels only and would alias
         small = cv2.resize(raw, self._size, interpolation=cv2.INTER_AREA)
         return np.asarray(cv2.remap(small, *self._maps[side], interpolation=cv2.INTER_LINEAR), np.uint8)
-
-
-def _rectify(
-    matrices: list[Array], distortions: list[Array], size: tuple[int, int], right_T_left: Array
-) -> tuple[list[Array], list[Array]]:
-    """Rotations raw to rectified and (3, 4) projections of both cameras (Bouguet), without black borders."""
-    result = cv2.stereoRectify(
-        matrices[0],
-        distortions[0],
-        matrices[1],
-        distortions[1],
-        size,
-        right_T_left[:3, :3],
-        right_T_left[:3, 3:],
-        flags=cv2.CALIB_ZERO_DISPARITY,
-        alpha=0,
-    )
-    return [np.asarray(turn) for turn in result[:2]], [np.asarray(projection) for projection in result[2:4]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,10 +93,8 @@ class Calibration:
     """How the sensors are built and mounted; poses are in the body frame (REP-103).
 
     Attributes:
-        camera: the rectified stereo pair.
-        body_T_camera: pose of the (rectified) left optical frame.
+        camera: the rectified stereo pair; `body_T_camera` is the pose of its left optical frame.
         body_T_lidar: pose of the LiDAR (Cube-1: x right, y forward, z up).
-        body_T_imu: pose of the IMU.
         lidar_time_offset_s: seconds to add to the stamp of a scan.
         min_intensity: returns up to this intensity, in the sensor's unit, are dropped; 0: none.
         max_height_m: returns further than this from the LiDAR's horizontal plane are dropped; infinite: none.
@@ -139,31 +115,23 @@ class Calibration:
         """Width and height of the images that arrive."""
         return self.rectifier.raw_size if self.rectifier else (self.camera.width, self.camera.height)
 
-    def with_poses(self, poses: Mapping[str, Array]) -> Calibration:
-        """Return this calibration with other poses of the sensors, `body_T_camera` or `body_T_lidar` by name."""
-        camera, lidar = (poses.get(f"body_T_{name}") for name in ("camera", "lidar"))
-        return replace(
-            self,
-            body_T_camera=self.body_T_camera if camera is None else camera,
-            body_T_lidar=self.body_T_lidar if lidar is None else lidar,
-        )
-
     def with_camera(self, camera: StereoCamera) -> Calibration:
-        """Return this calibration with the intrinsics of a camera_info.
-
-        A baseline of 0 (no right camera_info) keeps the one known here. The camera_info of raw images
-        describes other pixels than `camera` and is not used.
-        """
-        if self.rectifier is not None:
+        """Return this calibration with the intrinsics of a camera_info; a baseline of 0 keeps the one known here."""
+        if self.rectifier is not None:  # the camera_info of raw images describes other pixels
             return self
         return replace(self, camera=replace(camera, baseline=camera.baseline or self.camera.baseline))
+
+
+def calibration_of(settings: Settings) -> Calibration:
+    """The calibration that the settings name, else that of the data set; raises as `load_calibration`."""
+    return load_calibration(settings.calibration or settings.dataset)
 
 
 def load_calibration(source: str | Path) -> Calibration:
     """Calibration from a YAML file, or of a data set by its name, as in `s3li-etna`.
 
     Raises:
-        CalibrationError: the file cannot be read, or a key is missing, unknown or wrong; names the key.
+        CalibrationError: the file cannot be read, or a key, which is named, is missing, unknown or wrong.
     """
     path = load_preset(str(source)).calibration if source in dataset_names() else Path(source)
     try:
@@ -207,12 +175,9 @@ class _RawPair(Group):
     width: int = Field(gt=0, le=LARGEST_IMAGE)
     height: int = Field(gt=0, le=LARGEST_IMAGE)
 
-    def rectifier(self) -> StereoRectifier:
-        return StereoRectifier(self.left, self.right, self.left_T_right.matrix(), size=(self.width, self.height))
-
 
 class _File(Group):
-    """What a calibration file holds."""
+    """Contents of a calibration file."""
 
     camera: _Camera | None = None
     raw_camera: _RawPair | None = None
@@ -231,12 +196,13 @@ class _File(Group):
 
     def calibration(self) -> Calibration:
         body_T_camera = self.body_T_camera.matrix()
-        rectifier = self.raw_camera.rectifier() if self.raw_camera else None
-        if rectifier is not None:
-            camera, body_T_camera = rectifier.camera, body_T_camera @ rectifier.raw_T_rectified
+        if self.camera is not None:
+            rectifier, camera = None, StereoCamera(**self.camera.model_dump())
         else:
-            assert self.camera is not None
-            camera = StereoCamera(**self.camera.model_dump())
+            raw = self.raw_camera
+            assert raw is not None
+            rectifier = StereoRectifier(raw.left, raw.right, raw.left_T_right.matrix(), size=(raw.width, raw.height))
+            camera, body_T_camera = rectifier.camera, body_T_camera @ rectifier.raw_T_rectified
         return Calibration(
             camera,
             body_T_camera,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,29 +16,26 @@ from umf_ros.sensors.calibration import LARGEST_IMAGE
 
 # encoding -> channels, bytes per channel, OpenCV's conversion to grey
 _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
-    "mono8": (1, 1, None),
-    "8UC1": (1, 1, None),
+    **dict.fromkeys(("mono8", "8UC1"), (1, 1, None)),
     "mono16": (1, 2, None),
-    "rgb8": (3, 1, cv2.COLOR_RGB2GRAY),
-    "bgr8": (3, 1, cv2.COLOR_BGR2GRAY),
-    "rgba8": (4, 1, cv2.COLOR_RGBA2GRAY),
-    "bgra8": (4, 1, cv2.COLOR_BGRA2GRAY),
+    **{
+        f"{name}8": (len(name), 1, getattr(cv2, f"COLOR_{name.upper()}2GRAY"))
+        for name in ("rgb", "bgr", "rgba", "bgra")
+    },
     # ROS names the upper left 2x2 pixels; the names of OpenCV's older constants start one pixel further
-    "bayer_rggb8": (1, 1, cv2.COLOR_BayerRGGB2GRAY),
-    "bayer_bggr8": (1, 1, cv2.COLOR_BayerBGGR2GRAY),
-    "bayer_gbrg8": (1, 1, cv2.COLOR_BayerGBRG2GRAY),
-    "bayer_grbg8": (1, 1, cv2.COLOR_BayerGRBG2GRAY),
-    "yuv422": (2, 1, cv2.COLOR_YUV2GRAY_UYVY),
-    "uyvy": (2, 1, cv2.COLOR_YUV2GRAY_UYVY),
-    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2GRAY_YUY2),
-    "yuyv": (2, 1, cv2.COLOR_YUV2GRAY_YUY2),
+    **{
+        f"bayer_{name}8": (1, 1, getattr(cv2, f"COLOR_Bayer{name.upper()}2GRAY"))
+        for name in ("rggb", "bggr", "gbrg", "grbg")
+    },
+    **dict.fromkeys(("yuv422", "uyvy"), (2, 1, cv2.COLOR_YUV2GRAY_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, 1, cv2.COLOR_YUV2GRAY_YUY2)),
 }
 
 # sensor_msgs/PointField.datatype
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 LAST_STAMP_NS = 2**31 * 10**9
-"""What a stamp with seconds of 32 bits stays below."""
+"""Stamps with seconds of 32 bits stay below."""
 FURTHEST_M = 1e7
 """No odometry is further from its origin: a quarter of the earth."""
 NARROWEST_RAD, WIDEST_RAD = 0.02, 3.1
@@ -46,7 +43,7 @@ NARROWEST_RAD, WIDEST_RAD = 0.02, 3.1
 LARGEST_RECORD = 4096
 """Bytes of a point; drivers have some dozens."""
 INTENSITY_NAMES = ("intensity", "reflectivity", "reflectance", "i")
-"""Fields of the strength of a return, by whoever's driver."""
+"""Fields of the strength of a return, by driver."""
 TIME_NAMES = ("point_time_offset", "offset_time", "t", "time", "time_offset", "timestamp")
 """Fields of the time of a point: whole numbers are ns, others s; Blickfeld, Livox, Ouster, Velodyne, Hesai."""
 FURTHEST_RETURN_M = 1e4
@@ -58,12 +55,12 @@ NO_RETURN_RANGE_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """The real returns of one scan.
+    """The real returns of one scan, with intensities and times as far as the driver sends them.
 
     Attributes:
         points: (N, 3) float32, metres, LiDAR frame.
-        intensity: (N,) float32, or None when the driver sends none.
-        time_offset_ns: (N,) int64 after the stamp of the message, or None when the driver sends none.
+        intensity: (N,) float32.
+        time_offset_ns: (N,) int64 after the stamp of the message.
     """
 
     points: Points
@@ -71,14 +68,8 @@ class Cloud:
     time_offset_ns: NDArray[np.int64] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class OdometrySample:
-    """One pose of the odometry.
-
-    Attributes:
-        stamp_ns: when.
-        odom_T_body: (4, 4) pose.
-    """
+class OdometrySample(NamedTuple):
+    """One pose (4, 4) of the odometry and its stamp."""
 
     stamp_ns: int
     odom_T_body: Array
@@ -88,8 +79,7 @@ def stamp_ns(message: Any) -> int:
     """Stamp of the message's header in nanoseconds.
 
     Raises:
-        MessageError: of kind "stamp" when the driver has not set it, for it would look like a restart of the recording,
-            or when there is no such time.
+        MessageError: of kind "stamp" when there is no such time, or none is set: that looks like a restart.
     """
     stamp = message.header.stamp
     nanoseconds = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
@@ -101,13 +91,16 @@ def stamp_ns(message: Any) -> int:
 
 
 def decode_image(message: Any) -> Image:
-    """Grey image of a sensor_msgs/Image: (H, W) uint8, which may share the message's memory.
+    """Grey image (H, W) uint8 of a sensor_msgs/Image, which may share its memory, or of a CompressedImage.
 
     16-bit images are taken as full scale: the upper byte is kept.
 
     Raises:
-        MessageError: of kind "encoding", "size", "step" or "truncated".
+        MessageError: of kind "encoding", "size", "step" or "truncated"; of kind "compressed" when the content is no
+            picture, or one of depths.
     """
+    if not hasattr(message, "encoding"):
+        return _decode_compressed(message)
     if message.encoding not in _ENCODINGS:
         raise MessageError("encoding", f"image encoding {message.encoding!r} is not supported")
     channels, size, conversion = _ENCODINGS[message.encoding]
@@ -135,14 +128,13 @@ def _image_rows(message: Any, row_bytes: int) -> Image:
 
 
 def decode_cloud(message: Any) -> Cloud:
-    """Real returns of a sensor_msgs/PointCloud2; fields are found by name and read by data type.
-
-    Points that are not finite and dummies for pulses without a return are left out, so the result may
-    be empty. `intensity` and `point_time_offset` (ns) may be missing.
+    """Real returns, possibly none, of a Livox CustomMsg or a PointCloud2, its fields found by name and data type.
 
     Raises:
         MessageError: of kind "fields", "datatype", "step" or "truncated".
     """
+    if not hasattr(message, "fields"):
+        return _decode_livox(message)
     records = _cloud_records(message)
     names = records.dtype.names or ()
     points = np.stack([records[axis] for axis in "xyz"], axis=1, dtype=np.float32, casting="unsafe")
@@ -165,7 +157,7 @@ def real_returns(points: Points, intensity: Points | None) -> NDArray[np.bool_]:
 
 
 def _time_offsets_ns(records: NDArray[Any], message: Any) -> NDArray[np.int64] | None:
-    """(N,) ns after the message's stamp: drivers count from it, or since the epoch; None where they do not tell."""
+    """(N,) ns after the message's stamp, from which or since the epoch drivers count; None where there are no times."""
     name = next((name for name in TIME_NAMES if name in (records.dtype.names or ())), None)
     if name is None:
         return None
@@ -202,35 +194,25 @@ def _cloud_records(message: Any) -> NDArray[Any]:
     data = np.frombuffer(message.data, np.uint8)
     if data.size < row_step * (message.height - 1) + row_bytes:
         raise MessageError("truncated", f"cloud holds {data.size} bytes of {row_step * message.height}")
-    rows = [data[start : start + row_bytes] for start in range(0, row_step * message.height, row_step)]
-    return (rows[0] if len(rows) == 1 else np.concatenate(rows)).view(dtype)
+    shape, strides = (message.height, message.width), (row_step, message.point_step)
+    return np.ndarray(shape, dtype, data, strides=strides).reshape(-1)
 
 
 def _record_type(fields: list[Any], point_step: int, order: str) -> np.dtype[Any]:
     formats = []
     for field in fields:
         if field.datatype not in _DATATYPES or field.count > 1:
-            raise MessageError(
-                "datatype", f"cloud field {field.name} has datatype {field.datatype} and count {field.count}"
-            )
+            text = f"cloud field {field.name} has datatype {field.datatype} and count {field.count}"
+            raise MessageError("datatype", text)
         formats.append(np.dtype(order + _DATATYPES[field.datatype]))
         if field.offset + formats[-1].itemsize > point_step:
             raise MessageError("step", f"cloud field {field.name} lies outside the point step of {point_step} bytes")
-    layout = {
-        "names": [field.name for field in fields],
-        "formats": formats,
-        "offsets": [field.offset for field in fields],
-        "itemsize": point_step,
-    }
-    return np.dtype(layout)  # type: ignore[call-overload]
+    names, offsets = [field.name for field in fields], [field.offset for field in fields]
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": point_step})
 
 
 def decode_odometry(message: Any) -> OdometrySample:
-    """Pose of a nav_msgs/Odometry.
-
-    Raises:
-        MessageError: of kind "pose" when it is not finite or its quaternion is not of unit length.
-    """
+    """Pose of a nav_msgs/Odometry; raises as `decode_pose`."""
     return OdometrySample(stamp_ns(message), decode_pose(message.pose.pose))
 
 
@@ -276,20 +258,15 @@ def _projection(info: Any, name: str) -> Array:
     matrix = np.array(info.p, dtype=float).reshape(3, 4)
     if not matrix.any():
         matrix[:, :3] = np.array(info.k, dtype=float).reshape(3, 3)
-    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0 and info.width > 0 and info.height > 0):
-        raise MessageError("camera_info", f"{name} camera_info is not calibrated")
-    _check_pinhole(matrix, info, name)
-    return matrix
-
-
-def _check_pinhole(matrix: Array, info: Any, name: str) -> None:
-    """Refuse a camera that nobody can build."""
     width, height, fx, fy = float(info.width), float(info.height), matrix[0, 0], matrix[1, 1]
+    if not (np.isfinite(matrix).all() and min(width, height, fx, fy) > 0):
+        raise MessageError("camera_info", f"{name} camera_info is not calibrated")
     views = [2 * np.arctan2(size / 2, focal) for size, focal in ((width, fx), (height, fy))]
     centre = 0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height
     if not (all(NARROWEST_RAD < view < WIDEST_RAD for view in views) and 0.5 < fx / fy < 2 and centre):
         numbers = f"{width:.0f} x {height:.0f} pixels, fx {fx:.3g}, fy {fy:.3g}, centre {matrix[0, 2]:.3g}"
         raise MessageError("camera_info", f"{name} camera_info of no real camera: {numbers}, {matrix[1, 2]:.3g}")
+    return matrix
 
 
 IMAGE, COMPRESSED, CLOUD = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2"
@@ -323,33 +300,24 @@ uint8 line
 """As the drivers of Livox define it; recordings of them carry it too."""
 
 
-def decode_any_image(message: Any) -> Image:
-    """Grey image (H, W) uint8 of a sensor_msgs/Image or a sensor_msgs/CompressedImage.
-
-    Raises:
-        MessageError: as of `decode_image`; of kind "compressed" when the content is no picture, or one of depths.
-    """
-    if hasattr(message, "encoding"):
-        return decode_image(message)
+def _decode_compressed(message: Any) -> Image:
     if "compressedDepth" in message.format:
         raise MessageError("compressed", "compressed depth image: name the topic of the camera")
-    content = np.frombuffer(message.data, np.uint8)
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(content, flags) if len(content) else None
+    image = decode_picture(message.data)
     if image is None:
         raise MessageError("compressed", f"compressed image of format {message.format!r} cannot be read")
     if "bayer" in message.format:  # the mosaic was compressed as it lies: smooth it as a demosaicing would
-        image = cv2.resize(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), image.shape[::-1])
-    return np.asarray(image, np.uint8)
+        half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        image = np.asarray(cv2.resize(half, image.shape[::-1]), np.uint8)
+    return image
 
 
-def decode_any_cloud(message: Any) -> Cloud:
-    """Real returns of a sensor_msgs/PointCloud2 or a Livox CustomMsg.
-
-    Raises:
-        MessageError: as of `decode_cloud`.
-    """
-    return decode_cloud(message) if hasattr(message, "fields") else _decode_livox(message)
+def decode_picture(content: bytes) -> Image | None:
+    """(H, W) uint8 grey image of a compressed file, its pixels as the camera sees them; None where it is none."""
+    data = np.frombuffer(content, np.uint8)
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # a photograph that was turned for people is another
+    image = cv2.imdecode(data, flags) if len(data) else None
+    return None if image is None else np.asarray(image, np.uint8)
 
 
 def _decode_livox(message: Any) -> Cloud:

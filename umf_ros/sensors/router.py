@@ -1,4 +1,4 @@
-"""The way of a message into the synchronizer: the same live and offline."""
+"""Route messages into the synchronizer: the same live and offline."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from umf_ros.core.config import Topics
 from umf_ros.core.errors import MessageError
 from umf_ros.sensors.decode import (
     OdometrySample,
-    decode_any_cloud,
-    decode_any_image,
     decode_camera_info,
+    decode_cloud,
+    decode_image,
     decode_odometry,
     stamp_ns,
 )
@@ -40,7 +40,7 @@ def wanted_inputs(topics: Topics) -> set[Input]:
 class MessageRouter:
     """Decodes the messages of the input topics and adds them to a synchronizer.
 
-    A message that cannot be used is counted by kind and skipped; the first of each kind is told.
+    A message that cannot be used is counted by kind and skipped, with a warning for the first of each kind and topic.
     """
 
     def __init__(
@@ -52,13 +52,8 @@ class MessageRouter:
         mounting: TfExtrinsics | None = None,
         odometry_frames: OdometryFrames | None = None,
     ) -> None:
-        """Warn with one line per kind of fault and topic; `hear_odometry` gets every sample at its full rate.
-
-        `mounting` says where the sensors are on the body, and `odometry_frames` whose poses the odometry holds; None:
-        as the calibration says, and the body's.
-        """
-        self._mounting = mounting
-        self._odometry_frames = odometry_frames
+        """Give `hear_odometry` every sample; `mounting` None: as calibrated; `odometry_frames` None: of the body."""
+        self._mounting, self._odometry_frames = mounting, odometry_frames
         self._synchronizer = synchronizer
         self._hear_odometry = hear_odometry
         self._warn = warn
@@ -80,12 +75,14 @@ class MessageRouter:
         entry = self._entries[topic]
         try:
             if entry == ODOMETRY:
-                self.take_odometry(self._of_body(message, decode_odometry(message)))
+                sample, frames = decode_odometry(message), self._odometry_frames
+                pose = frames.to_body(message, sample.odom_T_body) if frames else sample.odom_T_body
+                self.take_odometry(OdometrySample(sample.stamp_ns, pose))
             elif entry in ("left_info", "right_info"):
                 self._use_info(entry, message)
             else:
                 self._mount(entry, message)
-                decode = decode_any_cloud if entry == "cloud" else decode_any_image
+                decode = decode_cloud if entry == "cloud" else decode_image
                 self._synchronizer.add(_INPUTS[entry], stamp_ns(message), decode(message))
         except MessageError as error:
             self.refuse(topic, error)
@@ -104,11 +101,6 @@ class MessageRouter:
         if (topic, error.kind) not in self._warned:
             self._warned.add((topic, error.kind))
             self._warn(f"{topic}: {error}; such messages are skipped")
-
-    def _of_body(self, message: Any, sample: OdometrySample) -> OdometrySample:
-        if self._odometry_frames is None:
-            return sample
-        return OdometrySample(sample.stamp_ns, self._odometry_frames.to_body(message, sample.odom_T_body))
 
     def _mount(self, entry: str, message: Any) -> None:
         if self._mounting is None or entry == "right_image":

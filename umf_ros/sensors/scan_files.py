@@ -6,8 +6,6 @@ import io
 import logging
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,296 +18,38 @@ from umf_ros.core.frames import Frame, Image, Points, StereoCamera
 from umf_ros.sensors.assembly import Anchor, ScanLimits, assemble
 from umf_ros.sensors.buffers import OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
-from umf_ros.sensors.decode import FURTHEST_RETURN_M, Cloud, real_returns
+from umf_ros.sensors.decode import FURTHEST_RETURN_M, Cloud, decode_picture, real_returns
+
+_log = logging.getLogger(__name__)
 
 Columns = dict[str, NDArray[Any]]
+Record = np.dtype[Any]
+
 MOST_READABLE = 0.9
 """Share of the points of a text that have to be readable: raw bytes may hold line ends."""
-_KINDS = {"F": "f", "U": "u", "I": "i"}
+MOST_STRETCH = 0.01
+"""Relative difference of the aspect of an image from the calibration's that rounding can explain."""
+OUT_OF_REACH = "no return within reach: expected metres, from the sensor"
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
+NO_CAMERA = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)
+UNCALIBRATED = Calibration(NO_CAMERA, np.eye(4), np.eye(4))
+"""Of files that come alone: a scan is in the body frame and seen from its origin; images have no geometry."""
 
-
-@dataclass(frozen=True, slots=True)
-class _Header:
-    """What stands before the data.
-
-    Attributes:
-        record: one point as it is stored.
-        points: how many there are to be; 0 where the header does not know.
-        data: ascii, binary or binary_compressed.
-        size: bytes of the header.
-    """
-
-    record: np.dtype[Any]
-    points: int
-    data: str
-    size: int
-
-
-def parse_pcd(content: bytes) -> Columns:
-    """The fields of the points, (N,) each or (N, count), by name in lower case.
-
-    The number of points is what the data hold where the header says otherwise (WIDTH 0, a recording that breaks
-    off); fields may repeat `_` for padding.
-
-    Raises:
-        SensorFileError: it is no such file, or the data are not what the header says.
-    """
-    header = _read_header(content)
-    body = content[header.size :]
-    if header.data == "ascii":
-        return _parse_text(body, header)
-    if header.data == "binary":
-        return _unpack(body, header)
-    if header.data == "binary_compressed":
-        return _unpack_by_field(_decompress(body), header)
-    raise SensorFileError(f"PCD data of kind {header.data!r}")
-
-
-def _read_header(content: bytes) -> _Header:
-    entries: dict[str, list[str]] = {}
-    start = 0
-    while "DATA" not in entries:
-        end = content.find(b"\n", start)
-        if end < 0:
-            raise SensorFileError("a PCD file without a DATA line")
-        words = content[start:end].decode("ascii", "replace").split()
-        start = end + 1
-        if words and not words[0].startswith("#"):
-            entries[words[0].upper()] = words[1:]
-    try:
-        points = int(entries.get("POINTS", ["0"])[0])
-        return _Header(_record_type(entries), points, entries["DATA"][0].lower(), start)
-    except (ValueError, IndexError, TypeError):
-        raise SensorFileError("a PCD header that cannot be read") from None
-
-
-def _record_type(entries: dict[str, list[str]]) -> np.dtype[Any]:
-    names = [name.lower() for name in entries.get("FIELDS", entries.get("COLUMNS", []))]
-    if not names:
-        raise SensorFileError("a PCD file without FIELDS")
-    unique = [name if names.count(name) == 1 else f"{name}{number}" for number, name in enumerate(names)]
-    sizes = entries.get("SIZE", ["4"] * len(names))
-    kinds = entries.get("TYPE", ["F"] * len(names))
-    counts = entries.get("COUNT", ["1"] * len(names))
-    fields: list[Any] = []
-    for name, size, kind, count in zip(unique, sizes, kinds, counts, strict=True):
-        if kind.upper() not in _KINDS:
-            raise SensorFileError(f"PCD field of type {kind!r}")
-        one = f"<{_KINDS[kind.upper()]}{size}"
-        fields.append((name, one) if int(count) == 1 else (name, one, (int(count),)))
-    return np.dtype(fields)
-
-
-def _parse_text(body: bytes, header: _Header) -> Columns:
-    names = header.record.names or ()
-    widths = [int(np.prod(header.record[name].shape)) for name in names]
-    try:
-        numbers = np.array(body.decode("ascii").split(), dtype=np.float64)
-    except ValueError:
-        return _parse_leading(body, header, widths)
-    whole = len(numbers) // sum(widths)
-    rows = numbers[: whole * sum(widths)].reshape(whole, -1)[: header.points or whole]
-    parts = np.split(rows, np.cumsum(widths)[:-1], axis=1)
-    return {name: part[:, 0] if part.shape[1] == 1 else part for name, part in zip(names, parts, strict=True)}
-
-
-def _parse_leading(body: bytes, header: _Header, widths: list[int]) -> Columns:
-    """Fields up to the last of x, y and z, for files whose other fields hold raw bytes (Livox `tag line`).
-
-    Raises:
-        SensorFileError: these are no numbers either.
-    """
-    names = list(header.record.names or ())
-    last = max((names.index(name) for name in "xyz" if name in names), default=-1) + 1
-    rows = []
-    for line in body.split(b"\n"):
-        words = line.split(maxsplit=sum(widths[:last]))[: sum(widths[:last])]
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            continue
-        if last and len(values) == sum(widths[:last]):
-            rows.append(values)
-    if not rows or len(rows) < MOST_READABLE * header.points:
-        raise SensorFileError("PCD data that are not numbers")
-    parts = np.split(np.array(rows), np.cumsum(widths[:last])[:-1], axis=1)
-    return {name: part[:, 0] if part.shape[1] == 1 else part for name, part in zip(names, parts, strict=False)}
-
-
-def _unpack(body: bytes, header: _Header) -> Columns:
-    stored = len(body) // header.record.itemsize
-    records = np.frombuffer(body, header.record, min(header.points or stored, stored))
-    return {name: records[name] for name in header.record.names or ()}
-
-
-def _unpack_by_field(body: bytes, header: _Header) -> Columns:
-    count = len(body) // header.record.itemsize
-    columns: Columns = {}
-    start = 0
-    for name in header.record.names or ():
-        kind = header.record[name]
-        columns[name] = np.frombuffer(body, np.dtype((kind.base, kind.shape)), count, start)
-        start += count * kind.itemsize
-    return columns
-
-
-def _decompress(body: bytes) -> bytes:
-    """The bytes that an LZF stream, with its two lengths before it, stands for."""
-    if len(body) < 8:
-        raise SensorFileError("PCD data that break off")
-    packed_size, size = struct.unpack_from("<II", body)
-    packed = body[8 : 8 + packed_size]
-    found = bytearray()
-    try:
-        at = 0
-        while at < len(packed):
-            at = _decompress_one(packed, at, found)
-    except IndexError:
-        raise SensorFileError("PCD data that break off") from None
-    if len(found) != size:
-        raise SensorFileError(f"PCD data of {len(found)} bytes, {size} expected")
-    return bytes(found)
-
-
-def _decompress_one(packed: bytes, at: int, found: bytearray) -> int:
-    """Append what one item of the stream stands for; returns where the next begins."""
-    control = packed[at]
-    if control < 32:  # so many bytes and one more as they are
-        found += packed[at + 1 : at + 2 + control]
-        return at + 2 + control
-    length = control >> 5
-    at += 1
-    if length == 7:
-        length += packed[at]
-        at += 1
-    start = len(found) - ((control & 31) << 8) - packed[at] - 1
-    if start < 0:
-        raise SensorFileError("PCD data that are damaged")
-    run = found[start : start + length + 2]
-    while len(run) < length + 2:  # it overlaps itself: a repetition
-        run += run[: length + 2 - len(run)]
-    found += run
-    return at + 1
-
-
-_TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
+_PCD_KINDS = {"F": "f", "U": "u", "I": "i"}
+_PLY_KINDS = {
+    **{"char": "i1", "short": "i2", "int": "i4", "uchar": "u1", "ushort": "u2", "uint": "u4"},
+    **{np.dtype(kind).name: kind for kind in ("i1", "i2", "i4", "u1", "u2", "u4", "f4", "f8")},
+    **{"float": "f4", "double": "f8", "list": "list"},
 }
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
-LIST = "list"
-
-
-@dataclass(slots=True)
-class _Element:
-    """A kind of record: its name, how many there are, and the names and types of its properties."""
-
-    name: str
-    count: int
-    properties: list[tuple[str, str]] = field(default_factory=list)
-
-    def record(self, order: str) -> np.dtype[Any]:
-        """One record of a binary file.
-
-        Raises:
-            SensorFileError: a property is a list, whose length varies.
-        """
-        if any(kind == LIST for _, kind in self.properties):
-            raise SensorFileError(f"a PLY file whose element {self.name} has lists")
-        return np.dtype([(name, order + kind) for name, kind in self.properties])
-
-
-def parse_ply(content: bytes) -> Columns:
-    """The properties of the vertices, (N,) each, by name in lower case.
-
-    Raises:
-        SensorFileError: it is no such file, or the data are not what the header says.
-    """
-    if not content.startswith(b"ply"):
-        raise SensorFileError("no PLY file")
-    end = content.find(b"end_header")
-    line_end = content.find(b"\n", end)
-    if end < 0 or line_end < 0:
-        raise SensorFileError("a PLY header that breaks off")
-    try:
-        form, elements = _ply_read_header(content[:end].decode("ascii", "replace"))
-    except (ValueError, IndexError, KeyError):
-        raise SensorFileError("a PLY header that cannot be read") from None
-    before = [element for element in elements[: _vertices(elements)] if element.count]
-    vertices, body = elements[_vertices(elements)], content[line_end + 1 :]
-    if form == "ascii":
-        return _ply_parse_text(body, sum(element.count for element in before), vertices)
-    order = _ORDERS[form]
-    start = sum(element.count * element.record(order).itemsize for element in before)
-    record = vertices.record(order)
-    if len(body) < start + vertices.count * record.itemsize:
-        raise SensorFileError(f"PLY data that break off before {vertices.count} vertices")
-    records = np.frombuffer(body, record, vertices.count, start)
-    return {name: records[name] for name in record.names or ()}
-
-
-def _ply_read_header(text: str) -> tuple[str, list[_Element]]:
-    form, elements = "", []
-    for line in text.splitlines()[1:]:
-        words = line.split()
-        if not words or words[0] in ("comment", "obj_info"):
-            continue
-        if words[0] == "format":
-            form = words[1]
-        elif words[0] == "element":
-            elements.append(_Element(words[1], int(words[2])))
-        elif words[0] == "property":
-            kind = LIST if words[1] == LIST else _TYPES[words[1]]
-            elements[-1].properties.append((words[-1].lower(), kind))
-    if form not in _ORDERS:
-        raise SensorFileError(f"PLY data of format {form!r}")
-    return form, elements
-
-
-def _vertices(elements: list[_Element]) -> int:
-    for index, element in enumerate(elements):
-        if element.name == "vertex":
-            return index
-    raise SensorFileError("a PLY file without vertices")
-
-
-def _ply_parse_text(body: bytes, skipped: int, vertices: _Element) -> Columns:
-    lines = [line for line in body.splitlines() if line.strip()][skipped : skipped + vertices.count]
-    if len(lines) < vertices.count:
-        raise SensorFileError(f"PLY data that break off before {vertices.count} vertices")
-    names = [name for name, _ in vertices.properties]
-    try:
-        rows = np.array(b" ".join(lines).split(), dtype=np.float64).reshape(-1, len(names))
-    except ValueError:
-        raise SensorFileError("PLY data that are not numbers") from None
-    return {name: rows[:, column] for column, name in enumerate(names)}
-
-
+_PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 _INTENSITY = ("intensity", "scalar_intensity", "reflectivity", "reflectance", "remission", "i")
 """Names under which drivers and CloudCompare store the strength of a return, the usual ones first."""
 _MOST_NEGATIVE = 0.01
 """Share of negative numbers that no column of intensities has: every other coordinate is negative."""
 
 
-OUT_OF_REACH = "no return within reach: expected metres, from the sensor"
-
-
 def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
-    """The real returns of one scan, in the frame of the file.
+    """Read the real returns of one scan, in the frame of the file.
 
     Args:
         path: .pcd (ascii, binary, binary_compressed), .ply (ascii, binary), or .npy and .bin of (N, 3) or (N, 4)
@@ -319,10 +59,12 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
     Raises:
         SensorFileError: the file cannot be read, is none of these, or holds no return; names it.
     """
-    if path.suffix.lower() not in SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
         raise SensorFileError(f"{path} is no scan: expected {either(SUFFIXES)}")
     try:
-        columns = _PARSERS[path.suffix.lower()](path.read_bytes(), bin_columns)
+        content = path.read_bytes()
+        columns = _parse_bin(content, bin_columns) if suffix == ".bin" else _PARSERS[suffix](content)
         cloud = _cloud_of(columns)
     except OSError as error:
         raise SensorFileError(f"cannot read {path}: {error.strerror}") from None
@@ -331,12 +73,9 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
     except Exception as error:  # damaged bytes provoke anything
         raise SensorFileError(f"{path} is damaged: {one_line(error)}") from None
     if not len(cloud.points):
-        raise SensorFileError(f"{path} has {OUT_OF_REACH}" if _has_far_points(columns) else f"{path} holds no return")
+        far = any(bool((np.abs(columns[axis]) > FURTHEST_RETURN_M).any()) for axis in "xyz")
+        raise SensorFileError(f"{path} has {OUT_OF_REACH}" if far else f"{path} holds no return")
     return cloud
-
-
-def _has_far_points(columns: Columns) -> bool:
-    return any(bool((np.abs(columns[axis]) > FURTHEST_RETURN_M).any()) for axis in "xyz")
 
 
 def _cloud_of(columns: Columns) -> Cloud:
@@ -348,6 +87,206 @@ def _cloud_of(columns: Columns) -> Cloud:
     intensity = None if name is None else columns[name].astype(np.float32)
     real = real_returns(points, intensity)
     return Cloud(points[real], None if intensity is None else intensity[real])
+
+
+def parse_pcd(content: bytes) -> Columns:
+    """Return the fields of the points, (N,) each or (N, count), by name in lower case.
+
+    The data decide how many there are where the header says otherwise (WIDTH 0, a file that breaks off).
+
+    Raises:
+        SensorFileError: it is no such file, or the data are not what the header says.
+    """
+    entries: dict[str, list[str]] = {}
+    start = 0
+    while "DATA" not in entries:
+        end = content.find(b"\n", start)
+        if end < 0:
+            raise SensorFileError("a PCD file without a DATA line")
+        words = content[start:end].decode("ascii", "replace").split()
+        start = end + 1
+        if words and not words[0].startswith("#"):
+            entries[words[0].upper()] = words[1:]
+    try:
+        record, kind = _pcd_record(entries), entries["DATA"][0].lower()
+        points = int(entries.get("POINTS", ["0"])[0])
+    except (ValueError, IndexError, TypeError):
+        raise SensorFileError("a PCD header that cannot be read") from None
+    body = content[start:]
+    if kind == "ascii":
+        return _parse_text(body, record, points)
+    if kind == "binary":
+        stored = len(body) // record.itemsize
+        return _unpack(body, record, min(points or stored, stored))
+    if kind == "binary_compressed":
+        return _unpack_by_field(_decompress(body), record)
+    raise SensorFileError(f"PCD data of kind {kind!r}")
+
+
+def _pcd_record(entries: dict[str, list[str]]) -> Record:
+    """One point as a PCD file stores it."""
+    names = [name.lower() for name in entries.get("FIELDS", entries.get("COLUMNS", []))]
+    if not names:
+        raise SensorFileError("a PCD file without FIELDS")
+    unique = [name if names.count(name) == 1 else f"{name}{number}" for number, name in enumerate(names)]
+    sizes, kinds, counts = (
+        entries.get(key, [default] * len(names)) for key, default in (("SIZE", "4"), ("TYPE", "F"), ("COUNT", "1"))
+    )
+    fields: list[Any] = []
+    for name, size, kind, count in zip(unique, sizes, kinds, counts, strict=True):
+        if kind.upper() not in _PCD_KINDS:
+            raise SensorFileError(f"PCD field of type {kind!r}")
+        one = f"<{_PCD_KINDS[kind.upper()]}{size}"
+        fields.append((name, one) if int(count) == 1 else (name, one, (int(count),)))
+    return np.dtype(fields)
+
+
+def _unpack(body: bytes, record: Record, count: int, start: int = 0) -> Columns:
+    records = np.frombuffer(body, record, count, start)
+    return {name: records[name] for name in record.names or ()}
+
+
+def _unpack_by_field(body: bytes, record: Record) -> Columns:
+    count = len(body) // record.itemsize
+    columns: Columns = {}
+    start = 0
+    for name in record.names or ():
+        kind = record[name]
+        columns[name] = np.frombuffer(body, np.dtype((kind.base, kind.shape)), count, start)
+        start += count * kind.itemsize
+    return columns
+
+
+def _parse_text(body: bytes, record: Record, points: int) -> Columns:
+    """Return the fields of points in ASCII, at most so many as are to be; 0: all there are.
+
+    Where other fields hold raw bytes (Livox `tag line`), those up to the last of x, y and z are read.
+
+    Raises:
+        SensorFileError: these are no numbers either.
+    """
+    names = list(record.names or ())
+    widths = [int(np.prod(record[name].shape)) for name in names]
+    try:
+        numbers = np.array(body.decode("ascii").split(), dtype=np.float64)
+        whole = len(numbers) // sum(widths)
+        rows = numbers[: whole * sum(widths)].reshape(-1, sum(widths))[: points or whole]
+    except ValueError:
+        last = max((names.index(name) for name in "xyz" if name in names), default=-1) + 1
+        widths = widths[:last]
+        rows = np.array(_leading_numbers(body, sum(widths)))
+        if not len(rows) or len(rows) < MOST_READABLE * points:
+            raise SensorFileError("data that are not numbers") from None
+    parts = np.split(rows, np.cumsum(widths)[:-1], axis=1)
+    return {name: part[:, 0] if part.shape[1] == 1 else part for name, part in zip(names, parts, strict=False)}
+
+
+def _leading_numbers(body: bytes, width: int) -> list[list[float]]:
+    """So many numbers at the start of each line; lines that begin otherwise are left out."""
+    rows = []
+    for line in body.split(b"\n") if width else ():
+        words = line.split(maxsplit=width)[:width]
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            continue
+        if len(values) == width:
+            rows.append(values)
+    return rows
+
+
+def _decompress(body: bytes) -> bytes:
+    """The bytes that an LZF stream, with its two lengths before it, stands for."""
+    found = bytearray()
+    try:
+        packed_size, size = struct.unpack_from("<II", body)
+        packed, at = body[8 : 8 + packed_size], 0
+        while at < len(packed):
+            control, at = packed[at], at + 1
+            if control < 32:  # so many bytes and one more as they are
+                found += packed[at : at + control + 1]
+                at += control + 1
+                continue
+            length = (control >> 5) + 2
+            if length == 9:
+                length, at = length + packed[at], at + 1
+            start, at = len(found) - ((control & 31) << 8) - packed[at] - 1, at + 1
+            if start < 0:
+                raise SensorFileError("PCD data that are damaged")
+            run = found[start : start + length]
+            found += (run * -(-length // len(run)))[:length]  # what overlaps itself is a repetition
+    except (IndexError, struct.error):
+        raise SensorFileError("PCD data that break off") from None
+    if len(found) != size:
+        raise SensorFileError(f"PCD data of {len(found)} bytes, {size} expected")
+    return bytes(found)
+
+
+def parse_ply(content: bytes) -> Columns:
+    """Return the properties of the vertices, (N,) each, by name in lower case.
+
+    Raises:
+        SensorFileError: it is no such file, or the data are not what the header says.
+    """
+    if not content.startswith(b"ply"):
+        raise SensorFileError("no PLY file")
+    end = content.find(b"end_header")
+    line_end = content.find(b"\n", end)
+    if end < 0 or line_end < 0:
+        raise SensorFileError("a PLY header that breaks off")
+    try:
+        form, elements = _parse_ply_header(content[:end].decode("ascii", "replace"))
+    except (ValueError, IndexError, KeyError):
+        raise SensorFileError("a PLY header that cannot be read") from None
+    at = next((number for number, (name, *_) in enumerate(elements) if name == "vertex"), None)
+    if at is None:
+        raise SensorFileError("a PLY file without vertices")
+    body, count = content[line_end + 1 :], elements[at][1]
+    if form == "ascii":
+        skipped = sum(number for _, number, _ in elements[:at])
+        lines = [line for line in body.splitlines() if line.strip()][skipped : skipped + count]
+        if len(lines) < count:
+            raise SensorFileError(f"PLY data that break off before {count} vertices")
+        if {len(line.split()) for line in lines} - {len(elements[at][2])}:
+            raise SensorFileError("PLY data whose rows do not fit the header")
+        return _parse_text(b"\n".join(lines), _ply_record(elements[at], form), count)
+    start = sum(one[1] * _ply_record(one, form).itemsize for one in elements[:at] if one[1])
+    record = _ply_record(elements[at], form)
+    if len(body) < start + count * record.itemsize:
+        raise SensorFileError(f"PLY data that break off before {count} vertices")
+    return _unpack(body, record, count, start)
+
+
+PlyElement = tuple[str, int, list[tuple[str, str]]]
+"""A kind of record: its name, how many there are, and the names and types of its properties."""
+
+
+def _parse_ply_header(text: str) -> tuple[str, list[PlyElement]]:
+    form = ""
+    elements: list[PlyElement] = []
+    for words in map(str.split, text.splitlines()[1:]):
+        match words:
+            case ["format", form, *_]:
+                pass
+            case ["element", name, count, *_]:
+                elements.append((name, int(count), []))
+            case ["property", kind, *_, name]:
+                elements[-1][2].append((name.lower(), _PLY_KINDS[kind]))
+    if form not in _PLY_ORDERS:
+        raise SensorFileError(f"PLY data of format {form!r}")
+    return form, elements
+
+
+def _ply_record(element: PlyElement, form: str) -> Record:
+    """One record of a file.
+
+    Raises:
+        SensorFileError: a property is a list, whose length varies.
+    """
+    name, _, properties = element
+    if any(kind == "list" for _, kind in properties):
+        raise SensorFileError(f"a PLY file whose element {name} has lists")
+    return np.dtype([(name, _PLY_ORDERS[form] + kind) for name, kind in properties])
 
 
 def _parse_npy(content: bytes) -> Columns:
@@ -387,45 +326,23 @@ def _by_name(array: NDArray) -> Columns:
     return dict(zip(("x", "y", "z", "intensity"), array.T[:4], strict=False))
 
 
-def _plain(parse: Callable[[bytes], Columns], content: bytes, _: int) -> Columns:
-    return parse(content)
-
-
-_PARSERS: dict[str, Callable[[bytes, int], Columns]] = {
-    ".pcd": partial(_plain, parse_pcd),
-    ".ply": partial(_plain, parse_ply),
-    ".npy": partial(_plain, _parse_npy),
-    ".bin": _parse_bin,
-}
-SUFFIXES = tuple(_PARSERS)
-
-
-_log = logging.getLogger(__name__)
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
-NO_CAMERA = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)
-UNCALIBRATED = Calibration(NO_CAMERA, np.eye(4), np.eye(4))
-"""Of files that come alone: a scan is in the body frame and seen from its origin; images have no geometry."""
-MOST_STRETCH = 0.01
-"""Relative difference of the aspect of an image from the calibration's that rounding can explain."""
+_PARSERS: dict[str, Callable[[bytes], Columns]] = {".pcd": parse_pcd, ".ply": parse_ply, ".npy": _parse_npy}
+SUFFIXES = (*_PARSERS, ".bin")
 
 
 def read_image(path: Path) -> Image:
-    """(H, W) uint8 grey image of a file, as its pixels lie there.
+    """(H, W) uint8 grey image of a file.
 
     Raises:
         SensorFileError: it cannot be read, or is no image.
     """
     try:
-        content = np.frombuffer(path.read_bytes(), np.uint8)
+        image = decode_picture(path.read_bytes())
     except OSError as error:
         raise SensorFileError(f"cannot read {path}: {error.strerror}") from None
-    # a photograph that was turned for people is no image of the calibrated camera
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(content, flags) if len(content) else None
     if image is None:
         raise SensorFileError(f"{path} is no image")
-    return np.asarray(image, np.uint8)
+    return image
 
 
 def fit_image(image: Image, calibration: Calibration) -> Image:
@@ -455,13 +372,8 @@ def make_snapshot(
 ) -> Frame:
     """The frame that these measurements of one moment make, as a synchronizer would.
 
-    Args:
-        cloud: in the LiDAR frame, which without a calibration is the body frame; or None.
-        left: (H, W) uint8, as the camera sends it at the size the calibration is for; or None.
-        right: likewise.
-        calibration: of the sensors.
-        stamp_ns: key of the frame.
-        warn: told when a limit of the calibration is not applied.
+    The scan is in the LiDAR frame, without a calibration that of the body; images are (H, W) uint8, as the camera sends
+    them at the size the calibration is for. `warn` is called when a limit of the calibration is not applied.
     """
     usable = None if cloud is None else ScanLimits(calibration, warn).apply(cloud)
     stamped_left, stamped_right = (None if image is None else StampedImage(stamp_ns, image) for image in (left, right))

@@ -24,12 +24,9 @@ LEAST_JUMP_M = 2.0
 
 @dataclass(frozen=True, slots=True)
 class StampedInput:
-    """A message as it arrives.
+    """A message as it arrives; of the odometry the value is (4, 4) `odom_T_body`.
 
     Attributes:
-        name: its input.
-        stamp_ns: its stamp.
-        value: what it says; of the odometry (4, 4) `odom_T_body`.
         fault: why it does not go on from its input's newest message ("duplicate", "out of order", "stale"), or why
             it was dropped ("clock jump", "position jump"); empty for an ordinary one.
     """
@@ -42,12 +39,7 @@ class StampedInput:
 
 @dataclass(frozen=True, slots=True)
 class Reset:
-    """Why a new session begins.
-
-    Attributes:
-        reason: for a person.
-        of_clock: the stamps went back; otherwise the odometry alone jumped and time goes on.
-    """
+    """Why a new session begins: the clock's stamps went back, or the odometry alone jumped and time goes on."""
 
     reason: str
     of_clock: bool
@@ -55,7 +47,7 @@ class Reset:
 
 @dataclass(frozen=True, slots=True)
 class SessionUpdate:
-    """What is to be done when a message has arrived.
+    """The result of one more message.
 
     Attributes:
         reset: a new session begins before the messages to use, or None.
@@ -73,37 +65,21 @@ class SessionClock:
 
     A message out of line with the newest of its input (its stamp went back, or the odometry jumped) is held until
     another agrees with it: of its own input one that goes on from it or, where the stamps went back, one of any
-    input. Then a new session begins. When its input goes on as before, the message is dropped.
-
-    Attributes:
-        session: number of resets.
+    input. Then a new session begins. When its input goes on as before, the message is dropped. `session` counts the
+    resets; `start_ns` is the first stamp on this clock.
     """
 
     def __init__(self) -> None:
         self.session = 0
         self._now_ns: int | None = None
-        self._start_ns = 0
+        self.start_ns = 0
         self._previous_end_ns: int | None = None
         self._newest: dict[Input, StampedInput] = {}
         self._held: dict[Input, tuple[StampedInput, Reset]] = {}
 
-    @property
-    def elapsed_ns(self) -> int:
-        """Time since the first stamp on this clock."""
-        return 0 if self._now_ns is None else self._now_ns - self._start_ns
-
-    @property
-    def start_ns(self) -> int:
-        """First stamp on this clock."""
-        return self._start_ns
-
     def newest_ns(self, *names: Input) -> int | None:
         """Latest stamp of some inputs on this clock, or None before their first."""
         return max((self._newest[name].stamp_ns for name in names if name in self._newest), default=None)
-
-    def has_heard(self, name: Input) -> bool:
-        """Whether a message of input `name` has come on this clock."""
-        return name in self._newest
 
     def take(self, arrival: StampedInput) -> SessionUpdate:
         """Take one message."""
@@ -155,7 +131,7 @@ class SessionClock:
             arrival if arrival.name == ODOMETRY else StampedInput(arrival.name, arrival.stamp_ns)
         )
         if self._now_ns is None:
-            self._now_ns = self._start_ns = arrival.stamp_ns
+            self._now_ns = self.start_ns = arrival.stamp_ns
         self._now_ns = max(self._now_ns, arrival.stamp_ns)
         return arrival
 
@@ -189,10 +165,10 @@ def _agree(held: StampedInput, why: Reset, arrival: StampedInput, reset: Reset) 
 
 
 class OdometryTaker(Protocol):
-    """Who works with odometry in sessions: a pose graph, or a localizer."""
+    """A user of odometry in sessions: a pose graph, or a localizer."""
 
     def begin_session(self) -> None:
-        """What follows does not go on from what was before."""
+        """The messages to come do not go on from those before."""
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> bool:
         """Take one message; returns whether it could be used."""
@@ -205,10 +181,7 @@ SLACK_M = 2.0
 
 
 class OdometrySessionSplitter:
-    """Gives a graph every odometry message, in sessions.
-
-    The live back-end hears the odometry on its topic, the replay reads it from the recording: both use this class,
-    so the same messages give the same chains.
+    """Gives a graph every odometry message, in sessions, alike live and in a replay.
 
     Attributes:
         newest_ns: latest stamp of the running session, -1 before its first.

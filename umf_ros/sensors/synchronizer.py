@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
+from dataclasses import replace
 from typing import Any
 
 from umf_ros.core.config import Sync
 from umf_ros.core.errors import MessageError
-from umf_ros.core.frames import Frame, Image, StereoCamera
-from umf_ros.core.geometry import Array
+from umf_ros.core.frames import Frame, StereoCamera
 from umf_ros.sensors.assembly import Anchor, ScanLimits, assemble
 from umf_ros.sensors.buffers import ImageBuffer, InputCounter, OdometryBuffer, StampedImage
 from umf_ros.sensors.calibration import Calibration
@@ -31,17 +31,13 @@ SILENCE_NS = 5_000_000_000
 class Synchronizer:
     """Builds one frame per scan from the image nearest to it and the odometry; without a LiDAR one per image.
 
-    Add measurements as they come, input by input in the order of their stamps, and `pop` what is
-    complete. A frame is complete when every input has passed it. Only stamps decide, never the time of
-    arrival: as long as no input lags behind another by more than `max_wait_s`, the same measurements
-    give the same frames however their arrivals interleave. A frame that has waited longer is completed
-    with what is there; an input that has been silent for long is not waited for until it speaks.
+    Add measurements as they come, input by input in the order of their stamps, and `pop` what is complete: every input
+    has passed it. Only stamps decide, never the time of arrival: as long as no input lags behind another by more than
+    `max_wait_s`, the same measurements give the same frames however their arrivals interleave. A frame that has waited
+    longer is completed with what is there; an input that has been silent for long is not waited for until it speaks.
 
-    When a new session begins (`SessionClock` says so: stamps went back because the recording starts again, or the
-    odometry was reset), the waiting frames are completed with what is there and what cannot be compared with the
-    measurements to come is forgotten: everything, or after a reset of the odometry its poses.
-
-    Not for several threads at once.
+    When a new session begins (see `SessionClock`), the waiting frames are completed with what is there, and all that
+    cannot be compared with the measurements to come is forgotten. Not for several threads at once.
 
     Attributes:
         counters: what became of the messages of each input.
@@ -55,10 +51,7 @@ class Synchronizer:
         inputs: Collection[Input] = INPUTS,
         warn: Callable[[str], None] = _log.warning,
     ) -> None:
-        """Wait for `inputs` only; "camera_info" among them: frames also wait for `use_camera`.
-
-        `warn` is told, once each, what the limits of the calibration do to the scans that nobody can have meant.
-        """
+        """Wait for `inputs` only; "camera_info" among them: frames also wait for `use_camera`."""
         self.counters: dict[Input, InputCounter] = {name: InputCounter() for name in INPUTS}
         self._settings = settings
         self._calibration = calibration
@@ -78,35 +71,28 @@ class Synchronizer:
         self._frames: list[Frame] = []
         self._given_up_ns = -1  # images up to here come too late
 
-    @property
-    def waiting(self) -> int:
-        """Scans (images without a LiDAR) that wait for other inputs."""
-        return len(self._anchors)
-
     def use_camera(self, camera: StereoCamera) -> None:
         """Replace the intrinsics by those of a camera_info."""
         self._calibration = self._calibration.with_camera(camera)
         self._absent.add("camera_info")  # comes no second time
 
-    def use_mounting(self, poses: Mapping[str, Array]) -> None:
+    def use_mounting(self, poses: dict[str, Any]) -> None:
         """Replace poses of the sensors, `body_T_camera` or `body_T_lidar` by name."""
-        self._calibration = self._calibration.with_poses(poses)
+        self._calibration = replace(self._calibration, **poses)
 
     def add(self, name: Input, stamp_ns: int, value: Any) -> None:
-        """Add a measurement.
-
-        Args:
-            name: its input.
-            stamp_ns: stamp of its message; a scan's is its start.
-            value: an image as the camera sends it, (H, W) uint8; a `Cloud`; or a (4, 4) pose of the odometry.
+        """Add a measurement: an image as the camera sends it, (H, W) uint8; a `Cloud`; or a (4, 4) pose `odom_T_body`.
 
         Raises:
             MessageError: of kind "size" when the calibration is for other images.
         """
-        if name in ("left", "right"):
-            self._check_size(value)
+        expected = self._calibration.image_size
+        if name in ("left", "right") and value.shape[::-1] != expected:
+            found = f"image of {value.shape[1]} x {value.shape[0]} pixels"
+            raise MessageError("size", f"{found}, the calibration is for {expected[0]} x {expected[1]}")
         ruling = self._clock.take(StampedInput(name, stamp_ns, value))
-        self._count_dropped(ruling.dropped)
+        for one in ruling.dropped:
+            self.reject(one.name, one.fault)
         if ruling.reset is not None:
             self._begin_session(ruling.reset)
         for one in ruling.usable:
@@ -133,20 +119,16 @@ class Synchronizer:
 
     def flush(self) -> list[Frame]:
         """Complete the waiting frames with what is there, at the end of the stream, and pop them."""
-        self._count_dropped(self._clock.give_up())
+        for one in self._clock.give_up():
+            self.reject(one.name, one.fault)
         self._clear()
         return self.pop()
-
-    def _count_dropped(self, wrong: list[StampedInput]) -> None:
-        for one in wrong:
-            self.reject(one.name, one.fault)
 
     def _begin_session(self, reset: Reset) -> None:
         if reset.of_clock:
             self._clear()
-        else:
-            self._complete_all()
-            self._odometry.clear()
+        self._complete_all()
+        self._odometry.clear()
         self.session = self._clock.session
 
     def _use(self, name: Input, stamp_ns: int, value: Any) -> None:
@@ -161,14 +143,6 @@ class Synchronizer:
             buffer.add(stamp_ns, value, late=stamp_ns <= self._given_up_ns)
             if name == "left" and ("cloud" not in self._inputs or self._is_silent("cloud", stamp_ns)):
                 self._anchors.append(Anchor(stamp_ns, stamp_ns))
-
-    def _check_size(self, image: Image) -> None:
-        height, width = image.shape
-        expected = self._calibration.image_size
-        if (width, height) != expected:
-            raise MessageError(
-                "size", f"image of {width} x {height} pixels, the calibration is for {expected[0]} x {expected[1]}"
-            )
 
     def _complete_all(self) -> None:
         while self._anchors:
@@ -204,7 +178,7 @@ class Synchronizer:
     def _is_complete(self, anchor: Anchor) -> bool:
         now_ns = self._sensed_ns
         if now_ns is not None and now_ns > anchor.stamp_ns + self._max_wait_ns:
-            self._note_absent()
+            self._absent |= {name for name in self._inputs if self._is_silent(name, now_ns)}
             return True
         if len(self._anchors) >= self._settings.queue_size:
             return True
@@ -219,14 +193,6 @@ class Synchronizer:
     def _awaits(self, name: Input) -> bool:
         return name in self._inputs and name not in self._absent
 
-    def _note_absent(self) -> None:
-        """Wait no longer for inputs that have been silent for long, until they speak."""
-        now_ns = self._sensed_ns
-        if now_ns is not None:
-            silent = {name for name in self._inputs if name != "camera_info" and self._is_silent(name, now_ns)}
-            never = {name for name in self._inputs if not self._clock.has_heard(name)}
-            self._absent |= silent | (never if self._clock.elapsed_ns > SILENCE_NS else set())
-
     def _is_silent(self, name: Input, now_ns: int) -> bool:
         """Whether an input has said nothing for long, by the stamps of the others."""
         newest_ns = self._clock.newest_ns(name)
@@ -237,16 +203,14 @@ class Synchronizer:
         right = self._right.nearest(left.stamp_ns, STEREO_SLOP_NS) if left else None
         if left is None and not self._left.passed(anchor.stamp_ns):
             self._given_up_ns = anchor.stamp_ns + self._slop_ns
-        if anchor.cloud is not None and not self._count_scan(anchor.cloud, left):
-            return
-        if anchor.cloud is None and left is None:
+        if not (self._count_scan(anchor.cloud, left) if anchor.cloud is not None else left):
             return
         self._left.use(left)
         self._right.use(right)
         self._frames.append(assemble(anchor, left, right, self._odometry, self._calibration, self.session))
 
     def _count_scan(self, cloud: Cloud, left: StampedImage | None) -> bool:
-        """Settle the fate of a scan: whether there will be a frame."""
+        """Count a scan as used or dropped; returns whether there will be a frame."""
         counter = self.counters["cloud"]
         without_image = left is None and (self._settings.require_image or not len(cloud.points))
         if not len(cloud.points):

@@ -16,15 +16,11 @@ from umf_ros.sensors.decode import stamp_ns
 TOPIC = "/tf_static"
 _UP = 0.9
 PATIENCE_S = 3.0
-"""What is latched comes this soon after a node has started, as a rule much sooner."""
+"""Latched messages come this soon after a node has started, as a rule much sooner."""
 
 
 class StaticTransforms:
-    """A tree of frames that do not move against each other.
-
-    Attributes:
-        version: number of changes so far.
-    """
+    """A tree of frames that do not move against each other; `version` counts its changes."""
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Array]] = {}
@@ -56,7 +52,7 @@ class StaticTransforms:
         name = frame
         while name in self._parents:
             parent, pose = self._parents[name]
-            if parent in poses:  # a circle: nobody's tree
+            if parent in poses:  # a circle is no tree
                 break
             poses[parent] = pose @ poses[name]
             name = parent
@@ -64,78 +60,58 @@ class StaticTransforms:
 
 
 class TfExtrinsics:
-    """The calibration, with the poses of camera and LiDAR from the transforms, as soon as they say them.
+    """The calibration, with the poses of camera and LiDAR in the body frame `base` as soon as the transforms have them.
 
-    Args:
-        calibration: what holds until then, and whatever the transforms do not say.
-        transforms: filled by whoever hears them.
-        base: name of the body frame.
-        warn: told in one line which pose is used, and how far it is from the calibration's.
+    `warn` is called with one line that says which pose is used, and how far it is from the calibration's.
     """
 
     def __init__(
         self, calibration: Calibration, transforms: StaticTransforms, base: str, warn: Callable[[str], None]
     ) -> None:
-        self._calibration = calibration
-        self._transforms = transforms
-        self._base = base
-        self._warn = warn
-        self._frames: dict[str, str] = {}
-        self._version = 0
+        self._poses = {"camera": calibration.body_T_camera, "lidar": calibration.body_T_lidar}
+        self._rectifier = calibration.rectifier
+        self._base, self._transforms, self._warn = base, transforms, warn
+        self._known: dict[str, tuple[str, int]] = {}
 
-    def update(self, sensor: str, frame_id: str) -> dict[str, Array]:
-        """Poses that are new, `body_T_camera` and `body_T_lidar` by name, when a message of a sensor has come.
-
-        Args:
-            sensor: "camera" or "lidar".
-            frame_id: of the message's header.
-        """
-        if self._frames.get(sensor) == frame_id and self._version == self._transforms.version:
+    def update(self, sensor: str, frame_id: str) -> dict[str, Any]:
+        """Return new poses, `body_T_camera` and `body_T_lidar` by name, given the frame of a "camera" or a "lidar"."""
+        state = frame_id, self._transforms.version
+        if self._known.get(sensor) == state:
             return {}
-        self._frames[sensor] = frame_id
-        self._version = self._transforms.version
-        found = {f"body_T_{name}": self._find(name, frame) for name, frame in self._frames.items()}
-        return {name: pose for name, pose in found.items() if pose is not None}
+        self._known[sensor] = state
+        pose = self._find(sensor, frame_id)
+        return {} if pose is None else {f"body_T_{sensor}": pose}
 
     def _find(self, sensor: str, frame: str) -> Array | None:
         pose = self._transforms.find(self._base, frame) if frame else None
         if pose is None:
             return None
-        before = getattr(self._calibration, f"body_T_{sensor}")
         if sensor == "camera":
             if pose[2, 2] > _UP:
                 self._warn(f"{frame} is not an optical frame (its z axis is up): the calibration's pose is kept")
                 return None
-            if self._calibration.rectifier is not None:
-                pose = pose @ self._calibration.rectifier.raw_T_rectified
-        if np.allclose(pose, before, atol=1e-6):
+            if self._rectifier is not None:
+                pose = pose @ self._rectifier.raw_T_rectified
+        if np.allclose(pose, self._poses[sensor], atol=1e-6):
             return None
-        apart_m = float(np.linalg.norm(pose[:3, 3] - before[:3, 3]))
+        apart_m = float(np.linalg.norm(pose[:3, 3] - self._poses[sensor][:3, 3]))
         self._warn(f"{sensor}: its pose is that of {frame} in {self._base} on {TOPIC}, {apart_m:.2f} m from the file's")
-        self._calibration = self._calibration.with_poses({f"body_T_{sensor}": pose})
+        self._poses[sensor] = pose
         return pose
 
 
 class OdometryFrames:
-    """Whose poses the odometry holds, and in which frame; another source on the same topic is refused.
+    """Converts odometry of any part of the robot to the body's; another source on the same topic is refused.
 
-    Args:
-        frames: names of the frames.
-        transforms: tell where the body is, if the odometry is of another part of the robot.
-        warn: told in one line when they do not.
-        patience_s: so long the odometry of another part waits for them, by its stamps.
-
-    Attributes:
-        odom: name of the odometry's frame: that of the messages, where they name one.
+    Odometry of another part waits `patience_s` for the transforms, by its stamps; then it is taken as the body's, with
+    a warning. `odom` is the name of the odometry's frame: that of the messages, where they name one.
     """
 
     def __init__(
         self, frames: FrameIds, transforms: StaticTransforms, warn: Callable[[str], None], patience_s: float = 0.0
     ) -> None:
+        self._base, self._transforms, self._warn = frames.base, transforms, warn
         self._patience_ns = int(patience_s * 1e9)
-        self._base = frames.base
-        self._transforms = transforms
-        self._warn = warn
         self._names: tuple[str, str] | None = None
         self._part_T_body: Array | None = None
         self._first_ns = 0
@@ -145,8 +121,7 @@ class OdometryFrames:
         """(4, 4) `odom_T_body` of a nav_msgs/Odometry whose pose is `odom_T_part`.
 
         Raises:
-            MessageError: of kind "frame" when its frames are not those of the first message; of kind "transforms" while
-                these may still come.
+            MessageError: of kind "frame": another source than the first message's; of kind "transforms": not yet known.
         """
         names = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
         if self._names is None:
@@ -160,11 +135,10 @@ class OdometryFrames:
             self._part_T_body = self._look_up(names[1], stamp_ns(message) - self._first_ns)
         if self._part_T_body is None:
             raise MessageError("transforms", f"odometry of {names[1]} waits for {TOPIC} to say where that is")
-        found: Array = odom_T_part @ self._part_T_body
-        return found
+        return np.asarray(odom_T_part @ self._part_T_body)
 
     def _look_up(self, part: str, waited_ns: int) -> Array | None:
-        """Where the body is on `part`; None while it is worth waiting."""
+        """`part_T_body`; None while it is worth waiting."""
         if not part or part == self._base:
             return np.eye(4)
         part_T_body = self._transforms.find(part, self._base)

@@ -17,12 +17,12 @@ from umf_ros.core.resources import find
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps.submap_history import DriftMeter, Submap, SubmapHistory
 from umf_ros.submaps.submap_index import Expectation, Found, Lookalikes, Proposal
-from umf_ros.verification import Verdict
+from umf_ros.verification import Hypothesis, RejectReason
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import Criterion, Logistic, log_ratio
 from umf_ros.verification.elevation_map import evaluate, shared_relief
-from umf_ros.verification.hypotheses import TemporalMemory, prior_sigmas
-from umf_ros.verification.measurement import SUBMAP, Measurement
+from umf_ros.verification.hypothesis import SUBMAP, Measurement
+from umf_ros.verification.pose_search import TemporalMemory, prior_sigmas
 from umf_ros.verification.prepared_scan import levelled
 from umf_ros.verification.scan_alignment import (
     Alignment,
@@ -218,7 +218,7 @@ class SubmapFinder:
         self._drift.reset()
         self._asked_m = -np.inf
 
-    def find(self, query: Keyframe, closures: Sequence[tuple[Keyframe, Array]]) -> list[Verdict]:
+    def find(self, query: Keyframe, closures: Sequence[tuple[Keyframe, Array]]) -> list[Hypothesis]:
         """One verdict for every submap that was tested; none where the scan alone has found the place.
 
         Args:
@@ -286,39 +286,41 @@ class SubmapFinder:
         self._asked_m = query.path_length_m
         return self.lookalikes(query)[: const.LOOKALIKES]
 
-    def _judge(self, tested: Tested) -> Verdict:
+    def _judge(self, tested: Tested) -> Hypothesis:
         query, match, pose = tested.query.keyframe, tested.match.keyframe, tested.alignment.pose
         index = self.trail.database.index_of(match.stamp_ns, match.session)
         candidate = Candidate(-1 if index is None else index, match.stamp_ns, tested.measurement.similarity)
         probability = self._acceptance.probability(tested.measurement)
+        found = Hypothesis(query.stamp_ns, candidate, tested.measurement, probability=probability, pose=pose)
         objection = self._objection(tested, probability)
-        if objection:
-            return Verdict(candidate, objection, tested.measurement, probability=probability)
+        if objection is not None:
+            found.reject(*objection)
+            return found
         covariance = self._acceptance.covariance(tested.alignment.information, tested.way_m)
-        closure = LoopClosure(query.stamp_ns, match.stamp_ns, pose, covariance, probability)
-        return Verdict(candidate, "accepted", tested.measurement, closure, probability=probability)
+        found.closure = LoopClosure(query.stamp_ns, match.stamp_ns, pose, covariance, probability)
+        return found
 
-    def _objection(self, tested: Tested, probability: float) -> str:
-        """Why a hypothesis is no closure; empty when it is one."""
+    def _objection(self, tested: Tested, probability: float) -> tuple[RejectReason, str] | None:
+        """Why a hypothesis is no closure, with figures; None when it is one."""
         pose = tested.alignment.pose
         shift_m, turn_deg = float(np.linalg.norm(pose[:3, 3])), abs(np.degrees(heading(pose)))
         if probability < self._settings.min_probability:
-            return f"probability {probability:.2f} is below {self._settings.min_probability:g}"
+            return RejectReason.IMPROBABLE, f"{probability:.2f} < {self._settings.min_probability:g}"
         if tested.measurement.terrain_correlation < const.MIN_TERRAIN:
-            return "the terrain does not fit"
+            return RejectReason.TERRAIN, f"correlation {tested.measurement.terrain_correlation:.2f}"
         drift_m, drift_rad = self._drift.over(tested.way_m)
         if not np.isfinite(drift_m):
-            return "nobody knows yet how far odometry drifts"
+            return RejectReason.DRIFT_UNKNOWN, ""
         if drift_m > const.MAX_DRIFT_M or drift_rad > const.MAX_DRIFT_RAD:
-            return f"odometry drifts by {drift_m:.1f} m and {np.degrees(drift_rad):.0f} deg inside the submaps"
+            return RejectReason.DRIFT, f"{drift_m:.1f} m and {np.degrees(drift_rad):.0f} deg"
         if tested.common < const.MIN_COMMON:
-            return f"only {tested.common:.0%} of the submap in common"
+            return RejectReason.LITTLE_IN_COMMON, f"{tested.common:.0%}"
         if 0 < self._settings.max_turn_deg < turn_deg:
-            return f"turned by {turn_deg:.0f} deg, more than {self._settings.max_turn_deg:g}"
+            return RejectReason.TURNED, f"{turn_deg:.0f} deg > {self._settings.max_turn_deg:g}"
         most_m = min(self._settings.max_shift_m, const.SUBMAP_NEAR_M)
         if shift_m > most_m:
-            return f"{shift_m:.1f} m apart, more than {most_m:g}"
-        return ""
+            return RejectReason.TOO_FAR, f"{shift_m:.1f} m > {most_m:g}"
+        return None
 
 
 def _narrow(keyframe: Keyframe) -> bool:

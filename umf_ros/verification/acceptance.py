@@ -19,7 +19,7 @@ import numpy as np
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.resources import find
 from umf_ros.verification import constants as const
-from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
+from umf_ros.verification.hypothesis import IMAGE, SCAN, Measurement, RejectReason
 from umf_ros.verification.scan_alignment import CovarianceModel
 
 SHIPPED = "config/verification/calibration.json"
@@ -111,13 +111,13 @@ def scores(measurement: Measurement) -> dict[str, float]:
     return {name: criterion(measurement) for name, criterion in criteria_of(measurement.kind).items()}
 
 
-def refuted(measurement: Measurement) -> str:
-    """Why a hypothesis is no closure however probable, or nothing."""
+def refuted(measurement: Measurement) -> tuple[RejectReason, str] | None:
+    """Why a hypothesis is no closure however probable, with figures; None when nothing refutes it."""
     if measurement.misfit > const.MAX_MISFIT:
-        return f"surfaces are {measurement.misfit:.0f} times their noise apart"
+        return RejectReason.MISFIT, f"{measurement.misfit:.0f} times"
     if measurement.passage_rival < 1.0:
-        return "surfaces fit as well elsewhere along the passage"
-    return "another pose fits as well" if measurement.runner_up < const.MIN_RUNNER_UP else ""
+        return RejectReason.PASSAGE, ""
+    return (RejectReason.AMBIGUOUS, "") if measurement.runner_up < const.MIN_RUNNER_UP else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,8 +162,8 @@ class AcceptanceModel:
         """The same if no other pose fitted the scans: what it cannot exceed before it is held against its rivals."""
         return self.probability(replace(measurement, rival_near=NO_RIVAL, rival_far=NO_RIVAL))
 
-    def unlike(self, measurement: Measurement) -> str:
-        """What no right pose that the decision was fitted on ever measured, or nothing: name and value of a number."""
+    def out_of_range(self, measurement: Measurement) -> str:
+        """Name and value of a number that no right example of the fit had; empty without one."""
         for name, (least, greatest) in self.bounds.get(measurement.kind, {}).items():
             value = getattr(measurement, name)
             if value < least or value > greatest:  # what is unknown is neither

@@ -13,7 +13,7 @@ import numpy as np
 
 # rerank: do the local features of two keyframes belong together?
 IMAGE_THRESHOLD = 0.03  # of the image's width; geometry: a cell of the feature map is 1.8 %
-CLOUD_THRESHOLD_M = 0.75  # geometry: the cells of the voxel features are about a metre wide
+POINT_THRESHOLD_M = 0.75  # geometry: the cells of the voxel features are about a metre wide
 SERIAL_PRODUCTS = 2**18  # multiplications up to which OpenBLAS stays on one thread; its others would spin for nothing
 SUPERFEATURE_RATIO = 0.9  # [UMF eq. 4.1]
 SAME_PLACE_M = 3.0  # by hand: candidates nearer than this to a chosen one show the same place
@@ -23,7 +23,6 @@ MIN_TRIANGLE = 1e-3  # by hand: of a sampled triangle, twice its area; the point
 MAX_TILT_RAD = 0.5  # by hand: a rover does not lie on its side
 
 # hypotheses: which poses are worth a closer look?
-POINT_THRESHOLD_M = 0.75  # geometry: as CLOUD_THRESHOLD_M
 MIN_POINTS = 6  # by hand: that agree on a motion
 MIN_PIXELS = 15  # measured: that agree on a view; of other places never more than 13 did
 DISTINCT_M, DISTINCT_RAD = 0.8, 0.1  # geometry: nearer hypotheses end in the same basin of the alignment

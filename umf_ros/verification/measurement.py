@@ -1,7 +1,7 @@
-"""Every test of a hypothesis, and the typed numbers that the tests give.
+"""Tests of a hypothesis.
 
-A new test is three steps: a function of what an `AlignedHypothesis` holds, a field of `Measurement` that `measure`
-fills with it, and a `Criterion` in `acceptance` that says which values speak for a closure. Its weight is 0 until
+A new test is three steps: a function of what a `Hypothesis` holds, a field of `Measurement` that `measure`
+fills with it, and a `Criterion` in `acceptance` with the values that speak for a closure. Its weight is 0 until
 `umf_ros/lab/fit/scan_acceptance.py` has fitted one.
 """
 
@@ -9,220 +9,47 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.frames import Candidate, Keyframe, Points
+from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.ambiguity import passage_rival
 from umf_ros.verification.elevation_map import evaluate, shared_relief
-from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, near, prior_sigmas
+from umf_ros.verification.hypothesis import IMAGE, SCAN, Hypothesis, Measurement
+from umf_ros.verification.pose_search import TemporalMemory, near, prior_sigmas
 from umf_ros.verification.prepared_scan import PreparedScan, joint_blur, levelled
-from umf_ros.verification.rerank import RankedCandidate, similarities, strongest
+from umf_ros.verification.rerank import similarities, strongest
 from umf_ros.verification.scan_alignment import (
     Alignment,
     CovarianceModel,
-    closure_covariance,
     covariance_of,
     nominal_deviations,
+    scan_covariance,
 )
 from umf_ros.verification.scan_consistency import meet, rivalry
 from umf_ros.verification.view_alignment import ViewAlignment
 
-SCAN, IMAGE, SUBMAP = "scan", "image", "submap"
 
-
-def measured(*kinds: str) -> Any:
-    """A field for hypotheses of these kinds; NaN for others, and where nothing can be said."""
-    return field(default=math.nan, metadata={"kinds": kinds})
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measurement:
-    """What was measured about one hypothesis, or, without a kind, about a candidate that got none.
-
-    The name of a field is its name in `candidates.csv` and on `~/candidates`.
-
-    Attributes:
-        kind: "scan" when two scans were aligned, "image" when only local features could be, "submap" when what was
-            seen along the way was aligned.
-        similarity: cosine similarity of the global descriptors.
-        inliers_image: pairs of image features that one homography explains.
-        inliers_cloud: pairs of the scan's features that one rigid motion explains.
-        superfeatures: eligible pairs of super-features, where the reranking goes by them.
-        residual_m: median point-to-plane distance of the scans; median distance of the pairs' points without scans.
-        residual_sigmas: size of the errors of reprojection in standard deviations of the features' noise.
-        residual_p90_m: nine of ten points are nearer than this to their counterpart's plane.
-        noise_m: how far the match's points scatter about their own planes, and may be off for the scans' motion.
-        overlap: share of the points seen by both that have a counterpart (of the feature pairs: that agree).
-        points: points that have one.
-        relief_m: standard deviation of the relief on the ground that both scans saw.
-        terrain_correlation: of both elevation maps' relief, -1 to 1.
-        terrain_score: the same in standard deviations of chance.
-        terrain_rival: correlation at the best of some poses beside this one.
-        common: share of a scan's points that the other should see, the smaller of both ways, as all that follow.
-        contradiction: share of these that the other's rays passed by, the larger of both.
-        counterparts: share of these that have a counterpart, as near as both scans' points let one expect.
-        upright_counterparts: the same of walls, trunks and rocks alone; NaN where next to nothing stands.
-        unexplained: share of what stands and should be seen that is far from everything, the larger of both.
-        rival_near: logarithm of how much worse the fit is half a metre on, along the way that is known least; NaN
-            where a hypothesis could not have become probable any more.
-        rival_far: the same of the best fit 1 to 6 m on: 0 when another place fits as well.
-        passage_rival: how much worse the surfaces of two scans fit at the best other pose along a passage: 0 when
-            another fits as well, 1 when a closure can be accepted; NaN outside passages and for improbable hypotheses.
-        pose_inliers: feature pairs that agree with the pose.
-        spread: of those pairs across the image: smaller deviation of column and row, of its width and height.
-        two_way_m: distance of the poses that the query's depths and the match's give by themselves.
-        position_std_m: standard deviation of the position along its least known direction, from the residuals.
-        heading_std_deg: of the heading.
-        agreement_image: whether image features reappear where the pose says, standard deviations of chance; a word
-            for people about the best hypothesis of a candidate, no part of the decision.
-        agreement_cloud: the same of the scan's features.
-        prior_sigmas: distance from what odometry predicts, in standard deviations of its drift.
-        support: earlier keyframes, of the last few, that found a pose which odometry carries over to this one.
-        runner_up: logarithm of how much more is missing at the next best hypothesis about the pair; NaN without one.
-    """
-
-    kind: str = ""
-    similarity: float
-    inliers_image: float = 0.0
-    inliers_cloud: float = 0.0
-    superfeatures: float = 0.0
-    residual_m: float = measured(SCAN, IMAGE, SUBMAP)
-    residual_sigmas: float = measured(IMAGE)
-    residual_p90_m: float = measured(SCAN)
-    noise_m: float = measured(SCAN)
-    overlap: float = measured(SCAN, IMAGE, SUBMAP)
-    points: float = measured(SCAN, SUBMAP)
-    relief_m: float = measured(SCAN, SUBMAP)
-    terrain_correlation: float = measured(SCAN, SUBMAP)
-    terrain_score: float = measured(SCAN, SUBMAP)
-    terrain_rival: float = measured(SUBMAP)
-    common: float = measured(SCAN)
-    contradiction: float = measured(SCAN)
-    counterparts: float = measured(SCAN)
-    upright_counterparts: float = measured(SCAN)
-    unexplained: float = measured(SCAN)
-    rival_near: float = measured(SCAN)
-    rival_far: float = measured(SCAN)
-    passage_rival: float = measured(SCAN)
-    pose_inliers: float = measured(IMAGE)
-    spread: float = measured(IMAGE)
-    two_way_m: float = measured(IMAGE)
-    position_std_m: float = measured(SCAN, IMAGE, SUBMAP)
-    heading_std_deg: float = measured(SCAN, IMAGE, SUBMAP)
-    agreement_image: float = measured(SCAN, IMAGE)
-    agreement_cloud: float = measured(SCAN, IMAGE)
-    prior_sigmas: float = measured(SCAN, IMAGE, SUBMAP)
-    support: float = measured(SCAN, IMAGE, SUBMAP)
-    runner_up: float = measured(SCAN)
-
-    @property
-    def misfit(self) -> float:
-        """How many times their noise the surfaces of two scans are apart in the median; NaN without scans."""
-        return self.residual_m / self.noise_m
-
-    @property
-    def missing(self) -> float:
-        """Share of what stands, or where nothing does of all, that should have a counterpart and has none."""
-        known = self.upright_counterparts
-        return 1.0 - (known if math.isfinite(known) else self.counterparts)
-
-    @property
-    def discord(self) -> str:
-        """What to say where one modality supports a pose that the other contradicts; else nothing."""
-        if self.agreement_image < const.IMAGE_CONTRADICTS and self.contradiction < const.SCANS_SUPPORT:
-            return "the scans support it, the image contradicts it"
-        if self.agreement_image > const.IMAGE_SUPPORTS and self.contradiction > const.SCANS_CONTRADICT:
-            return "the image supports it, the scans contradict it"
-        return ""
-
-    @property
-    def numbers(self) -> dict[str, float]:
-        """What was measured for this kind, by name: for tables, messages and people."""
-        return {
-            one.name: getattr(self, one.name)
-            for one in fields(self)
-            if one.name != "kind" and self.kind in one.metadata.get("kinds", [self.kind])
-        }
-
-
-@dataclass(frozen=True, slots=True)
-class AlignedHypothesis:
-    """A hypothesis after its alignment: everything that a test may look at.
-
-    Attributes:
-        query: the query keyframe.
-        hypothesis: as it was found, with its candidate.
-        alignment: the refined pose, its residuals and what they were measured on.
-        scans: of the match and of the query; None when only their views were aligned.
-    """
-
-    query: Keyframe
-    hypothesis: Hypothesis
-    alignment: Alignment | ViewAlignment
-    scans: tuple[PreparedScan, PreparedScan] | None
-
-    @property
-    def match(self) -> Keyframe:
-        """The matched keyframe."""
-        return self.hypothesis.ranked.keyframe
-
-    @property
-    def pose(self) -> Array:
-        """(4, 4) `match_T_query`."""
-        return self.alignment.pose
-
-    def covariance(self, model: CovarianceModel) -> Array:
-        """Covariance (6, 6) of the pose in ROS order, match axes, m^2 and rad^2."""
-        if isinstance(self.alignment, ViewAlignment):
-            return covariance_of(self.alignment.information, model)
-        return closure_covariance(self.match, self.query, self.alignment, model)
-
-    @property
-    def consistent_pixels(self) -> Points:
-        """Pixels (K, 4) of the image features that obey the pose: u, v of the query and u, v of the match."""
-        views = self.hypothesis.views
-        return views.consistent_pixels(self.pose) if views else np.empty((0, 4), np.float32)
-
-
-def measure_candidate(ranked: RankedCandidate) -> Measurement:
-    """What is known of a candidate before any hypothesis about it."""
-    return Measurement(
-        similarity=ranked.candidate.similarity,
-        inliers_image=float(ranked.inliers_image),
-        inliers_cloud=float(ranked.inliers_cloud),
-        superfeatures=float(ranked.superfeatures),
-    )
-
-
-def uncompared(candidate: Candidate) -> Measurement:
-    """What is known of a candidate whose local features nobody looked at."""
-    unknown = math.nan
-    return Measurement(
-        similarity=candidate.similarity, inliers_image=unknown, inliers_cloud=unknown, superfeatures=unknown
-    )
-
-
-def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) -> Measurement:
-    """Every test of one hypothesis but those of `against_rivals`.
+def measure(hypothesis: Hypothesis, memory: TemporalMemory, drift: float) -> Measurement:
+    """Return the results of all tests of an aligned hypothesis but the slow ones and those that need others.
 
     Args:
-        aligned: the hypothesis.
-        memory: what earlier keyframes found.
+        hypothesis: with its keyframes, scans and alignment.
+        memory: findings of earlier keyframes.
         drift: odometry error per distance driven.
     """
-    query, match, pose, alignment = aligned.query, aligned.match, aligned.pose, aligned.alignment
-    known = measure_candidate(aligned.hypothesis.ranked)
+    (query, match), pose, alignment = hypothesis.keyframes, hypothesis.pose, hypothesis.alignment
+    known = Measurement.of(hypothesis.candidate)
+    assert alignment is not None
     if isinstance(alignment, ViewAlignment):
         fit = _measure_views(known, alignment)
     else:
-        assert aligned.scans is not None
-        fit = _measure_scans(known, alignment, *aligned.scans)
+        fit = _measure_scans(known, alignment, *hypothesis.scans)
     position_std_m, heading_std_deg = nominal_deviations(alignment.information)
     return replace(
         fit,
@@ -234,28 +61,39 @@ def measure(aligned: AlignedHypothesis, memory: TemporalMemory, drift: float) ->
     )
 
 
-def against_rivals(measurement: Measurement, aligned: AlignedHypothesis) -> Measurement:
-    """The same, knowing how much worse the scans fit at poses beside this one: what takes longest to find out."""
-    if aligned.scans is None or isinstance(aligned.alignment, ViewAlignment):
-        return measurement
-    near_by, far = rivalry(*aligned.scans, aligned.pose, aligned.alignment.information)
-    return replace(measurement, rival_near=near_by, rival_far=far)
+def measure_ambiguity(hypothesis: Hypothesis) -> Measurement:
+    """Return the measurement with the fit of the scans at poses beside this one, the slowest test but one."""
+    if not hypothesis.scans or not isinstance(hypothesis.alignment, Alignment):
+        return hypothesis.measurement
+    match, query = hypothesis.scans
+    near_by, far = rivalry(match, query, hypothesis.pose, hypothesis.alignment.information)
+    return replace(hypothesis.measurement, rival_near=near_by, rival_far=far)
 
 
-def against_passage(measurement: Measurement, aligned: AlignedHypothesis) -> Measurement:
-    """The same, knowing how much worse the surfaces fit elsewhere along a passage."""
-    if aligned.scans is None or isinstance(aligned.alignment, ViewAlignment):
-        return measurement
-    return replace(measurement, passage_rival=passage_rival(*aligned.scans, aligned.pose))
+def measure_passage(hypothesis: Hypothesis) -> Measurement:
+    """Return the measurement with the fit of the surfaces elsewhere along a passage, the slowest test."""
+    if not hypothesis.scans:
+        return hypothesis.measurement
+    match, query = hypothesis.scans
+    return replace(hypothesis.measurement, passage_rival=passage_rival(match, query, hypothesis.pose))
 
 
-def beside(measurement: Measurement, pose: Array, others: Sequence[tuple[Array, Measurement]]) -> Measurement:
-    """The same, knowing the other hypotheses about the pair: poses `match_T_query` and what was measured there."""
+def compare_poses(measurement: Measurement, pose: Array, others: Sequence[tuple[Array, Measurement]]) -> Measurement:
+    """Return the measurement with its lead over other poses `match_T_query` for the same candidate."""
     distinct = [other.missing for there, other in others if not near(pose, there, const.DISTINCT_M, const.DISTINCT_RAD)]
     if measurement.kind != SCAN or not distinct:
         return measurement
     room = const.RUNNER_UP_ROOM
     return replace(measurement, runner_up=math.log((min(distinct) + room) / (measurement.missing + room)))
+
+
+def closure_covariance(hypothesis: Hypothesis, model: CovarianceModel) -> Array:
+    """Covariance (6, 6) of the pose in ROS order, match axes, m^2 and rad^2."""
+    query, match = hypothesis.keyframes
+    if isinstance(hypothesis.alignment, Alignment):
+        return scan_covariance(match, query, hypothesis.alignment, model)
+    assert hypothesis.alignment is not None
+    return covariance_of(hypothesis.alignment.information, model)
 
 
 def image_agreement(query: Keyframe, match: Keyframe, pose: Array) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
 
@@ -208,51 +208,16 @@ WITHOUT: dict[str, Any] = {
 """What the choice of modalities takes out of an embedding."""
 
 
-@dataclass(frozen=True, slots=True)
-class RankedCandidate:
-    """A candidate and what its local features share with the query's.
-
-    Attributes:
-        candidate: the candidate.
-        keyframe: its keyframe.
-        image_pairs: (P, 2) mutual neighbours among the image features (query, match).
-        cloud_pairs: the same among the scan's features.
-        image: homography between the pairs' pixels, or None.
-        cloud: rigid motion between the pairs' points (query to match), or None.
-        superfeatures: eligible pairs of super-features of both modalities.
-        score: inliers, or pairs of super-features, of both modalities.
-        order: what the ranking goes by.
-    """
-
-    candidate: Candidate
-    keyframe: Keyframe
-    image_pairs: Indices = field(default_factory=lambda: NO_PAIRS)
-    cloud_pairs: Indices = field(default_factory=lambda: NO_PAIRS)
-    image: Consensus | None = None
-    cloud: Consensus | None = None
-    superfeatures: int = 0
-    score: float = 0.0
-    order: float = 0.0
-
-    @property
-    def inliers_image(self) -> int:
-        """Pairs of image features that one homography explains."""
-        return self.image.count if self.image else 0
-
-    @property
-    def inliers_cloud(self) -> int:
-        """Pairs of the scan's features that one rigid motion explains."""
-        return self.cloud.count if self.cloud else 0
+Offered = tuple[Candidate, Keyframe]
+"""A candidate with its keyframe."""
 
 
-def rerank(
-    query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]], settings: Verification
-) -> list[RankedCandidate]:
-    """The candidates, best first; equals are ordered by similarity, then by age."""
+def rerank(query: Keyframe, candidates: Sequence[Offered], settings: Verification) -> list[Offered]:
+    """The candidates with their inliers and scores, best first; equals are ordered by similarity, then by age."""
     count = _by_superfeatures if settings.rerank == "superfeatures" else _by_ransac
     query = replace(query, embedding=replace(query.embedding, **WITHOUT[settings.modalities]))
-    ranked = [count(query, candidate, keyframe, settings) for candidate, keyframe in candidates]
-    return sorted(ranked, key=lambda item: (-item.order, -item.candidate.similarity, item.candidate.stamp_ns))
+    ranked = [(count(query, candidate, keyframe, settings), keyframe) for candidate, keyframe in candidates]
+    return sorted(ranked, key=lambda item: (-item[0].score, -item[0].similarity, item[0].stamp_ns))
 
 
 def weigh(similarity: float, counts: Iterable[float], settings: Verification) -> float:
@@ -260,16 +225,16 @@ def weigh(similarity: float, counts: Iterable[float], settings: Verification) ->
     return similarity + settings.rerank_weight * float(np.log1p(list(counts)).sum())
 
 
-def select(ranked: list[RankedCandidate], count: int) -> list[RankedCandidate]:
+def select(ranked: list[Offered], count: int) -> list[Offered]:
     """At most `count` candidates of different places, the most promising first.
 
     The order of the local features and that of the global descriptor take turns, for either may be
     blind (features under another sun, descriptors in a place that repeats).
     """
-    similar = sorted(ranked, key=lambda item: (-item.candidate.similarity, item.candidate.stamp_ns))
-    chosen: list[RankedCandidate] = []
+    similar = sorted(ranked, key=lambda item: (-item[0].similarity, item[0].stamp_ns))
+    chosen: list[Offered] = []
     for item in (one for pair in zip(ranked, similar, strict=True) for one in pair):
-        if len(chosen) < count and not any(_same_place(item.keyframe, other.keyframe) for other in chosen):
+        if len(chosen) < count and not any(_same_place(item[1], other) for _, other in chosen):
             chosen.append(item)
     return chosen
 
@@ -324,25 +289,28 @@ def eligible_superfeatures(
     return ids[nearest <= ratio**2 * second]
 
 
-def _by_superfeatures(
-    query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification
-) -> RankedCandidate:
+def _by_superfeatures(query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification) -> Candidate:
     ours, theirs = query.embedding, match.embedding
     pairs = (ours.super_image, theirs.super_image), (ours.super_cloud, theirs.super_cloud)
     counts = [len(eligible_superfeatures(mine, other)) for mine, other in pairs if mine and other]
-    order = weigh(candidate.similarity, counts, settings)
-    return RankedCandidate(candidate, match, superfeatures=sum(counts), score=float(sum(counts)), order=order)
+    score = weigh(candidate.similarity, counts, settings)
+    return replace(candidate, inliers_image=0.0, inliers_cloud=0.0, superfeatures=float(sum(counts)), score=score)
 
 
-def _by_ransac(query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification) -> RankedCandidate:
+def _by_ransac(query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification) -> Candidate:
     ours, theirs = query.embedding, match.embedding
     reach = const.IMAGE_THRESHOLD * query.camera.width
     image_pairs, image = _explain(ours.image, theirs.image, fit_homography, reach, settings)
-    cloud_pairs, cloud = _explain(ours.cloud, theirs.cloud, fit_rigid, const.CLOUD_THRESHOLD_M, settings)
-    counts = [consensus.count for consensus in (image, cloud) if consensus]
-    order = weigh(candidate.similarity, counts, settings)
-    return RankedCandidate(
-        candidate, match, image_pairs, cloud_pairs, image, cloud, score=float(sum(counts)), order=order
+    cloud_pairs, cloud = _explain(ours.cloud, theirs.cloud, fit_rigid, const.POINT_THRESHOLD_M, settings)
+    counts = [consensus.count if consensus else 0 for consensus in (image, cloud)]
+    return replace(
+        candidate,
+        inliers_image=float(counts[0]),
+        inliers_cloud=float(counts[1]),
+        superfeatures=0.0,
+        image_pairs=image_pairs,
+        cloud_pairs=cloud_pairs,
+        score=weigh(candidate.similarity, counts, settings),
     )
 
 

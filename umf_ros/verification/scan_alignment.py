@@ -157,7 +157,7 @@ def nominal_deviations(found: Array) -> tuple[float, float]:
     return float(np.sqrt(np.linalg.eigvalsh(nominal[:3, :3])[-1])), float(np.degrees(np.sqrt(nominal[5, 5])))
 
 
-def closure_covariance(match: Keyframe, query: Keyframe, alignment: Alignment, model: CovarianceModel) -> Array:
+def scan_covariance(match: Keyframe, query: Keyframe, alignment: Alignment, model: CovarianceModel) -> Array:
     """Covariance (6, 6) of a pose in ROS order, match axes, m^2 and rad^2: of its residuals and of the motion."""
     of_residuals = covariance_of(alignment.information, model, alignment.overlap)
     return of_residuals + motion_covariance(match, query, alignment, model)

@@ -1,86 +1,33 @@
-"""From candidates to verified loop closures."""
+"""Verify candidates geometrically: from retrieved places to metric loop closures."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from umf_ros.core.config import Verification
-from umf_ros.core.frames import Candidate, Frame, Keyframe, LoopClosure, Points
+from umf_ros.core.frames import Frame, Keyframe, LoopClosure
 from umf_ros.core.geometry import heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
-from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, find_hypotheses, near
+from umf_ros.verification.hypothesis import Hypothesis, RejectReason
 from umf_ros.verification.measurement import (
-    AlignedHypothesis,
-    Measurement,
-    against_passage,
-    against_rivals,
-    beside,
+    closure_covariance,
+    compare_poses,
     image_agreement,
     measure,
-    measure_candidate,
-    uncompared,
+    measure_ambiguity,
+    measure_passage,
 )
+from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses, near
 from umf_ros.verification.prepared_scan import ScanCache, levelled, views_tell
-from umf_ros.verification.rerank import RankedCandidate, rerank, select
+from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans
 from umf_ros.verification.yaw_search import RotatedElevationMap
-
-UNTESTED, NO_POSE = "less promising than others", "no pose fits, or others fit better"
-FOUND_BEFORE = "not compared: one was found"
-LESS_SURE = "a more probable closure of this keyframe is published"
-NO_DEPTH = "no depth: neither a scan nor a stereo pair"
-"""Why there is nothing to judge about a candidate."""
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What verification found for one candidate.
-
-    Attributes:
-        candidate: the candidate that was tested.
-        reason: one word or a short phrase; "accepted" when there is a closure.
-        measurement: what was measured about its most probable hypothesis, or only about the candidate.
-        closure: the loop closure, or None when rejected.
-        inlier_pixels: (K, 4) float32: u, v in the query image and u, v in the match image.
-        probability: that the hypothesis is right; None without one.
-    """
-
-    candidate: Candidate
-    reason: str
-    measurement: Measurement
-    closure: LoopClosure | None = None
-    inlier_pixels: Points = field(default_factory=lambda: np.empty((0, 4), np.float32))
-    probability: float | None = None
-
-    @property
-    def numbers(self) -> dict[str, float]:
-        """What was measured, and the probability made of it, by name."""
-        return self.measurement.numbers | ({} if self.probability is None else {"probability": self.probability})
-
-
-@dataclass(frozen=True, slots=True)
-class JudgedHypothesis:
-    """An aligned hypothesis, what was measured about it, and the probability that it is right."""
-
-    aligned: AlignedHypothesis
-    measurement: Measurement
-    probability: float
-
-    @property
-    def match_stamp_ns(self) -> int:
-        """Key of the matched keyframe."""
-        return self.aligned.match.stamp_ns
-
-    def told_by_images(self) -> JudgedHypothesis:
-        """The same, knowing whether the images agree: for people, and too slow for every hypothesis."""
-        agreement = image_agreement(self.aligned.query, self.aligned.match, self.aligned.pose)
-        return replace(self, measurement=replace(self.measurement, agreement_image=agreement))
 
 
 class Verifier:
@@ -119,65 +66,56 @@ class Verifier:
         """Make ready what is asked of a scan whose keyframe is verified next."""
         self._scans.prefetch(frame)
 
-    def verify(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[Verdict]:
-        """One verdict per candidate, accepted ones first, then in the order of the reranking.
+    def verify(self, query: Keyframe, candidates: Sequence[Offered]) -> list[Hypothesis]:
+        """Return one hypothesis per candidate with its reason, accepted ones first, then in the order of the reranking.
 
         Args:
             query: the newest keyframe.
-            candidates: what the database returned, with their keyframes.
+            candidates: of the database, with their keyframes.
         """
         self.latency_ms = {"rerank": 0.0, "refine": 0.0}
         with self._timed("refine"):
             turned = self._turned(query) if candidates else None
-        # where odometry carries an accepted closure to is looked at first: most often that is all there is to do
-        expected = self._memory.expected(query, candidates)
-        ranked = self._rank(query, expected)
-        judged = self._refine(query, ranked, turned)
-        tested = {item.candidate.stamp_ns for item in ranked}
+        # the candidate that odometry predicts from an accepted closure comes first: most often it suffices
+        ranked = chosen = self._rank(query, self._memory.expected(query, candidates))
+        judged = self._refine(query, chosen, turned)
         if self._wanting(judged):
+            expected = {candidate.stamp_ns for candidate, _ in chosen}
             ranked = self._rank(query, candidates)
-            chosen = select(ranked, self._settings.refine_best)
-            judged += self._refine(query, [one for one in chosen if one.candidate.stamp_ns not in tested], turned)
-            tested |= {item.candidate.stamp_ns for item in chosen}
-        found = [(one.aligned.match, one.aligned.pose, one.probability >= self._threshold) for one in judged]
-        self._memory.remember(query, found)
-        verdicts = self._surest(self._decide(query, ranked, judged, tested))
-        known = {verdict.candidate.index for verdict in verdicts}
-        rest = [candidate for candidate, _ in candidates if candidate.index not in known]
-        return verdicts + [Verdict(one, FOUND_BEFORE, uncompared(one)) for one in rest]
-
-    def _surest(self, verdicts: list[Verdict]) -> list[Verdict]:
-        """Keep the `max_closures` most probable closures: those of one keyframe are correlated."""
-        accepted = sorted(
-            (one for one in verdicts if one.closure is not None), key=lambda one: -(one.probability or 0.0)
+            selected = select(ranked, self._settings.refine_best)
+            judged += self._refine(query, [one for one in selected if one[0].stamp_ns not in expected], turned)
+            chosen = chosen + selected
+        self._memory.remember(
+            query, [(one.keyframes[1], one.pose, (one.probability or 0.0) >= self._threshold) for one in judged]
         )
-        surplus = {id(one) for one in accepted[self._settings.max_closures :]}
-        kept = [replace(one, closure=None, reason=LESS_SURE) if id(one) in surplus else one for one in verdicts]
-        return sorted(kept, key=lambda one: one.closure is None)
+        found = self._best(query, ranked, judged, {candidate.stamp_ns for candidate, _ in chosen})
+        compared = {candidate.index for candidate, _ in ranked}
+        for candidate, keyframe in candidates:
+            if candidate.index not in compared:
+                found.append(Hypothesis.of(query, candidate, keyframe, reason=RejectReason.NOT_COMPARED))
+        return found
 
-    def examine(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[JudgedHypothesis]:
-        """Every hypothesis about every candidate, without a decision: what the decision is fitted on."""
+    def examine(self, query: Keyframe, candidates: Sequence[Offered]) -> list[Hypothesis]:
+        """Return all judged hypotheses about all candidates, without a decision: the examples of the fit."""
         hypotheses = self._hypotheses(query, rerank(query, candidates, self._settings), self._turned(query))
-        examined = self._judge(query, hypotheses, 0.0)
-        first = {one.match_stamp_ns: one.aligned for one in reversed(examined)}
-        self._memory.remember(query, [(one.match, one.pose, False) for one in first.values()])
+        examined = self._judge(hypotheses, 0.0)
+        first = {one.match_stamp_ns: one for one in reversed(examined)}
+        self._memory.remember(query, [(one.keyframes[1], one.pose, False) for one in first.values()])
         return examined
 
-    def _rank(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[RankedCandidate]:
+    def _rank(self, query: Keyframe, candidates: Sequence[Offered]) -> list[Offered]:
         with self._timed("rerank"):
             return rerank(query, candidates, self._settings)
 
-    def _refine(
-        self, query: Keyframe, ranked: list[RankedCandidate], turned: RotatedElevationMap | None
-    ) -> list[JudgedHypothesis]:
+    def _refine(self, query: Keyframe, ranked: list[Offered], turned: RotatedElevationMap | None) -> list[Hypothesis]:
         """The best hypotheses about some candidates, judged."""
         with self._timed("refine"):
             hypotheses = self._hypotheses(query, ranked, turned)[: const.MAX_REFINED]
-            return self._judge(query, hypotheses, min(const.HOPELESS, self._threshold))
+            return self._judge(hypotheses, min(const.HOPELESS, self._threshold))
 
-    def _wanting(self, judged: list[JudgedHypothesis]) -> bool:
+    def _wanting(self, judged: list[Hypothesis]) -> bool:
         """Whether more closures are asked for than were found."""
-        accepted = {one.match_stamp_ns for one in judged if not self._objection(one)}
+        accepted = {one.match_stamp_ns for one in judged if self._objection(one) is None}
         return len(accepted) < self._settings.max_closures
 
     @contextmanager
@@ -190,117 +128,128 @@ class Verifier:
         return RotatedElevationMap(self._scans[query]) if self._scans[query].usable else None
 
     def _hypotheses(
-        self, query: Keyframe, ranked: list[RankedCandidate], turned: RotatedElevationMap | None
+        self, query: Keyframe, ranked: list[Offered], turned: RotatedElevationMap | None
     ) -> list[Hypothesis]:
         """Hypotheses about the given candidates, the most promising first."""
         found: list[Hypothesis] = []
-        for item in ranked:
-            found += find_hypotheses(query, item, turned, self._scans[item.keyframe], self._settings)
+        for candidate, keyframe in ranked:
+            found += find_hypotheses(query, candidate, keyframe, turned, self._scans[keyframe], self._settings)
         return sorted(found, key=lambda one: -one.score)
 
-    def _judge(self, query: Keyframe, hypotheses: list[Hypothesis], hopeless: float) -> list[JudgedHypothesis]:
-        """Align and measure hypotheses, and judge each knowing the others about its candidate.
+    def _judge(self, hypotheses: list[Hypothesis], hopeless: float) -> list[Hypothesis]:
+        """Align and measure hypotheses, and judge each beside the others about its candidate.
 
-        What stays below the probability `hopeless` even without rivals is not held against any.
+        The slow tests are left out below the probability `hopeless` that a hypothesis would have if it passed them.
         """
-        measured = [(one, self._measure(one)) for one in self._aligned(query, hypotheses)]
-        judged = []
-        for one, measurement in measured:
-            others = [(other.pose, found) for other, found in measured if other.match is one.match]
-            known = beside(measurement, one.pose, others)
-            if self._acceptance.at_best(known) >= hopeless:
-                known = against_rivals(known, one)
-            probability = self._probability(one, known)
-            if probability >= self._threshold:
-                known = against_passage(known, one)
-            judged.append(JudgedHypothesis(one, known, probability))
-        return judged
+        aligned = self._aligned(hypotheses)
+        for one in aligned:
+            one.measurement = measure(one, self._memory, self._settings.odometry_drift)
+        compared = []
+        for one in aligned:
+            others = [(other.pose, other.measurement) for other in aligned if other.candidate is one.candidate]
+            compared.append(compare_poses(one.measurement, one.pose, others))
+        for one, one.measurement in zip(aligned, compared, strict=True):
+            if self._acceptance.at_best(one.measurement) >= hopeless:
+                one.measurement = measure_ambiguity(one)
+            one.probability = self._probability(one)
+            if one.probability >= self._threshold:
+                one.measurement = measure_passage(one)
+        return aligned
 
-    def _probability(self, aligned: AlignedHypothesis, measurement: Measurement) -> float:
+    def _probability(self, hypothesis: Hypothesis) -> float:
         """That a hypothesis is right; where scans show bare ground alone, nothing would refute a texture seen twice."""
-        found = self._acceptance.probability(measurement)
-        scans = self._scans[aligned.match], self._scans[aligned.query]
-        if aligned.scans is not None or not all(scan.usable and scan.bare for scan in scans):
+        found = self._acceptance.probability(hypothesis.measurement)
+        scans = [self._scans[keyframe] for keyframe in hypothesis.keyframes]
+        if hypothesis.scans or not all(scan.usable and scan.bare for scan in scans):
             return found
-        if measurement.spread < const.BARE_SPREAD:
+        if hypothesis.measurement.spread < const.BARE_SPREAD:
             return 0.0
         return found / (found + const.BARE_ODDS * (1.0 - found))
 
-    def _aligned(self, query: Keyframe, hypotheses: list[Hypothesis]) -> list[AlignedHypothesis]:
+    def _aligned(self, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         """Each aligned; of those that begin or end where another of the same candidate ended, only the first."""
-        kept: list[AlignedHypothesis] = []
-        for hypothesis in hypotheses:
-            ends = [one.pose for one in kept if one.match is hypothesis.ranked.keyframe]
-            if any(near(hypothesis.pose, end, const.DISTINCT_M, const.DISTINCT_RAD) for end in ends):
+        kept: list[Hypothesis] = []
+        for one in hypotheses:
+            ends = [other.pose for other in kept if other.candidate is one.candidate]
+            if any(near(one.pose, end, const.DISTINCT_M, const.DISTINCT_RAD) for end in ends):
                 continue
-            aligned = self._align(query, hypothesis)
-            if not any(near(aligned.pose, end, const.SAME_M, const.SAME_RAD) for end in ends):
-                kept.append(aligned)
+            self._align(one)
+            if not any(near(one.pose, end, const.SAME_M, const.SAME_RAD) for end in ends):
+                kept.append(one)
         return kept
 
-    def _align(self, query: Keyframe, hypothesis: Hypothesis) -> AlignedHypothesis:
-        scans = self._scans[hypothesis.ranked.keyframe], self._scans[query]
+    def _align(self, hypothesis: Hypothesis) -> None:
+        query, match = hypothesis.keyframes
+        scans = self._scans[match], self._scans[query]
         if hypothesis.views is not None and views_tell(*scans):
-            return AlignedHypothesis(query, hypothesis, hypothesis.views.align(hypothesis.pose), None)
-        return AlignedHypothesis(query, hypothesis, align_scans(*scans, hypothesis.pose), scans)
+            hypothesis.alignment = hypothesis.views.align(hypothesis.pose)
+        else:
+            hypothesis.scans, hypothesis.alignment = scans, align_scans(*scans, hypothesis.pose)
+        hypothesis.pose = hypothesis.alignment.pose
 
-    def _measure(self, aligned: AlignedHypothesis) -> Measurement:
-        return measure(aligned, self._memory, self._settings.odometry_drift)
-
-    def _decide(
-        self, query: Keyframe, ranked: list[RankedCandidate], judged: list[JudgedHypothesis], tested: set[int]
-    ) -> list[Verdict]:
-        best: dict[int, JudgedHypothesis] = {}
+    def _best(
+        self, query: Keyframe, ranked: list[Offered], judged: list[Hypothesis], tested: set[int]
+    ) -> list[Hypothesis]:
+        """The most probable hypothesis of each candidate, decided; accepted ones first."""
+        best: dict[int, Hypothesis] = {}
         for one in judged:
-            known = best.get(one.match_stamp_ns)
-            if known is None or one.probability > known.probability:
+            known = best.setdefault(one.match_stamp_ns, one)
+            if (one.probability or 0.0) > (known.probability or 0.0):
                 best[one.match_stamp_ns] = one
-        verdicts = []
-        for item in ranked:
-            stamp = item.candidate.stamp_ns
-            if stamp in best:
-                verdicts.append(self._verdict(item, best[stamp].told_by_images()))
+        found = []
+        for candidate, keyframe in ranked:
+            if candidate.stamp_ns in best:
+                found.append(best[candidate.stamp_ns])
+                self._decide(found[-1])
             else:
-                metric = query.has_depth or item.keyframe.has_depth
-                reason = (NO_POSE if metric else NO_DEPTH) if stamp in tested else UNTESTED
-                verdicts.append(Verdict(item.candidate, reason, measure_candidate(item)))
-        return sorted(verdicts, key=lambda verdict: verdict.closure is None)
+                metric = query.has_depth or keyframe.has_depth
+                reason = RejectReason.NO_POSE if metric else RejectReason.NO_DEPTH
+                reason = reason if candidate.stamp_ns in tested else RejectReason.NOT_SELECTED
+                found.append(Hypothesis.of(query, candidate, keyframe, reason=reason))
+        accepted = sorted((one for one in found if one.accepted), key=lambda one: -(one.probability or 0.0))
+        for one in accepted[self._settings.max_closures :]:  # closures of one keyframe are correlated
+            one.reject(RejectReason.LESS_PROBABLE)
+        return sorted(found, key=lambda one: not one.accepted)
 
-    def _verdict(self, ranked: RankedCandidate, judged: JudgedHypothesis) -> Verdict:
-        aligned, measurement, probability = judged.aligned, judged.measurement, judged.probability
-        pixels = aligned.consistent_pixels
-        objection = self._objection(judged)
-        if objection:
-            return Verdict(ranked.candidate, objection, measurement, None, pixels, probability)
-        covariance = aligned.covariance(self._acceptance.covariances[measurement.kind])
-        closure = LoopClosure(aligned.query.stamp_ns, ranked.candidate.stamp_ns, aligned.pose, covariance, probability)
-        return Verdict(ranked.candidate, "accepted", measurement, closure, pixels, probability)
+    def _decide(self, hypothesis: Hypothesis) -> None:
+        """Fill in what people and the closure need, and the reason against it, if there is one."""
+        query, match = hypothesis.keyframes
+        if hypothesis.views is not None:
+            hypothesis.inlier_pixels = hypothesis.views.consistent_pixels(hypothesis.pose)
+        agreement = image_agreement(query, match, hypothesis.pose)
+        hypothesis.measurement = replace(hypothesis.measurement, agreement_image=agreement)
+        if (objection := self._objection(hypothesis)) is not None:
+            hypothesis.reject(*objection)
+            return
+        covariance = closure_covariance(hypothesis, self._acceptance.covariances[hypothesis.measurement.kind])
+        probability = hypothesis.probability or 0.0
+        hypothesis.closure = LoopClosure(*hypothesis.endpoints, hypothesis.pose, covariance, probability)
 
-    def _objection(self, judged: JudgedHypothesis) -> str:
-        """Why a hypothesis is no closure; empty when it is one."""
-        if judged.probability < self._threshold:
-            below = f"probability {judged.probability:.2f} is below {self._threshold:g}"
-            return ": ".join(filter(None, (below, judged.measurement.discord)))
-        if reason := refuted(judged.measurement):
+    def _objection(self, hypothesis: Hypothesis) -> tuple[RejectReason, str] | None:
+        """Why a hypothesis is no closure, with figures; None when it is one."""
+        probability, measurement, pose = hypothesis.probability or 0.0, hypothesis.measurement, hypothesis.pose
+        if probability < self._threshold:
+            below = f"{probability:.2f} < {self._threshold:g}"
+            return RejectReason.IMPROBABLE, ", ".join(filter(None, (below, measurement.modality_conflict)))
+        if (reason := refuted(measurement)) is not None:
             return reason
-        if strange := self._acceptance.unlike(judged.measurement):
-            return f"unlike anything the decision was fitted on: {strange}"
-        pose = judged.aligned.pose
+        if strange := self._acceptance.out_of_range(measurement):
+            return RejectReason.OUT_OF_RANGE, strange
         turn_deg, shift_m = abs(np.degrees(heading(pose))), float(np.linalg.norm(pose[:3, 3]))
-        # a place is a position and a view [UMF 5.1.2]: whoever looks elsewhere is somewhere else
+        # a place is a position and a view [UMF 5.1.2]
         if 0 < self._settings.max_turn_deg < turn_deg:
-            return f"turned by {turn_deg:.0f} deg, more than {self._settings.max_turn_deg:g}"
-        if (shared := _shared_view(judged.aligned)) < const.MIN_SHARED_VIEW:
-            return f"turned by {turn_deg:.0f} deg: the views share only {max(shared, 0):.0%}"
+            return RejectReason.TURNED, f"{turn_deg:.0f} deg > {self._settings.max_turn_deg:g}"
+        if (shared := _shared_view(hypothesis)) < const.MIN_SHARED_VIEW:
+            return RejectReason.LITTLE_SHARED_VIEW, f"{max(shared, 0):.0%}, turned by {turn_deg:.0f} deg"
         if shift_m > self._settings.max_shift_m:
-            return f"{shift_m:.1f} m apart, more than {self._settings.max_shift_m:g}"
-        return ""
+            return RejectReason.TOO_FAR, f"{shift_m:.1f} m > {self._settings.max_shift_m:g}"
+        return None
 
 
-def _shared_view(aligned: AlignedHypothesis) -> float:
+def _shared_view(hypothesis: Hypothesis) -> float:
     """Share of the narrower view that both sensors see at the pose that was found."""
-    if aligned.scans is None:
-        return 1.0 - abs(heading(aligned.pose)) / min(one.camera.width_rad for one in (aligned.query, aligned.match))
-    match, query = aligned.scans
-    turn = heading(levelled(match, query, aligned.pose))
+    if not hypothesis.scans:
+        return 1.0 - abs(heading(hypothesis.pose)) / min(one.camera.width_rad for one in hypothesis.keyframes)
+    match, query = hypothesis.scans
+    turn = heading(levelled(match, query, hypothesis.pose))
     return float(match.view.overlap(query.view, np.array([turn]))[0])

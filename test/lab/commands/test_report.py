@@ -25,18 +25,24 @@ from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection
 from umf_ros.runs.reader import remember_recording
 from umf_ros.runs.writer import RunRecorder
-from umf_ros.verification import Measurement, Verdict
+from umf_ros.verification import Hypothesis, Measurement, RejectReason
 
 LATENCY = {"embed": 30.0, "query": 1.0, "verify": 9.0, "total": 40.0}
 PIXELS = np.array([[10, 12, 50, 30], [40, 20, 20, 41]], np.float32)
 
 
-def verdict(query: Frame, match: Frame, error_m: float, probability: float) -> Verdict:
+def verdict(query: Frame, match: Frame, error_m: float, probability: float) -> Hypothesis:
     """A closure between two frames that is wrong by so much, sideways."""
     poses = [drive((frame.stamp_ns - START_NS) * 1e-9) for frame in (match, query)]
     pose = relative(*poses) @ make_pose(np.eye(3), [0, error_m, 0])
     closure = LoopClosure(query.stamp_ns, match.stamp_ns, pose, np.eye(6) * 0.01, probability)
-    return Verdict(Candidate(0, match.stamp_ns, 0.8), "accepted", Measurement(similarity=0.8), closure, PIXELS)
+    return Hypothesis(
+        query.stamp_ns,
+        Candidate(0, match.stamp_ns, 0.8),
+        Measurement(similarity=0.8),
+        closure=closure,
+        inlier_pixels=PIXELS,
+    )
 
 
 def record_run(folder: Path, bag: Path, settings_folder: Path) -> list[Frame]:
@@ -49,7 +55,9 @@ def record_run(folder: Path, bag: Path, settings_folder: Path) -> list[Frame]:
     closures[12] = verdict(frames[12], frames[7], 0.8, 0.9123)
     for i, frame in enumerate(frames):
         keyframe = replace(make_keyframe(0, 0.2 * i), stamp_ns=frame.stamp_ns)
-        rejected = Verdict(Candidate(1, frames[0].stamp_ns, 0.1), "few inliers", Measurement(similarity=0.1))
+        rejected = Hypothesis(
+            frames[0].stamp_ns, Candidate(1, frames[0].stamp_ns, 0.1), Measurement(similarity=0.1), RejectReason.NO_POSE
+        )
         found = [closures[i], rejected] if i in closures else []
         recorder.record(frame, Detection(frame.stamp_ns, keyframe, found, LATENCY))
     recorder.write_summary({"image": 1, "cloud": 0, "odometry": 0, "worker": 0})

@@ -20,8 +20,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, PointCloud2
 
 from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.presets import topics_of
 from umf_ros.bags.reader import open_bag
+from umf_ros.core.config import topics_of
 from umf_ros.lab.live.bag_player_node import TRANSPORT
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.decode import decode_cloud, decode_image, stamp_ns

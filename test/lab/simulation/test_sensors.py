@@ -182,7 +182,7 @@ def test_raw_colour_cameras_are_bent_and_rectify_to_the_calibrated_pair(drive):
     raw = left.camera.take(pose @ left.body_T_camera, Sun(30, 30), np.random.default_rng(0))
     ideal = Camera(drive.world, calibration.camera)
     flat = ideal.take(pose @ calibration.body_T_camera, Sun(30, 30), np.random.default_rng(0))
-    rectified = calibration.rectifier.left(raw.image)
+    rectified = calibration.rectifier.apply(raw.image, 0)
     match = np.corrcoef(rectified[200:500].ravel(), flat.image[200:500].ravel())[0, 1]
     resized_raw = cv2.resize(raw.image, (688, 512), interpolation=cv2.INTER_AREA)
     assert match > 0.8

@@ -10,7 +10,7 @@ import pytest
 from measurements import BAD, GOOD
 
 from umf_ros.lab.fit.acceptance import Example, load_examples, save_examples
-from umf_ros.verification.measurement import IMAGE
+from umf_ros.verification.hypothesis import IMAGE
 
 EXAMPLES = [
     Example(GOOD, True, "spin64-street-car"),

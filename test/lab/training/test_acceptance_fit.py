@@ -19,7 +19,7 @@ from umf_ros.lab.fit.acceptance import (
 )
 from umf_ros.verification import Measurement
 from umf_ros.verification.acceptance import scores
-from umf_ros.verification.measurement import IMAGE, SCAN
+from umf_ros.verification.hypothesis import IMAGE, SCAN
 from umf_ros.verification.scan_alignment import CovarianceModel, covariance_of
 
 

@@ -12,8 +12,8 @@ from umf_ros.core.config import Verification
 from umf_ros.core.errors import writing
 from umf_ros.core.frames import Candidate, Image, Keyframe, Points
 from umf_ros.core.geometry import transform
+from umf_ros.verification import Hypothesis, Verifier
 from umf_ros.verification.acceptance import load_acceptance
-from umf_ros.verification.verifier import JudgedHypothesis, Verifier
 
 MOST_LINES = 60
 
@@ -33,7 +33,7 @@ class Explanation:
 
     query: Keyframe
     match: Keyframe
-    best: JudgedHypothesis | None
+    best: Hypothesis | None
     threshold: float
     contributions: dict[str, float]
     pixels: Points
@@ -43,8 +43,9 @@ class Explanation:
         """One line for a person."""
         if self.best is None:
             return "rejected: no pose fits"
-        word = "accepted" if self.best.probability >= self.threshold else "rejected"
-        return f"{word}: probability {self.best.probability:.3f}, {self.threshold:g} is needed"
+        probability = self.best.probability or 0.0
+        word = "accepted" if probability >= self.threshold else "rejected"
+        return f"{word}: probability {probability:.3f}, {self.threshold:g} is needed"
 
 
 def explain(query: Keyframe, match: Keyframe, settings: Verification) -> Explanation:
@@ -53,9 +54,10 @@ def explain(query: Keyframe, match: Keyframe, settings: Verification) -> Explana
     examined = Verifier(settings).examine(query, [(Candidate(0, match.stamp_ns, similarity), match)])
     if not examined:
         return Explanation(query, match, None, settings.min_probability, {}, np.empty((0, 4), np.float32))
-    best = max(examined, key=lambda one: one.probability)
+    best = max(examined, key=lambda one: one.probability or 0.0)
     contributions = load_acceptance(settings.calibration).contributions(best.measurement)
-    return Explanation(query, match, best, settings.min_probability, contributions, best.aligned.consistent_pixels)
+    pixels = best.views.consistent_pixels(best.pose) if best.views else np.empty((0, 4), np.float32)
+    return Explanation(query, match, best, settings.min_probability, contributions, pixels)
 
 
 def draw(explanation: Explanation, query_image: Image | None, match_image: Image | None, path: Path) -> None:
@@ -93,7 +95,7 @@ def _draw_images(axes: Any, explanation: Explanation, query: Image | None, match
 def _draw_scans(axes: Any, explanation: Explanation, height_axis: int, label: str, title: str) -> None:
     match, query = explanation.match.points, explanation.query.points
     if explanation.best is not None:
-        query = transform(explanation.best.aligned.pose, query)
+        query = transform(explanation.best.pose, query)
         title += ", aligned"
     for points, colour, name in ((match, "tab:blue", "match"), (query, "tab:orange", "query")):
         axes.scatter(points[:, 0], points[:, height_axis], s=1.2, c=colour, label=name, linewidths=0)

@@ -212,7 +212,7 @@ def _image_frame(file: Path, number: int, calibration: Calibration | None) -> Fr
 def _rectified(image: Image, calibration: Calibration | None) -> Image:
     if calibration is None or calibration.rectifier is None:
         return image
-    return calibration.rectifier.left(image)
+    return calibration.rectifier.apply(image, 0)
 
 
 def _scan_frame(file: Path, number: int, calibration: Calibration | None) -> Frame:

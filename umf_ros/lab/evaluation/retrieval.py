@@ -146,7 +146,7 @@ class PairInliers:
         if np.isnan(self._worth[row, reference]):
             keyframe = self._references[reference]
             alone = [(Candidate(0, keyframe.stamp_ns, 0.0), keyframe)]
-            self._worth[row, reference] = rerank(self._queries[row], alone, self._settings)[0].order
+            self._worth[row, reference] = rerank(self._queries[row], alone, self._settings)[0][0].score
         return float(self._worth[row, reference])
 
 
@@ -317,8 +317,8 @@ def rerank_all(
             started = time.perf_counter()
             ranked = rerank(query, candidates, way)
             took[method].append(1e3 * (time.perf_counter() - started))
-            for item in ranked:
-                scores[method][row, item.candidate.index] = item.order
+            for candidate, _ in ranked:
+                scores[method][row, candidate.index] = candidate.score
         report()
     timed = {reranker: took.get(f"{reranker} both", []) for reranker in RERANKERS}
     medians = {reranker: float(np.median(each)) for reranker, each in timed.items() if each}

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from umf_ros.core.geometry import Array
 from umf_ros.runs.truth import normalised_errors, share_inside
 from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, refuted, scores
-from umf_ros.verification.measurement import IMAGE, SCAN, Measurement
+from umf_ros.verification.hypothesis import IMAGE, SCAN, Measurement
 from umf_ros.verification.scan_alignment import CovarianceModel, covariance_of
 
 EXAMPLES = Path(__file__).with_name("acceptance_examples.npz")

@@ -30,7 +30,7 @@ from umf_ros.lab.simulation.domains import DOMAINS, Domain
 from umf_ros.lab.simulation.domains.pairs import QUICK, SAME, TURNED, pairs_of, places_of
 from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.runs.truth import MEDIAN_EXPECTED, normalised_errors, pose_error, share_inside
-from umf_ros.verification.measurement import SCAN
+from umf_ros.verification.hypothesis import SCAN
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import (
     Alignment,

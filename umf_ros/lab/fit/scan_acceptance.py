@@ -38,10 +38,11 @@ from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance, refuted
-from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory
-from umf_ros.verification.measurement import SCAN, AlignedHypothesis, Measurement, beside, measure
+from umf_ros.verification.hypothesis import SCAN, Hypothesis, Measurement
+from umf_ros.verification.measurement import compare_poses, measure
+from umf_ros.verification.pose_search import TemporalMemory
 from umf_ros.verification.prepared_scan import ScanCache
-from umf_ros.verification.rerank import RankedCandidate, rerank
+from umf_ros.verification.rerank import rerank
 from umf_ros.verification.scan_alignment import align_scans
 
 RIGHT_M, RIGHT_DEG = 0.3, 2.5
@@ -115,16 +116,14 @@ def _examples(tried: Tried, verifier: Verifier, domain: Domain, rng: np.random.G
     verifier.reset()
     candidates = [(Candidate(0, tried.match.stamp_ns, tried.pair.similarity), tried.match)]
     found = [
-        (one.aligned.pose, one.measurement)
-        for one in verifier.examine(tried.query, candidates)
-        if one.measurement.kind == SCAN
+        (one.pose, one.measurement) for one in verifier.examine(tried.query, candidates) if one.measurement.kind == SCAN
     ]
     scans = ScanCache()
     if all(scans[keyframe].usable for keyframe in (tried.match, tried.query)):
-        ranked = rerank(tried.query, candidates, Verification())[0]
+        ranked, _ = rerank(tried.query, candidates, Verification())[0]
         guesses = _guesses(tried, domain.scanner.all_round, rng)
         guessed = [_aligned(tried, ranked, scans, guess) for guess in guesses]
-        found += [(pose, beside(measurement, pose, found)) for pose, measurement in guessed]
+        found += [(pose, compare_poses(measurement, pose, found)) for pose, measurement in guessed]
     kept: list[Array] = []
     for pose, measurement in found:
         right = tried.is_right(pose)
@@ -152,11 +151,12 @@ def _guesses(tried: Tried, all_round: bool, rng: np.random.Generator) -> list[Ar
     return [tried.true @ move for move in moves + around]
 
 
-def _aligned(tried: Tried, ranked: RankedCandidate, scans: ScanCache, guess: Array) -> tuple[Array, Measurement]:
+def _aligned(tried: Tried, ranked: Candidate, scans: ScanCache, guess: Array) -> tuple[Array, Measurement]:
     prepared = scans[tried.match], scans[tried.query]
     alignment = align_scans(*prepared, guess)
-    aligned = AlignedHypothesis(tried.query, Hypothesis(ranked, guess, 0.0), alignment, prepared)
-    return alignment.pose, measure(aligned, TemporalMemory(), Verification().odometry_drift)
+    found = {"pose": alignment.pose, "scans": prepared, "alignment": alignment}
+    hypothesis = Hypothesis.of(tried.query, ranked, tried.match, **found)
+    return alignment.pose, measure(hypothesis, TemporalMemory(), Verification().odometry_drift)
 
 
 def _between_worlds(places: list[ScannedPlace], rng: np.random.Generator) -> ScanPair:
@@ -282,7 +282,7 @@ def examine(drive: SurveyedDrive, keyframes: list[Keyframe]) -> Iterator[Example
             strength = float(rng.choice([0.0, 0.0, 1.0, 2.0]))
             pairs = [(one, _degraded(database[one.index], strength, rng)) for one in chosen]
             for one in verifier.examine(_degraded(keyframe, strength, rng), pairs):
-                metres, degrees = drive.error(query, one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose)
+                metres, degrees = drive.error(query, one.candidate.index, one.pose)
                 right = is_right(metres, degrees)
                 if right is not None:
                     yield Example(one.measurement, right, f"drive {drive.seed}")

@@ -42,9 +42,8 @@ from umf_ros.lab.fit.acceptance import (
 from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, POSE_TOLERANCE_DEG, POSE_TOLERANCE_M
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, Logistic, load_acceptance, scores
-from umf_ros.verification.measurement import IMAGE
+from umf_ros.verification.hypothesis import IMAGE, Hypothesis
 from umf_ros.verification.scan_alignment import covariance_of
-from umf_ros.verification.verifier import JudgedHypothesis
 
 DEFAULT_OUT = Path("config/verification/calibration.json")
 RIGHT_M, RIGHT_DEG = 0.3, 2.0  # examples between right and wrong are left out
@@ -90,7 +89,7 @@ class ViewFinding:
     """An examined hypothesis of a recording, and the error (6,) of its pose: without bounds for another recording's."""
 
     recording: str
-    examined: JudgedHypothesis
+    examined: Hypothesis
     error: Array
     tracked: bool
 
@@ -145,7 +144,7 @@ def fit(findings: list[ViewFinding]) -> tuple[AcceptanceModel, dict[str, float]]
     tracked = np.array([finding.tracked for finding in findings])
     sure = [one for one, good in zip(findings, right & accepted, strict=True) if good]
     errors = np.array([one.error for one in sure])
-    informations = np.array([one.examined.aligned.alignment.information for one in sure])
+    informations = np.array([one.examined.alignment.information for one in sure if one.examined.alignment])
     covariance = fit_covariance(errors, informations)
     results = {
         "image_examples": float(len(findings)),
@@ -194,7 +193,7 @@ def _examined(
         match = replace(match, session=1) if row < 0 else match
         pairs.append((Candidate(row, match.stamp_ns, similarity), match if tracked else _untracked(match)))
     for one in verifier.examine(asked, pairs):
-        row, pose = one.aligned.hypothesis.ranked.candidate.index, one.aligned.pose
+        row, pose = one.candidate.index, one.pose
         yield ViewFinding(mine.name, one, mine.error(query, row, pose) if row >= 0 else np.full(6, np.inf), tracked)
 
 

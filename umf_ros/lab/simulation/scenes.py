@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Candidate, Embedding, Keyframe, LocalFeatures, StereoCamera
 from umf_ros.core.geometry import Array, invert, make_pose, transform
-from umf_ros.verification import Verdict, Verifier, thin_scan
+from umf_ros.verification import Hypothesis, Verifier, thin_scan
 
 CAMERA = StereoCamera(688, 512, 579.488, 579.488, 342.133, 255.806, 0.2003)
 BODY_T_CAMERA = make_pose(Rotation.from_euler("ZYX", [-90, 0, -96], degrees=True).as_matrix(), [0.3, 0.1, 1.1])
@@ -228,7 +228,7 @@ TRAPS: dict[str, Callable[[int], Pair]] = {
 }
 
 
-def spring(verifier: Verifier, trap: Callable[[int], Pair], seed: int) -> Verdict:
+def spring(verifier: Verifier, trap: Callable[[int], Pair], seed: int) -> Hypothesis:
     """What the verifier says of one trap, similarity of the global descriptors pretended to be high."""
     query, match = trap(seed)
     verifier.reset()

@@ -167,7 +167,7 @@ class Simulator:
         rectifier = self.calibration.rectifier
         if rectifier is None:
             return left.image, right.image if right else None
-        return rectifier.left(left.image), rectifier.right(right.image) if right else None
+        return rectifier.apply(left.image, 0), rectifier.apply(right.image, 1) if right else None
 
     def odometry_at(self, stamp_ns: int) -> Array:
         """Odometry at any time: the last sample, moved on by the true motion since."""

@@ -1,7 +1,4 @@
-"""Hypotheses about where the rover stood: from elevation maps, from local features, from earlier findings.
-
-A hypothesis is a pose worth a closer look; nothing is decided here.
-"""
+"""Find poses for a candidate: from elevation maps, from local features and from findings of earlier keyframes."""
 
 from __future__ import annotations
 
@@ -15,32 +12,17 @@ from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.verification import constants as const
+from umf_ros.verification.hypothesis import Hypothesis
 from umf_ros.verification.prepared_scan import PreparedScan, views_tell
-from umf_ros.verification.rerank import RankedCandidate, fit_rigid
+from umf_ros.verification.rerank import fit_rigid
 from umf_ros.verification.view_alignment import PairedViews
 from umf_ros.verification.yaw_search import Fit, RotatedElevationMap, scout, search
 
 
-@dataclass(frozen=True, slots=True)
-class Hypothesis:
-    """A pose to refine.
-
-    Attributes:
-        ranked: the candidate it belongs to.
-        pose: (4, 4) `match_T_query`.
-        score: of the elevation maps at that pose, or inliers without scans; larger is better.
-        views: both images, where there are any.
-    """
-
-    ranked: RankedCandidate
-    pose: Array
-    score: float
-    views: PairedViews | None = None
-
-
 def find_hypotheses(
     query: Keyframe,
-    ranked: RankedCandidate,
+    candidate: Candidate,
+    keyframe: Keyframe,
     turned: RotatedElevationMap | None,
     match: PreparedScan,
     settings: Verification,
@@ -49,38 +31,45 @@ def find_hypotheses(
 
     Args:
         query: the query keyframe.
-        ranked: the candidate.
+        candidate: the candidate, reranked.
+        keyframe: its keyframe.
         turned: the query's surroundings at every heading; None without a usable scan.
         match: the candidate's scan, usable or not.
         settings: RANSAC iterations and seed.
     """
     views = None
     if settings.modalities != "cloud":
-        views = PairedViews.of(query, ranked.keyframe, const.VIEW_NOISE[settings.features])
+        views = PairedViews.of(query, keyframe, const.VIEW_NOISE[settings.features])
     if turned is None or not match.usable or (views is not None and views_tell(match, turned.scan)):
         seen = views.best_pose() if views else None
-        return [Hypothesis(ranked, seen[0], float(seen[1]), views)] if seen else []
-    from_points = pose_from_points(query, ranked, settings.ransac_iterations, settings.seed)
+        poses = [(seen[0], float(seen[1]))] if seen else []
+        return [Hypothesis.of(query, candidate, keyframe, pose=pose, score=score, views=views) for pose, score in poses]
+    from_points = pose_from_points(query, candidate, keyframe, settings.ransac_iterations, settings.seed)
     guesses = (from_points, views.any_pose() if views else None)
-    poses = [pose for pose in guesses if pose is not None]
-    fits = [fit for pose in poses if (fit := scout(match, turned.scan, pose)).telling] + search(match, turned)
+    fits = [scout(match, turned.scan, pose) for pose in guesses if pose is not None]
+    fits = [fit for fit in fits if fit.telling] + search(match, turned)
     fits.sort(key=lambda fit: -fit.score)
-    return [Hypothesis(ranked, fit.pose, fit.score, views) for fit in _distinct(fits)]
+    return [
+        Hypothesis.of(query, candidate, keyframe, pose=fit.pose, score=fit.score, views=views)
+        for fit in _distinct(fits)
+    ]
 
 
-def pose_from_points(query: Keyframe, ranked: RankedCandidate, iterations: int, seed: int) -> Array | None:
+def pose_from_points(
+    query: Keyframe, candidate: Candidate, match: Keyframe, iterations: int, seed: int
+) -> Array | None:
     """`match_T_query` from 3-D/3-D pairs of both modalities at once, or None."""
-    ours, theirs = paired_points(query, ranked)
+    ours, theirs = paired_points(query, candidate, match)
     consensus = fit_rigid(ours, theirs, const.POINT_THRESHOLD_M, iterations, seed)
     return consensus.model if consensus is not None and consensus.count >= const.MIN_POINTS else None
 
 
-def paired_points(query: Keyframe, ranked: RankedCandidate) -> tuple[Array, Array]:
+def paired_points(query: Keyframe, candidate: Candidate, match: Keyframe) -> tuple[Array, Array]:
     """Points (P, 3) of the query and of the match, each in its body frame, of all pairs with known depths."""
     ours, theirs = [np.empty((0, 3))], [np.empty((0, 3))]
     for mine, other, pairs in (
-        (query.embedding.image, ranked.keyframe.embedding.image, ranked.image_pairs),
-        (query.embedding.cloud, ranked.keyframe.embedding.cloud, ranked.cloud_pairs),
+        (query.embedding.image, match.embedding.image, candidate.image_pairs),
+        (query.embedding.cloud, match.embedding.cloud, candidate.cloud_pairs),
     ):
         if mine is not None and other is not None:
             a, b = mine.points[pairs[:, 0]].astype(float), other.points[pairs[:, 1]].astype(float)

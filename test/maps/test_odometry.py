@@ -1,0 +1,93 @@
+"""The odometry of a recording in a map: kept in the file of its run, and fed to the joint graph."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from umf_ros.core.config import PoseGraphSettings, Settings
+from umf_ros.core.errors import UmfError
+from umf_ros.core.geometry import make_pose
+from umf_ros.maps.map_folder import MapFolder
+from umf_ros.pose_graph.backend import PoseGraph
+from umf_ros.replay import feed
+from umf_ros.runs.run_file import RunFile, StoredOdometry
+
+SECOND_NS = 10**9
+UNKNOWN = np.diag([np.inf] * 6)
+
+
+def at(x: float) -> np.ndarray:
+    return make_pose(np.eye(3), [x, 0, 0])
+
+
+def messages(*positions: float) -> list[StoredOdometry]:
+    return [StoredOdometry(row * SECOND_NS, at(x)) for row, x in enumerate(positions)]
+
+
+TRACKED = [
+    StoredOdometry(second * SECOND_NS, at(x), covariance)
+    for second, x, covariance in ((0, 0, UNKNOWN), (1, 1, 0.01 * np.eye(6)), (5, 0, UNKNOWN), (6, 1, 0.04 * np.eye(6)))
+]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> MapFolder:
+    folder = MapFolder.open_or_create(tmp_path / "map", Settings())
+    folder.folder_of("a").mkdir(parents=True)
+    return folder
+
+
+@pytest.mark.parametrize("put", [messages(0, 1, 2, 3), TRACKED], ids=["messages", "tracked"])
+def test_odometry_is_read_back_as_it_was(folder: MapFolder, put: list[StoredOdometry]) -> None:
+    with closing(RunFile(folder.folder_of("a"))) as file:
+        for number, one in enumerate(put):
+            file.append_odometry(number, one)
+    got = folder.odometry_of("a")
+    assert [one.stamp_ns for one in got] == [one.stamp_ns for one in put]
+    for ours, theirs in zip(got, put, strict=True):
+        np.testing.assert_array_equal(ours.odom_T_body, theirs.odom_T_body)
+        assert (ours.covariance is None) == (theirs.covariance is None)
+        if ours.covariance is not None and theirs.covariance is not None:
+            np.testing.assert_array_equal(ours.covariance, theirs.covariance)
+
+
+@pytest.mark.parametrize("tracked", [False, True])
+def test_odometry_of_an_earlier_release_is_read(folder: MapFolder, tracked: bool) -> None:
+    put = TRACKED if tracked else messages(0, 1, 2)
+    kept = [np.eye(6) if one.covariance is UNKNOWN else one.covariance for one in put] if tracked else []
+    np.savez(
+        folder.folder_of("a") / "odometry.npz",
+        stamps=np.array([one.stamp_ns for one in put]),
+        poses=np.array([one.odom_T_body for one in put]),
+        covariances=np.array(kept, float).reshape(-1, 6, 6),
+        starts=np.array([0, 2] if tracked else [], np.int64),
+    )
+    got = folder.odometry_of("a")
+    assert [one.stamp_ns for one in got] == [one.stamp_ns for one in put]
+    for ours, theirs in zip(got, put, strict=True):
+        np.testing.assert_array_equal(ours.odom_T_body, theirs.odom_T_body)
+        np.testing.assert_array_equal(ours.covariance, theirs.covariance)
+    (folder.folder_of("a") / "odometry.npz").write_text("noise")
+    with pytest.raises(UmfError, match=r"odometry\.npz cannot be read"):
+        folder.odometry_of("a")
+
+
+def test_a_graph_gets_it_on_another_clock_and_in_its_sessions() -> None:
+    graph = PoseGraph(PoseGraphSettings())
+    assert feed(graph, messages(0, 1, 2, 500, 501, 502), 70 * SECOND_NS)  # it jumps: the rover was carried
+    assert graph.session_spans() == [(70 * SECOND_NS, 72 * SECOND_NS), (73 * SECOND_NS, 75 * SECOND_NS)]
+
+
+def test_tracked_poses_keep_their_sessions() -> None:
+    graph = PoseGraph(PoseGraphSettings())
+    feed(graph, TRACKED)
+    assert graph.session_spans() == [(0, SECOND_NS), (5 * SECOND_NS, 6 * SECOND_NS)]
+
+
+def test_a_session_without_its_run_is_refused(folder: MapFolder) -> None:
+    with pytest.raises(UmfError, match=r"there is no run .*run\.sqlite"):
+        folder.odometry_of("a")
