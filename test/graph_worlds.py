@@ -14,7 +14,7 @@ from umf_ros.lab.datasets.g2o import G2oGraph, GraphRecording
 from umf_ros.lab.datasets.g2o import drive as drive_recording
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, WorldClosure
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.pose_graph.closures import PlacedClosure, State
+from umf_ros.pose_graph.closures import Closures, PlacedClosure, State, as_closures
 from umf_ros.pose_graph.odometry import OdometryChain
 from umf_ros.pose_graph.solver import Edge, between
 
@@ -63,9 +63,11 @@ def lap_pairs(*first: int) -> list[tuple[int, int]]:
     return [(k, k + LAP) for k in first]
 
 
-def chain_of(world: GraphWorld, settings: PoseGraphSettings = SETTINGS, stated: float = 1.0) -> OdometryChain:
+def chain_of(
+    world: GraphWorld, settings: PoseGraphSettings = SETTINGS, stated: float = 1.0, session: int = 0
+) -> OdometryChain:
     """The world's odometry alone."""
-    chain = OdometryChain(settings)
+    chain = OdometryChain(settings, session)
     for k, pose in enumerate(world.odometry):
         covariance = world.step_covariance(k)
         chain.add(k * PERIOD_NS, pose, None if covariance is None else covariance * stated**2)
@@ -76,6 +78,12 @@ def chain_of(world: GraphWorld, settings: PoseGraphSettings = SETTINGS, stated: 
 def placed(world: GraphWorld) -> list[PlacedClosure]:
     """The world's closures, all in the first session."""
     return [PlacedClosure(0, 0, world.message(row)) for row in range(len(world.closures))]
+
+
+def rows_of(world: GraphWorld) -> Closures:
+    """The world's closures with the odometry at their endpoints."""
+    chains = [chain_of(world)]
+    return np.concatenate([as_closures(one, row, chains) for row, one in enumerate(placed(world))])
 
 
 def feed_odometry(graph: PoseGraph, world: GraphWorld, poses: Iterable[int], stated: float = 1.0) -> None:

@@ -9,7 +9,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from sources import PACKAGE, ROOT, distributions, imports, required
+from sources import PACKAGE, ROOT, distributions, imports, requirements
 
 STILL_SHARED = {"PoseGraph", "World"}
 """Names of classes that mean two things."""
@@ -53,7 +53,7 @@ def without(missing: list[str]) -> str:
 
 def lab_packages() -> list[str]:
     """Modules of the distributions that only the lab asks for."""
-    wanted = required("requirements-lab.txt")
+    wanted = requirements("lab").keys()
     return [module for module, owners in distributions().items() if owners & wanted]
 
 

@@ -46,7 +46,7 @@ from umf_ros.lab.simulation.pose_graphs import (
 )
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.noise_scale import NoiseScale
+from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.solver import Edge, between
 
 FIRST_SEED = 20_000

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from graph_worlds import SETTINGS, chain_of, closing, drive, feed_odometry, lap_pairs, placed, two_laps
+from graph_worlds import SETTINGS, closing, drive, feed_odometry, lap_pairs, rows_of, two_laps
 
 from umf_ros.core.geometry import Array, expmap
 from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops, with_wrong_closures
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.pose_graph.closures import ClosureArrays
-from umf_ros.pose_graph.consistency import squared_mahalanobis
-from umf_ros.pose_graph.noise_scale import LoopResiduals, NoiseScale, NoiseScaleEstimator, loop_residuals
+from umf_ros.pose_graph.consistency import (
+    LOOP,
+    Loops,
+    NoiseScale,
+    NoiseScaleEstimator,
+    loops_between,
+    squared_mahalanobis,
+)
 
 
 def covariances(rng: np.random.Generator, count: int, turn_rad: float, metres: float) -> Array:
@@ -21,49 +26,53 @@ def covariances(rng: np.random.Generator, count: int, turn_rad: float, metres: f
     return lower @ np.swapaxes(lower, -1, -2)
 
 
-def loops(count: int, odometry: float, closures: float, seed: int = 0) -> LoopResiduals:
+def as_loops(residuals: Array, odometry: Array, closures: Array) -> Loops:
+    found = np.zeros(len(residuals), LOOP)
+    found["residual"], found["odometry"], found["closures"] = residuals, odometry, closures
+    return found
+
+
+def loops(count: int, odometry: float, closures: float, seed: int = 0) -> Loops:
     """Loops whose true deviations are the stated ones times the factors."""
     rng = np.random.default_rng(seed)
     walk, ends = covariances(rng, count, 0.01, 0.15), covariances(rng, count, 0.01, 0.07)
     lower = np.linalg.cholesky(odometry**2 * walk + closures**2 * ends)
-    return LoopResiduals((lower @ rng.normal(size=(count, 6, 1)))[..., 0], walk, ends)
+    return as_loops((lower @ rng.normal(size=(count, 6, 1)))[..., 0], walk, ends)
 
 
-def take(estimator: NoiseScaleEstimator, found: LoopResiduals, first_place: int = 0) -> None:
+def take(estimator: NoiseScaleEstimator, found: Loops, first_place: int = 0) -> None:
     """Ten loops of each place."""
-    for start in range(0, len(found.residuals), 10):
+    for start in range(0, len(found), 10):
         estimator.add(found[start : start + 10], first_place + start)
 
 
-def wrong(count: int, metres: float) -> LoopResiduals:
+def wrong(count: int, metres: float) -> Loops:
     right = loops(count, 1.0, 1.0, seed=9)
     rng = np.random.default_rng(10)
-    return LoopResiduals(rng.normal(0, [0.3] * 3 + [metres] * 3, (count, 6)), right.odometry_noise, right.closure_noise)
+    return as_loops(rng.normal(0, [0.3] * 3 + [metres] * 3, (count, 6)), right["odometry"], right["closures"])
 
 
-def loop(world: GraphWorld, one: int = 0, other: int = 1) -> LoopResiduals:
-    arrays, chain = ClosureArrays(), chain_of(world)
-    for closure in placed(world):
-        arrays.append([chain], closure)
-    return loop_residuals(arrays, np.array([one]), np.array([other]))
+def loop(world: GraphWorld, one: int = 0, other: int = 1) -> Loops:
+    closures = rows_of(world)
+    return loops_between(closures[[one]], closures[[other]])
 
 
 def test_exact_closures_on_exact_odometry_close() -> None:
     found = loop(closing(two_laps(noise=0), lap_pairs(10, 30)))
-    np.testing.assert_allclose(found.residuals, 0, atol=1e-12)
+    np.testing.assert_allclose(found["residual"], 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("shift", [(3.0, 0, 0), (0, -2.0, 0), (1.0, 2.0, 2.0)])
 def test_a_loop_misses_by_as_much_as_its_closure_is_wrong(shift: tuple[float, float, float]) -> None:
     world = closing(closing(two_laps(noise=0), lap_pairs(10)), lap_pairs(30), shift)
     found = loop(world)
-    assert np.linalg.norm(found.residuals[0, 3:]) == pytest.approx(np.linalg.norm(shift))
-    np.testing.assert_allclose(found.residuals[0, :3], 0, atol=1e-12)
+    assert np.linalg.norm(found["residual"][0, 3:]) == pytest.approx(np.linalg.norm(shift))
+    np.testing.assert_allclose(found["residual"][0, :3], 0, atol=1e-12)
 
 
 def test_one_shift_of_the_world_closes_all_its_loops() -> None:
     found = loop(closing(two_laps(noise=0), lap_pairs(10, 30), (5.0, 3.0, 0)))
-    np.testing.assert_allclose(found.residuals, 0, atol=1e-12)
+    np.testing.assert_allclose(found["residual"], 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("pairs", [[(10, 110), (35, 135)], [(35, 135), (10, 110)], [(10, 135), (35, 110)]])
@@ -76,26 +85,25 @@ def test_covariances_explain_the_misses_of_many_drives(pairs: list[tuple[int, in
             noise = expmap((lower * rng.normal(size=6))[None])[0]
             world.closures[row] = closure._replace(pose=closure.pose @ noise)
         found = loop(world)
-        distances += squared_mahalanobis(found.residuals, found.covariances(NoiseScale())).tolist()
+        distances += squared_mahalanobis(
+            found["residual"], NoiseScale().covariances(found["odometry"], found["closures"])
+        ).tolist()
     # a chi-square of six degrees of freedom: mean 6, and the mean of 40 has a deviation of 0.55
     assert 4.3 < np.mean(distances) < 7.7
 
 
 def test_a_scale_widens_its_own_share_only() -> None:
     found = loop(closing(two_laps(), lap_pairs(10, 30)))
-    np.testing.assert_allclose(
-        found.covariances(NoiseScale(odometry=3.0)), 9 * found.odometry_noise + found.closure_noise
-    )
-    np.testing.assert_allclose(
-        found.covariances(NoiseScale(closures=2.0)), found.odometry_noise + 4 * found.closure_noise
-    )
+    walked, ends = found["odometry"], found["closures"]
+    np.testing.assert_allclose(NoiseScale(odometry=3.0).covariances(walked, ends), 9 * walked + ends)
+    np.testing.assert_allclose(NoiseScale(closures=2.0).covariances(walked, ends), walked + 4 * ends)
 
 
 def test_the_longer_the_way_between_the_less_a_loop_says() -> None:
     world = closing(two_laps(), lap_pairs(10, 12, 60))
     near, far = loop(world, 0, 1), loop(world, 0, 2)
-    assert np.trace(far.odometry_noise[0]) > 10 * np.trace(near.odometry_noise[0])
-    np.testing.assert_allclose(np.trace(far.closure_noise[0, :3, :3]), np.trace(near.closure_noise[0, :3, :3]))
+    assert np.trace(far["odometry"][0]) > 10 * np.trace(near["odometry"][0])
+    np.testing.assert_allclose(np.trace(far["closures"][0, :3, :3]), np.trace(near["closures"][0, :3, :3]))
 
 
 @pytest.mark.parametrize(("odometry", "closures"), [(3.0, 1.0), (5.0, 1.0), (1.0, 4.0), (0.4, 1.0), (3.0, 3.0)])
@@ -142,7 +150,7 @@ def test_few_loops_change_nothing() -> None:
     estimator = NoiseScaleEstimator()
     take(estimator, loops(9, 10.0, 1.0))
     assert estimator.scale == NoiseScale()
-    estimator.add(LoopResiduals(np.empty((0, 6)), np.empty((0, 6, 6)), np.empty((0, 6, 6))), 0)
+    estimator.add(np.empty(0, LOOP), 0)
     assert estimator.loops == 9
 
 

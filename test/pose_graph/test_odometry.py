@@ -48,7 +48,7 @@ def test_noise_between_two_stamps_is_that_of_the_steps_between() -> None:
         chain.add(k * PERIOD_NS, WORLD.odometry[k], WORLD.step_covariance(k))
     chain.update()
     points = chain.at(np.array([20, 50]) * PERIOD_NS)
-    noise, back = np.diff(points.noise, axis=0), adjoint(invert(points.poses[1:]))
+    noise, back = np.diff(points["noise"], axis=0), adjoint(invert(points["pose"][1:]))
     expected = np.zeros((6, 6))
     for k in range(21, 51):
         carry = gtsam.Pose3(relative(WORLD.odometry[50], WORLD.odometry[k])).AdjointMap()
@@ -64,7 +64,7 @@ def test_the_model_grows_with_the_way_not_with_the_messages() -> None:
             chain.add(stamp, expmap(np.array([[0, 0, 0, 0.5 * stamp / 1e9, 0, 0]]))[0])
         chain.update()
         end = np.array([60_000_000_000])
-        ends.append(chain.at(end).noise[0])
+        ends.append(chain.at(end)["noise"][0])
         assert len(chain.stamps) == pytest.approx(30 / 0.25, abs=2)
     np.testing.assert_allclose(ends[0], ends[1], rtol=0.02, atol=1e-12)
     assert np.sqrt(ends[0][3, 3]) == pytest.approx(PoseGraphSettings().odometry_sigma_m * np.sqrt(30), rel=0.05)

@@ -9,14 +9,13 @@ from graph_worlds import drive
 from umf_ros.core.geometry import invert
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.pose_graph.closures import PoseSamples
+from umf_ros.pose_graph.odometry import PathPoints
 from umf_ros.pose_graph.solver import Edge, between
 
 
-def stop(graph: PoseGraph, *poses: int) -> PoseSamples:
+def stop(graph: PoseGraph, *poses: int) -> PathPoints:
     """Where poses of the first session are."""
-    stamps = np.array(poses, np.int64) * PERIOD_NS
-    return PoseSamples(np.zeros(len(poses), np.int64), stamps, graph._sessions.chains[0].at(stamps))
+    return graph._sessions.chains[0].at(np.array(poses, np.int64) * PERIOD_NS)
 
 
 def test_the_bound_of_a_relative_covariance_is_never_below_the_true_one() -> None:
@@ -36,5 +35,5 @@ def test_the_bound_of_a_relative_covariance_is_never_below_the_true_one() -> Non
         anchored = gtsam.NonlinearFactorGraph(full)
         anchored.add(gtsam.PriorFactorPose3(i, values.atPose3(i), gtsam.noiseModel.Isotropic.Sigma(6, 1e-9)))
         exact = gtsam.Marginals(anchored, values).marginalCovariance(j)
-        bound = relative_poses.bounds(stop(solved, i), stop(solved, j)).covariances[0]
+        bound = relative_poses.bounds(stop(solved, i), stop(solved, j))[0][0]
         assert np.linalg.eigvalsh(bound - exact).min() > -0.02 * np.linalg.eigvalsh(exact).max()

@@ -17,7 +17,7 @@ from umf_ros.lab.simulation.pose_graphs import (
     with_wrong_closures,
 )
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.pose_graph.noise_scale import NoiseScale
+from umf_ros.pose_graph.consistency import NoiseScale
 
 ROVER = rover_loops(400, 11)
 

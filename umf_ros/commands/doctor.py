@@ -30,7 +30,7 @@ _PACKAGES = (
     ("gtsam", "gtsam", "4.3"),
     ("mcap", "mcap", "1.2"),
     ("rosbags", "rosbags", "0.10"),
-    ("pydantic", "pydantic", "2"),
+    ("pydantic", "pydantic", "2.7"),
     ("matplotlib", "matplotlib", "3.8"),
     ("jinja2", "Jinja2", "3.1"),
     ("plotly", "plotly", "6"),

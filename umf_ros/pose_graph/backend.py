@@ -27,11 +27,12 @@ from umf_ros.pose_graph.closures import (
     check_covariance,
     check_pose,
 )
+from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.g2o import verdict_table, write_g2o, write_vertex_table
-from umf_ros.pose_graph.noise_scale import NoiseScale
 from umf_ros.pose_graph.odometry import OdometryChain, Stamps
 from umf_ros.pose_graph.rejection import OutlierRejection
 from umf_ros.pose_graph.sessions import Sessions
+from umf_ros.pose_graph.solver import Edge
 
 logger = logging.getLogger(__name__)
 
@@ -46,24 +47,23 @@ class PoseGraph:
         self._settings = settings or PoseGraphSettings()
         self._sessions = Sessions(self._settings)
         self._rejection = OutlierRejection(self._settings, self._sessions)
-        self._reprocessing: _Reprocessing | None = None
+        # decisions in order of stamps as far as they have come, and the sessions with odometry that they know
+        self._ordered: tuple[list[int], Sessions, OutlierRejection] | None = None
         self._waiting: list[tuple[LoopClosure, int | None]] = []  # with the newest stamp when the closure came
         self._held: list[PlacedClosure] = []
         self._settled = False
-        self._seen: set[tuple[int, int, bytes]] = set()
         self._placed: set[tuple[int, int, int, int, bytes]] = set()
         self._refused: list[ClosureVerdict] = []
         self.counts: Counter[str] = Counter()
 
     def retune(self, settings: PoseGraphSettings) -> None:
         """Use other gates from now on; the model of the odometry's noise stays."""
-        self._settings, self._reprocessing, self._settled = settings, None, False
+        self._settings, self._ordered, self._settled = settings, None, False
         self._rejection.retune(settings)
 
     def begin_session(self) -> None:
         """Start a new odometry chain with its own gauge; later odometry belongs to it."""
         self._sessions.begin()
-        self._seen.clear()  # a looped recording closes the same loops again, between the same stamps
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
         """Take one odometry message; any order, a second message of one stamp is dropped.
@@ -98,8 +98,7 @@ class PoseGraph:
         self._refresh()
         refused = [verdict for closure in closures if (verdict := self._receive(closure))]
         decided, known = self.update(), {id(closure) for closure in closures}
-        waiting = [closure for closure, _ in self._waiting if id(closure) in known]
-        return refused + [_waits(closure) for closure in waiting] + decided
+        return refused + [verdict for verdict in self._pending() if id(verdict.closure) in known] + decided
 
     def hold(self, closure: LoopClosure) -> None:
         """Take one closure that was decided about before; `resume` gives it its verdict."""
@@ -115,9 +114,9 @@ class PoseGraph:
         """
         self._refresh()
         held, self._held = self._held + self._take_waiting()[1], []
-        pairs = [(placed.closure.match_stamp_ns, placed.closure.query_stamp_ns) for placed in held]
-        times, decided, new = Counter(pairs), [], []
-        for pair, placed in zip(pairs, held, strict=True):
+        times, decided, new = Counter(_endpoints(placed.closure) for placed in held), [], []
+        for placed in held:
+            pair = _endpoints(placed.closure)
             decision = verdicts.get(pair) if times[pair] == 1 else None
             if decision is None or decision[0] is State.REFUSED or decision[1] is ClosureReason.NO_ODOMETRY_YET:
                 new.append(placed)
@@ -135,10 +134,16 @@ class PoseGraph:
         return refused + self._attempt(lambda: self._rejection.consider(arrived))
 
     def prepare(self, within_s: float) -> None:
-        """Do a part of the work of `settle`, for so long at most."""
+        """Do a part of the work of `settle`, for so long at most: at the end of a long mission it takes minutes."""
         self._refresh()
-        work = self._reprocess()
-        work.advance(work.passed(self._in_order()), self._attempt, within_s)
+        order, chains = self._in_order(), self._sessions.chains
+
+        def is_passed(placed: PlacedClosure) -> bool:
+            match, query, closure = placed
+            ends = (match, closure.match_stamp_ns), (query, closure.query_stamp_ns)
+            return all(chains[session].stamps[-1] > stamp for session, stamp in ends)
+
+        self._reprocess(order, len(list(takewhile(is_passed, order))), within_s)
 
     def settle(self, within_s: float = float("inf")) -> list[ClosureVerdict] | None:
         """Decide finally and solve for the exact optimum, as at the end of a mission.
@@ -152,12 +157,13 @@ class PoseGraph:
         verdicts = self.update()
         if self._settled:  # nothing has come since
             return verdicts
-        before, revoked, work = self._rejection, self._rejection.revoked, self._reprocess()
-        if not work.advance(self._in_order(), self._attempt, within_s):
+        before, order = self._rejection, self._in_order()
+        ordered = self._reprocess(order, len(order), within_s)
+        if ordered is None:
             return None
-        self._sessions, self._rejection, self._reprocessing = work.sessions, work.rejection, None
-        for closure in revoked:
-            self.revoke(closure.match_stamp_ns, closure.query_stamp_ns)
+        (self._sessions, self._rejection), self._ordered = ordered, None
+        for row in np.flatnonzero(before.revoked).tolist():
+            self.revoke(*_endpoints(before.placed[row].closure))
         states = {id(placed): verdict.state for placed, verdict in zip(before.placed, before.verdicts, strict=True)}
         after = zip(self._rejection.placed, self._rejection.verdicts, strict=True)
         verdicts += [verdict for placed, verdict in after if verdict.state is not states[id(placed)]]
@@ -166,20 +172,34 @@ class PoseGraph:
         return verdicts
 
     def _in_order(self) -> list[PlacedClosure]:
-        stamps = [(one.closure.query_stamp_ns, one.closure.match_stamp_ns) for one in self._rejection.placed]
-        return [self._rejection.placed[row] for row in sorted(range(len(stamps)), key=stamps.__getitem__)]
+        """All closures by the stamps of query and match."""
+        return sorted(self._rejection.placed, key=lambda placed: _endpoints(placed.closure)[::-1])
 
-    def _reprocess(self) -> _Reprocessing:
-        """The decisions in order of stamps as far as they have come."""
-        work = self._reprocessing
-        if work is None or not work.holds(self._in_order(), self._sessions):
-            work = self._reprocessing = _Reprocessing(self._settings, self._sessions)
-        return work
+    def _reprocess(
+        self, order: list[PlacedClosure], count: int, within_s: float
+    ) -> tuple[Sessions, OutlierRejection] | None:
+        """Decide about the first closures of `order` anew, from the odometry alone; None when the time was up first."""
+        until_s = time.monotonic() + within_s
+        if self._ordered is not None:
+            taken = self._ordered[2].placed
+            same = len(taken) <= len(order) and all(a is b for a, b in zip(taken, order, strict=False))
+            if not same or self._ordered[0] != self._sessions.begun:  # a closure came late, or a session began
+                self._ordered = None
+        if self._ordered is None:
+            anew = self._sessions.anew()
+            self._ordered = self._sessions.begun, anew, OutlierRejection(self._settings, anew)
+        _, sessions, rejection = self._ordered
+        for placed in order[len(rejection.placed) : count]:
+            if time.monotonic() > until_s:
+                return None
+            self._attempt(lambda: rejection.consider([placed]))  # noqa: B023 (called at once)
+        return sessions, rejection
 
     def _refresh(self) -> None:
+        """Take in the odometry that has come."""
         if self._sessions.update():
             self.counts["odometry out of order"] += 1
-            self._reprocessing = None
+            self._ordered = None
             self._attempt(self._rejection.renew)
 
     def _attempt(self, step: Callable[[], list[ClosureVerdict] | None]) -> list[ClosureVerdict]:
@@ -197,9 +217,8 @@ class PoseGraph:
         Raises:
             GraphError: there is no such closure, or the graph cannot be solved without it.
         """
-        endpoints = (match_stamp_ns, query_stamp_ns)
-        closures = enumerate(placed.closure for placed in self._rejection.placed)
-        rows = [row for row, one in closures if (one.match_stamp_ns, one.query_stamp_ns) == endpoints]
+        pairs = [_endpoints(placed.closure) for placed in self._rejection.placed]
+        rows = [row for row, pair in enumerate(pairs) if pair == (match_stamp_ns, query_stamp_ns)]
         self._settled = False
         if not rows:
             raise GraphError(f"no closure between keyframes {match_stamp_ns} and {query_stamp_ns}")
@@ -211,13 +230,6 @@ class PoseGraph:
             check_closure(closure, self._settings.max_closure_m)
         except GraphError as error:
             return self._refuse(closure, error.args[0])
-        # two measurements of one pair are two closures; the same measurement again is a message sent twice
-        message = (closure.match_stamp_ns, closure.query_stamp_ns, closure.match_T_query.tobytes())
-        if message in self._seen:
-            self.counts["closure twice"] += 1
-            return None
-        self._seen.add(message)
-        self._settled = False
         self._waiting.append((closure, self._sessions.newest_ns))
         return None
 
@@ -232,40 +244,41 @@ class PoseGraph:
         newest_ns, oldest_ns = self._sessions.newest_ns, self._sessions.oldest_ns
         for closure, known_ns in self._waiting:
             since_ns = newest_ns if known_ns is None else known_ns
-            waited_ns = 0 if newest_ns is None or since_ns is None else newest_ns - since_ns
-            first_ns = min(closure.match_stamp_ns, closure.query_stamp_ns)
-            placed = self._place(closure)
-            if placed is not None:
-                if self._is_new(placed):
-                    arrived.append(placed)
-            elif waited_ns > self._settings.max_gap_s * 1e9 and oldest_ns is not None and first_ns < oldest_ns:
+            waited_s = 0.0 if newest_ns is None or since_ns is None else (newest_ns - since_ns) / 1e9
+            query = self._sessions.find(closure.query_stamp_ns)
+            match = self._sessions.find(closure.match_stamp_ns, before=query)
+            if query is not None and match is not None:
+                arrived += self._if_new(PlacedClosure(match, query, closure))
+            elif waited_s > self._settings.max_gap_s and oldest_ns is not None and min(_endpoints(closure)) < oldest_ns:
                 refused.append(self._refuse(closure, ClosureReason.BEFORE_ODOMETRY))
-            elif waited_ns > self._settings.max_pending_s * 1e9:
+            elif waited_s > self._settings.max_pending_s:
                 refused.append(self._refuse(closure, ClosureReason.NO_ODOMETRY))
             else:
                 waiting.append((closure, since_ns))
         self._waiting = waiting
         return refused, arrived
 
-    def _is_new(self, placed: PlacedClosure) -> bool:
-        """Whether no closure like this joins the same sessions: a latched topic repeats its history."""
-        stamps = placed.closure.match_stamp_ns, placed.closure.query_stamp_ns
-        key = placed.match, placed.query, *stamps, placed.closure.match_T_query.tobytes()
+    def _if_new(self, placed: PlacedClosure) -> list[PlacedClosure]:
+        """The closure, unless one like it joins the same sessions: a latched topic repeats its history.
+
+        Two measurements of one pair are two closures; the same measurement again is a message sent twice.
+        """
+        match, query, closure = placed
+        key = match, query, *_endpoints(closure), closure.match_T_query.tobytes()
         if key in self._placed:
             self.counts["closure twice"] += 1
-            return False
+            return []
         self._placed.add(key)
-        return True
-
-    def _place(self, closure: LoopClosure) -> PlacedClosure | None:
-        """The closure with its sessions; None before the odometry at its keyframes has arrived."""
-        query = self._sessions.find(closure.query_stamp_ns)
-        match = self._sessions.find(closure.match_stamp_ns, before=query)
-        return None if query is None or match is None else PlacedClosure(match, query, closure)
+        self._settled = False
+        return [placed]
 
     def closures(self) -> list[ClosureVerdict]:
         """The latest verdict of every closure, in order of arrival."""
-        return self._rejection.verdicts + [_waits(closure) for closure, _ in self._waiting] + self._refused
+        return self._rejection.verdicts + self._pending() + self._refused
+
+    def _pending(self) -> list[ClosureVerdict]:
+        """Verdicts of closures whose odometry has not arrived."""
+        return [ClosureVerdict(one, State.PENDING, ClosureReason.NO_ODOMETRY_YET) for one, _ in self._waiting]
 
     @property
     def scale(self) -> NoiseScale:
@@ -278,7 +291,19 @@ class PoseGraph:
 
     def trajectory(self) -> tuple[Stamps, Array]:
         """Stamps (N,) in ns and `map_T_body` (N, 4, 4) of every keyframe that is joined to the map."""
-        return self._keyframes(lambda session, chain: self._sessions.at(session, chain.stamps))
+        stamps, chains = self._keyframes()
+        return stamps, np.concatenate([np.empty((0, 4, 4)), *(self._sessions.at(one.at(one.stamps)) for one in chains)])
+
+    def odometry(self) -> tuple[Stamps, Array]:
+        """Stamps (N,) in ns and `odom_T_body` (N, 4, 4) of the same keyframes as `trajectory`."""
+        stamps, chains = self._keyframes()
+        return stamps, np.concatenate([np.empty((0, 4, 4)), *(chain.poses for chain in chains)])
+
+    def _keyframes(self) -> tuple[Stamps, list[OdometryChain]]:
+        """Stamps (N,) of the keyframes that are joined to the map, and the odometry of their sessions."""
+        self._refresh()
+        chains = [self._sessions.chains[session] for session in self._sessions.members(0)]
+        return np.concatenate([np.empty(0, np.int64), *(chain.stamps for chain in chains)]), chains
 
     def poses_at(self, stamps: Stamps) -> tuple[Array, NDArray[np.bool_]]:
         """(N, 4, 4) `map_T_body` at stamps, in the frame of the largest part of the map, and (N,) whether it has them.
@@ -287,11 +312,10 @@ class PoseGraph:
         """
         self._refresh()
         poses, known = np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps), bool)
-        for session in self.sessions_of_map():
-            chain = self._sessions.chains[session]
+        for chain in (self._sessions.chains[session] for session in self.sessions_of_map()):
             mine = ~known & np.fromiter((chain.covers(stamp) for stamp in stamps.tolist()), bool, len(stamps))
             if mine.any():
-                poses[mine] = self._sessions.at(session, stamps[mine])
+                poses[mine] = self._sessions.at(chain.at(stamps[mine]))
                 known |= mine
         return poses, known
 
@@ -302,38 +326,26 @@ class PoseGraph:
     def session_spans(self) -> list[tuple[int, int] | None]:
         """First and last stamp of the odometry of every session; None without any."""
         self._refresh()
-        chains = self._sessions.chains
-        spans = ((chain.oldest_ns, chain.newest_ns) for chain in chains)
+        spans = ((chain.oldest_ns, chain.newest_ns) for chain in self._sessions.chains)
         return [None if first is None or last is None else (first, last) for first, last in spans]
-
-    def odometry(self) -> tuple[Stamps, Array]:
-        """Stamps (N,) in ns and `odom_T_body` (N, 4, 4) of the same keyframes as `trajectory`."""
-        return self._keyframes(lambda _, chain: chain.poses)
-
-    def _keyframes(self, poses_of: Callable[[int, OdometryChain], Array]) -> tuple[Stamps, Array]:
-        self._refresh()
-        chains = [(session, self._sessions.chains[session]) for session in self._sessions.joined]
-        stamps = [np.empty(0, np.int64), *(chain.stamps for _, chain in chains)]
-        return np.concatenate(stamps), np.concatenate([np.empty((0, 4, 4)), *(poses_of(*one) for one in chains)])
 
     def map_T_odom(self) -> Array:
         """(4, 4) pose of the newest session's odometry frame in the map: where its newest pose went."""
         self._refresh()
         chain = self._sessions.chains[-1]
-        if not len(chain.stamps):
+        if chain.newest_ns is None:
             return np.eye(4)
         last = np.array([chain.newest_ns])
-        return self._sessions.at(len(self._sessions.chains) - 1, last)[0] @ invert(chain.poses_at(last)[0])
+        return self._sessions.at(chain.at(last))[0] @ invert(chain.poses_at(last)[0])
 
     def covariance(self) -> Array:
         """(6, 6) marginal covariance of the newest pose in ROS order about the map's axes; zero without odometry."""
         self._refresh()
-        session = len(self._sessions.chains) - 1
-        last = self._sessions.chains[session].newest_ns
-        if last is None:
+        chain = self._sessions.chains[-1]
+        if chain.newest_ns is None:
             return np.zeros((6, 6))
-        covariance = self._sessions.covariance(session, last, self._rejection.scale)
-        return gtsam_to_ros_covariance(covariance, self._sessions.at(session, np.array([last]))[0])
+        last = chain.at(np.array([chain.newest_ns]))
+        return gtsam_to_ros_covariance(self._sessions.covariance(last), self._sessions.at(last)[0])
 
     def write_tum(self, path: str | Path, optimized: bool = True) -> None:
         """Write the trajectory, or the odometry, of all joined sessions in order of their stamps as a TUM file.
@@ -363,10 +375,9 @@ class PoseGraph:
             OutputError: a file cannot be written.
         """
         self._refresh()
-        endpoints = [self._rejection.endpoints_in(session) for session in range(len(self._sessions.chains))]
-        full = self._sessions.expand(self._rejection.accepted, endpoints, self._rejection.scale)
+        full = self._sessions.expand(self._rejection.accepted, self._rejection.closures)
         ids = [row if vertex_of is None else vertex_of(stamp) for row, (_, stamp) in enumerate(full.vertices)]
-        write_g2o(path, full.poses, [full.edges[row] for row in range(len(full.edges))], planar, ids)
+        write_g2o(path, full.poses, [Edge(*edge) for edge in full.edges], planar, ids)
         if vertex_of is None:
             write_vertex_table(Path(path).with_suffix(".csv"), full.vertices)
 
@@ -390,40 +401,5 @@ class PoseGraph:
         return settled
 
 
-class _Reprocessing:
-    """Decide about all closures anew in the order of their stamps, from the odometry alone.
-
-    At the end of a long mission that takes minutes; `PoseGraph.prepare` does it while the graph grows.
-    """
-
-    def __init__(self, settings: PoseGraphSettings, sessions: Sessions) -> None:
-        self.sessions = sessions.anew()
-        self.rejection = OutlierRejection(settings, self.sessions)
-        self._begun = sessions.begun
-
-    def holds(self, order: list[PlacedClosure], sessions: Sessions) -> bool:
-        """Whether the decisions so far stay: no closure has come late, and no session began."""
-        taken = self.rejection.placed
-        same = all(one is other for one, other in zip(taken, order, strict=False))
-        return same and len(taken) <= len(order) and self._begun == sessions.begun
-
-    def passed(self, order: list[PlacedClosure]) -> list[PlacedClosure]:
-        """The first closures of `order` whose odometry is complete."""
-        return list(takewhile(self._is_passed, order))
-
-    def advance(self, order: list[PlacedClosure], attempt: Callable[..., object], within_s: float) -> bool:
-        """Decide about the closures that are still open; False when the time was up first."""
-        until_s = time.monotonic() + within_s
-        for placed in order[len(self.rejection.placed) :]:
-            if time.monotonic() > until_s:
-                return False
-            attempt(lambda: self.rejection.consider([placed]))  # noqa: B023 (called at once)
-        return True
-
-    def _is_passed(self, placed: PlacedClosure) -> bool:
-        ends = (placed.match, placed.closure.match_stamp_ns), (placed.query, placed.closure.query_stamp_ns)
-        return all(self.sessions.chains[session].stamps[-1] > stamp for session, stamp in ends)
-
-
-def _waits(closure: LoopClosure) -> ClosureVerdict:
-    return ClosureVerdict(closure, State.PENDING, ClosureReason.NO_ODOMETRY_YET)
+def _endpoints(closure: LoopClosure) -> tuple[int, int]:
+    return closure.match_stamp_ns, closure.query_stamp_ns

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from umf_ros.core.errors import GraphError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, ros_to_gtsam_covariance
-from umf_ros.pose_graph.odometry import OdometryChain, PathPoints, Stamps, Table
+from umf_ros.pose_graph.odometry import POINT, OdometryChain
 
 VERDICT_COLUMNS = ("match_stamp_ns", "query_stamp_ns", "verdict", "reason", "mahalanobis", "misfit_m")
 """Columns of a table of verdicts."""
@@ -100,71 +100,23 @@ class PlacedClosure(NamedTuple):
     closure: LoopClosure
 
 
-class PoseSamples(NamedTuple):
-    """N places: (N,) their sessions and stamps, and the odometry there."""
-
-    sessions: NDArray[np.int64]
-    stamps: Stamps
-    points: PathPoints
-
-
-class Endpoints(Table):
-    """One endpoint of N closures: session and stamp, with path length, pose and noise of the odometry there."""
-
-    def __init__(self) -> None:
-        whole, poses = np.empty(0, np.int64), np.empty((0, 4, 4))
-        super().__init__(session=whole, stamp=whole, travel=np.empty(0), pose=poses, noise=np.empty((0, 6, 6)))
-
-    def append(self, chain: OdometryChain, session: int, stamp: int) -> None:
-        """Append an endpoint by session and stamp."""
-        at = np.array([stamp], np.int64)
-        points = chain.at(at)
-        self.extend(session=[session], stamp=at, travel=chain.travel_at(at), pose=points.poses, noise=points.noise)
-
-    def renew(self, chains: Sequence[OdometryChain]) -> None:
-        """Look the odometry up again after its past changed."""
-        for session in np.unique(self["session"]):
-            rows = self["session"] == session
-            stamps = self["stamp"][rows]
-            points = chains[session].at(stamps)
-            self["pose"][rows], self["noise"][rows] = points.poses, points.noise
-            self["travel"][rows] = chains[session].travel_at(stamps)
-
-    def samples(self, rows: NDArray[np.int64]) -> PoseSamples:
-        """The endpoints of some closures."""
-        return PoseSamples(
-            self["session"][rows], self["stamp"][rows], PathPoints(self["pose"][rows], self["noise"][rows])
-        )
-
-    def distances(self, row: int) -> Array:
-        """(N,) metres along the path from endpoint `row` to every other; infinite between sessions."""
-        same = self["session"] == self["session"][row]
-        return np.where(same, np.abs(self["travel"] - self["travel"][row]), np.inf)
+Closures = NDArray[np.void]
+CLOSURE = np.dtype(
+    [("row", "i8"), ("match", POINT), ("query", POINT), ("pose", "f8", (4, 4)), ("covariance", "f8", (6, 6))]
+)
+"""Fields of `Closures`: number, odometry at both endpoints, `match_T_query`, and its covariance in GTSAM's order in the
+tangent space of the query."""
 
 
-class ClosureArrays(Table):
-    """N closures as arrays, with both their endpoints.
-
-    Columns: `pose` (N, 4, 4) `match_T_query` and `covariance` (N, 6, 6) in GTSAM's order, tangent space of the query.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(pose=np.empty((0, 4, 4)), covariance=np.empty((0, 6, 6)))
-        self.match = Endpoints()
-        self.query = Endpoints()
-
-    def append(self, chains: Sequence[OdometryChain], placed: PlacedClosure) -> None:
-        """Append one closure."""
-        match, query, closure = placed
-        self.match.append(chains[match], match, closure.match_stamp_ns)
-        self.query.append(chains[query], query, closure.query_stamp_ns)
-        covariance = ros_to_gtsam_covariance(closure.covariance, closure.match_T_query)
-        self.extend(pose=[closure.match_T_query], covariance=[covariance])
-
-    def renew(self, chains: Sequence[OdometryChain]) -> None:
-        """Look the odometry up again after its past changed."""
-        self.match.renew(chains)
-        self.query.renew(chains)
+def as_closures(placed: PlacedClosure, row: int, chains: Sequence[OdometryChain]) -> Closures:
+    """(1,) a closure with the odometry at its endpoints."""
+    match, query, closure = placed
+    found = np.zeros(1, CLOSURE)
+    found["row"], found["pose"] = row, closure.match_T_query
+    found["match"] = chains[match].at(np.array([closure.match_stamp_ns]))
+    found["query"] = chains[query].at(np.array([closure.query_stamp_ns]))
+    found["covariance"] = ros_to_gtsam_covariance(closure.covariance, closure.match_T_query)
+    return found
 
 
 def check_closure(closure: LoopClosure, max_length_m: float) -> Array:
@@ -183,11 +135,7 @@ def check_closure(closure: LoopClosure, max_length_m: float) -> Array:
 
 
 def check_pose(pose: Array) -> None:
-    """Refuse a matrix that is not a rigid transform.
-
-    Raises:
-        GraphError: of a `ClosureReason`: wrong shape, not finite, or no rotation.
-    """
+    """Raise a `GraphError` of a `ClosureReason` for a matrix that is not a rigid transform."""
     if np.shape(pose) != (4, 4):
         raise GraphError(ClosureReason.POSE_SHAPE)
     if not np.isfinite(pose).all():
@@ -200,11 +148,7 @@ def check_pose(pose: Array) -> None:
 
 
 def check_covariance(covariance: Array) -> None:
-    """Refuse a matrix that is not a covariance of a full pose.
-
-    Raises:
-        GraphError: of a `ClosureReason`: wrong shape, not finite, not symmetric or not positive definite.
-    """
+    """Raise a `GraphError` of a `ClosureReason` for a matrix that is not a covariance of a full pose."""
     if np.shape(covariance) != (6, 6):
         raise GraphError(ClosureReason.COVARIANCE_SHAPE)
     if not np.isfinite(covariance).all():

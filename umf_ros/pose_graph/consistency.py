@@ -1,28 +1,64 @@
-"""Which closures are consistent with the map and with each other, and how much that says.
+"""Consistency of closures with each other, its evidence, and the noise scale estimated from it.
 
-Two closures are consistent when the loop through both closes (pairwise consistency maximisation, kept
-up incrementally). How much that says depends on how easily a wrong closure would have passed: the area
-that the prediction leaves open over the area in which wrong closures to similar places are found.
-Closures of one place count once.
+Two closures close to each other and the odometry between their endpoints form a loop, whose residual has to fit the
+stated covariances: then both are consistent (pairwise consistency maximisation, kept up incrementally). The evidence
+is the larger, the smaller the area that the prediction leaves open within the area in which wrong closures to similar
+places are found. Closures of one place count once.
+
+Over many loops the factor by which residuals do not fit is found by maximum likelihood. Loops with a wrong closure are
+outliers of that likelihood, and wrong closures that are consistent with each other do no harm: they are so through the
+same true odometry. Two wrong sets that overlap look like noise of closures worse than stated: no single place decides
+about that.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from umf_ros.core.config import PoseGraphSettings
-from umf_ros.core.geometry import Array
-from umf_ros.pose_graph.closures import ClosureArrays
-from umf_ros.pose_graph.noise_scale import LoopResiduals, NoiseScale, loop_residuals
+from umf_ros.core.geometry import Array, adjoint, invert, logmap, propagate
+from umf_ros.pose_graph.closures import CLOSURE, Closures
+from umf_ros.pose_graph.odometry import Table, noise_between
 
+Loops = NDArray[np.void]
+LOOP = np.dtype([("residual", "f8", 6), ("odometry", "f8", (6, 6)), ("closures", "f8", (6, 6))])
+"""Fields of `Loops`: by how much a loop misses closing, and the covariances of it that the stated noise of odometry and
+of closures explains."""
 _MOST_COMPARED = 40
 _DEGREES = 6
 # nats: where one place is mistaken for another, the next is too more often than by chance
 _MOST_PER_PLACE = 4.0
+
+_GRID = np.exp(np.linspace(np.log(1 / 64), np.log(64), 33))
+# standard deviations of the residual of a loop with a wrong closure: of aliases close by, and of anything at all
+_ALIAS_SIGMAS = np.array([[0.5] * 3 + [5.0] * 3, [1.5] * 3 + [50.0] * 3])
+_IN_PLANE, _OUT_OF_PLANE = np.array([2, 3, 4]), np.array([0, 1, 5])
+_OUTLIERS = 0.5
+# loops share closures and odometry, so that together they say less than their sum: to trust odometry more than
+# stated takes more than to trust it less
+_NATS_PER_FACTOR, _NATS_TO_TRUST = 5.0, 20.0
+_FEWEST_LOOPS = 10
+_TOLERANCE = np.log(1.8)
+_SAME_UNITS = np.log(4.0)
+# an error that builds up in one direction hardly shows in short loops, unless all is stated in other units
+_LEAST_ODOMETRY = 0.3
+
+
+@dataclass(frozen=True)
+class NoiseScale:
+    """By how much the true standard deviations exceed the stated ones."""
+
+    odometry: float = 1.0
+    closures: float = 1.0
+
+    def covariances(self, odometry: Array, closures: Array) -> Array:
+        """(..., 6, 6) sum of stated covariances of odometry and of closures, scaled."""
+        return self.odometry**2 * odometry + self.closures**2 * closures
 
 
 def squared_mahalanobis(twists: Array, covariances: Array) -> Array:
@@ -44,99 +80,98 @@ def likelihood_ratio(false_alarms: Array, distances: Array, settings: PoseGraphS
         distances: (N,) squared Mahalanobis distances from them; better than most right ones says no more.
         settings: of the pose graph.
     """
-    likeliest = _DEGREES - 2
-    right = chi2.pdf(np.maximum(distances, likeliest), _DEGREES)
-    wrong = false_alarms / settings.gate_chi2
-    return np.minimum(wrong / np.maximum(right, 1e-12), 1.0)
+    right = chi2.pdf(np.maximum(distances, _DEGREES - 2), _DEGREES)
+    return np.minimum(false_alarms / settings.gate_chi2 / np.maximum(right, 1e-12), 1.0)
+
+
+def loops_between(one: Closures, others: Closures) -> Loops:
+    """(N,) the loops of one closure (1,) with (N,) others, whose endpoints are pairwise in one session.
+
+    A loop leads from the match of one to its query, the query of the other, the match of the other, and back.
+    """
+    after_back = invert(others["match"]["pose"]) @ one["match"]["pose"]
+    after_query = invert(others["pose"]) @ after_back
+    after_one = invert(one["query"]["pose"]) @ others["query"]["pose"] @ after_query
+    # the covariance of an inverse lives in the tangent space of the match
+    other_noise = propagate(adjoint(invert(after_back)) @ adjoint(others["pose"]), others["covariance"])
+    walked_query = propagate(adjoint(invert(others["query"]["pose"])), noise_between(one["query"], others["query"]))
+    walked_match = propagate(adjoint(invert(one["match"]["pose"])), noise_between(others["match"], one["match"]))
+    loops = np.zeros(len(others), LOOP)
+    loops["residual"] = logmap(one["pose"] @ after_one)
+    loops["odometry"] = propagate(adjoint(invert(after_query)), walked_query) + walked_match
+    loops["closures"] = propagate(adjoint(invert(after_one)), one["covariance"]) + other_noise
+    return loops
+
+
+def paths_between(one: Closures, other: Closures) -> Array:
+    """(2, N) metres driven between the matches and between the queries of closures; infinite between sessions."""
+    found = []
+    for a, b in ((one["match"], other["match"]), (one["query"], other["query"])):
+        found.append(np.where(a["session"] == b["session"], np.abs(a["travel"] - b["travel"]), np.inf))
+    return np.stack(found)
 
 
 class ConsistencyGraph:
-    """Which closures are consistent; a row is the number of a closure in `ClosureArrays`.
+    """Which closures are consistent; a row is the number of a closure.
 
     Attributes:
+        settings: of the pose graph.
+        scale: of the stated noise, as closures are compared.
         place_of: for each closure the first one of the same place.
     """
 
-    def __init__(self, closures: ClosureArrays, settings: PoseGraphSettings) -> None:
-        self._closures = closures
-        self._settings = settings
+    def __init__(self, settings: PoseGraphSettings) -> None:
+        self.settings = settings
+        self.scale = NoiseScale()
+        self._table = Table(closure=np.empty(0, CLOSURE))
+        self.compare_all(self.scale)
+
+    @property
+    def closures(self) -> Closures:
+        """(N,) all closures; valid until the next is added."""
+        return self._table["closure"]
+
+    def add(self, closure: Closures) -> Loops:
+        """Take one closure (1,) and compare it with all near ones; returns the loops it makes with them."""
+        self._table.extend(closure=closure)
+        return self._compare(len(self._table) - 1)
+
+    def compare_all(self, scale: NoiseScale) -> None:
+        """Compare all again, with another scale."""
+        self.scale = scale
+        self.place_of: list[int] = []
         self._consistent: list[dict[int, float]] = []
         self._inconsistent: list[set[int]] = []
-        self.place_of: list[int] = []
-
-    def retune(self, settings: PoseGraphSettings) -> None:
-        """Compare by other gates from now on."""
-        self._settings = settings
-
-    def add(self, row: int, scale: NoiseScale) -> LoopResiduals:
-        """Compare the newest closure with all near ones; returns the loops it makes with them."""
-        assert row == len(self._consistent)
-        self._consistent.append({})
-        self._inconsistent.append(set())
-        near = self._near(row)
-        known = np.unique(np.array(self.place_of, np.int64)[near])
-        same = known[self._same_place(known, row)]
-        self.place_of.append(int(same[0]) if len(same) else row)
-        loops = loop_residuals(self._closures, np.full(len(near), row), near)
-        self._compare(row, near, loops, scale)
-        return loops
-
-    def renew(self, scale: NoiseScale) -> None:
-        """Compare all again, as after a change of scale or of the odometry's past."""
-        count = len(self._consistent)
-        self._consistent, self._inconsistent, self.place_of = [], [], []
-        for row in range(count):
-            self.add(row, scale)
+        for row in range(len(self._table)):
+            self._compare(row)
 
     def consistency_set(self, row: int, members: NDArray[np.bool_]) -> tuple[list[int], float]:
-        """Closures out of `members` consistent with `row` and among each other, and the evidence for them in nats."""
+        """Closures out of `members` consistent with `row` and among each other, and the evidence for them in nats.
+
+        From place to place the evidence grows by the improbability that the next one is consistent with the nearest
+        by chance.
+        """
         consistent = [other for other in self._consistent[row] if members[other]]
         consistent.sort(key=lambda other: -sum(1 for third in consistent if third in self._consistent[other]))
         found = [row]
         for other in consistent:
             if not any(other in self._inconsistent[member] for member in found):
                 found.append(other)
-        return self._well_linked(found)
-
-    def _well_linked(self, found: list[int]) -> tuple[list[int], float]:
-        """The set without what only hangs on to it, and the evidence for it.
-
-        From the two places that are linked best on, every further place adds the improbability that it is
-        consistent with the nearest by chance. Once that is enough, a place must be believable for itself: a
-        wrong one is consistent with right ones too where little would have shown it.
-        """
-        linked, others, evidence = [self._best_linked(found)], found, 0.0
+        linked, others, evidence = [row], found, 0.0
         while others := self._elsewhere(others, linked[-1]):
             ratio, nearest = min(
                 (min((self._consistent[other][k] for k in linked if k in self._consistent[other]), default=1.0), other)
                 for other in others
             )
-            if evidence >= self._settings.min_support and ratio > self._settings.max_chance:
-                break
             evidence += min(-float(np.log(max(ratio, 1e-9))), _MOST_PER_PLACE)
             linked.append(nearest)
-        return [member for member in found if member not in others], evidence
+        return found, evidence
 
-    def _best_linked(self, found: list[int]) -> int:
-        """One of the two most consistent closures of different places."""
-        inside = set(found)
-        pairs = [
-            (ratio, one, other)
-            for one in found
-            for other, ratio in self._consistent[one].items()
-            if one < other and other in inside and self.place_of[one] != self.place_of[other]
-        ]
-        return next((one for _, one, other in sorted(pairs) if self._elsewhere([one], other)), found[0])
-
-    def companions(self, rows: Sequence[int], members: NDArray[np.bool_]) -> list[list[int]]:
-        """For each closure those out of `members` of the same place that are consistent with it."""
-        pairs = [(row, other) for row in rows for other in self._consistent[row] if members[other]]
-        one, other = np.array(pairs, np.int64).reshape(-1, 2).T
-        found: dict[int, list[int]] = {row: [] for row in rows}
-        for (row, companion), same in zip(pairs, self._same_place(other, one).tolist(), strict=True):
-            if same:
-                found[row].append(companion)
-        return list(found.values())
+    def companions(self, row: int, members: NDArray[np.bool_]) -> list[int]:
+        """Closures out of `members` of the same place that are consistent with this one."""
+        others = [other for other in self._consistent[row] if members[other]]
+        elsewhere = self._elsewhere(others, row)
+        return [other for other in others if other not in elsewhere]
 
     def opponents(self, row: int, members: NDArray[np.bool_]) -> list[int]:
         """Closures out of `members` that are inconsistent with this one."""
@@ -149,33 +184,116 @@ class ConsistencyGraph:
             rows, count = self._elsewhere(rows, rows[0]), count + 1
         return count
 
-    def _near(self, row: int) -> NDArray[np.int64]:
-        apart = np.maximum(self._closures.match.distances(row), self._closures.query.distances(row))
-        return np.flatnonzero(apart[:row] <= self._settings.support_range_m)[-_MOST_COMPARED:]
-
-    def _compare(self, row: int, near: NDArray[np.int64], loops: LoopResiduals, scale: NoiseScale) -> None:
-        covariances = loops.covariances(scale)
-        distances = squared_mahalanobis(loops.residuals, covariances)
-        false_alarms = false_alarm_probability(covariances, self._settings)
-        ratios = likelihood_ratio(false_alarms, distances, self._settings)
+    def _compare(self, row: int) -> Loops:
+        one = self.closures[row : row + 1]
+        near = np.flatnonzero(paths_between(self.closures[:row], one).max(axis=0) <= self.settings.support_range_m)
+        near = near[-_MOST_COMPARED:]
+        places = sorted({self.place_of[other] for other in near})
+        elsewhere = self._elsewhere(places, row)
+        self.place_of.append(next((place for place in places if place not in elsewhere), row))
+        self._consistent.append({})
+        self._inconsistent.append(set())
+        loops = loops_between(one, self.closures[near])
+        covariances = self.scale.covariances(loops["odometry"], loops["closures"])
+        distances = squared_mahalanobis(loops["residual"], covariances)
+        false_alarms = false_alarm_probability(covariances, self.settings)
+        ratios = likelihood_ratio(false_alarms, distances, self.settings)
         for other, distance, false_alarm, ratio in zip(near.tolist(), distances, false_alarms, ratios, strict=True):
-            if false_alarm >= 1:  # says nothing
+            if false_alarm >= 1:  # any closure would pass
                 continue
-            if distance <= self._settings.pair_chi2:
+            if distance <= self.settings.pair_chi2:
                 self._consistent[row][other] = self._consistent[other][row] = float(ratio)
             else:
                 self._inconsistent[row].add(other)
                 self._inconsistent[other].add(row)
+        return loops
 
-    def _same_place(self, rows: Sequence[int] | NDArray[np.int64], other: int | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(N,) which closures are of the place of another one, or each of that of its own other one."""
-        rows = np.asarray(rows, np.int64)
-        same, apart = np.ones(len(rows), bool), np.full(len(rows), np.inf)
-        for ends in (self._closures.match, self._closures.query):
-            same &= ends["session"][rows] == ends["session"][other]
-            apart = np.minimum(apart, np.abs(ends["travel"][rows] - ends["travel"][other]))
-        return same & (apart < self._settings.place_m)
-
-    def _elsewhere(self, rows: list[int], other: int) -> list[int]:
+    def _elsewhere(self, rows: Sequence[int], other: int) -> list[int]:
         """Those of other places than one closure."""
-        return [row for row, same in zip(rows, self._same_place(rows, other), strict=True) if not same]
+        at = np.array(rows, np.int64)
+        paths_m = paths_between(self.closures[at], self.closures[other : other + 1])
+        same = np.isfinite(paths_m).all(axis=0) & (paths_m.min(axis=0) < self.settings.place_m)
+        return [int(row) for row in at[~same]]
+
+
+class NoiseScaleEstimator:
+    """Adds up the likelihood of both factors on a grid, loop by loop and place by place.
+
+    Attributes:
+        loops: how many were taken in.
+    """
+
+    def __init__(self) -> None:
+        logs = np.log(_GRID)
+        # one decade off is two sigmas: a few loops cannot move a stated covariance
+        self._likelihood = -0.5 * ((logs[:, None] / 1.15) ** 2 + (logs[None, :] / 1.15) ** 2)
+        self._of_place: dict[int, Array] = {}
+        self.loops = 0
+
+    def add(self, loops: Loops, place: int) -> None:
+        """Take in N loops of one place, to which others may have been added before."""
+        if not len(loops):
+            return
+        new = _likelihoods(loops).sum(axis=0)
+        self._of_place[place] = self._of_place.get(place, 0.0) + new
+        self._likelihood = self._likelihood + new
+        self.loops += len(loops)
+
+    @property
+    def scale(self) -> NoiseScale:
+        """The factors, exactly 1 unless the loops contradict the stated covariances clearly."""
+        if self.loops < _FEWEST_LOOPS:
+            return NoiseScale()
+        likelihood, one = self._likelihood, len(_GRID) // 2
+        odometry, closures = int(np.argmax(likelihood[:, one])), int(np.argmax(likelihood[one]))
+        both = np.unravel_index(np.argmax(likelihood), likelihood.shape)
+        # a factor has to earn its freedom, else noise in few loops would be taken for a wrong scale
+        of_odometry = [(0, one, one), (1, odometry, one)]
+        of_closures = [(1, one, closures), (2, int(both[0]), int(both[1]))]
+
+        def merit(choice: tuple[int, int, int]) -> float:
+            factors, row, column = choice
+            trusting = _NATS_TO_TRUST - _NATS_PER_FACTOR if row < one else 0.0
+            return float(likelihood[row, column]) - _NATS_PER_FACTOR * factors - trusting
+
+        best, plain = max(of_odometry + of_closures, key=merit), max(of_odometry, key=merit)
+        accepted = best[2] <= one or self._is_widely_better(best[1:], plain[1:])
+        # closures that are about as stated are taken as stated, and odometry is judged by that
+        row, column = best[1:] if accepted and _unless_small(_GRID[best[2]]) != 1 else plain[1:]
+        odometry_factor, closures_factor = float(_GRID[row]), float(_GRID[column])
+        if one not in (row, column) and abs(np.log(odometry_factor / closures_factor)) < _SAME_UNITS:
+            # rather other units than two mistakes: what counts is the ratio, and that is as stated
+            odometry_factor = closures_factor = max(odometry_factor, closures_factor)
+        closures_factor = _unless_small(closures_factor)
+        least = _LEAST_ODOMETRY * min(closures_factor, 1.0)
+        return NoiseScale(max(_unless_small(odometry_factor), least), closures_factor)
+
+    def _is_widely_better(self, one: tuple[int, int], other: tuple[int, int]) -> bool:
+        """Whether one choice would be better without the place that speaks for it most."""
+        gains = np.array([likelihood[one] - likelihood[other] for likelihood in self._of_place.values()])
+        return bool(gains.sum() - gains.max() > _NATS_PER_FACTOR)
+
+
+def _unless_small(factor: float) -> float:
+    return factor if abs(np.log(factor)) > _TOLERANCE else 1.0
+
+
+def _likelihoods(loops: Loops) -> Array:
+    """(N, G, G) log-likelihood of each loop over the grids of odometry and closure factors."""
+    # height, roll and pitch count unless all is flat (a 2-D graph): that they fit exactly says nothing
+    flat = np.abs(loops["residual"][:, _OUT_OF_PLANE]).max() <= 1e-9
+    axes = _IN_PLANE if flat else np.arange(6)
+    residuals, square = loops["residual"][:, axes], np.ix_(np.arange(len(loops)), axes, axes)
+    # whiten by the closures' noise, then turn the odometry's to its axes: both become diagonal
+    lower = np.linalg.cholesky(loops["closures"][square])
+    white = np.linalg.solve(lower, np.swapaxes(np.linalg.solve(lower, loops["odometry"][square]), -1, -2))
+    gains, turns = np.linalg.eigh(0.5 * (white + np.swapaxes(white, -1, -2)))
+    turned = np.swapaxes(turns, -1, -2) @ np.linalg.solve(lower, residuals[..., None])
+    spread = _GRID[:, None, None] ** 2 * np.maximum(gains, 0)[:, None, None, :] + _GRID[None, :, None] ** 2
+    determinant = 2 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
+    inlier = -0.5 * ((turned[..., 0] ** 2)[:, None, None, :] / spread + np.log(spread)).sum(axis=-1)
+    inlier -= 0.5 * determinant[:, None, None]
+    aliases = _ALIAS_SIGMAS[:, axes]
+    deviations = residuals[:, None, :] / aliases
+    outlier = np.logaddexp.reduce(-0.5 * (deviations**2).sum(axis=-1) - np.log(aliases).sum(axis=-1), axis=-1)
+    return np.logaddexp(np.log(1 - _OUTLIERS) + inlier, np.log(_OUTLIERS / 2) + outlier[:, None, None])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,19 @@ from umf_ros.core.trajectory import bracket, interpolated
 
 Stamps = NDArray[np.int64]
 Rows = NDArray[np.int64]
+PathPoints = NDArray[np.void]
+POINT = np.dtype(
+    [("session", "i8"), ("stamp", "i8"), ("travel", "f8"), ("pose", "f8", (4, 4)), ("noise", "f8", (6, 6))]
+)
+"""Fields of `PathPoints`, the odometry at some stamps: session, stamp in ns, path length in m since its start, pose,
+and the noise of all steps so far. Pose and noise are seen from the session's first position, so that sums stay well
+conditioned."""
+
+
+def noise_between(a: PathPoints, b: PathPoints) -> Array:
+    """(..., 6, 6) noise of the odometry between points of one session, at the origin of both."""
+    forward = (a["stamp"] <= b["stamp"])[..., None, None]
+    return np.where(forward, 1.0, -1.0) * (b["noise"] - a["noise"])
 
 
 class Table:
@@ -59,22 +72,6 @@ class Table:
         self._size = size
 
 
-class PathPoints(NamedTuple):
-    """Odometry at N stamps, seen from the position of the session's first pose: that keeps sums well conditioned.
-
-    Attributes:
-        poses: (N, 4, 4).
-        noise: (N, 6, 6) noise of all steps so far, at the origin.
-    """
-
-    poses: Array
-    noise: Array
-
-    def of(self, rows: Rows | NDArray[np.bool_]) -> PathPoints:
-        """Those at some rows."""
-        return PathPoints(self.poses[rows], self.noise[rows])
-
-
 class OdometryChain:
     """All messages of one session, and keyframes among them with the noise collected along the way.
 
@@ -83,8 +80,8 @@ class OdometryChain:
     in the tangent space of b. So any two stamps of a session are compared in constant time.
     """
 
-    def __init__(self, settings: PoseGraphSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: PoseGraphSettings, session: int = 0) -> None:
+        self._settings, self._session = settings, session
         self._noise = OdometryNoise.stated(settings)
         self._arrived: list[tuple[int, Array]] = []
         self._covariances: dict[int, Array] = {}
@@ -138,23 +135,22 @@ class OdometryChain:
         """(N, 4, 4) odometry poses interpolated at the stamps, held constant outside the messages."""
         return interpolated(self._messages["stamp"], self._messages["pose"], stamps)
 
-    def travel_at(self, stamps: Stamps) -> Array:
-        """(N,) metres driven since the start of the session, turns on the spot included."""
-        return np.interp(stamps.astype(float), self.stamps.astype(float), self._keyframes["travel"])
-
     def at(self, stamps: Stamps) -> PathPoints:
-        """The path at stamps the odometry covers."""
+        """(N,) the path at stamps the odometry covers."""
         poses, collected = self.poses_at(stamps), self._keyframes["noise"]
         lower, upper, share = bracket(self.stamps, stamps)
+        points = np.zeros(len(stamps), POINT)
+        points["session"], points["stamp"], points["pose"] = self._session, stamps, self._from_origin(poses)
+        points["travel"] = np.interp(stamps.astype(float), self.stamps.astype(float), self._keyframes["travel"])
         shares = share[:, None, None]
-        noise = (1 - shares) * collected[lower] + shares * collected[upper]
+        points["noise"] = (1 - shares) * collected[lower] + shares * collected[upper]
         beyond = stamps > self.stamps[-1]
         if beyond.any():
             last = np.broadcast_to(self.poses[-1], poses[beyond].shape)
             elapsed_s = (stamps[beyond] - self.stamps[-1]) / 1e9
             steps = self._noise.covariances(self._noise.path_lengths(last, poses[beyond], elapsed_s))
-            noise[beyond] += propagate(adjoint(self._from_origin(poses[beyond])), steps)
-        return PathPoints(self._from_origin(poses), noise)
+            points["noise"][beyond] += propagate(adjoint(points["pose"][beyond]), steps)
+        return points
 
     def _from_origin(self, poses: Array) -> Array:
         shifted = poses.copy()
@@ -222,54 +218,34 @@ class CorrectedPath:
     which is its least-squares optimum; beyond the last one the path follows the odometry.
 
     Attributes:
-        chain: the odometry.
-        stamps: (N,) sorted stamps of the solved poses.
-        points: the odometry at `stamps`.
-        poses: (N, 4, 4) solved `map_T_body` at `stamps`.
+        points: (N,) the odometry at the solved poses, sorted by stamp.
+        poses: (N, 4, 4) solved `map_T_body`.
     """
 
-    chain: OdometryChain
-    stamps: Stamps
     points: PathPoints
     poses: Array
 
-    def at(self, stamps: Stamps, points: PathPoints | None = None) -> Array:
-        """(M, 4, 4) `map_T_body` at stamps the odometry covers; `points`: the odometry there, where it is known."""
-        rows = np.minimum(np.searchsorted(self.stamps, stamps), len(self.stamps) - 1)
-        poses, other = self.poses[rows], self.stamps[rows] != stamps
-        if other.any():
-            chosen = stamps[other]
-            there = self.chain.at(chosen) if points is None else points.of(other)
-            poses[other] = self._between(chosen, there)
-        return poses
-
-    def _between(self, stamps: Stamps, points: PathPoints) -> Array:
-        """(M, 4, 4) `map_T_body` at stamps that are not solved."""
-        after = np.searchsorted(self.stamps, stamps, side="right")
+    def at(self, points: PathPoints) -> Array:
+        """(M, 4, 4) `map_T_body` at points of the session."""
+        after = np.searchsorted(self._stamps, points["stamp"], side="right")
         lower = np.maximum(after - 1, 0)
-        twists = np.zeros((len(stamps), 6))
-        inside = (after > 0) & (after < len(self.stamps))
+        twists = np.zeros((len(points), 6))
+        inside = (after > 0) & (after < len(self.points))
         if inside.any():
-            walked = points.noise[inside] - self.points.noise[lower[inside]]
-            steps, of_step = np.unique(lower[inside], return_inverse=True)
-            twists[inside] = (walked @ self._multipliers(steps)[of_step][..., None])[..., 0]
-        start = self.poses[lower] @ invert(self.points.poses[lower])
-        return start @ expmap(twists) @ points.poses
+            walked = points["noise"][inside] - self.points["noise"][lower[inside]]
+            twists[inside] = (walked @ self._multipliers[lower[inside]][..., None])[..., 0]
+        start = self.poses[lower] @ invert(self.points["pose"][lower])
+        return start @ expmap(twists) @ points["pose"]
 
     @cached_property
-    def _found(self) -> tuple[Array, NDArray[np.bool_]]:
-        """(N-1, 6) multipliers of the steps between solved poses, and (N-1,) which of them are known yet."""
-        return np.zeros((len(self.stamps) - 1, 6)), np.zeros(len(self.stamps) - 1, bool)
+    def _stamps(self) -> Stamps:
+        return np.ascontiguousarray(self.points["stamp"])
 
-    def _multipliers(self, steps: Rows) -> Array:
-        """(M, 6) correction from some solved poses to the next per noise: Lagrange multipliers of the solved poses."""
-        multipliers, known = self._found
-        new = steps[~known[steps]]
-        if len(new):
-            here, there = self.points.of(new), self.points.of(new + 1)
-            walked = invert(here.poses) @ there.poses
-            misfits = logmap(invert(walked) @ invert(self.poses[new]) @ self.poses[new + 1])
-            twists = adjoint(there.poses) @ misfits[..., None]
-            multipliers[new] = np.linalg.solve(there.noise - here.noise, twists)[..., 0]
-            known[new] = True
-        return multipliers[steps]
+    @cached_property
+    def _multipliers(self) -> Array:
+        """(N-1, 6) correction from each solved pose to the next per noise: Lagrange multipliers of the solved poses."""
+        here, there = self.points[:-1], self.points[1:]
+        walked = invert(here["pose"]) @ there["pose"]
+        misfits = logmap(invert(walked) @ invert(self.poses[:-1]) @ self.poses[1:])
+        twists = adjoint(there["pose"]) @ misfits[..., None]
+        return np.linalg.solve(there["noise"] - here["noise"], twists)[..., 0]

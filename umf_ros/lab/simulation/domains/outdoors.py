@@ -32,7 +32,7 @@ class Undulation:
         return found
 
 
-CELLS, CELL_M = 241, 0.5
+FOREST_CELLS, FOREST_CELL_M = 241, 0.5
 SWAY_M = 0.04
 LEAVES = 220
 
@@ -43,8 +43,8 @@ class Trees:
     def __init__(self, seed: int, regular: bool) -> None:
         self._seed = seed
         rng = np.random.default_rng([seed, 32, int(regular)])
-        relief = rng.uniform(0.3, 1.0) * spectral_noise(CELLS, 4.2, rng, 1, 20)
-        self._ground = Undulation(relief + 0.03 * spectral_noise(CELLS, 2.6, rng, 20), CELL_M)
+        relief = rng.uniform(0.3, 1.0) * spectral_noise(FOREST_CELLS, 4.2, rng, 1, 20)
+        self._ground = Undulation(relief + 0.03 * spectral_noise(FOREST_CELLS, 2.6, rng, 20), FOREST_CELL_M)
         self.lateral_m = 0.8 if regular else 1.5
         if regular:
             gap = rng.uniform(4.0, 5.0)
@@ -65,7 +65,7 @@ class Trees:
     def scene(self, visit: int) -> Scene:
         """Trunks stay, leaves move in the wind."""
         solids, wind = Solids(), np.random.default_rng([self._seed, 33, visit])
-        solids.ground(self._ground.heights, CELL_M)
+        solids.ground(self._ground.heights, FOREST_CELL_M)
         for number, (place, size) in enumerate(zip(self._places, self._sizes, strict=True)):
             rng = np.random.default_rng([self._seed, 34, number])
             foot = np.array([*place, float(self.height(*place)) - 0.1])
@@ -86,7 +86,7 @@ class Trees:
         return (grid + rng.normal(0, 0.12, grid.shape))[~missing]
 
 
-CELLS, CELL_M = 361, 0.4
+QUARRY_CELLS, QUARRY_CELL_M = 361, 0.4
 
 
 class Quarry:
@@ -97,9 +97,9 @@ class Quarry:
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng([seed, 31])
         self.trail = wobbly_ring(rng.uniform(16, 24), 0.15, rng)
-        self._ground = Undulation(self._heights(rng), CELL_M)
+        self._ground = Undulation(self._heights(rng), QUARRY_CELL_M)
         solids = Solids()
-        solids.ground(self._ground.heights, CELL_M, rng.uniform(0.3, 0.5))
+        solids.ground(self._ground.heights, QUARRY_CELL_M, rng.uniform(0.3, 0.5))
         self._blocks(solids, rng)
         self._scene = solids.scene()
 
@@ -112,13 +112,13 @@ class Quarry:
         return self._scene
 
     def _heights(self, rng: np.random.Generator) -> Array:
-        axis = (np.arange(CELLS) - CELLS // 2) * CELL_M
+        axis = (np.arange(QUARRY_CELLS) - QUARRY_CELLS // 2) * QUARRY_CELL_M
         x, y = np.meshgrid(axis, axis)
-        ragged = spectral_noise(CELLS, 3.4, rng, 2, 40)
+        ragged = spectral_noise(QUARRY_CELLS, 3.4, rng, 2, 40)
         away = np.hypot(x, y) + 4 * ragged
         bench, rise = rng.uniform(7, 11), rng.uniform(3, 6)
         terraces = rise * sum(smooth_step(away, 32 + k * bench, 33.5 + k * bench) for k in range(3))
-        rough = 0.3 * spectral_noise(CELLS, 3.6, rng, 3, 30) + 0.04 * spectral_noise(CELLS, 2.5, rng, 30)
+        rough = 0.3 * spectral_noise(QUARRY_CELLS, 3.6, rng, 3, 30) + 0.04 * spectral_noise(QUARRY_CELLS, 2.5, rng, 30)
         return np.asarray(terraces + rough, np.float32)
 
     def _blocks(self, solids: Solids, rng: np.random.Generator) -> None:
