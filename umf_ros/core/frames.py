@@ -39,7 +39,7 @@ class StereoCamera:
         return 2 * math.atan(self.width / (2 * self.fx))
 
     def project(self, points: Array, body_T_camera: Array) -> tuple[Array, Array]:
-        """Left pixels (N, 2) and depths (N,) m of points (N, 3) of the body frame; depths <= 0 lie behind the camera."""
+        """Left pixels (N, 2) and depths (N,) m, <= 0 behind the camera, of points (N, 3) in the body frame."""
         optical = transform(invert(body_T_camera), points)
         depth = optical[:, 2]
         safe = np.where(depth > 0, depth, 1.0)

@@ -56,8 +56,7 @@ class BaseNode(LifecycleNode, ABC):
         self._results = own["results_dir"]
         self._watches: list[InputWatch] = []
         self._own: list[Any] = []
-        self._faults: Counter[str] = Counter()
-        self._last_fault = ""
+        self._faults, self._last_fault = Counter[str](), ""
         self._throttle = Throttle()
         self._clockless_s = 0.0
         self._active = self._opened = self._leaving = False
@@ -123,7 +122,7 @@ class BaseNode(LifecycleNode, ABC):
         """
         self._leaving = True
         if self._opened and rclpy.ok(context=self.context):
-            self.trigger_shutdown()  # who waits for our last words hears when they begin and when all are said
+            self.trigger_shutdown()  # listeners hear when the last messages begin and when they are out
         self._close()
         error, self._unwritten = self._unwritten, None
         if error is not None:

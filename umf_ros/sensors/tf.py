@@ -103,8 +103,8 @@ class TfExtrinsics:
 class OdometryFrames:
     """Converts odometry of any part of the robot to the body's; another source on the same topic is refused.
 
-    Odometry of another part waits `patience_s` for the transforms, by its stamps; then it is taken as the body's, with a
-    warning. `odom` is the name of the odometry's frame: that of the messages, where they name one.
+    Odometry of another part waits `patience_s` for the transforms, by its stamps; then it is taken as the body's, with
+    a warning. `odom` is the name of the odometry's frame: that of the messages, where they name one.
     """
 
     def __init__(
