@@ -47,7 +47,7 @@ def command(
     if write is not None:
         _write(console, found, recording, write)
     elif found.settings is None:
-        console.print(f"of no known data set: umf inspect {bag} --write . writes a first --config", **PLAIN)
+        console.print(found.unknown, **PLAIN)
     if not found.works:
         console.print("It would find nothing.", style="red")
         raise typer.Exit(USELESS)

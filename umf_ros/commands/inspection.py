@@ -1,4 +1,4 @@
-"""What a recording holds, and whether it would work."""
+"""Contents of a recording, and whether a replay would work."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from umf_ros.bags.reader import Bag, decode
 from umf_ros.core.config import Settings, Topics
 from umf_ros.core.errors import MessageError, UmfError
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
+from umf_ros.core.keyframes import gap_remedy
 from umf_ros.runs.reader import Advice
+from umf_ros.sensors.calibration import TO_BE_MEASURED
 from umf_ros.sensors.decode import (
     CLOUD,
     COMPRESSED,
@@ -35,7 +37,7 @@ FEW_PAIRS = 0.5
 OPTICAL = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """`body_T_camera` of a camera that looks ahead, at the origin: what stands in for a mounting nobody told."""
 BODIES = ("base_link", "base_footprint", "body", "imu_link")
-GUESS = "TO BE MEASURED: a guess"
+GUESS = f"{TO_BE_MEASURED}: a guess"
 RAW = "  # the images look raw: rectify them, or see raw_camera in config/calibration/s3li_vulcano.yaml"
 
 
@@ -50,7 +52,8 @@ class Inspected:
         advice: what is wrong or missing, with what helps.
         info: left and right camera_info, as far as there are.
         image_size: width and height, or None.
-        settings: that would be used without --config; None where the topics are of no known data set.
+        settings: that would be used without --config; None where the recording is of no known data set.
+        unknown: why it is of none.
     """
 
     topics: Topics
@@ -60,6 +63,7 @@ class Inspected:
     info: dict[str, Any] = field(default_factory=dict)
     image_size: tuple[int, int] | None = None
     settings: Settings | None = None
+    unknown: str = ""
 
     @property
     def works(self) -> bool:
@@ -72,8 +76,8 @@ def inspect(bag: Bag) -> Inspected:
     found = Inspected(guess_topics(bag))
     try:
         found.settings = settings_for(bag, None, "auto")
-    except UmfError:
-        found.settings = None
+    except UmfError as error:
+        found.unknown = str(error)
     _read_samples(bag, found)
     _about_depth(found)
     _about_odometry(bag, found)
@@ -232,11 +236,12 @@ def _distances(images: NDArray[np.int64], scans: NDArray[np.int64]) -> NDArray[n
 
 
 def _about_gaps(bag: Bag, found: Inspected) -> None:
-    rules = (found.settings or Settings()).loop
-    if bag.duration_s < rules.min_time_gap_s:
-        gap = f"loop.min_time_gap_s, {rules.min_time_gap_s:g} s"
+    settings = found.settings or Settings()
+    if bag.duration_s < settings.loop.min_time_gap_s:
+        gap = f"loop.min_time_gap_s, {settings.loop.min_time_gap_s:g} s"
         what = f"{bag.duration_s:.1f} s are shorter than {gap}: no match is allowed"
-        found.advice.append(Advice("fault", what, "drive longer, or lower loop.min_time_gap_s"))
+        remedy = gap_remedy(bag.duration_s, None if found.topics.odometry else 0.0, settings)
+        found.advice.append(Advice("fault", what, f"drive longer, or set {remedy}"))
 
 
 def write_settings(found: Inspected, calibration: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import sqlite3
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -271,17 +272,6 @@ MOST_NODES = 100_000
 """A file of settings has some hundreds; aliases of aliases are how a small one stands for a thousand million."""
 
 
-class _OnceLoader(yaml.SafeLoader):
-    """Refuses a name that is given twice: the first value would be dropped without a word."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        names = [str(getattr(key, "value", "")) for key, _ in node.value]
-        twice = next((name for i, name in enumerate(names) if name in names[:i] and name != "<<"), None)
-        if twice is not None:
-            raise yaml.constructor.ConstructorError(None, None, f"{twice} is given twice", node.start_mark)
-        return dict(super().construct_mapping(node, deep))
-
-
 def is_yaml(path: Path) -> bool:
     """Whether a path names a YAML file, and not data."""
     return path.suffix in (".yaml", ".yml")
@@ -299,7 +289,7 @@ def read_yaml(path: Path) -> Any:
         if len(text) > LARGEST_YAML:
             raise ConfigError(f"{path} is not valid YAML: larger than {LARGEST_YAML >> 20} MB")
         _count_nodes(yaml.compose(text, yaml.SafeLoader), {})
-        return yaml.load(text, _OnceLoader)
+        return yaml.safe_load(text)
     except ConfigError:
         raise
     except OSError as error:
@@ -312,7 +302,7 @@ def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
     """Nodes of a document with every alias written out.
 
     Raises:
-        ValueError: they are too many, or a node is its own part.
+        ValueError: they are too many, a node is its own part, or a name is given twice: one value would be lost.
     """
     if id(node) in known:
         if not known[id(node)]:
@@ -322,6 +312,9 @@ def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
     if isinstance(node, yaml.SequenceNode):
         count = sum(_count_nodes(item, known) for item in node.value)
     elif isinstance(node, yaml.MappingNode):
+        for name, times in Counter(str(getattr(key, "value", "")) for key, _ in node.value).items():
+            if times > 1 and name != "<<":
+                raise ValueError(f"{name} is given twice{node.start_mark}")
         count = sum(_count_nodes(item, known) for pair in node.value for item in pair)
     known[id(node)] = count + 1
     if count > MOST_NODES:
@@ -340,13 +333,11 @@ def read_values(path: Path) -> dict[str, Any]:
         return {}
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: expected names and values, found a {type(content).__name__}")
-    _check_names(content, path)
+    groups = [content]
+    while groups:
+        group = groups.pop()
+        wrong = [name for name in group if not isinstance(name, str)]
+        if wrong:
+            raise ConfigError(f"{path}: a name is text, not {wrong[0]!r}")
+        groups += [value for value in group.values() if isinstance(value, dict)]
     return content
-
-
-def _check_names(content: dict[Any, Any], path: Path) -> None:
-    for name, value in content.items():
-        if not isinstance(name, str):
-            raise ConfigError(f"{path}: a name is text, not {name!r}")
-        if isinstance(value, dict):
-            _check_names(value, path)

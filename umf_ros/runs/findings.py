@@ -11,6 +11,7 @@ import numpy as np
 
 from umf_ros.bags.reader import Bag
 from umf_ros.core.config import Settings
+from umf_ros.core.keyframes import gap_remedy
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, GateDiagnosis
 from umf_ros.runs.reader import Advice, FinishedRun, absent_inputs, useless_inputs
@@ -29,6 +30,8 @@ SCALE = 0.08
 """Measured on simulated drives: a right baseline comes out within 1 %."""
 SAME_DEG = 5.0
 """By hand: two sensors that differ from the odometry alike: it is the odometry."""
+REFUSED = ("size", "encoding", "step", "truncated", "compressed", "fields", "datatype", "unusable", "stamp")
+"""Reasons why a message is of no use by itself, whatever the others are."""
 ACROSS = 0.5
 """Of the way, by hand: a body drives along its x, or its y where it can."""
 
@@ -223,8 +226,11 @@ def _truth(about: ExaminedRun) -> Iterator[Advice]:
 
 def _pairs(about: ExaminedRun) -> Iterator[Advice]:
     summary, settings = about.run.summary, about.run.settings
-    received = {name: one["received"] for name, one in summary.get("inputs", {}).items()}
-    if summary["frames"] and not summary["pairs"] and received.get("left") and received.get("cloud"):
+    usable = {
+        name: one["received"] - sum(count for reason, count in one["dropped"].items() if reason in REFUSED)
+        for name, one in summary.get("inputs", {}).items()
+    }
+    if summary["frames"] and not summary["pairs"] and usable.get("left") and usable.get("cloud"):
         yield Advice(
             "fault",
             f"none of {summary['frames']} scans has an image within {settings.sync.slop_s:g} s of it",
@@ -250,7 +256,7 @@ def _gaps(about: ExaminedRun) -> Iterator[Advice]:
         "fault",
         f"the gap rules exclude every pair: a match must be {rules.min_time_gap_s:g} s older and "
         f"{rules.min_travel_m:g} m back, and the run lasts {seconds:.0f} s and {metres:.0f} m",
-        "loop.min_time_gap_s and loop.min_travel_m",
+        gap_remedy(seconds, float(metres), about.run.settings),
     )
 
 
