@@ -250,6 +250,6 @@ def print_findings(path: Path) -> bool:
     bag = open_bag(path)
     settings = settings_for(bag, None, "auto")
     seen = check_sensors(bag, settings)
-    found = [one.what for one in about_sensors(seen, settings)]
+    found = [one.what for one in about_sensors(seen)]
     print(f"{path.stem}: {'; '.join(found) or 'nothing wrong'} ({seen.lidar}, {seen.camera})", flush=True)
     return not found

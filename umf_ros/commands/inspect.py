@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
 
-SEVERITY = {"fault": "red", "warning": "yellow", "note": "dim"}
-
 
 def command(
     bag: BagPath,
@@ -58,6 +56,8 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
     from rich.markup import escape
     from rich.table import Table
 
+    from umf_ros.runs.report import COLOURS
+
     console.print(f"{bag}: {recording.duration_s:.1f} s", **PLAIN)
     if recording.warning:
         console.print(recording.warning, style="yellow", **PLAIN)
@@ -73,7 +73,7 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
     if "pairs" in found.found:
         console.print(found.found["pairs"], **PLAIN)
     for one in found.advice:
-        console.print(f"{one.severity}: {one.line}", style=SEVERITY[one.severity], **PLAIN)
+        console.print(f"{one.severity}: {one.line}", style=COLOURS[one.severity], **PLAIN)
     if found.settings is not None:
         console.print(f"data set: {found.settings.dataset}; umf replay {bag} needs no --config", **PLAIN)
 

@@ -27,11 +27,7 @@ from umf_ros.runs.writer import write_atomically
 
 
 def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
-    """Write all results of a solved map; returns the summary.
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
+    """Write all results of a solved map; returns the summary."""
     path = folder.path
     _write_poses(path / POSES, joint)
     trajectories = path / "trajectories"
@@ -69,11 +65,8 @@ def summarise(joint: JointMap) -> dict[str, Any]:
 
 def sentence(summary: dict[str, Any]) -> str:
     """Joined sessions and closures between them, in one sentence."""
-    between, joined = summary["closures_between"], summary["joined"]
-    return (
-        f"{joined} of {len(summary['sessions'])} sessions in one frame; closures between them: "
-        f"{between['accepted']} of {between['found']} accepted"
-    )
+    between, joined = summary["closures_between"], f"{summary['joined']} of {len(summary['sessions'])} sessions"
+    return f"{joined} in one frame; closures between them: {between['accepted']} of {between['found']} accepted"
 
 
 def crispness(summary: dict[str, Any]) -> str:

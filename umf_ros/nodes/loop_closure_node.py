@@ -46,6 +46,9 @@ from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms, TfExtrinsics
 from umf_ros.verification import Hypothesis
 
+if TYPE_CHECKING:
+    from umf_ros.fleet.inter_robot_closures import InterRobotClosure
+
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
 INTAKE_QUEUE = 400
 MESSAGE_TYPES = {"cloud": PointCloud2, "odometry": Odometry}

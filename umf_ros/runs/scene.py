@@ -14,7 +14,7 @@ from umf_ros.core.geometry import Array, align, relative, rotation_angle
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis
-from umf_ros.runs.findings import PENDING, ExaminedRun
+from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.gallery import SCAN_UNIT_M, Gallery, Photograph
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.tables import Endpoints
@@ -89,7 +89,7 @@ def _kind(about: ExaminedRun, key: Endpoints, judged: JudgedClosure | None) -> K
     verdict = about.run.verdicts.get(key)
     if verdict is None or verdict.state == State.ACCEPTED:
         return "accepted"
-    return "pending" if verdict.state in PENDING else "rejected"
+    return "pending" if verdict.state == State.PENDING else "rejected"
 
 
 def _missed(about: ExaminedRun, tested: dict[Endpoints, Hypothesis]) -> list[Pair]:

@@ -171,11 +171,7 @@ def _judge_closures(closures: list[LoopClosure], truth: Trajectory) -> list[Judg
     stamps = np.array([endpoints(closure) for closure in closures], np.int64)
     poses, known = truth.at(stamps.reshape(-1))
     ends = zip(closures, poses.reshape(-1, 2, 4, 4), known.reshape(-1, 2), strict=True)
-    return [
-        judge_closure(one, query, match, truth.has_orientation)
-        for one, (query, match), covered in ends
-        if covered.all()
-    ]
+    return [judge_closure(one, pair[0], pair[1], truth.has_orientation) for one, pair, covered in ends if covered.all()]
 
 
 def judge_closure(
