@@ -65,10 +65,11 @@ class Opening:
 
     def odometry_of(self, recording: Path, settings: Settings) -> Trajectory | None:
         """The odometry of a recording from its TUM file; None where there is none."""
-        for ending in (".tum", ".odometry.tum") if self.odometry else ():
-            path = self.odometry / f"{recording.stem}{ending}"
-            if path.is_file():
-                return read_odometry(path, self.odometry_frame, settings)
+        if self.odometry is not None:
+            for ending in (".tum", ".odometry.tum"):
+                path = self.odometry / f"{recording.stem}{ending}"
+                if path.is_file():
+                    return read_odometry(path, self.odometry_frame, settings)
         return None
 
 

@@ -179,9 +179,8 @@ def judge_closure(
 ) -> JudgedClosure:
     """Hold one closure against the truth.
 
-    True means: both keyframes within 12 m of each other [UMF 5.1.2], whatever their headings (who recognises a place
-    from another side is not wrong), and the published relative pose within 0.5 m and 5 deg. A truth of positions
-    alone (RTKLIB) checks distances only.
+    True means: both keyframes within 12 m of each other [UMF 5.1.2], whatever their headings, and the published
+    relative pose within 0.5 m and 5 deg. A truth of positions alone (RTKLIB) checks distances only.
     """
     truth = relative(world_T_match, world_T_query)
     distance_m = float(np.linalg.norm(truth[:3, 3]))
