@@ -31,7 +31,7 @@ def write(path: Path, entries: Iterable[Entry], monkeypatch: pytest.MonkeyPatch)
 
 
 def config_for(bag: Path, folder: Path) -> Path:
-    """What `umf inspect --write` makes of a recording, with the calibration's images as large as they are."""
+    """The files that `umf inspect --write` makes of a recording, with the calibration's images as large as they are."""
     ended = umf("inspect", bag, "--write", folder)
     assert (folder / "my_rover.yaml").is_file(), ended.text
     return folder / "my_rover.yaml"

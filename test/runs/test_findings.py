@@ -1,4 +1,4 @@
-"""What to look at first, and the verdict: green only when something was found or there was nothing to find."""
+"""Findings in their order, and the verdict: green only when something was found or there was nothing to find."""
 
 from __future__ import annotations
 
