@@ -82,7 +82,7 @@ def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> 
     from umf_ros.bags.frames import read_transforms
     from umf_ros.commands.inspection import GUESS, write_calibration, write_settings
     from umf_ros.core.errors import writing
-    from umf_ros.runs.writer import write_atomically
+    from umf_ros.core.io import write_atomically
 
     settings, calibration = folder / "my_rover.yaml", folder / "my_calibration.yaml"
     for path in (settings, calibration):

@@ -9,6 +9,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,12 @@ def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file that is never seen half-written."""
+    with atomic_write(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
 def check_writable(folder: Path) -> None:
     """Make a folder and check that results can be written into it, before hours of work.
 
@@ -52,6 +60,29 @@ def check_writable(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK):
         raise OutputError(f"cannot write to {folder}: permission denied")
+
+
+def create_run_folder(out: Path, latest: bool = True) -> Path:
+    """Make a new folder inside `out`, named after the local time; `out/latest` leads to it unless `latest` is false."""
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    with writing(f"to {out}"):
+        out.mkdir(parents=True, exist_ok=True)
+        names = (stamp if number == 1 else f"{stamp}_{number}" for number in count(1))
+        folder = next(folder for name in names if _is_new(folder := out / name))
+        if latest:  # in one step, so that it always leads to a folder
+            fresh = out / f".latest-{os.getpid()}"
+            fresh.symlink_to(folder.name, target_is_directory=True)
+            fresh.replace(out / "latest")
+    return folder
+
+
+def _is_new(folder: Path) -> bool:
+    """Make a folder; returns false where there is one of this name."""
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        return False
+    return True
 
 
 class FileLock:

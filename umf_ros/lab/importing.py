@@ -23,10 +23,9 @@ from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.config import Topics
 from umf_ros.core.errors import SensorFileError
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose, to_quaternion
-from umf_ros.core.io import read_yaml
+from umf_ros.core.io import read_yaml, write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.lab.simulation.bag_writer import BagWriter, image_message, pose_message
-from umf_ros.runs.writer import write_atomically
 from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.scan_files import IMAGE_SUFFIXES, SUFFIXES, read_image, read_scan
 

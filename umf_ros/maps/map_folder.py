@@ -16,9 +16,9 @@ import numpy as np
 
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.io import write_atomically
 from umf_ros.places.database import PLACES_OF_MAP
 from umf_ros.runs.run_file import RunFile, StoredOdometry
-from umf_ros.runs.writer import write_atomically
 
 SCHEMA_VERSION = 1
 BETWEEN = "closures_between.csv"

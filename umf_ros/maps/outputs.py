@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from umf_ros.core.errors import writing
-from umf_ros.core.io import atomic_write
+from umf_ros.core.io import atomic_write, write_atomically
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.localizer import POSES
 from umf_ros.maps.joint_graph import JointMap, JointSession
@@ -23,7 +23,6 @@ from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.g2o import verdict_table
 from umf_ros.runs.gallery import data_address
 from umf_ros.runs.report import plot_trajectories, render
-from umf_ros.runs.writer import write_atomically
 
 
 def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:

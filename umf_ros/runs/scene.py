@@ -151,9 +151,14 @@ def describe(about: ExaminedRun, pair: Pair, full: bool) -> dict[str, Any]:
     if pair.pose is not None:
         told["pose"] = [round(float(value), 4) for value in pair.pose[:3].ravel()]
         told["pose_source"] = pair.pose_source
-        told["shift_m"] = round(float(np.linalg.norm(pair.pose[:3, 3])), 2)
-        told["turn_deg"] = round(float(np.degrees(rotation_angle(pair.pose))), 1)
+        shift_m, turn_deg = size_of(pair.pose)
+        told |= {"shift_m": round(shift_m, 2), "turn_deg": round(turn_deg, 1)}
     return told
+
+
+def size_of(pose: Array) -> tuple[float, float]:
+    """Metres and degrees of a pose (4, 4)."""
+    return float(np.linalg.norm(pose[:3, 3])), float(np.degrees(rotation_angle(pose)))
 
 
 def _truth_words(pair: Pair) -> str:

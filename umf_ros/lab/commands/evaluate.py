@@ -198,8 +198,8 @@ class EveryMethod:
         return self._compare(console, [places], note)
 
     def _compare(self, console: Console, sets: Iterable[FrameSet], note: str) -> Figures:
+        from umf_ros.core.io import create_run_folder
         from umf_ros.lab.evaluation.methods_run import compare_methods
-        from umf_ros.runs.writer import create_run_folder
 
         with progress_bar(console) as bar:
             task = bar.add_task("reading", total=None)
@@ -291,7 +291,7 @@ def command(
     if json_file is not None:
         import json
 
-        from umf_ros.runs.writer import write_atomically
+        from umf_ros.core.io import write_atomically
 
         write_atomically(json_file, json.dumps(figures, indent=2) + "\n")
 
@@ -316,8 +316,8 @@ def _refuse(data: str, options: Mapping[str, object]) -> None:
 def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
+    from umf_ros.core.io import create_run_folder
     from umf_ros.lab.evaluation.worlds import WorldsRun, work
-    from umf_ros.runs.writer import create_run_folder
 
     console = Console()
     chosen = choose_worlds(name, seed, quick, count)
@@ -340,9 +340,9 @@ def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Pa
 def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
+    from umf_ros.core.io import create_run_folder
     from umf_ros.embedding import make_embedder
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
-    from umf_ros.runs.writer import create_run_folder
 
     console = Console()
     opened = options.open(console, weights)
@@ -376,13 +376,13 @@ def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) ->
 def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
+    from umf_ros.core.io import create_run_folder
     from umf_ros.lab.datasets.listed import SequenceList
     from umf_ros.lab.evaluation.results import EvaluationReport
     from umf_ros.lab.evaluation.retrieval import RULES
     from umf_ros.lab.training.metric_objective import answerable, means, table, validate
     from umf_ros.networks.config import locate_weights
     from umf_ros.networks.weights import load_weights
-    from umf_ros.runs.writer import create_run_folder
 
     if rule not in RULES:
         raise ConfigError(f"--rule: expected {' or '.join(RULES)}, not {rule!r}")
@@ -406,8 +406,8 @@ def _on_places(listing: Path, config: Path | None, embedder: str | None, weights
     from rich.console import Console
 
     from umf_ros.core.config import load_settings
+    from umf_ros.core.io import create_run_folder
     from umf_ros.lab.evaluation.places import evaluate_place_sets
-    from umf_ros.runs.writer import create_run_folder
 
     console = Console()
     chosen = {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}
