@@ -146,7 +146,7 @@ def drive(solver: GraphSolver, sizes: range) -> Array:
 
 
 def optimum(size: int, without: tuple[int, ...] = ()) -> Array:
-    return GraphSolver().solve(grown(WORLD, size, WORLD.odometry[:size], without), exact=True)
+    return GraphSolver().solve(grown(WORLD, size, WORLD.odometry[:size], without))
 
 
 def apart_m(one: Array, other: Array) -> float:

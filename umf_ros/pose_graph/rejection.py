@@ -119,7 +119,6 @@ class OutlierRejection:
             self.verdicts[self._take(placed)] = ClosureVerdict(placed.closure, *decision)
         self._rescale()
         self._solve()
-        self._sessions.refine(self.accepted)
         rows = np.flatnonzero(~self._in_state(State.ACCEPTED))
         joined, ratios = self._compare(rows)[2:4]
         for row, known, ratio in zip(rows.tolist(), joined, ratios, strict=True):

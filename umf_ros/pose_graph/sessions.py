@@ -141,7 +141,7 @@ class Sessions:
             gaps = [np.abs(chain.stamps - own[np.clip(row, 0, len(own) - 1)]) for row in (after - 1, after)]
             stamps.append(np.union1d(own, chain.stamps[np.min(gaps, axis=0) > _TOO_CLOSE_NS]))
         vertices, graph = self._graph(stamps, closures, self.components)
-        self._refined = _paths_through(vertices, self._refiner.solve(graph, exact=True))
+        self._refined = _paths_through(vertices, self._refiner.solve(graph))
 
     def expand(self, closures: Closures, extra: Closures) -> Graph:
         """Graph of every keyframe and the endpoints of `extra` closures, odometry and the given closures."""
