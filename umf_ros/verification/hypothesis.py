@@ -89,6 +89,7 @@ class Measurement:
             another fits as well, 1 when a closure can be accepted; NaN outside passages and for improbable hypotheses.
         pose_inliers: feature pairs that agree with the pose.
         spread: of those pairs across the image: smaller deviation of column and row, of its width and height.
+        disparity_bias_px: estimated bias of all disparities; positive where stereo measures too little.
         two_way_m: distance of the poses that the query's depths and the match's give by themselves.
         position_std_m: standard deviation of the position along its least known direction, from the residuals.
         heading_std_deg: of the heading.
@@ -125,6 +126,7 @@ class Measurement:
     passage_rival: float = measured(SCAN)
     pose_inliers: float = measured(IMAGE)
     spread: float = measured(IMAGE)
+    disparity_bias_px: float = measured(IMAGE)
     two_way_m: float = measured(IMAGE)
     position_std_m: float = measured(SCAN, IMAGE, SUBMAP)
     heading_std_deg: float = measured(SCAN, IMAGE, SUBMAP)

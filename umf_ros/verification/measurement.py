@@ -168,6 +168,7 @@ def _measure_views(known: Measurement, alignment: ViewAlignment) -> Measurement:
         overlap=alignment.share,
         pose_inliers=float(len(alignment.residuals)),
         spread=alignment.spread,
+        disparity_bias_px=alignment.bias_px,
         two_way_m=alignment.two_way_m,
     )
 

@@ -3,7 +3,9 @@
 Each feature of an image is measured as column, row and disparity, for that is where a camera's noise lives: half a
 pixel of disparity is a centimetre near by and metres at the horizon. A feature of one view is carried over to the other
 and compared there in pixels, weighed by what both measurements leave open. Where a depth came from elsewhere (LiDAR),
-it is taken as if stereo had measured it, which is the careful side.
+it is taken as if stereo had measured it, which is the careful side. A bias of all disparities, as of a rectification
+that is not quite right, is estimated along with the pose; as far as the features leave it open, it widens the
+covariance.
 """
 
 from __future__ import annotations
@@ -95,7 +97,9 @@ class ViewAlignment:
     Attributes:
         pose: (4, 4) `match_T_query`.
         residuals: (P, 3) of the features that agree: column, row and disparity in standard deviations of their noise.
-        jacobian: (P, 3, 6) of the residuals by (x y z rx ry rz) about the match axes at the query's origin.
+        jacobian: (P, 3, 7) of the residuals by (x y z rx ry rz) about the match axes at the query's origin, and by the
+            bias of all disparities in its prior standard deviations.
+        bias_px: estimated bias of all disparities, pixels; positive where stereo measures too little.
         pixels: (P, 4) of those features: column and row in the query's image and in the match's.
         size: (2,) width and height of the match's image.
         distance_m: median distance of the two points of a pair, where both depths are known; NaN without any.
@@ -107,6 +111,7 @@ class ViewAlignment:
     pose: Array
     residuals: Array
     jacobian: Array
+    bias_px: float
     pixels: Array
     size: Array
     distance_m: float
@@ -116,12 +121,14 @@ class ViewAlignment:
 
     @property
     def information(self) -> Array:
-        """Information (6, 6) of the residuals as if they were independent."""
+        """Information (6, 6) of the residuals as if they were independent, whatever the bias of the disparities."""
         if not len(self.residuals):
             return np.zeros((6, 6))
         weight = _trust(self.residuals)
-        found: Array = np.einsum("n,nki,nkj->ij", weight, self.jacobian, self.jacobian)
-        return found / max(self.spread_sigmas, const.MIN_VIEW_SIGMAS) ** 2
+        whole = np.einsum("n,nki,nkj->ij", weight, self.jacobian, self.jacobian)
+        whole = whole / max(self.spread_sigmas, const.MIN_VIEW_SIGMAS) ** 2
+        found: Array = whole[:6, :6] - np.outer(whole[:6, 6], whole[6, :6]) / (whole[6, 6] + 1.0)
+        return found
 
     @property
     def spread_sigmas(self) -> float:
@@ -194,12 +201,15 @@ class PairedViews:
             if moved < const.VIEW_TOLERANCE:
                 break
         fit = nearby._compare(pose)
+        _, bias = _solve(fit)
+        fit = fit.corrected(bias)
         agreeing = PairedViews(nearby.query.only(fit.agreeing), nearby.match.only(fit.agreeing))
         known = int((self.query.lifted | self.match.lifted).sum())
         return ViewAlignment(
             pose,
             fit.residuals[fit.agreeing],
             fit.jacobian[fit.agreeing],
+            bias * const.DISPARITY_BIAS * self.match.camera.width,
             agreeing.pixels,
             np.array([self.match.camera.width, self.match.camera.height]),
             agreeing.distance(pose),
@@ -231,11 +241,7 @@ class PairedViews:
 
     def _step(self, pose: Array) -> tuple[Array, float]:
         """The pose one step on, and the largest part of the step."""
-        fit = self._compare(pose)
-        weight = np.where(fit.usable, _trust(fit.residuals), 0.0)
-        normal = np.einsum("n,nki,nkj->ij", weight, fit.jacobian, fit.jacobian)
-        slope = np.einsum("n,nki,nk->i", weight, fit.jacobian, fit.residuals)
-        step = -np.linalg.solve(normal + 1e-6 * np.eye(6), slope)
+        step, _ = _solve(self._compare(pose))
         turn = Rotation.from_rotvec(step[3:]).as_matrix()
         return make_pose(turn @ pose[:3, :3], pose[:3, 3] + step[:3]), float(np.abs(step).max())
 
@@ -255,11 +261,15 @@ class PairedViews:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """All pairs at a pose: residuals (N, 3) in standard deviations, Jacobian (N, 3, 6), and which can be used (N,)."""
+    """All pairs at a pose: residuals (N, 3) in standard deviations, Jacobian (N, 3, 7), and which can be used (N,)."""
 
     residuals: Array
     jacobian: Array
     usable: Mask
+
+    def corrected(self, bias: float) -> _Fit:
+        """The fit were all disparities off by so many prior standard deviations."""
+        return _Fit(self.residuals + bias * self.jacobian[..., 6], self.jacobian, self.usable)
 
     @property
     def agreeing(self) -> Mask:
@@ -270,6 +280,18 @@ class _Fit:
     def near(self) -> Mask:
         """Near enough to be drawn in."""
         return self.usable & ((self.residuals**2).sum(axis=1) < const.VIEW_NEAR)
+
+
+def _solve(fit: _Fit) -> tuple[Array, float]:
+    """Step (6,) of the pose and bias of the disparities, in prior standard deviations, with the least residuals."""
+    bias = 0.0
+    for _ in range(2):  # outliers are told by the residuals that the bias leaves
+        weight = np.where(fit.usable, _trust(fit.corrected(bias).residuals), 0.0)
+        normal = np.einsum("n,nki,nkj->ij", weight, fit.jacobian, fit.jacobian)
+        slope = np.einsum("n,nki,nk->i", weight, fit.jacobian, fit.residuals)
+        solution = -np.linalg.solve(normal + np.diag([1e-6] * 6 + [1.0]), slope)
+        bias = float(solution[6])
+    return solution[:6], bias
 
 
 def _carry(
@@ -299,7 +321,11 @@ def _carry(
     if inverse:
         motion = -pose[:3, :3] @ motion
     residual = np.where(usable[:, None], np.einsum("nij,nj->ni", whiten, residual), 0.0)
-    return residual, whiten @ derivative @ motion, usable
+    # more disparity brings the source's point nearer and is added to the target's measurement
+    shift = scatter[:, :, 2] / source.noise[2] - np.array([0.0, 0.0, 1.0])
+    by_bias = np.einsum("nij,nj->ni", whiten, np.where(usable[:, None], shift, 0.0)) * const.DISPARITY_BIAS
+    by_pose = whiten @ derivative @ motion
+    return residual, np.concatenate([by_pose, by_bias[:, :, None] * target.camera.width], axis=2), usable
 
 
 def _locate(source: CameraView, target: CameraView) -> Array | None:
