@@ -29,7 +29,7 @@ _PACKAGES = (
     ("small_gicp", "small_gicp", "1"),
     ("gtsam", "gtsam", "4.3"),
     ("mcap", "mcap", "1.2"),
-    ("rosbags", "rosbags", "0.11"),
+    ("rosbags", "rosbags", "0.11.2"),
     ("pydantic", "pydantic", "2.7"),
     ("matplotlib", "matplotlib", "3.8"),
     ("jinja2", "Jinja2", "3.1"),
