@@ -28,6 +28,7 @@ def in_path() -> list[tuple[str, list[str]]]:
 setup(
     name=PACKAGE,
     version=ElementTree.parse("package.xml").findtext("version"),
+    license="Apache-2.0",
     python_requires=">=3.11",  # from pyproject.toml it would be an object, and colcon reads literals
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={PACKAGE: [f"**/*.{suffix}" for suffix in ("j2", "html", "css", "js", "npz")]},

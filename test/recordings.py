@@ -197,11 +197,7 @@ def write_mcap(
 
 def write_db3(path: Path, entries: Iterable[Entry]) -> Path:
     with Ros2Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        connections: dict[str, Any] = {}
-        for topic, log_ns, message in entries:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=STORE)
-            writer.write(connections[topic], log_ns, STORE.serialize_cdr(message, message.__msgtype__))
+        _write(writer, entries, STORE, STORE.serialize_cdr)
     return path
 
 
@@ -209,12 +205,16 @@ def write_ros1(path: Path, entries: Iterable[Entry]) -> Path:
     """Write entries made of the messages of `Stores.ROS1_NOETIC`."""
     store = get_typestore(Stores.ROS1_NOETIC)
     with Ros1Writer(path) as writer:
-        connections: dict[str, Any] = {}
-        for topic, log_ns, message in entries:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
-            writer.write(connections[topic], log_ns, store.serialize_ros1(message, message.__msgtype__))
+        _write(writer, entries, store, store.serialize_ros1)
     return path
+
+
+def _write(writer: Any, entries: Iterable[Entry], store: Any, serialize: Callable[[Any, str], Any]) -> None:
+    connections: dict[str, Any] = {}
+    for topic, log_ns, message in entries:
+        if topic not in connections:
+            connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
+        writer.write(connections[topic], log_ns, serialize(message, message.__msgtype__))
 
 
 CALIBRATION = """

@@ -21,14 +21,14 @@ TIMEOUT_S = 60
 
 _PACKAGES = {
     "numpy": ("numpy", "1.26"),
-    "scipy": ("scipy", "1.11"),
+    "scipy": ("scipy", "1.16"),
     "cv2": ("opencv-python-headless", "4.10"),
     "torch": ("torch", "2.4"),
     "safetensors": ("safetensors", "0.4"),
     "small_gicp": ("small_gicp", "1"),
     "gtsam": ("gtsam", "4.3"),
     "mcap": ("mcap", "1.2"),
-    "rosbags": ("rosbags", "0.10"),
+    "rosbags": ("rosbags", "0.11.2"),
     "pydantic": ("pydantic", "2.7"),
     "matplotlib": ("matplotlib", "3.8"),
     "jinja2": ("Jinja2", "3.1"),

@@ -109,7 +109,7 @@ def test_adaptive_shadows_agree_with_testing_every_pixel(drive, monkeypatch):
     camera = Camera(drive.world, drive.calibration.camera)
     pose = drive.pose(drive.exposures[5].stamp_ns) @ drive.calibration.body_T_camera
     fast = camera.take(pose, Sun(70, 20), np.random.default_rng(0)).image
-    monkeypatch.setattr("umf_ros.lab.simulation.shading._LARGE_PX", 10_000)
+    monkeypatch.setattr("umf_ros.lab.simulation.camera._LARGE_PX", 10_000)
     exact = camera.take(pose, Sun(70, 20), np.random.default_rng(0)).image
     assert np.mean(np.abs(fast.astype(int) - exact) > 8) < 0.01
 
