@@ -1,4 +1,4 @@
-"""What leaves the pose graph: results and graph files."""
+"""Files of the pose graph: results and graphs."""
 
 from __future__ import annotations
 

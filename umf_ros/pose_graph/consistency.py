@@ -1,7 +1,7 @@
 """Consistency of closures with each other, its evidence, and the noise scale estimated from it.
 
 Two closures close to each other and the odometry between their endpoints form a loop, whose residual has to fit the
-stated covariances: then both are consistent (pairwise consistency maximisation, kept up incrementally). The evidence
+stated covariances: then both are consistent [Mangelson 2018], kept up with each new closure. The evidence
 is the larger, the smaller the area that the prediction leaves open within the area in which wrong closures to similar
 places are found. Closures of one place count once.
 

@@ -75,10 +75,11 @@ class GraphJournal:
         """The latest decision about every closure, by the stamps of match and query."""
         with self._file.reading() as connection:
             rows = connection.execute("SELECT match_ns, query_ns, state, reason, residual, residual_m FROM verdict")
-            return {
-                (match, query): (State(state), ClosureReason(reason), *(np.nan if one is None else one for one in rest))
-                for match, query, state, reason, *rest in rows  # SQLite has no NaN
-            }
+            found = {}
+            for match, query, state, reason, *numbers in rows:  # SQLite has no NaN
+                sigmas, metres = (np.nan if number is None else float(number) for number in numbers)
+                found[match, query] = State(state), ClosureReason(reason), sigmas, metres
+            return found
 
     def settings_mark(self) -> int:
         """Mark of the settings that the verdicts were decided by, 0 without one."""

@@ -215,7 +215,7 @@ class OutlierRejection:
         return agreed
 
     def _judge(self, distance: float, misfit_m: float) -> tuple[State, ClosureReason]:
-        """What the map says to a closure, by its squared Mahalanobis distance and its misfit."""
+        """Decision about a closure by its squared Mahalanobis distance from the map, and its misfit."""
         if self.settings.reject_outliers and distance > self.settings.gate_chi2:
             return State.REJECTED, ClosureReason.CONTRADICTS
         if self.settings.max_correction_m and misfit_m > self.settings.max_correction_m:
