@@ -2,7 +2,7 @@
 # make test   the whole test suite
 # make test-jazzy   the suite against what an installed Jazzy has: NumPy 1.26.4, in a venv of its own
 # make check   lint and the fast tests, about two minutes
-# make lint   ruff, mypy, codespell and the import contracts
+# make lint   ruff, mypy, codespell, the import contracts and the rules of prose
 # make docs   the documentation as a site, build/site
 .PHONY: demo test check test-jazzy lint docs install clean
 SHELL := /bin/bash
@@ -49,6 +49,7 @@ lint: install
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
 	@$(BIN)/codespell
+	@$(BIN)/python tools/style_check.py
 
 # every page and every link, as a site in build/site
 docs: install

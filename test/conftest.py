@@ -1,4 +1,4 @@
-"""What tests share: frames and keyframes made of noise, a small recording, and a DDS domain of their own."""
+"""Shared fixtures: frames and keyframes made of noise, a small recording, and a DDS domain of their own."""
 
 from __future__ import annotations
 
@@ -124,9 +124,8 @@ def mini_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fast drive around a small loop, one and a half times, in a world no one trained or tuned on."""
     from umf_ros.lab.simulation.bag_writer import BagWriter
     from umf_ros.lab.simulation.presets import DEMO, Preset, gentle_loop
-    from umf_ros.lab.simulation.recording import record, write_side_files
     from umf_ros.lab.simulation.route import Walker
-    from umf_ros.lab.simulation.simulator import Simulator
+    from umf_ros.lab.simulation.simulator import Simulator, record, write_side_files
 
     def plan(relief: Relief, rng: np.random.Generator) -> Walker:
         return Walker(gentle_loop(relief, 30.0, rng), rng).forward(29).forward(20, lateral_m=0.5)

@@ -1,11 +1,14 @@
-"""What the package's own files say, read and not run."""
+"""Sources of the package, read and not run."""
 
 from __future__ import annotations
 
 import ast
+import tomllib
 from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
+
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "umf_ros"
@@ -22,10 +25,11 @@ def imports(path: Path) -> list[str]:
     return names
 
 
-def required(*lists: str) -> set[str]:
-    """Names of the distributions in requirements files, in lower case."""
-    lines = [line for name in lists for line in (ROOT / name).read_text().splitlines()]
-    return {line.split("==")[0].split("[")[0].lower() for line in lines if line and line[0] != "#"}
+def requirements(*parts: str) -> dict[str, Requirement]:
+    """Requirements of `dependencies` and of extras in pyproject.toml, by their names in lower case."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    listed = {"dependencies": project["dependencies"], **project["optional-dependencies"]}
+    return {one.name.lower(): one for part in parts for one in map(Requirement, listed[part])}
 
 
 @cache

@@ -75,7 +75,7 @@ def ground() -> np.ndarray:
 
 
 def scan_from(ground: np.ndarray, world_T_body: np.ndarray, seed: int) -> np.ndarray:
-    """What a 70 degree LiDAR sees of it, thinned with range, with 1 cm noise."""
+    """The part that a 70 degree LiDAR sees, thinned with range, with 1 cm noise."""
     rng = np.random.default_rng(seed)
     points = transform(invert(world_T_body), ground)
     reach = np.linalg.norm(points[:, :2], axis=1)

@@ -1,4 +1,4 @@
-"""Who may import what: the contracts of pyproject.toml, and what a fresh interpreter says to them."""
+"""Imports: the contracts of pyproject.toml, checked in a fresh interpreter too."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from sources import PACKAGE, ROOT, distributions, imports, required
+from sources import PACKAGE, ROOT, distributions, imports, requirements
 
 STILL_SHARED = {"PoseGraph", "World"}
 """Names of classes that mean two things."""
@@ -52,8 +52,8 @@ def without(missing: list[str]) -> str:
 
 
 def lab_packages() -> list[str]:
-    """What can be imported of the distributions that only the lab asks for."""
-    wanted = required("requirements-lab.txt")
+    """Modules of the distributions that only the lab asks for."""
+    wanted = requirements("lab").keys()
     return [module for module, owners in distributions().items() if owners & wanted]
 
 
@@ -129,7 +129,7 @@ def test_only_nodes_and_the_player_import_rclpy() -> None:
 
 def test_modules_are_imported_by_their_full_names() -> None:
     """So that a search for a module finds all who use it."""
-    for path in [*PACKAGE.rglob("*.py"), *(ROOT / "benchmarks").glob("*.py")]:
+    for path in [*PACKAGE.rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")]:
         assert not re.search(r"^\s*from \.", path.read_text(), re.MULTILINE), path
 
 

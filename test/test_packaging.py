@@ -11,13 +11,12 @@ from xml.etree import ElementTree
 
 import pytest
 from processes import Process
-from sources import PACKAGE, ROOT, distributions, imports, required
+from sources import PACKAGE, ROOT, distributions, imports, requirements
 
 from umf_ros.core.resources import LAB_PACKAGES
 
-PARTS = ["package.xml", "setup.py", "setup.cfg", "NOTICE", "umf_ros", "resource"]
+PARTS = ["package.xml", "pyproject.toml", "setup.py", "setup.cfg", "README.md", "NOTICE", "umf_ros", "resource"]
 PARTS += ["config", "launch", "models", "tools"]
-PARTS += [path.name for path in ROOT.glob("requirements*.txt")]
 MODULES = {"tf2_ros_py": ["tf2_ros"], "tf2_ros": []}
 """Modules of packages that have other names: tf2_ros is a library of C++."""
 ELSEWHERE = {"rerun": "rerun-sdk"}
@@ -25,9 +24,8 @@ ELSEWHERE = {"rerun": "rerun-sdk"}
 TEMPLATE = Path("runs", "templates", "planted.html.j2")
 
 
-@pytest.fixture(scope="module")
-def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    workspace = tmp_path_factory.mktemp("workspace")
+def built(workspace: Path, *options: str) -> Path:
+    """The package as colcon installs it from a copy of its sources."""
     source = workspace / "src" / "umf_ros"
     source.mkdir(parents=True)
     for part in PARTS:
@@ -39,11 +37,36 @@ def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tools = Path(sys.executable).parent
     path = f"{tools}{os.pathsep}{os.environ['PATH']}"
     environment = {**os.environ, "PATH": path, "AMENT_PREFIX_PATH": str(Path(sys.prefix))}
+    command = ["colcon", "build", *options]
     done = subprocess.run(
-        ["colcon", "build"], cwd=workspace, env=environment, capture_output=True, text=True, check=False, timeout=300
+        command, cwd=workspace, env=environment, capture_output=True, text=True, check=False, timeout=300
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return workspace / "install" / "umf_ros"
+
+
+@pytest.fixture(scope="module")
+def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built(tmp_path_factory.mktemp("workspace"))
+
+
+def test_a_workspace_of_links_has_the_same_executables(install: Path, tmp_path: Path) -> None:
+    """`colcon build --symlink-install` builds beside links to the sources, without pyproject.toml."""
+    linked = built(tmp_path, "--symlink-install")
+    for folder in ("bin", "lib/umf_ros", "share/umf_ros/launch", "share/umf_ros/models"):
+        assert {path.name for path in (linked / folder).iterdir()} == {
+            path.name for path in (install / folder).iterdir()
+        }
+    done = subprocess.run(
+        ["bash", "-c", f". {linked}/share/umf_ros/package.sh && umf --version"],
+        env=os.environ
+        | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "COLCON_CURRENT_PREFIX": str(linked)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.stdout.startswith("umf_ros "), done.stderr
 
 
 def test_everything_is_installed_to_share(install: Path) -> None:
@@ -128,8 +151,8 @@ def test_what_is_not_python_is_installed_with_the_package(install: Path) -> None
 @pytest.mark.parametrize(
     ("wing", "lists"),
     [
-        ("runtime", ["requirements.txt", "requirements-fleet.txt", "requirements-rerun.txt"]),
-        ("lab", ["requirements.txt", "requirements-lab.txt"]),
+        ("runtime", ["dependencies", "fleet", "rerun"]),
+        ("lab", ["dependencies", "lab"]),
     ],
 )
 def test_what_is_imported_is_required(wing: str, lists: list[str]) -> None:
@@ -140,17 +163,9 @@ def test_what_is_imported_is_required(wing: str, lists: list[str]) -> None:
     depends = [element.text or "" for element in ElementTree.parse(ROOT / "package.xml").iter("exec_depend")]
     ros = {module for name in depends for module in MODULES.get(name, [name])}
     for module in imported - {"umf_ros", *sys.stdlib_module_names} - ros:
-        assert distributions().get(module, {ELSEWHERE.get(module, module)}) & required(*lists), (
+        assert distributions().get(module, {ELSEWHERE.get(module, module)}) & requirements(*lists).keys(), (
             f"{module} is imported but not in {' or '.join(lists)}"
         )
-
-
-def test_an_installed_jazzy_gets_everything_that_a_rover_needs() -> None:
-    """`tools/install_jazzy.sh` installs that list alone, pinned, with the NumPy of Ubuntu 24.04."""
-    assert required("requirements-jazzy.txt") == required("requirements.txt")
-    lines = [line for line in (ROOT / "requirements-jazzy.txt").read_text().splitlines() if line[:1] != "#"]
-    assert all("==" in line for line in lines)
-    assert "numpy==1.26.4" in lines
 
 
 @pytest.mark.parametrize(
@@ -176,7 +191,7 @@ def test_a_package_that_is_missing_is_asked_for_in_one_line(module: str, advice:
 
 
 def test_the_packages_of_the_lab_are_those_of_its_extra() -> None:
-    assert {distribution for distribution, _ in LAB_PACKAGES.values()} == required("requirements-lab.txt")
+    assert {distribution for distribution, _ in LAB_PACKAGES.values()} == requirements("lab").keys()
 
 
 def test_the_parameter_documentation_is_up_to_date() -> None:

@@ -2,7 +2,8 @@
 
 Patterns: a sentence that begins with what, who or whoever; "nobody"; "of ours"; path length written as "way";
 metaphors of buildings; states of a closure other than accepted, pending, rejected, refused. Questions may begin with
-what; code in backticks, fenced blocks of pages and strings of one word are not read. `--baseline` prints the number of findings by folder and exits with 0.
+what; code in backticks, fenced blocks of pages and strings of one word are not read. `--baseline` prints the number of
+findings by folder, of the whole tree, and exits with 0.
 """
 
 from __future__ import annotations
@@ -32,6 +33,10 @@ RULES: dict[str, str] = {
 
 SKIPPED = {"CHANGELOG.rst", "CHANGELOG.md", "tools/style_check.py", "LICENSE", "NOTICE"}
 """Files that quote older words, or whose text is fixed."""
+
+PACKAGES = "bags commands comparison core fleet maps nodes pose_graph runs sensors submaps verification".split()
+NOT_YET = (*(f"umf_ros/{name}/" for name in PACKAGES), "umf_ros/detector.py", "benchmarks/accuracy/pose_graph.py")
+"""Paths whose prose is still to be mended: read only if they are named."""
 
 Block = tuple[int, str]
 """Number of the first line, and lines that belong together: a comment, a string, a paragraph."""
@@ -78,20 +83,25 @@ def findings(path: Path) -> Iterator[str]:
                 yield f"{path}:{first + number}: {sentence}: {block.splitlines()[number][:80]}"
 
 
-def files(asked: list[str]) -> list[Path]:
-    """Python files and pages under version control, of the whole tree or of the paths named."""
+def files(asked: list[str], everything: bool) -> list[Path]:
+    """Python files and pages under version control: those of the paths named, else all but `NOT_YET`."""
+    left_out = () if asked or everything else NOT_YET
     listed = subprocess.check_output(["git", "ls-files", "--", *asked], text=True).splitlines()
     of_a_kind = [Path(name) for name in listed if name not in SKIPPED and name.endswith((".py", ".md", ".yaml"))]
-    return [path for path in of_a_kind if path.is_file()]
+    return [path for path in of_a_kind if path.is_file() and not str(path).startswith(left_out)]
 
 
 def main() -> int:
     """Print the findings; 1 if there are any."""
     parser = argparse.ArgumentParser(description="Check the prose of docstrings, comments, strings and pages.")
-    parser.add_argument("paths", nargs="*", help="files or folders; by default the whole tree")
-    parser.add_argument("--baseline", action="store_true", help="print the number of findings by folder, exit with 0")
+    parser.add_argument("paths", nargs="*", help="files or folders; by default all that is mended")
+    parser.add_argument(
+        "--baseline", action="store_true", help="print the number of findings by folder, of the whole tree"
+    )
     arguments = parser.parse_args()
-    found = [(path, one) for path in files(arguments.paths) for one in dict.fromkeys(findings(path))]
+    found = [
+        (path, one) for path in files(arguments.paths, arguments.baseline) for one in dict.fromkeys(findings(path))
+    ]
     if arguments.baseline:
         for folder, number in sorted(Counter("/".join(path.parts[:2]) for path, _ in found).items()):
             print(f"{folder:40} {number:5}")

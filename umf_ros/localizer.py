@@ -163,26 +163,18 @@ class Localizer:
 
     def _update(self, at: _Sample, pose: Array, covariance: Array, probability: float) -> None:
         """Compare a measured pose with every hypothesis, and add one where none agrees."""
-        trust = min(_logit(probability), _MOST_PER_CLOSURE)
-        agreed = [one for one in self._hypotheses if self._agrees(one, at, pose, covariance)]
-        gain = trust
+        gain = trust = min(_logit(probability), _MOST_PER_CLOSURE)
+        agreed = [one for one in self._hypotheses if self._correct(one, at, pose, covariance)]
         for one in agreed:
             gain = min(gain, _NATS_PER_M * max(at.path_m - one.counted_m, 0.0))
-            self._correct(one, at, pose, covariance)
+            one.counted_m = at.path_m
         for one in self._hypotheses:
-            one.odds += gain if one in agreed else -trust if not agreed else -gain
-            one.odds = min(one.odds, _MOST_ODDS)
-            one.counted_m = at.path_m if one in agreed else one.counted_m
+            one.odds = min(one.odds + (gain if one in agreed else -gain), _MOST_ODDS)
         if not agreed:
             self._hypotheses.append(_PoseHypothesis(at, pose, covariance, trust, at.path_m))
-        self._count(agreed)
+        known = "agreed" if self._accepted in agreed else "contradicted"
+        self.counts["searching" if self._accepted is None else known] += 1
         self._choose()
-
-    def _count(self, agreed: list[_PoseHypothesis]) -> None:
-        if self._accepted is None:
-            self.counts["searching"] += 1
-        else:
-            self.counts["agreed" if self._accepted in agreed else "contradicted"] += 1
 
     def _choose(self) -> None:
         """Keep the likeliest hypotheses, one of each pose, and accept the best where its odds suffice."""
@@ -198,19 +190,17 @@ class Localizer:
         elif self._accepted not in self._hypotheses:
             self._accepted = None
 
-    def _agrees(self, one: _PoseHypothesis, at: _Sample, pose: Array, covariance: Array) -> bool:
+    def _correct(self, one: _PoseHypothesis, at: _Sample, pose: Array, covariance: Array) -> bool:
+        """Correct a hypothesis by a measured pose that agrees with it (Kalman update); returns whether it does."""
         expected, spread = self._propagated(one, at)
         miss = logmap(relative(expected, pose)[None])[0]
-        return float(miss @ np.linalg.solve(spread + covariance, miss)) <= self._settings.gate_chi2
-
-    def _correct(self, one: _PoseHypothesis, at: _Sample, pose: Array, covariance: Array) -> None:
-        """Correct a hypothesis by a measured pose (Kalman update)."""
-        expected, spread = self._propagated(one, at)
+        if not float(miss @ np.linalg.solve(spread + covariance, miss)) <= self._settings.gate_chi2:
+            return False
         gain = spread @ np.linalg.inv(spread + covariance)
-        one.pose = expected @ expmap((gain @ logmap(relative(expected, pose)[None])[0])[None])[0]
-        one.covariance = (np.eye(6) - gain) @ spread
-        one.covariance = 0.5 * (one.covariance + one.covariance.T)
-        one.at = at
+        corrected = (np.eye(6) - gain) @ spread
+        one.at, one.pose = at, expected @ expmap((gain @ miss)[None])[0]
+        one.covariance = 0.5 * (corrected + corrected.T)
+        return True
 
     def _propagated(self, one: _PoseHypothesis, at: _Sample) -> tuple[Array, Array]:
         """Pose and covariance of a hypothesis, propagated by odometry to another sample."""
@@ -234,14 +224,12 @@ class Localizer:
 
     def _sample(self, stamp_ns: int) -> _Sample | None:
         """The odometry at a stamp; None before the first message, or in a gap."""
-        samples = list(self._samples)
-        stamps = np.array([one.stamp_ns for one in samples], np.int64)
-        pose, known = Trajectory(stamps, np.array([one.pose for one in samples]).reshape(-1, 4, 4)).at(
-            np.array([stamp_ns], np.int64)
-        )
+        stamps = np.array([one.stamp_ns for one in self._samples], np.int64)
+        odometry = Trajectory(stamps, np.array([one.pose for one in self._samples]).reshape(-1, 4, 4))
+        pose, known = odometry.at(np.array([stamp_ns], np.int64))
         if not known[0]:
             return None
-        path_m = float(np.interp(stamp_ns - stamps[0], stamps - stamps[0], [one.path_m for one in samples]))
+        path_m = float(np.interp(stamp_ns - stamps[0], stamps - stamps[0], [one.path_m for one in self._samples]))
         return _Sample(stamp_ns, pose[0], path_m)
 
 
@@ -257,16 +245,21 @@ def _logit(probability: float) -> float:
 
 
 def read_poses(path: Path) -> Trajectory:
-    """Read the poses of a map's places, on the map's clock.
-
-    Raises:
-        UmfError: the map has not been solved, or the file is damaged.
-    """
+    """Read the poses of a map's places, on the map's clock; an `UmfError` where the map has not been solved."""
     try:
         with np.load(path / POSES) as stored:
             return Trajectory(stored["stamps"], stored["poses"])
     except (OSError, ValueError, KeyError):
         raise UmfError(f"{path / POSES} cannot be read: umf map writes it when a map is solved") from None
+
+
+_STATES = {
+    "agreed": (State.ACCEPTED, ClosureReason.AGREES_WITH_POSE),
+    "contradicted": (State.REJECTED, ClosureReason.CONTRADICTS_POSE),
+    "searching": (State.PENDING, ClosureReason.POSE_UNKNOWN),
+    "unusable": (State.REFUSED, ClosureReason.NOT_OF_MAP),
+}
+"""State of a closure by what the localizer counted it as."""
 
 
 class MapFollower:
@@ -330,27 +323,6 @@ class MapFollower:
         self._states[state] += 1
         return [ClosureVerdict(closure, state, reason)]
 
-    def update(self) -> list[ClosureVerdict]:
-        """Return no verdicts: no closure is pending."""
-        return []
-
-    def prepare(self, within_s: float) -> None:
-        """Do nothing: there is no graph to settle."""
-
-    def revoke(self, match_ns: int, query_ns: int) -> list[ClosureVerdict]:
-        """Refuse to reject a closure by hand: none are kept.
-
-        Raises:
-            GraphError: always.
-        """
-        raise GraphError("localisation in a fixed map keeps no closures to reject")
-
-    def close(self) -> None:
-        """Do nothing: no file is open."""
-
-    def retune(self, settings: object) -> None:
-        """Do nothing: the settings are those of the start."""
-
     def map_T_odom(self) -> Array | None:
         """(4, 4) pose of the odometry frame in the map; None while it is unknown."""
         return self._localizer.map_T_odom()
@@ -365,35 +337,41 @@ class MapFollower:
         stamps = np.array([one.stamp_ns for one in self._poses], np.int64)
         return stamps, np.array([one.map_T_body for one in self._poses]).reshape(-1, 4, 4)
 
-    def closures(self) -> list[ClosureVerdict]:
-        """No closures: none are kept."""
-        return []
-
-    def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
-        """No closures and no lines (0, 2, 3)."""
-        return [], np.empty((0, 2, 3))
-
     def verdict_counts(self) -> Counter[State]:
         """Number of closures by state."""
         return Counter(self._states)
 
-    def write_results(self, folder: str | Path, within_s: float = float("inf")) -> bool:
-        """Write the trajectory, `trajectory_in_map.tum`; returns true, there is nothing to settle before.
+    # there is no graph, no file and no closure that is kept, pending or to be revoked
 
-        Raises:
-            OutputError: it cannot be written.
-        """
+    def closures(self) -> list[ClosureVerdict]:
+        """Return no closures."""
+        return []
+
+    def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
+        """Return no closures and no lines (0, 2, 3)."""
+        return [], np.empty((0, 2, 3))
+
+    def update(self) -> list[ClosureVerdict]:
+        """Return no verdicts."""
+        return []
+
+    def prepare(self, within_s: float) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def retune(self, settings: object) -> None:
+        """Do nothing."""
+
+    def revoke(self, match_ns: int, query_ns: int) -> list[ClosureVerdict]:
+        """Raise a `GraphError`: there is nothing to revoke."""
+        raise GraphError("localisation in a fixed map keeps no closures to reject")
+
+    def write_results(self, folder: str | Path, within_s: float = float("inf")) -> bool:
+        """Write the trajectory, `trajectory_in_map.tum`; returns true, there is nothing to settle before."""
         stamps, poses = self.trajectory()
         with writing(f"to {folder}"):
             Path(folder).mkdir(parents=True, exist_ok=True)
         write_tum(Path(folder) / "trajectory_in_map.tum", Trajectory(stamps, poses))
         return True
-
-
-_STATES = {
-    "agreed": (State.ACCEPTED, ClosureReason.AGREES_WITH_POSE),
-    "contradicted": (State.REJECTED, ClosureReason.CONTRADICTS_POSE),
-    "searching": (State.PENDING, ClosureReason.POSE_UNKNOWN),
-    "unusable": (State.REFUSED, ClosureReason.NOT_OF_MAP),
-}
-"""State of a closure by what the localizer counted it as."""

@@ -1,4 +1,4 @@
-"""What `umf adapt` gains on rovers of kinds the network has never seen, in another world.
+"""Gain of `umf adapt` on rovers of kinds the network has never seen, in another world.
 
     python benchmarks/accuracy/adaptation.py --json adaptation.json  # three rovers, about an hour on one core
     python benchmarks/accuracy/adaptation.py --quick --seed 10101 --json F        # one rover, shorter drives
@@ -7,7 +7,7 @@ Each rover has a camera of another height, tilt, angle of view and response, and
 Cube-1's pulses and speaks of intensity in another unit. It learns from one drive of a recording with odometry that
 drifts. Then it drives two passes through a world of another seed and family, in the hard setting of `umf evaluate`
 (offset to 4.5 m, yaw to 16 degrees, sun moved by 70, aliasing), and the second asks the first.
-What the network pools of the frames stays in `--work` and is taken up again.
+Pooled features of the frames stay in `--work` and are used again.
 
 Prints and writes, per rover and as means: recall@1 of the second pass before and after of `fused`, `image` and
 `lidar`, and their `_gain`; `kept`: whether the revisits held out of the drive found that anything was gained (where
@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import copy
 import json
+import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,33 +28,43 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
-from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.core.frames import Frame, Image, ScanMotion
+from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array
 from umf_ros.lab.datasets.sample import label, places_of
 from umf_ros.lab.evaluation.results import score
 from umf_ros.lab.evaluation.retrieval import THESIS_RULE, place_recognition, rank
 from umf_ros.lab.evaluation.worlds import FIRST, FULL, QUICK, REVISIT, Sampling, TestWorld
-from umf_ros.lab.fit.adaptation import GAINED, PARTS, Adaptation, Lesson, adapt, measure
+from umf_ros.lab.fit.adaptation import (
+    GAINED,
+    PARTS,
+    Adaptation,
+    Drive,
+    DriveReader,
+    Lesson,
+    adapt,
+    label_drive,
+    measure,
+    pool,
+)
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.lidar import ETNA
 from umf_ros.lab.simulation.presets import Preset, gentle_loop
-from umf_ros.lab.simulation.recording import record
 from umf_ros.lab.simulation.relief import Relief
 from umf_ros.lab.simulation.route import Walker
-from umf_ros.lab.simulation.simulator import Simulator
+from umf_ros.lab.simulation.simulator import Simulator, record
 from umf_ros.lab.simulation.world import TEST
-from umf_ros.lab.training.drives import Drive, DriveReader, label_drive, pool
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
 from umf_ros.sensors.calibration import load_calibration
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
+from support.strange_rovers import ROVERS, Rover, StrangeSensors, calibration_of
 
 
 @dataclass(frozen=True)
@@ -75,92 +86,6 @@ def twice(loop_m: float) -> Preset:
     )
 
 
-@dataclass(frozen=True)
-class Rover:
-    """What differs from the rover that the network was trained on.
-
-    Attributes:
-        family: the worlds it drives in.
-        height_m: of the camera; down_deg: its tilt.
-        focal_px: of 688 columns.
-        gamma: of its response; dark: how much the corners lose.
-        every: of the LiDAR's pulses, one is kept; right_deg: none further to the right.
-        unit: of the intensity, against the Cube-1's; 0: it has none.
-        noise_m: more of each range.
-    """
-
-    family: str
-    height_m: float
-    down_deg: float
-    focal_px: float
-    gamma: float
-    dark: float
-    every: int
-    right_deg: float
-    unit: float
-    noise_m: float
-
-
-ROVERS = (
-    Rover("canyon", 0.55, 4.0, 420.0, 0.6, 0.5, 3, 35.0, 0.01, 0.01),
-    Rover("mounds", 2.1, 18.0, 330.0, 1.6, 0.3, 2, 10.0, 0.0, 0.02),
-    Rover("moon", 1.0, 0.0, 800.0, 1.0, 0.0, 5, 35.0, 16.0, 0.04),
-)
-
-
-class StrangeSensors:
-    """Turns the frames of the simulated rig into those of a rover's sensors.
-
-    Args:
-        rover: whose.
-        seed: of the noise.
-    """
-
-    def __init__(self, rover: Rover, seed: int) -> None:
-        self._rover, self._rng = rover, np.random.default_rng([seed, 77])
-
-    def see(self, frame: Frame) -> Frame:
-        """The frame as they would have taken it."""
-        if frame.left is not None:
-            right = None if frame.right is None else self._exposed(frame.right)
-            frame = replace(frame, left=self._exposed(frame.left), right=right)
-        return frame if frame.points is None else self._swept(frame)
-
-    def _exposed(self, image: Image) -> Image:
-        rows, columns = (np.linspace(-1, 1, count) for count in image.shape)
-        corner = 1 - self._rover.dark * (rows[:, None] ** 2 + columns**2) / 2
-        return (255 * (image / 255 * corner) ** self._rover.gamma).astype(np.uint8)
-
-    def _swept(self, frame: Frame) -> Frame:
-        assert frame.points is not None and frame.intensity is not None
-        rover, points = self._rover, frame.points
-        bearing = np.degrees(np.arctan2(-points[:, 1], points[:, 0]))
-        kept = np.flatnonzero((np.arange(len(points)) % rover.every == 0) & (bearing < rover.right_deg))
-        away = points[kept] - frame.body_T_lidar[:3, 3].astype(np.float32)
-        longer = rover.noise_m * self._rng.standard_normal((len(kept), 1)) / np.linalg.norm(away, axis=1, keepdims=True)
-        moved = frame.motion
-        return replace(
-            frame,
-            points=(points[kept] + longer * away).astype(np.float32),
-            intensity=frame.intensity[kept] * rover.unit if rover.unit else None,
-            motion=moved and ScanMotion(moved.moments_s[kept], moved.rates, moved.noise),
-        )
-
-
-def calibration_of(rover: Rover, path: Path) -> Path:
-    """The simulated rig's calibration with the rover's camera in it, written to a file."""
-    content = yaml.safe_load(Path(__file__).parents[2].joinpath(ETNA.calibration).read_text(encoding="utf-8"))
-    content["camera"] |= {"fx": rover.focal_px, "fy": rover.focal_px}
-    mount = content["body_T_camera"]
-    lower = rover.height_m - mount["translation"][2]
-    for name in ("body_T_camera", "body_T_lidar", "body_T_imu"):
-        content[name]["translation"][2] += lower
-    tilted = Rotation.from_euler("y", rover.down_deg, degrees=True) * Rotation.from_quat(mount["quaternion"])
-    mount["quaternion"] = tilted.as_quat().tolist()
-    path.write_text(yaml.safe_dump(content), encoding="utf-8")
-    return path
-
-
 def recorded(path: Path, rover: Rover, seed: int, preset: Preset) -> Path:
     """The recording of a drive, simulated unless it is there."""
     calibration = calibration_of(rover, path.with_suffix(".yaml"))
@@ -172,7 +97,7 @@ def recorded(path: Path, rover: Rover, seed: int, preset: Preset) -> Path:
 
 
 def read_drive(recording: Path, rover: Rover, seed: int, network: UMF) -> tuple[Drive, Array, float]:
-    """What the drive teaches, true poses (N, 4, 4) of its keyframes, and the minutes it took to read."""
+    """Labelled keyframes of a drive, true poses (N, 4, 4) of its keyframes, and the minutes it took to read."""
     bag = open_bag(recording)
     kept, settings = recording.with_suffix(".npz"), settings_for(bag, None, "simulated")
     settings = settings.model_copy(update={"calibration": str(recording.with_suffix(".yaml"))})
@@ -188,7 +113,7 @@ def read_drive(recording: Path, rover: Rover, seed: int, network: UMF) -> tuple[
 
 
 def read_passes(world: TestWorld, kept: Path, rover: Rover, network: UMF) -> Drive:
-    """What the network pools of both passes, as sessions of one drive, at their true poses."""
+    """Pooled features of both passes, as sessions of one drive, at their true poses."""
     if not kept.exists():
         sensors = StrangeSensors(rover, world.seed)
         visits, pooled = [], []

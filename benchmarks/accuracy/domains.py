@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -26,27 +26,20 @@ from rich.table import Table
 
 from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Candidate, LoopClosure
-from umf_ros.core.geometry import Array
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.fit.acceptance import (
     EXAMPLES,
     bounds_of,
     fit_decision,
-    inside_ellipsoid,
     load_examples,
     save_acceptance,
 )
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
 from umf_ros.lab.simulation.domains.pairs import (
-    ELSEWHERE,
     FULL,
     QUICK,
-    SAME,
-    TURNED,
     Extent,
     ScanPair,
-    error_vector,
-    is_wrong,
     pairs_of,
     places_of,
 )
@@ -55,51 +48,8 @@ from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
 from umf_ros.verification.hypothesis import SCAN
 
-
-@dataclass
-class Outcome:
-    """What the verifier made of one domain's pairs; `left_out`: what one does that never saw the domain."""
-
-    name: str
-    pairs: dict[str, int] = field(default_factory=lambda: dict.fromkeys((SAME, TURNED, ELSEWHERE), 0))
-    right: dict[str, int] = field(default_factory=lambda: dict.fromkeys((SAME, TURNED, ELSEWHERE), 0))
-    wrong: dict[str, int] = field(default_factory=lambda: dict.fromkeys((SAME, TURNED, ELSEWHERE), 0))
-    errors: list[Array] = field(default_factory=list)
-    covariances: list[Array] = field(default_factory=list)
-    refine_ms: list[float] = field(default_factory=list)
-    left_out: Outcome | None = None
-
-    def judge(self, pair: ScanPair, closure: LoopClosure | None) -> None:
-        """Count one verdict."""
-        self.pairs[pair.kind] += 1
-        if closure is None:
-            return
-        if pair.kind == ELSEWHERE or is_wrong(closure.match_T_query, pair.match_T_query):
-            self.wrong[pair.kind] += 1
-            return
-        self.right[pair.kind] += 1
-        self.errors.append(error_vector(closure.match_T_query, pair.match_T_query))
-        self.covariances.append(closure.covariance)
-
-    def share(self, kind: str) -> float:
-        """Share of the pairs of a kind that were rightly accepted."""
-        return self.right[kind] / self.pairs[kind] if self.pairs[kind] else float("nan")
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """The domain's own figures."""
-        inside = inside_ellipsoid(np.array(self.errors), np.array(self.covariances)) if self.errors else float("nan")
-        return {
-            "pairs": sum(self.pairs.values()),
-            "accepted": sum(self.right.values()) + sum(self.wrong.values()),
-            "wrong": sum(self.wrong.values()),
-            "wrong_elsewhere": self.wrong[ELSEWHERE],
-            "wrong_left_out": sum(self.left_out.wrong.values()) if self.left_out else 0,
-            "recall_left_out": self.left_out.share(SAME) if self.left_out else float("nan"),
-            "recall": self.share(SAME),
-            "turned_recall": self.share(TURNED),
-            "inside_95": inside,
-        }
+sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
+from support.domain_outcomes import Outcome, summary
 
 
 def main(
@@ -145,25 +95,6 @@ def run(domain: Domain, seed: int, extent: Extent, folder: Path | None) -> Outco
         left_out.judge(pair, _closure(stranger, pair))
     outcome.left_out = left_out
     return outcome
-
-
-def summary(outcomes: list[Outcome]) -> dict[str, float]:
-    """The figures over all domains; means and worst are of the domains, whatever their size."""
-    recall = [outcome.share(SAME) for outcome in outcomes]
-    inside = [outcome.figures["inside_95"] for outcome in outcomes]
-    turned = [sum(outcome.right[TURNED] for outcome in outcomes), sum(outcome.pairs[TURNED] for outcome in outcomes)]
-    known = [value for value in inside if np.isfinite(value)]
-    return {
-        "accepted": sum(outcome.figures["accepted"] for outcome in outcomes),
-        "wrong": sum(outcome.figures["wrong"] for outcome in outcomes),
-        "wrong_left_out": sum(outcome.figures["wrong_left_out"] for outcome in outcomes),
-        "recall_mean": float(np.mean(recall)),
-        "recall_worst": float(np.min(recall)),
-        "inside_95_mean": float(np.mean(known)) if known else float("nan"),
-        "inside_95_worst": float(np.min(known)) if known else float("nan"),
-        "turned_recall": turned[0] / max(turned[1], 1),
-        "refine_ms": float(np.median(np.concatenate([outcome.refine_ms for outcome in outcomes]))),
-    }
 
 
 def _without(domain: Domain) -> Verifier:

@@ -142,7 +142,7 @@ def set_up(server: PostgresServer, names: list[str], identity: tuple[str, int], 
 
 
 def fill_archive(server: PostgresServer, count: int, seed: int) -> None:
-    """Many places that nobody will see again, loaded at once and put into the graph afterwards."""
+    """Many places that are never seen again, loaded at once and put into the graph afterwards."""
     rng, store, row = np.random.default_rng(seed), uuid4(), 0
     with connect(server) as connection:
         connection.execute("DROP INDEX place_descriptor")
@@ -201,7 +201,7 @@ def wait_for(holds: Any, seconds: float = 60) -> None:
 
 
 def lost_places(server: PostgresServer, rovers: list[Rover]) -> int:
-    """What a rover stored and the server does not have, descriptor and data."""
+    """Descriptors and data that a rover stored and the server lacks."""
     with connect(server) as connection:
         query = "SELECT robot, stamp_ns FROM place JOIN place_data USING (robot, store, session, stamp_ns)"
         there = {(str(robot), int(stamp)) for robot, stamp in connection.execute(query)}

@@ -23,8 +23,8 @@ from umf_ros.lab.commands import simulate
 from umf_ros.lab.datasets.simulated import WorldFolder
 from umf_ros.lab.evaluation.results import print_table
 from umf_ros.lab.simulation.world import TRAINING, VALIDATION
+from umf_ros.lab.training.metric_objective import MODES, Results, mean_of, validate
 from umf_ros.lab.training.trainer import load_run, train
-from umf_ros.lab.training.validation import MODES, Results, mean_of, validate
 from umf_ros.networks.weights import load_weights
 
 FIGURES = {"R@1": "recall1", "R@5": "recall5", "top 1 %": "recall_top_percent", "within 5 m": "recall1_within_5m"}

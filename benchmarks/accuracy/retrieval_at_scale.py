@@ -15,9 +15,10 @@ with as much noise as tells two scans of one place apart.
 from __future__ import annotations
 
 import json
+import sys
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated
@@ -32,9 +33,9 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.core.config import EmbeddingSettings, Settings
+from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import BagError
-from umf_ros.core.frames import Candidate, Frame, Keyframe, LoopClosure
+from umf_ros.core.frames import Frame, Keyframe, LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import LoopDetector, make_detector_embedder
@@ -44,57 +45,8 @@ from umf_ros.lab.evaluation.worlds import FULL, QUICK, TestWorld
 from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.runs.truth import find_revisits, judge_closure
 
-PLACES = (0, 1_000, 10_000, 100_000)
-NOISE = 0.05  # length of what is added to a unit descriptor; scans of one place a second apart differ by about as much
-
-
-@dataclass(frozen=True)
-class Method:
-    """A way to embed, and the senses it has."""
-
-    name: str
-    embedder: str = "umf"
-    camera: bool = True
-    lidar: bool = True
-
-    def seen(self, frame: Frame) -> Frame:
-        """What is embedded of a frame; all of it is still verified."""
-        if not self.camera:
-            frame = replace(frame, left=None, right=None)
-        return frame if self.lidar else replace(frame, points=None, intensity=None, motion=None)
-
-
-METHODS = (
-    Method("umf"),
-    Method("umf_lidar", camera=False),
-    Method("umf_image", lidar=False),
-    Method("scan_context", "scan_context"),
-    Method("thumbnail", "thumbnail"),
-)
-
-
-class CrowdedDetector(LoopDetector):
-    """A detector whose candidates compete with places of other worlds.
-
-    Args:
-        settings: of the recording.
-        embedder: of the method.
-        crowd: (N, D) float32 descriptors of other places.
-    """
-
-    def __init__(self, settings: Settings, embedder: Embedder, crowd: Array) -> None:
-        super().__init__(settings, embedder)
-        self._crowd, self._count = crowd, settings.loop.top_k
-
-    def query(self, keyframe: Keyframe) -> list[Candidate]:
-        """Those of the own places that are still among the best of all."""
-        others = np.sort(self._crowd @ keyframe.embedding.descriptor)
-        kept = []
-        for rank, candidate in enumerate(super().query(keyframe)):
-            better = len(others) - int(np.searchsorted(others, candidate.similarity))
-            if rank + better < self._count:
-                kept.append(candidate)
-        return kept
+sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
+from support.crowds import METHODS, PLACES, CrowdedDetector, Method, crowd_of
 
 
 class Recording:
@@ -151,20 +103,6 @@ def other_places(worlds: int, quick: bool) -> Iterator[tuple[int, Frame]]:
         for visit in TestWorld(seed, QUICK if quick else FULL):
             if visit.pass_index == 0:
                 yield seed, visit.frame
-
-
-def crowd_of(known: Array, worlds: Array, count: int = PLACES[-1], seed: int = 0) -> Array:
-    """(count, D) float32 unit descriptors: the known ones, and as many more between neighbours on a trail."""
-    rng = np.random.default_rng(seed)
-    neighbours = np.flatnonzero(worlds[1:] == worlds[:-1])
-    missing = max(count - len(known), 0)
-    first = rng.choice(neighbours, missing)
-    share = rng.random((missing, 1)).astype(np.float32)
-    mixed = (1 - share) * known[first] + share * known[first + 1]
-    mixed += rng.standard_normal(mixed.shape).astype(np.float32) * NOISE / np.sqrt(known.shape[1])
-    mixed /= np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-9)
-    found: Array = np.concatenate([known[:count], mixed]).astype(np.float32)
-    return found
 
 
 def main(

@@ -40,8 +40,7 @@ from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.presets import SESSION
-from umf_ros.lab.simulation.recording import record
-from umf_ros.lab.simulation.simulator import Simulator
+from umf_ros.lab.simulation.simulator import Simulator, record
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.localizer import Localizer, read_poses
 from umf_ros.maps.joint_graph import JointMap, solve

@@ -46,7 +46,7 @@ Query = tuple[Keyframe, list[tuple[Candidate, Keyframe]]]
 
 @dataclass
 class World:
-    """What one world gave."""
+    """Results of one world."""
 
     name: str
     queries: int = 0

@@ -1,4 +1,4 @@
-"""What the package survives: kill -9, damaged input, long drives. Prints a table and writes it as JSON.
+"""Endurance tests: kill -9, damaged input, long drives. Prints a table and writes it as JSON.
 
     python benchmarks/robustness/endurance.py --json endurance.json --quick              (a quarter of an hour)
     python benchmarks/robustness/endurance.py --json endurance.json --folder endurance   (hours)

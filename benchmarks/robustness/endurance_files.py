@@ -90,7 +90,7 @@ def with_other_words(whole: bytes, rng: Rng) -> bytes:
 
 
 def lie_in_sqlite(path: Path, rng: Rng) -> None:
-    """Change a SQLite file by statements: values that no program of ours writes, and what runs when it is used."""
+    """Change a SQLite file by statements: values that this package never writes, and triggers that run in use."""
     with closing(sqlite3.connect(path)) as connection, suppress(sqlite3.Error), connection:
         tables = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
         table = tables[rng.integers(len(tables))]

@@ -95,7 +95,7 @@ class Rover:
 
 
 def fuzz_messages(count: int, rng: np.random.Generator, settings: Settings, bag: Bag) -> Outcome:
-    """A recording in which many messages mean harm, or have fields that nobody sends, through the whole front-end."""
+    """A recording with many harmful messages, or fields that no sensor sends, through the whole front-end."""
     outcome: Outcome = Counter()
     rover = Rover(settings)
     infos = {rover.topics.left_info, rover.topics.right_info}

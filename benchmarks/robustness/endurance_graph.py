@@ -153,12 +153,12 @@ def saved(poses: int, folder: Path) -> Figures:
 
 
 def long_graph(poses: int = 20_000) -> Figures:
-    """What an event costs at the end of a long way."""
+    """Cost of an event at the end of a long path."""
     return all_at_once(poses) | one_by_one(poses)
 
 
 def live_graph(folder: Path, poses: int = 20_000) -> Figures:
-    """What the node makes of it."""
+    """The same events in the node."""
     return live(poses, folder) | saved(poses, folder)
 
 

@@ -1,4 +1,4 @@
-"""What the live nodes survive, for `endurance.py`: kill -9, nonsense, each other; and how fast they are."""
+"""Endurance tests of the live nodes, for `endurance.py`: kill -9, nonsense, each other, speed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SIZES = [0, 1, 688, 512, 2**31, 2**32 - 1]
 MANY = QoSProfile(depth=500)
 FIRST_LOOP = 215
 DISCOVERY_S = 1.0
-"""The writer knows its reader before the reader knows it, and what is sent between is nobody's."""
+"""The writer knows its reader before the reader knows it, and messages sent between are lost."""
 """Poses until the first loops of the world are closed."""
 
 
@@ -150,7 +150,7 @@ def _fresh(folder: Path, name: str) -> Path:
 
 
 def fuzz_back_end(folder: Path, count: int, rng: np.random.Generator) -> Figures:
-    """Messages to the back-end that nobody sends: each has to show in the diagnostics, by what became of it."""
+    """Messages to the back-end that no front-end sends: each has to show in the diagnostics, by what became of it."""
     with own_domain():
         ears = Ears()
         publishers: list[Any] = [
@@ -195,7 +195,7 @@ def fuzz_back_end(folder: Path, count: int, rng: np.random.Generator) -> Figures
 
 
 def fuzz_front_end(folder: Path, count: int, config: Path, rng: np.random.Generator) -> Figures:
-    """Messages to the front-end that nobody sends: each has to show in the diagnostics of its input."""
+    """Messages to the front-end that no sensor sends: each has to show in the diagnostics of its input."""
     topics = topics_of(load_settings())
     kinds = {"left_image": Image, "right_image": Image, "left_info": CameraInfo, "right_info": CameraInfo}
     kinds |= {"cloud": PointCloud2, "odometry": Odometry}
@@ -246,7 +246,7 @@ def _odd_odometry(rng: np.random.Generator) -> Odometry:
 
 
 def _odd(kind: type, rng: np.random.Generator) -> Any:
-    """A message of a sensor with sizes, kinds and numbers that nobody sends."""
+    """A message of a sensor with impossible sizes, kinds and numbers."""
     if kind is Odometry:
         return _odd_odometry(rng)
     message = kind()

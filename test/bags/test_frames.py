@@ -171,3 +171,19 @@ def test_raw_bayer_images_of_vulcano_arrive_rectified(tmp_path: Path) -> None:
     assert frame.left.shape == frame.right.shape == (512, 688) == (frame.camera.height, frame.camera.width)
     assert np.abs(frame.left.astype(int) - 90).max() <= 1
     assert frame.camera.baseline == pytest.approx(0.0892, abs=1e-4)
+
+
+def test_guesses_of_the_calibration_are_one_warning(tmp_path: Path) -> None:
+    settings = small_settings(tmp_path)
+    calibration = Path(settings.calibration)
+    text = calibration.read_text()
+    bag, told = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), list[str]()
+    FrameReader(bag, settings, warn=told.append)
+    assert not any("guess" in line for line in told)
+    lines = text.split("\n")
+    guessed = [f"{line}  # TO BE MEASURED: a guess" if line.startswith("body_T_l") else line for line in lines]
+    calibration.write_text("# TO BE MEASURED: the baseline\n" + "\n".join(guessed))
+    FrameReader(bag, settings, warn=told.append)
+    assert [line for line in told if "guess" in line] == [
+        "the calibration holds guesses, measure them: the baseline, body_T_lidar"
+    ]

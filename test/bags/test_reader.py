@@ -13,6 +13,7 @@ from recordings import (
     START_NS,
     STORE,
     TRUTH,
+    camera_info,
     image,
     traverse,
     write_db3,
@@ -180,6 +181,19 @@ def test_data_sets_are_told_by_their_topics(tmp_path: Path) -> None:
     assert detect_dataset(open_bag(write_mcap(tmp_path / "d.mcap", bayer))) == "s3li-vulcano"
     with pytest.raises(BagError, match="/odom"):
         dataset("e.mcap", {ODOMETRY})
+
+
+def test_a_data_set_is_not_recognised_where_camera_info_contradicts(tmp_path: Path) -> None:
+    raw = load_preset("s3li-vulcano").topics.left_image
+    entries = [(raw, START_NS, image(START_NS, np.zeros((4, 4), np.uint8), "bayer_rggb8"))]
+    entries.append(("/g319c_left/camera_info", START_NS, camera_info(START_NS, 700.0, (1242, 375))))
+    bag = open_bag(write_mcap(tmp_path / "a.mcap", entries))
+    with pytest.raises(BagError, match=r"of s3li-vulcano, but .* 1242 x 375 pixels, .* 2064 x 1544"):
+        settings_for(bag, None, "auto")
+    own = settings_for(bag, None, "auto", calibration="my_calibration.yaml")
+    assert own.dataset == settings_for(bag, None, "s3li-vulcano").dataset == "s3li-vulcano"
+    entries[-1] = ("/g319c_left/camera_info", START_NS, camera_info(START_NS, 700.0, (2064, 1544)))
+    assert settings_for(open_bag(write_mcap(tmp_path / "b.mcap", entries)), None, "auto").dataset == "s3li-vulcano"
 
 
 def test_a_recording_is_read_as_the_file_says_and_only_then_by_its_topics(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from adaptation import ROVERS, Rover, StrangeSensors, calibration_of
 from conftest import make_frame
+from support.strange_rovers import ROVERS, Rover, StrangeSensors, calibration_of
 
 from umf_ros.core.frames import Frame, ScanMotion
 from umf_ros.sensors.calibration import load_calibration

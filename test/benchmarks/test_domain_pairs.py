@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import make_keyframe
-from domains import Outcome, summary
 from scipy.spatial.transform import Rotation
+from support.domain_outcomes import Outcome, summary
 
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.lab.simulation.domains import Domain, DomainScan
 from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, SAME, TURNED, ScannedPlace, ScanPair, pairs_of
-from umf_ros.lab.simulation.domains.sweeps import Sweep
+from umf_ros.lab.simulation.domains.scanners import Sweep
 
 OPEN, INDOORS = Domain("spin16", "street", "rover"), Domain("spin16", "corridor", "rover")
 NOTHING = Sweep(np.empty((0, 3), np.float32), None, None)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import planted_faults
 import pytest
+from support import planted_faults
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import load_settings

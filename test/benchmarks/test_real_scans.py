@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import make_keyframe
 from measurements import GOOD
-from real_scans import RealPair, cropped, draw_pairs, read_pairs, summary
+from support.real_pairs import RealPair, cropped, draw_pairs, read_pairs, summary
 
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import make_pose

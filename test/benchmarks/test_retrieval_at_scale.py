@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import make_keyframe, unit
-from retrieval_at_scale import METHODS, CrowdedDetector, crowd_of
+from support.crowds import METHODS, CrowdedDetector, crowd_of
 
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Embedding, Frame
@@ -14,7 +14,7 @@ DIMENSION = 16
 
 
 class Silent:
-    """An embedder nobody asks: the descriptors are given."""
+    """An embedder that is never called: the descriptors are given."""
 
     name, dimension = "silent", DIMENSION
 

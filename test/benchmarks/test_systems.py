@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from system_peers import Scans, found
-from systems import OURS, SETTINGS, FoundClosure, SystemRun, _drive, judge
+from support.peer_scans import Scans, found
+from support.system_scores import OURS, SETTINGS, FoundClosure, SystemRun, drive_of, judge
 
 from umf_ros.core.config import Loop
 from umf_ros.core.geometry import make_pose, relative
@@ -33,7 +33,7 @@ TRUTH = Trajectory(STAMPS, poses())
 
 
 def drive():  # type: ignore[no-untyped-def]
-    return _drive(Path("a.mcap"), TRUTH, STAMPS, poses(), Loop(), Path())
+    return drive_of(Path("a.mcap"), TRUTH, STAMPS, poses(), Loop(), Path())
 
 
 def closure(query: int, match: int, shift_m: float = 0.0, window: tuple[int, int] | None = None) -> FoundClosure:

@@ -19,7 +19,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def no_file_longer_than(size: int) -> Iterator[None]:
-    """As on a disk that is full: whoever writes more gets an error."""
+    """As on a full disk: a larger file is an error."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
     try:

@@ -31,7 +31,7 @@ def write(path: Path, entries: Iterable[Entry], monkeypatch: pytest.MonkeyPatch)
 
 
 def config_for(bag: Path, folder: Path) -> Path:
-    """What `umf inspect --write` makes of a recording, with the calibration's images as large as they are."""
+    """The files of `umf inspect --write` for a recording, with the calibration's images as large as they are."""
     ended = umf("inspect", bag, "--write", folder)
     assert (folder / "my_rover.yaml").is_file(), ended.text
     return folder / "my_rover.yaml"
@@ -58,7 +58,9 @@ def test_every_kind_of_message_goes_through_inspection_and_replay(
     usual = list(
         FrameReader(open_bag(as_usual), load_settings(config, topics__left_image=LEFT, topics__right_image=RIGHT))
     )
-    frames = list(FrameReader(open_bag(bag), load_settings(config), warn=pytest.fail))
+    told: list[str] = []
+    frames = list(FrameReader(open_bag(bag), load_settings(config), warn=told.append))
+    assert told == ["the calibration holds guesses, measure them: camera, body_T_camera, body_T_lidar"]
     assert len(frames) == len(usual) > 10
     for mine, other in zip(frames, usual, strict=True):
         assert mine.points is not None and other.points is not None and (mine.left is None) == (other.left is None)
@@ -150,3 +152,11 @@ def test_an_imu_is_no_odometry_and_what_to_run_is_said(tmp_path: Path, monkeypat
 
 def test_a_recording_that_is_not_there_is_one_line() -> None:
     assert only_line(umf("inspect", "nowhere.mcap")) == "there is no recording nowhere.mcap"
+
+
+def test_a_data_set_that_camera_info_contradicts_is_not_recognised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entries = [*traverse(25.0), ("/stereo/left/camera_info", START_NS + 1, camera_info(START_NS, 50.0, (1242, 375)))]
+    ended = umf("inspect", write(tmp_path / "bag.mcap", entries, monkeypatch))
+    assert "data set:" not in ended.text and "1242 x 375 pixels" in ended.text and "--write" in ended.text

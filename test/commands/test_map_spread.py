@@ -25,7 +25,7 @@ def recordings(mini_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> list
 
 
 def tables(out: Path) -> dict[str, str]:
-    """What a map says of closures and poses."""
+    """Closures and poses of a map."""
     names = [session.name for session in MapFolder.open(out).sessions]
     files = [f"sessions/{name}/{table}.csv" for name in names for table in ("closures", "closures_between")]
     return {name: (out / name).read_text() for name in [*files, "graph_verdicts.csv"]}

@@ -23,7 +23,7 @@ SIGNALS = signal.SIGINT, signal.SIGTERM
 
 @pytest.fixture(autouse=True)
 def handlers() -> Iterator[None]:
-    """What Ctrl-C and SIGTERM do outside of a run; they must do that again afterwards."""
+    """Handlers of Ctrl-C and SIGTERM outside of a run; they must be the same afterwards."""
     former = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     before = [signal.getsignal(number) for number in SIGNALS]
     yield

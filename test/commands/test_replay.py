@@ -130,7 +130,7 @@ def test_without_odometry_closures_are_found_and_the_graph_is_skipped(
     assert done.returncode == 0, done.stderr
     assert "the pose graph is skipped" in done.stdout
     summary = json.loads((tmp_path / "out" / "latest" / "summary.json").read_text())
-    # at 2.5 m/s a scan that nobody can straighten is half a metre long: found, not precise
+    # at 2.5 m/s a scan without motion correction is half a metre long: found, not precise
     assert summary["ground_truth"]["closures_true"] >= 3
     assert summary["ground_truth"]["ate_odometry_m"] is None
     assert not (tmp_path / "out" / "latest" / "graph.g2o").exists()

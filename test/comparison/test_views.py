@@ -105,7 +105,7 @@ def test_a_recording_is_read_once_for_all_that_is_expected_of_it(here: Path, mon
     with pytest.raises(UmfError, match="no frame within a second of 99"):
         source.keyframe(asked[4])
     assert len(opened) == 1
-    source.keyframe(PlaceView(f"{here}/drive.mcap@1.2"))  # nobody expected it
+    source.keyframe(PlaceView(f"{here}/drive.mcap@1.2"))  # not expected
     assert len(opened) == 2
 
 

@@ -1,14 +1,15 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 from conftest import make_frame
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.config import KeyframePolicy, Loop
+from umf_ros.core.config import KeyframePolicy, Loop, Settings, load_settings
 from umf_ros.core.geometry import make_pose
-from umf_ros.core.keyframes import KeyframeSelector, is_past
+from umf_ros.core.keyframes import KeyframeSelector, gap_remedy, is_past
 
 
 def at(x_m: float, yaw_deg: float = 0.0) -> np.ndarray:
@@ -76,3 +77,27 @@ def test_the_past_is_old_enough_and_far_enough_back() -> None:
     found = is_past(age_ns.astype(np.int64), way_m, rules, same_session)
     assert found.tolist() == [True, False, False, True, True, True]
     assert is_past(age_ns.astype(np.int64), way_m, rules).tolist() == [True, False, False, True, True, False]
+
+
+def test_the_remedy_for_gap_rules_allows_matches_without_odometry() -> None:
+    settings, stamps_ns = load_settings(), np.arange(120) * 10**8  # a corridor in 12 s
+
+    def matches(settings: Settings) -> int:
+        selector = KeyframeSelector(settings.keyframe)
+        chosen = np.array([stamp for stamp in stamps_ns.tolist() if selector.select(make_frame(stamp * 1e-9))])
+        ages = np.maximum(chosen[:, None] - chosen, 0)
+        return int(is_past(ages, np.full(ages.shape, np.nan), settings.loop).sum())
+
+    remedy = gap_remedy(12.0, 0.0, settings)
+    named = dict(re.findall(r"([\w.]+): ([\d.]+)", remedy))
+    changes = {name.replace(".", "__"): float(value) for name, value in named.items()}
+    assert matches(settings) == 0
+    assert matches(load_settings(loop__min_time_gap_s=changes["loop__min_time_gap_s"])) < 50
+    assert matches(load_settings(**changes)) > 50 and "--odometry" in remedy
+
+
+def test_the_remedy_for_gap_rules_names_the_rules_that_exclude() -> None:
+    settings = load_settings()
+    assert gap_remedy(600.0, 12.0, settings) == "loop.min_travel_m: 3"
+    assert gap_remedy(12.0, 600.0, settings) == "loop.min_time_gap_s: 3"
+    assert gap_remedy(12.0, None, settings).endswith("loop.min_travel_m: a quarter of the path length")

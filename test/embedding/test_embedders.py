@@ -325,7 +325,7 @@ def test_the_untrained_trunk_needs_its_published_weights_and_sees_the_image_alon
 
 
 def test_the_mount_of_the_lidar_changes_neither_descriptor_nor_where_features_lie(weights):
-    """What a mount tilts a scan is undone before the network reads it."""
+    """The tilt of a mount is undone before the network reads a scan."""
     embedder = UmfEmbedder(weights, EmbeddingSettings(runtime="torch", threads=1))
     x, y = np.random.default_rng(3).uniform([[1.0], [-18.0]], [[38.0], [18.0]], (2, 20_000))
     rocks = 1.5 * (np.sin(2 * x) * np.cos(1.5 * y) > 0.9)

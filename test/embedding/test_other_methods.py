@@ -24,7 +24,7 @@ from umf_ros.core.geometry import make_pose
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.fit.vocabulary import grow
-from umf_ros.lab.training.descriptors import DescriptorObjective
+from umf_ros.lab.training.baseline_objectives import DescriptorObjective
 from umf_ros.lab.training.networks import DescriptorSettings, save_tensors
 from umf_ros.replay import Replay
 

@@ -94,7 +94,7 @@ def test_intensities_that_vary_as_none_did_in_training_fade():
 
 
 def test_intensities_of_the_cube_are_taken_as_they_are():
-    """What the network was trained on: bit for bit."""
+    """The input the network was trained on, bit for bit."""
     points, level = some_scan(1), np.random.default_rng(0).uniform(16, 900, 2000).astype(np.float32)
     inside = (np.abs((points - ORIGIN_M) / VOXEL_M / CELLS - 0.5) < 0.5).all(axis=1)
     logs = np.log1p(level[inside])

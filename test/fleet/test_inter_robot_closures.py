@@ -63,7 +63,7 @@ def test_two_rovers_at_two_common_places_get_closures(server: PostgresServer) ->
 
 def test_a_fleet_needs_a_server() -> None:
     class Nobody:
-        name, dimension = "nobody", 16
+        name, dimension = "none", 16
 
     with pytest.raises(ConfigError, match=r"postgres needs database\.server"):
         LoopDetector(Settings(database={"backend": "postgres"}), Nobody())

@@ -12,7 +12,7 @@ from support.postgres import PASSWORD, PostgresServer, free_port
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Keyframe
 from umf_ros.fleet.server import MIGRATIONS, FleetServer, LinkError, add_rover, migrate
-from umf_ros.places.packing import unpack
+from umf_ros.places.store import unpack
 
 STORE = uuid4()
 

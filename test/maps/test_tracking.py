@@ -8,7 +8,7 @@ from umf_ros.core.config import Verification
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, relative
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take
-from umf_ros.maps.tracking import track
+from umf_ros.maps.mapping import track
 
 GROUND = landscape(20)
 

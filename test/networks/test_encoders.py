@@ -91,7 +91,7 @@ def encoder() -> VoxelEncoder:
 
 
 def test_voxels_are_described_one_by_one(encoder):
-    """What is asked for besides, and in which order, changes nothing."""
+    """Other requested features and their order change nothing."""
     batch = some_input()
     coarse, fine = encoder(batch.grid, batch.coarse_index, batch.fine_index)
     assert coarse.shape == (2, TINY.coarse_voxels, TINY.tokens) and fine.shape == (2, TINY.fine_voxels, TINY.local)

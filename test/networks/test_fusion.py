@@ -1,4 +1,4 @@
-"""What becomes of tokens: absent modalities, pooling, and the union of both halves."""
+"""Fusion of tokens: absent modalities, pooling, and the union of both halves."""
 
 from __future__ import annotations
 

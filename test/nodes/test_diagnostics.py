@@ -1,4 +1,4 @@
-"""What a node says of its inputs: rates, and why nothing arrives."""
+"""Diagnostics of a node's inputs: rates, and the reason why nothing arrives."""
 
 from __future__ import annotations
 

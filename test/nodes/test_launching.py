@@ -1,4 +1,4 @@
-"""What a launch checks before it starts anything."""
+"""Checks of a launch before any process starts."""
 
 from __future__ import annotations
 

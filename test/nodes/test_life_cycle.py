@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections import Counter
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 from lifecycle_msgs.msg import TransitionEvent
@@ -15,6 +16,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from umf_ros.core.errors import OutputError
+from umf_ros.nodes import diagnostics
 from umf_ros.nodes.pose_graph_node import PoseGraphNode
 
 
@@ -59,6 +61,27 @@ def test_a_node_that_is_made_anew_is_there_once(node: Back) -> None:
         node.trigger_configure()
         node.trigger_activate()
         assert entities(node) == made
+
+
+def test_a_player_that_is_still_starting_is_no_warning(
+    node: Back, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    now_s = [1000.0]
+    monkeypatch.setattr(diagnostics, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+
+    def logged(seconds: int) -> str:
+        for _ in range(seconds):
+            now_s[0] += 1.0
+            node._watch()
+        return capfd.readouterr().err
+
+    node.set_parameters([Parameter("use_sim_time", value=True)])
+    assert "WARN" not in logged(25)
+    monkeypatch.setattr(node, "_lacks_clock", lambda: False)  # it plays
+    assert "WARN" not in logged(4)
+    assert "nothing received: no publisher on /odom" in logged(4)
+    monkeypatch.undo()
+    assert "nothing comes on /clock" in logged(35)
 
 
 def test_garbage_is_looked_for_among_what_comes_while_the_node_runs(node: Back) -> None:

@@ -13,8 +13,7 @@ from umf_ros.core.config import Database, Loop
 from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.core.frames import Keyframe
 from umf_ros.places.database import VISITS, PlaceDatabase
-from umf_ros.places.packing import pack, unpack
-from umf_ros.places.store import stored_identity
+from umf_ros.places.store import pack, stored_identity, unpack
 
 RULES = Loop(min_similarity=-1, min_time_gap_s=20, min_travel_m=15, top_k=50)
 

@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from umf_ros.core.frames import Embedding, Keyframe, LocalFeatures, ScanMotion
-from umf_ros.places.packing import pack, unpack
+from umf_ros.places.store import pack, unpack
 
 GROUPS = ("image", "cloud", "super_image", "super_cloud")
 

@@ -1,4 +1,4 @@
-"""Files of the pose graph: results and graphs."""
+"""Exports of the pose graph: results and graph files."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 
 TURN = np.array([0, 0, np.deg2rad(0.3), 0.03, 0, 0])
-"""Error of odometry with a bias, per metre."""
+"""Error per metre of odometry with a bias."""
 
 
 def driven(world: GraphWorld, settings: PoseGraphSettings = SETTINGS, stated: float = 1.0) -> PoseGraph:

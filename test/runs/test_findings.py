@@ -1,4 +1,4 @@
-"""What to look at first, and the verdict: green only when something was found or there was nothing to find."""
+"""Findings and the verdict: green only when something was found or there was nothing to find."""
 
 from __future__ import annotations
 
@@ -80,6 +80,16 @@ def test_nothing_found_without_a_truth_is_not_green(tmp_path: Path) -> None:
         (
             {"pairs": 0, "inputs": {name: {"received": 9, "used": 9, "dropped": {}} for name in ("left", "cloud")}},
             "None of 90 scans has an image within 0.05 s of it",
+        ),
+        (  # the cause, and not the clocks
+            {
+                "pairs": 0,
+                "inputs": {
+                    "left": {"received": 9, "used": 0, "dropped": {"size": 9}},
+                    "cloud": {"received": 9, "used": 9, "dropped": {}},
+                },
+            },
+            "9 of 9 messages of the left images could not be used (size 9)",
         ),
         ({"settings": load_settings(None, loop__min_time_gap_s=600)}, "The gap rules exclude every pair: a match must"),
         (

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from umf_ros.core.errors import OutputError
-from umf_ros.core.io import check_writable
-from umf_ros.runs.writer import create_run_folder, write_atomically
+from umf_ros.core.io import check_writable, create_run_folder, write_atomically
 
 
 def test_latest_follows_the_newest_run(tmp_path: Path) -> None:

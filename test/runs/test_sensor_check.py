@@ -19,6 +19,11 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.sensor_check import MIN_PAIRS, SensorCheck, SensorReport, Step, compare_motion
 from umf_ros.sensors.decode import OdometrySample
 
+
+def stamps(*seconds: float) -> list[int]:
+    return [round(second * 1e9) for second in seconds]
+
+
 Drive = tuple[list[Frame], Trajectory]
 
 
@@ -94,18 +99,18 @@ def test_a_clock_that_is_off_is_found_whatever_the_mounting(lag_s: float) -> Non
     for start, earlier, later in zip(starts, bumpy(starts), bumpy(starts + 0.25), strict=True):
         motion = np.linalg.inv(earlier) @ later
         turn = mounted.T @ Rotation.from_matrix(motion[:3, :3]).as_rotvec()
-        steps.append(Step(start - lag_s, start + 0.25 - lag_s, turn, mounted.T @ motion[:3, 3]))
-    found = compare_motion(steps, odometry, 0)
+        steps.append(Step(*stamps(start - lag_s, start + 0.25 - lag_s), turn, mounted.T @ motion[:3, 3]))
+    found = compare_motion(steps, odometry)
     assert found is not None and found.lag_s == pytest.approx(lag_s) and found.mounting_deg is not None
     np.testing.assert_allclose(np.radians(found.mounting_deg), [0.1, -0.2, 0.3], atol=0.01)
-    assert compare_motion(steps[: MIN_PAIRS - 1], odometry, 0) is None
+    assert compare_motion(steps[: MIN_PAIRS - 1], odometry) is None
 
 
 def test_motion_that_has_nothing_to_do_with_the_odometry_says_nothing(rng: np.random.Generator) -> None:
     seconds = np.arange(0, 60, 0.05)
     odometry = Trajectory((seconds * 1e9).astype(np.int64), bumpy(seconds))
-    noise = [Step(s, s + 0.25, rng.normal(0, 0.02, 3), rng.normal(0, 0.2, 3)) for s in np.arange(5, 50, 0.25)]
-    assert compare_motion(noise, odometry, 0) is None
+    noise = [Step(*stamps(s, s + 0.25), rng.normal(0, 0.02, 3), rng.normal(0, 0.2, 3)) for s in np.arange(5, 50, 0.25)]
+    assert compare_motion(noise, odometry) is None
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -119,6 +124,6 @@ def test_a_clock_is_right_until_the_motion_clearly_says_otherwise(seed: int) -> 
     for start, earlier, later in zip(starts, bumpy(starts), bumpy(starts + 0.25), strict=True):
         motion = np.linalg.inv(earlier) @ later
         turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec() + rng.normal(0, 0.01, 3)
-        steps.append(Step(start - 0.08, start + 0.17, turn, motion[:3, 3]))
-    found = compare_motion(steps, odometry, 0)
+        steps.append(Step(*stamps(start - 0.08, start + 0.17), turn, motion[:3, 3]))
+    found = compare_motion(steps, odometry)
     assert found is None or found.lag_s == 0

@@ -24,7 +24,7 @@ PASSWORD = "a password of the tests"
 
 
 class PostgresServer:
-    """A server of its own folder and port, for 127.0.0.1 with passwords; as nobody where the caller is root.
+    """A server of its own folder and port, for 127.0.0.1 with passwords; as the user `nobody` where the caller is root.
 
     Attributes:
         port: that it listens on.
@@ -52,7 +52,7 @@ class PostgresServer:
 
     @property
     def log(self) -> str:
-        """What the server has written down."""
+        """The server's log."""
         return (self._folder / "log").read_text(encoding="utf-8", errors="replace")
 
     def address(self, user: str = ADMIN, port: int | None = None) -> str:
@@ -119,7 +119,7 @@ class CuttableLink:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def cut(self, seconds: float) -> None:
-        """Cut what is connected, and let nobody through for a while."""
+        """Cut all connections, and accept none for a while."""
         self._open = False
         for one in list(self._sockets):
             self.cuts += 1
@@ -162,6 +162,6 @@ def _pass_on(source: socket.socket, target: socket.socket) -> None:
 
 
 def free_port() -> int:
-    """A port that nobody listens on."""
+    """A port that no process listens on."""
     with socket.create_server(("127.0.0.1", 0)) as found:
         return int(found.getsockname()[1])

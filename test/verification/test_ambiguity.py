@@ -10,11 +10,10 @@ import pytest
 from umf_ros.core.geometry import Array, make_pose
 from umf_ros.verification import Measurement
 from umf_ros.verification.acceptance import refuted
-from umf_ros.verification.ambiguity import passage_direction, passage_rival
+from umf_ros.verification.ambiguity import passage_direction, passage_rival, scan_ambiguity
 from umf_ros.verification.hypothesis import SCAN
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import align_scans
-from umf_ros.verification.scan_consistency import rivalry
 
 ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
 AZIMUTHS = np.radians(np.arange(0.0, 360.0, 0.4))
@@ -75,7 +74,7 @@ def test_points_find_the_identity_in_a_passage_and_surfaces_do_not(name: str) ->
     match, query = PAIRS[name]
     alignment = align_scans(match, query, np.eye(4))
     assert np.linalg.norm(alignment.pose[:3, 3]) < 0.3  # 5 m off in the corridor
-    _, far = rivalry(match, query, alignment.pose, alignment.information)
+    _, far = scan_ambiguity(match, query, alignment.pose, alignment.information)
     assert far > 0.3  # from point to point every other pose looks worse
     assert passage_rival(match, query, alignment.pose) < 0.8
 

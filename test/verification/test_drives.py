@@ -1,4 +1,4 @@
-"""What the benchmark calls overlap and error, on a wall whose geometry is known."""
+"""Overlap and error as the benchmark counts them, on a wall whose geometry is known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What rays say about the points of another scan."""
+"""Rays of one scan against the points of another."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def test_a_pair_of_scans_is_measured_completely() -> None:
     found = measured(QUERY, MATCH)
     assert found.kind == SCAN and found.similarity == 0.7
     assert found.residual_m < found.residual_p90_m < 0.1 < 0.8 < found.overlap
-    assert found.noise_m > BLUR_M  # nobody removed the motion during these scans
+    assert found.noise_m > BLUR_M  # the motion during these scans is not removed
     steady = [replace(one, motion=ScanMotion.none(len(one.points))) for one in (QUERY, MATCH)]
     assert measured(*steady).residual_m < measured(*steady).noise_m < found.residual_p90_m
     assert found.points > 500 and found.relief_m > 0.04

@@ -9,9 +9,10 @@ import pytest
 
 from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.verification import thin_scan
+from umf_ros.verification.ambiguity import scan_ambiguity
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import inspect
-from umf_ros.verification.scan_consistency import Meeting, meet, rivalry
+from umf_ros.verification.scan_consistency import Meeting, meet
 from umf_ros.verification.surroundings import Sight
 
 RNG = np.random.default_rng(5)
@@ -31,7 +32,7 @@ def box(x: tuple[float, float], y: tuple[float, float], height: float, pillars: 
 
 
 def seen(world: Array, world_T_body: Array, limit_m: float = 40.0) -> PreparedScan:
-    """What a LiDAR 1.5 m above the body sees; pillars hide nothing, which is forgivable."""
+    """The view of a LiDAR 1.5 m above the body; pillars hide nothing, which is forgivable."""
     points = transform(invert(world_T_body), world)
     near = np.linalg.norm(points, axis=1) < limit_m
     noisy = points[near] + RNG.normal(0, 0.01, (int(near.sum()), 3))
@@ -92,16 +93,16 @@ def test_only_what_stands_counts_as_upright() -> None:
 def test_a_corridor_fits_anywhere_along_it_and_a_hall_does_not() -> None:
     here = make_pose(np.eye(3), [1.0, 0.0, 0.0])
     query, match = seen(corridor(), here, 15.0), seen(corridor(), np.eye(4), 15.0)
-    near, far = rivalry(match, query, here, inspect(match, query, here).information)
+    near, far = scan_ambiguity(match, query, here, inspect(match, query, here).information)
     assert abs(near) < 0.1 and far < 0.1
-    near, far = rivalry(MATCH, QUERY, THERE, inspect(MATCH, QUERY, THERE).information)
+    near, far = scan_ambiguity(MATCH, QUERY, THERE, inspect(MATCH, QUERY, THERE).information)
     assert near > 0.15 and far > 0.3
 
 
 def test_a_pose_beside_the_right_one_has_a_better_rival() -> None:
     beside = make_pose(np.eye(3), [2.0, 0.0, 0.0]) @ THERE
     information = np.diag([0.1, 100.0, 100.0, 100.0, 100.0, 100.0])  # x is known least
-    assert rivalry(MATCH, QUERY, beside, information)[1] < -0.3
+    assert scan_ambiguity(MATCH, QUERY, beside, information)[1] < -0.3
 
 
 def test_pillars_that_come_again_to_any_side_are_rivals() -> None:
@@ -111,5 +112,5 @@ def test_pillars_that_come_again_to_any_side_are_rivals() -> None:
     found = []
     for pillars in (lattice, single):
         query, match = (seen(box((-30, 30), (-30, 30), 3.0, pillars), np.eye(4), 9.0) for _ in range(2))
-        found.append(rivalry(match, query, np.eye(4), np.diag([100.0, 100.0, 100.0, 100.0, 100.0, 100.0]))[1])
+        found.append(scan_ambiguity(match, query, np.eye(4), np.diag([100.0, 100.0, 100.0, 100.0, 100.0, 100.0]))[1])
     assert found[0] < 0.15 < found[1] - 0.1

@@ -1,4 +1,4 @@
-"""What motion adds to a covariance: checked against scans that are really bent."""
+"""The share of motion in a covariance: checked against scans that are really bent."""
 
 from __future__ import annotations
 

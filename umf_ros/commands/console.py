@@ -26,12 +26,7 @@ WARNING: dict[str, Any] = {"style": "yellow", "markup": False, "highlight": Fals
 
 
 class FrameProgress(Progress):
-    """A bar over the recording, with what was found beside it and what the graph makes of it so far.
-
-    Args:
-        console: where.
-        graph_counts: gives the number of closures by the graph's state.
-    """
+    """A bar over the recording, with the numbers of places and closures, and of closures by the graph's state."""
 
     def __init__(self, console: Console, graph_counts: Callable[[], Mapping[str, int]] = dict) -> None:
         found = TextColumn("{task.fields[found]}")
@@ -49,13 +44,12 @@ class FrameProgress(Progress):
         if detection.closures:
             self._closures += len(detection.closures)
             self._graph = _in_graph(self._graph_counts())
-        self.update(
-            self._frames, completed=done, found=f"{self._places} places, {self._closures} closures{self._graph}"
-        )
+        found = f"{self._places} places, {self._closures} closures{self._graph}"
+        self.update(self._frames, completed=done, found=found)
 
 
 def _in_graph(counts: Mapping[str, int]) -> str:
-    """As " (30 in the graph, 4 pending)": what is pending is not rejected."""
+    """As " (30 in the graph, 4 pending)"."""
     rejected = counts.get("rejected", 0) + counts.get("refused", 0)
     pending = sum(counts.values()) - counts.get("accepted", 0) - rejected
     words = {"in the graph": counts.get("accepted", 0), "pending": pending, "rejected": rejected}
@@ -77,12 +71,12 @@ class InputConsole:
         self.told: frozenset[str] = frozenset()
 
     def warn(self, text: str) -> None:
-        """Tell what cannot be read."""
+        """Print a warning, and keep it for the summary."""
         self._warnings.append(text)
         self._tell(text)
 
     def tell_absent(self, settings: Settings, odometry_from_file: bool) -> None:
-        """Tell which inputs the recording lacks, one line each."""
+        """Print the inputs that the recording lacks, one line each."""
         for finding in absent_inputs(self._bag, settings, odometry_from_file):
             self._tell(finding.line)
 
@@ -94,15 +88,15 @@ class InputConsole:
         odometry: Path | None,
         odometry_frame: str,
     ) -> None:
-        """Keep in the summary what the report needs to know of the inputs."""
-        source = {"path": str(odometry.resolve()), "frame": odometry_frame} if odometry else None
-        known = {
-            "inputs": input_counts(counters),
-            "warnings": self._warnings,
-            "interrupted": interrupted,
-            "odometry_file": source,
-        }
-        remember_recording(folder, self._bag, **known)
+        """Keep in the summary what the report needs of the inputs."""
+        remember_recording(
+            folder,
+            self._bag,
+            inputs=input_counts(counters),
+            warnings=self._warnings,
+            interrupted=interrupted,
+            odometry_file={"path": str(odometry.resolve()), "frame": odometry_frame} if odometry else None,
+        )
 
     def _tell(self, text: str) -> None:
         if text not in self.told:

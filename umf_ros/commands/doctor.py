@@ -19,22 +19,22 @@ from umf_ros.core.resources import LAB_PACKAGES
 
 TIMEOUT_S = 60
 
-# module, distribution, first version known to work
-_PACKAGES = (
-    ("numpy", "numpy", "1.26"),
-    ("scipy", "scipy", "1.11"),
-    ("cv2", "opencv-python-headless", "4.10"),
-    ("torch", "torch", "2.4"),
-    ("safetensors", "safetensors", "0.4"),
-    ("small_gicp", "small_gicp", "1"),
-    ("gtsam", "gtsam", "4.3"),
-    ("mcap", "mcap", "1.2"),
-    ("rosbags", "rosbags", "0.10"),
-    ("pydantic", "pydantic", "2"),
-    ("matplotlib", "matplotlib", "3.8"),
-    ("jinja2", "Jinja2", "3.1"),
-    ("plotly", "plotly", "6"),
-)
+_PACKAGES = {
+    "numpy": ("numpy", "1.26"),
+    "scipy": ("scipy", "1.11"),
+    "cv2": ("opencv-python-headless", "4.10"),
+    "torch": ("torch", "2.4"),
+    "safetensors": ("safetensors", "0.4"),
+    "small_gicp": ("small_gicp", "1"),
+    "gtsam": ("gtsam", "4.3"),
+    "mcap": ("mcap", "1.2"),
+    "rosbags": ("rosbags", "0.10"),
+    "pydantic": ("pydantic", "2.7"),
+    "matplotlib": ("matplotlib", "3.8"),
+    "jinja2": ("Jinja2", "3.1"),
+    "plotly": ("plotly", "6"),
+}
+"""Distribution and first version known to work, by module."""
 _WITHOUT_OPENVINO = "torch runs the network instead (OpenVINO asks for glibc 2.35)"
 _WITHOUT_LAB = "only the lab needs it: pip install 'umf_ros[lab]'"
 _MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "visualization_msgs", "std_srvs")
@@ -85,7 +85,7 @@ def command() -> None:
 def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
     """All checks by name, to be run one by one."""
     yield "Python", check_python
-    for module, distribution, minimum in _PACKAGES:
+    for module, (distribution, minimum) in _PACKAGES.items():
         yield distribution, partial(check_package, module, distribution, minimum)
     yield "openvino", partial(check_optional, "openvino", "openvino", "2025", _WITHOUT_OPENVINO)
     for module, (distribution, minimum) in LAB_PACKAGES.items():
@@ -146,9 +146,7 @@ def check_messages() -> Finding:
 def check_dds() -> Finding:
     """A publisher and a subscriber find each other and exchange an image."""
     status, output = _run("-m", "umf_ros.nodes.dds_check")
-    advice = (
-        "check ROS_DOMAIN_ID, RMW_IMPLEMENTATION, and that a firewall lets UDP multicast pass on the loopback device"
-    )
+    advice = "check ROS_DOMAIN_ID, RMW_IMPLEMENTATION, and that a firewall lets UDP multicast pass on loopback"
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
     return Finding("DDS", status == 0, f"{_last_line(output)} (domain {domain})", advice)
 
@@ -176,22 +174,19 @@ def check_weights() -> Finding:
 
 
 def check_processor() -> Finding:
-    """What the network runs on."""
+    """Processor and graphics card that the network can use."""
     cores = len(os.sched_getaffinity(0))
     found = f"{cores} {'core' if cores == 1 else 'cores'}"
-    status, output = _run(
-        "-c", "import torch; print(torch.cuda.get_device_name() if torch.cuda.is_available() else '')"
-    )
+    status, output = _run("-c", "import torch as t; print(t.cuda.get_device_name() if t.cuda.is_available() else '')")
     if status == 0 and _last_line(output):
         found += f", {_last_line(output)} (parameter embedding.device: cuda)"
     return Finding("processor", cores >= 2, found, "two cores are needed to keep up with a live rover")
 
 
 def _run(*arguments: str) -> tuple[int, str]:
+    command = [sys.executable, *arguments]
     try:
-        done = subprocess.run(
-            [sys.executable, *arguments], capture_output=True, text=True, timeout=TIMEOUT_S, check=False
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
         return 1, f"no answer within {TIMEOUT_S} s"
     return done.returncode, done.stdout + (done.stderr if done.returncode else "")

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
 
-SEVERITY = {"fault": "red", "warning": "yellow", "note": "dim"}
-
 
 def command(
     bag: BagPath,
@@ -47,7 +45,7 @@ def command(
     if write is not None:
         _write(console, found, recording, write)
     elif found.settings is None:
-        console.print(f"of no known data set: umf inspect {bag} --write . writes a first --config", **PLAIN)
+        console.print(found.unknown, **PLAIN)
     if not found.works:
         console.print("It would find nothing.", style="red")
         raise typer.Exit(USELESS)
@@ -57,6 +55,8 @@ def command(
 def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None:
     from rich.markup import escape
     from rich.table import Table
+
+    from umf_ros.runs.report import COLOURS
 
     console.print(f"{bag}: {recording.duration_s:.1f} s", **PLAIN)
     if recording.warning:
@@ -73,7 +73,7 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
     if "pairs" in found.found:
         console.print(found.found["pairs"], **PLAIN)
     for one in found.advice:
-        console.print(f"{one.severity}: {one.line}", style=SEVERITY[one.severity], **PLAIN)
+        console.print(f"{one.severity}: {one.line}", style=COLOURS[one.severity], **PLAIN)
     if found.settings is not None:
         console.print(f"data set: {found.settings.dataset}; umf replay {bag} needs no --config", **PLAIN)
 
@@ -82,7 +82,7 @@ def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> 
     from umf_ros.bags.frames import read_transforms
     from umf_ros.commands.inspection import GUESS, write_calibration, write_settings
     from umf_ros.core.errors import writing
-    from umf_ros.runs.writer import write_atomically
+    from umf_ros.core.io import write_atomically
 
     settings, calibration = folder / "my_rover.yaml", folder / "my_calibration.yaml"
     for path in (settings, calibration):

@@ -1,8 +1,9 @@
-"""What a recording holds, and whether it would work."""
+"""Contents of a recording, and whether a replay would work."""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +15,9 @@ from umf_ros.bags.reader import Bag, decode
 from umf_ros.core.config import Settings, Topics
 from umf_ros.core.errors import MessageError, UmfError
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
+from umf_ros.core.keyframes import gap_remedy
 from umf_ros.runs.reader import Advice
+from umf_ros.sensors.calibration import TO_BE_MEASURED
 from umf_ros.sensors.decode import (
     CLOUD,
     COMPRESSED,
@@ -33,24 +36,25 @@ FEW_PAIRS = 0.5
 """Share of the scans with an image, by hand, below which something is wrong."""
 
 OPTICAL = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
-"""`body_T_camera` of a camera that looks ahead, at the origin: what stands in for a mounting nobody told."""
+"""`body_T_camera` of a camera that looks ahead, at the origin, in place of a mounting that is unknown."""
 BODIES = ("base_link", "base_footprint", "body", "imu_link")
-GUESS = "TO BE MEASURED: a guess"
+GUESS = f"{TO_BE_MEASURED}: a guess"
 RAW = "  # the images look raw: rectify them, or see raw_camera in config/calibration/s3li_vulcano.yaml"
 
 
 @dataclass
 class Inspected:
-    """What was found.
+    """Findings about a recording.
 
     Attributes:
         topics: that would be used.
-        found: words about each input, by its name in `Topics`.
+        found: words about each input, by its name in `Topics`, and about `pairs` of scan and image.
         frames: `header.frame_id` of each input.
         advice: what is wrong or missing, with what helps.
         info: left and right camera_info, as far as there are.
         image_size: width and height, or None.
-        settings: that would be used without --config; None where the topics are of no known data set.
+        settings: that would be used without --config; None where the recording is of no known data set.
+        unknown: why it is of none.
     """
 
     topics: Topics
@@ -60,6 +64,7 @@ class Inspected:
     info: dict[str, Any] = field(default_factory=dict)
     image_size: tuple[int, int] | None = None
     settings: Settings | None = None
+    unknown: str = ""
 
     @property
     def works(self) -> bool:
@@ -72,13 +77,11 @@ def inspect(bag: Bag) -> Inspected:
     found = Inspected(guess_topics(bag))
     try:
         found.settings = settings_for(bag, None, "auto")
-    except UmfError:
-        found.settings = None
+    except UmfError as error:
+        found.unknown = str(error)
     _read_samples(bag, found)
-    _about_depth(found)
-    _about_odometry(bag, found)
-    _about_pairs(bag, found)
-    _about_gaps(bag, found)
+    for rule in (_about_depth, _about_odometry, _about_pairs, _about_gaps):
+        found.advice += rule(bag, found)
     return found
 
 
@@ -178,35 +181,32 @@ _DESCRIBE: dict[str, Any] = {
 }
 
 
-def _about_depth(found: Inspected) -> None:
+def _about_depth(_: Bag, found: Inspected) -> Iterator[Advice]:
     topics = found.topics
     if not topics.left_image and not topics.cloud:
-        found.advice.append(Advice("fault", "neither images nor scans", "nothing to recognise a place by"))
+        yield Advice("fault", "neither images nor scans", "nothing to recognise a place by")
     elif not topics.cloud and not topics.right_image:
         what = "one camera without a LiDAR or a second camera: places are recognised, but no closure is metric"
-        found.advice.append(Advice("fault", what, "record scans or a stereo pair"))
+        yield Advice("fault", what, "record scans or a stereo pair")
     elif not topics.cloud:
-        found.advice.append(Advice("warning", "no scans: everything rests on the stereo pair"))
+        yield Advice("warning", "no scans: everything rests on the stereo pair")
     elif not topics.left_image:
-        found.advice.append(Advice("warning", "no images: everything rests on the scans"))
+        yield Advice("warning", "no images: everything rests on the scans")
     if topics.left_image and not topics.left_info:
-        found.advice.append(Advice("note", "no camera_info: the calibration must say the intrinsics"))
+        yield Advice("note", "no camera_info: the calibration must say the intrinsics")
 
 
-def _about_odometry(bag: Bag, found: Inspected) -> None:
-    if found.topics.odometry:
-        return
-    imu = [topic for topic, info in bag.topics.items() if info.type == "sensor_msgs/msg/Imu"]
-    remedy = "run one (KISS-ICP on the scans, Basalt on the images) and give its poses with --odometry FILE.tum"
-    also = f"; {imu[0]} is an IMU, which is no odometry" if imu else ""
-    found.advice.append(Advice("warning", f"no odometry: closures only, the pose graph is skipped{also}", remedy))
+def _about_odometry(bag: Bag, found: Inspected) -> Iterator[Advice]:
+    if not found.topics.odometry:
+        imu = [topic for topic, info in bag.topics.items() if info.type == "sensor_msgs/msg/Imu"]
+        also = f"; {imu[0]} is an IMU, which is no odometry" if imu else ""
+        remedy = "run one (KISS-ICP on the scans, Basalt on the images) and give its poses with --odometry FILE.tum"
+        yield Advice("warning", f"no odometry: closures only, the pose graph is skipped{also}", remedy)
 
 
-def _about_pairs(bag: Bag, found: Inspected) -> None:
+def _about_pairs(bag: Bag, found: Inspected) -> Iterator[Advice]:
     """How many scans will have an image, by their stamps alone."""
-    topics, slop_ns = found.topics, 0.05e9
-    if found.settings is not None:
-        slop_ns = found.settings.sync.slop_s * 1e9
+    topics, slop_s = found.topics, (found.settings or Settings()).sync.slop_s
     if not topics.left_image or not topics.cloud:
         return
     stamps: dict[str, list[int]] = {topics.left_image: [], topics.cloud: []}
@@ -214,38 +214,38 @@ def _about_pairs(bag: Bag, found: Inspected) -> None:
         seconds, nanoseconds = struct.unpack_from("<iI" if raw.data[1] & 1 else ">iI", raw.data, 4)
         stamps[raw.topic].append(seconds * 10**9 + nanoseconds)
     scans = np.array(stamps[topics.cloud])
-    away = _distances(np.sort(stamps[topics.left_image]), scans)
-    pairs, median_s = int((away <= slop_ns).sum()), float(np.median(away)) * 1e-9
-    told = f"{pairs} of {len(scans)} scans have an image within {slop_ns * 1e-9:g} s, {median_s:.3f} s in the median"
+    away_ns = _distances(np.sort(stamps[topics.left_image]), scans)
+    pairs, median_s = int((away_ns <= slop_s * 1e9).sum()), float(np.median(away_ns)) * 1e-9
+    told = f"{pairs} of {len(scans)} scans have an image within {slop_s:g} s, {median_s:.3f} s in the median"
     found.found["pairs"] = told
     if pairs < FEW_PAIRS * len(scans):
         what = f"only {pairs} of {len(scans)} scans have an image, {median_s:.2f} s away in the median"
-        remedy = "two clocks? sync.slop_s, or the driver's stamps"
-        found.advice.append(Advice("warning" if pairs else "fault", what, remedy))
+        yield Advice("warning" if pairs else "fault", what, "two clocks? sync.slop_s, or the driver's stamps")
+
+
+def _about_gaps(bag: Bag, found: Inspected) -> Iterator[Advice]:
+    settings = found.settings or Settings()
+    if bag.duration_s < settings.loop.min_time_gap_s:
+        gap = f"loop.min_time_gap_s, {settings.loop.min_time_gap_s:g} s"
+        what = f"{bag.duration_s:.1f} s are shorter than {gap}: no match is allowed"
+        remedy = gap_remedy(bag.duration_s, None if found.topics.odometry else 0.0, settings)
+        yield Advice("fault", what, f"drive longer, or set {remedy}")
 
 
 def _distances(images: NDArray[np.int64], scans: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How far the nearest image is from each scan, ns."""
+    """Time in ns from each scan to the nearest image, whose stamps are sorted."""
     after = np.clip(np.searchsorted(images, scans), 0, len(images) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.minimum(np.abs(scans - images[before]), np.abs(scans - images[after]))
-
-
-def _about_gaps(bag: Bag, found: Inspected) -> None:
-    rules = (found.settings or Settings()).loop
-    if bag.duration_s < rules.min_time_gap_s:
-        gap = f"loop.min_time_gap_s, {rules.min_time_gap_s:g} s"
-        what = f"{bag.duration_s:.1f} s are shorter than {gap}: no match is allowed"
-        found.advice.append(Advice("fault", what, "drive longer, or lower loop.min_time_gap_s"))
+    return np.minimum(np.abs(scans - images[np.maximum(after - 1, 0)]), np.abs(scans - images[after]))
 
 
 def write_settings(found: Inspected, calibration: str) -> str:
     """A first parameter file: the topics, and the calibration beside it."""
     defaults = Topics().model_dump()
-    topics = {name: topic for name, topic in found.topics.model_dump().items()}
     lines = ["# What umf inspect found; docs/parameters.md lists everything that may stand here.", "/**:"]
     lines += ["  ros__parameters:", f"    calibration: {calibration}", "    topics:"]
-    lines += [f'      {name}: "{topic}"' for name, topic in topics.items() if topic or defaults[name]]
+    lines += [
+        f'      {name}: "{topic}"' for name, topic in found.topics.model_dump().items() if topic or defaults[name]
+    ]
     return "\n".join(lines) + "\n"
 
 

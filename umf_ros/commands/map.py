@@ -22,7 +22,7 @@ from umf_ros.commands.recordings import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.maps.map_folder import MapFolder
+    from umf_ros.maps.map_folder import MapFolder, MapSession
     from umf_ros.maps.mapping import Opening
 
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.")]
@@ -59,9 +59,11 @@ def command(
 
     from rich.console import Console
 
+    from umf_ros.bags.reader import open_bag
     from umf_ros.core.io import check_writable
     from umf_ros.core.tasks import spread
     from umf_ros.maps.joint_graph import solve
+    from umf_ros.maps.map_folder import MapFolder
     from umf_ros.maps.mapping import Opening, find_recordings, unmatched
     from umf_ros.maps.outputs import write_results
 
@@ -69,39 +71,18 @@ def command(
     check_writable(out)
     opening = Opening(config, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
     found = find_recordings(recordings)
-    target = _open(out, opening, found[0])
+    target = MapFolder.open_or_create(out, opening.settings(open_bag(found[0])))
+    new = _new_ones(target, found, console)
     if ray is None and workers == 1:
-        for recording in found:
-            _add(target, recording, opening, console)
+        for name, recording in new.items():
+            _add(target, name, recording, opening, console)
     else:
-        _add_all(target, found, opening, partial(spread, workers=workers, ray=ray), console)
+        _add_all(target, new, opening, partial(spread, workers=workers, ray=ray), console)
     for session in unmatched(target):
-        _match(target, session.name, console)
+        _match(target, session, console)
     with console.status("Solving the joint graph"):
         summary = write_results(target, solve(target))
     _tell(out, summary, console)
-
-
-def _open(out: Path, opening: Opening, first: Path) -> MapFolder:
-    from umf_ros.bags.reader import open_bag
-    from umf_ros.maps.map_folder import MapFolder
-
-    return MapFolder.open_or_create(out, opening.settings(open_bag(first)))
-
-
-def _add_all(
-    target: MapFolder, recordings: list[Path], opening: Opening, spread: Callable[..., None], console: Console
-) -> None:
-    """Replay all recordings at once, then compare all with those before them; the same map as one after the other."""
-    from umf_ros.maps.mapping import add_session, match_task, replay_task, unmatched
-
-    new = _new_ones(target, recordings, console)
-    tasks = [(recording, opening, target.folder_of(name)) for name, recording in new.items()]
-    _with_bar(console, "Replaying", len(tasks), lambda done: spread(replay_task, tasks, done=done))
-    for name, recording in new.items():
-        add_session(target, name, recording)
-    names = [(target.path, session.name) for session in unmatched(target)]
-    _with_bar(console, "Comparing with the map", len(names), lambda done: spread(match_task, names, done=done))
 
 
 def _new_ones(target: MapFolder, recordings: list[Path], console: Console) -> dict[str, Path]:
@@ -113,51 +94,56 @@ def _new_ones(target: MapFolder, recordings: list[Path], console: Console) -> di
     described = []
     for recording in recordings:
         about = describe_recording(open_bag(recording)) | {"path": ""}
-        if target.knows(about) is not None or about in described:
-            console.print(f"{recording}: in the map already", markup=False, soft_wrap=True)
+        known = target.knows(about)
+        if known is not None or about in described:
+            as_name = f", as {known.name}" if known else ""
+            console.print(f"{recording}: in the map already{as_name}", markup=False, soft_wrap=True)
             continue
         described.append(about)
         new[target.free_name(recording, new)] = recording
     return new
 
 
-def _with_bar(console: Console, what: str, total: int, run: Callable[[Callable[[int], None]], None]) -> None:
+def _add_all(
+    target: MapFolder, new: dict[str, Path], opening: Opening, spread: Callable[..., None], console: Console
+) -> None:
+    """Replay all recordings at once, then compare all with those before them; the same map as one after the other."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    from umf_ros.maps.mapping import add_session, match_task, replay_task, unmatched
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("recordings")
     with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task(what, total=total)
-        run(lambda done: progress.update(task, completed=done))
+
+        def run(what: str, work: Callable[..., None], tasks: list[tuple[Any, ...]]) -> None:
+            bar = progress.add_task(what, total=len(tasks))
+            spread(work, tasks, done=lambda count: progress.update(bar, completed=count))
+
+        run("Replaying", replay_task, [(recording, opening, target.folder_of(name)) for name, recording in new.items()])
+        for name, recording in new.items():
+            add_session(target, name, recording)
+        run("Comparing with the map", match_task, [(target.path, session) for session in unmatched(target)])
 
 
-def _add(target: MapFolder, recording: Path, opening: Opening, console: Console) -> None:
-    """Replay a recording into the map, unless it is there."""
-    from umf_ros.bags.reader import open_bag
+def _add(target: MapFolder, name: str, recording: Path, opening: Opening, console: Console) -> None:
+    """Replay a recording into the map, and compare it with those before it."""
     from umf_ros.commands.console import FrameProgress
     from umf_ros.maps.mapping import add_session, replay_session
-    from umf_ros.runs.reader import describe_recording
 
-    known = target.knows(describe_recording(open_bag(recording)))
-    if known is not None:
-        console.print(f"{recording}: in the map already, as {known.name}", markup=False, soft_wrap=True)
-        return
-    name = target.free_name(recording)
     console.print(f"{recording}: session {name}", markup=False, soft_wrap=True)
     with FrameProgress(console) as progress:
         replay_session(recording, opening, target.folder_of(name), progress.show)
-    add_session(target, name, recording)
-    _match(target, name, console)
+    _match(target, add_session(target, name, recording), console)
 
 
-def _match(target: MapFolder, name: str, console: Console) -> None:
+def _match(target: MapFolder, session: MapSession, console: Console) -> None:
     """Compare a session with those before it."""
     from rich.progress import track
 
     from umf_ros.maps.mapping import match_session
 
-    session = next(one for one in target.sessions if one.name == name)
-    matches = match_session(target, session)
-    for _ in track(matches, f"Comparing {name} with the map", session.places, console=console, transient=True):
+    title = f"Comparing {session.name} with the map"
+    for _ in track(match_session(target, session), title, session.places, console=console, transient=True):
         pass
 
 

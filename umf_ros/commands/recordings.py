@@ -1,4 +1,7 @@
-"""Opening a recording with its settings: the same options and the same way in for every command."""
+"""Options of the commands that read a recording, and how it is opened with them.
+
+A file that is missing raises a `BagError`, a `ConfigError` or an `UmfError` before anything that takes time to import.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ OdometryFrame = Annotated[
     str,
     typer.Option(
         "--odometry-frame",
-        help="Whose poses --odometry holds: body (the default), imu, camera or lidar (S3LI's Eval/BASALT: imu).",
+        help="Frame of the poses in --odometry: body (the default), imu, camera or lidar (S3LI's Eval/BASALT: imu).",
         show_default=False,
     ),
 ]
@@ -39,12 +42,7 @@ RunsFolder = Annotated[Path, typer.Option("--out", help="Where results/<timestam
 
 
 def check_files(bag: Path, *others: Path | None) -> None:
-    """Say what is not there before anything that takes time to import.
-
-    Raises:
-        BagError: there is no such recording.
-        ConfigError: one of the other files is not there.
-    """
+    """Check that a recording and other files exist."""
     if not bag.exists():
         raise BagError(f"there is no recording {bag}")
     for path in others:
@@ -53,21 +51,13 @@ def check_files(bag: Path, *others: Path | None) -> None:
 
 
 def check_map(folder: Path | None) -> None:
-    """Likewise of a map's folder, if one is asked for.
-
-    Raises:
-        UmfError: it holds no map.
-    """
+    """Check that a folder, if one is given, holds a map."""
     if folder is not None and not (folder / "map.json").is_file():
         raise UmfError(f"{folder} holds no map: map.json is missing (umf map makes one)")
 
 
 def check_run(folder: Path) -> None:
-    """Likewise of a run folder.
-
-    Raises:
-        UmfError: it holds no finished run.
-    """
+    """Check that a folder holds a finished run."""
     if not (folder / "summary.json").is_file():
         raise UmfError(f"{folder} holds no finished run: summary.json is missing")
 
@@ -80,20 +70,7 @@ def open_recording(
     weights: Path | None = None,
     **overrides: Any,
 ) -> tuple[Bag, Settings]:
-    """A recording, and the settings to read it with.
-
-    Args:
-        bag: the recording.
-        config: parameter file.
-        dataset: name of its data set, or auto.
-        embedder: method, before what the file says.
-        weights: file or name, likewise.
-        overrides: as in `load_settings`.
-
-    Raises:
-        BagError: it cannot be opened, or its data set is not known.
-        ConfigError: the file cannot be read, or a name, type or value is wrong.
-    """
+    """Open a recording, and load the settings to read it with; `overrides` are those of `load_settings`."""
     check_files(bag, config)
 
     from umf_ros.bags.presets import settings_for
@@ -105,11 +82,7 @@ def open_recording(
 
 
 def check_odometry_options(odometry: Path | None, odometry_frame: str) -> str:
-    """The frame of the odometry file; without a file there is nothing it could be the frame of.
-
-    Raises:
-        ConfigError: only the frame was given.
-    """
+    """Return the frame of the odometry file; an error where only the frame is given."""
     if odometry_frame and odometry is None:
         raise ConfigError("--odometry-frame says whose poses an --odometry file holds, and there is none")
     return odometry_frame or "body"
@@ -118,12 +91,7 @@ def check_odometry_options(odometry: Path | None, odometry_frame: str) -> str:
 def open_frames(
     recording: Bag, settings: Settings, warn: Callable[[str], None], odometry: Path | None, odometry_frame: str
 ) -> FrameReader:
-    """The frames of a recording, with the odometry of a file where one is named; `warn` is told of faults.
-
-    Raises:
-        BagError: the recording or the file cannot be read as frames or odometry.
-        CalibrationError: the calibration cannot be read.
-    """
+    """Read the frames of a recording, with the odometry of a file where one is named; `warn` gets the faults."""
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.trajectories import read_odometry
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -72,15 +72,17 @@ def _tell(console: Console, about: ExaminedRun, row: int, why: ClosureDiagnosis)
     def at(stamp_ns: int) -> str:
         return f"{(stamp_ns - start) * 1e-9:.1f} s"
 
-    plain: dict[str, Any] = {"highlight": False, "soft_wrap": True}
-    console.print(f"keyframe {row + 1} of {len(about.run.keyframes)}, {at(why.stamp_ns)}, {why.stamp_ns} ns", **plain)
-    console.print(f"[bold]{escape(why.gate)}[/]: {escape(why.what)}", **plain)
+    def say(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True)
+
+    say(f"keyframe {row + 1} of {len(about.run.keyframes)}, {at(why.stamp_ns)}, {why.stamp_ns} ns")
+    say(f"[bold]{escape(why.gate)}[/]: {escape(why.what)}")
     if why.match_stamp_ns is not None:
         apart = f", {why.distance_m:.1f} m away by the truth" if why.distance_m < float("inf") else ""
-        console.print(f"the place is that of {at(why.match_stamp_ns)}, {why.match_stamp_ns} ns{apart}", **plain)
+        say(f"the place is that of {at(why.match_stamp_ns)}, {why.match_stamp_ns} ns{apart}")
     if why.gate != "found":
         through = why.parameter or "no parameter: the measurements do not speak for it"
-        console.print(f"would let it through: {escape(through)}", **plain)
+        say(f"would let it through: {escape(through)}")
     tested = about.gates.tested(why.stamp_ns)
     if tested:
         table = Table("returned", "similarity", "probability", "m by the truth", "reason", box=None, pad_edge=False)
@@ -94,6 +96,6 @@ def _tell(console: Console, about: ExaminedRun, row: int, why: ClosureDiagnosis)
             )
         console.print(table)
     for name, value in sorted(why.contributions.items(), key=lambda one: -abs(one[1]))[:SHOWN]:
-        console.print(f"  {name.replace('_', ' '):24} {value:+.1f}", **plain)
+        say(f"  {name.replace('_', ' '):24} {value:+.1f}")
     if why.match_stamp_ns is not None:
-        console.print(f"a picture of it: umf explain BAG {why.stamp_ns} {why.match_stamp_ns}", **plain)
+        say(f"a picture of it: umf explain BAG {why.stamp_ns} {why.match_stamp_ns}")

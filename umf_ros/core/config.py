@@ -58,7 +58,7 @@ class Topics(Group):
 
 
 class DatasetPreset(Group):
-    """What is known of a data set by its name: a file in `config/datasets`."""
+    """Calibration and topics of a data set, by its name: a file in `config/datasets`."""
 
     calibration: Path = Field(description="calibration file, relative to this one")
     topics: Topics = Topics()
@@ -271,11 +271,9 @@ class Settings(Group):
 
 
 def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:
-    """Settings from a YAML file, plain or a ROS parameter file (`/**: ros__parameters:`).
+    """Settings from a YAML file, plain or a ROS parameter file (`/**: ros__parameters:`); None gives the defaults.
 
-    Args:
-        path: the file; None gives the defaults.
-        overrides: values by dotted name with `__` for the dot, as in `loop__top_k=10`; None is skipped.
+    Overrides are by dotted name with `__` for the dot, as in `loop__top_k=10`; None is skipped.
 
     Raises:
         ConfigError: the file cannot be read, or a name, type or value is wrong.

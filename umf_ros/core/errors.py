@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 LONGEST = 300
-"""Letters of an error's text or of a name in it: both may be what somebody sent."""
+"""Letters of an error's text or of a name in it: both may come from outside."""
 
 
 def shortened(text: object) -> str:
@@ -16,7 +16,7 @@ def shortened(text: object) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """What an exception says; its kind where it says nothing."""
+    """Text of an exception on one line; its kind where it has none."""
     return shortened(error) or type(error).__name__
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import fcntl
 import os
 import sqlite3
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +44,12 @@ def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file that is never seen half-written."""
+    with atomic_write(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
 def check_writable(folder: Path) -> None:
     """Make a folder and check that results can be written into it, before hours of work.
 
@@ -51,6 +60,29 @@ def check_writable(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK):
         raise OutputError(f"cannot write to {folder}: permission denied")
+
+
+def create_run_folder(out: Path, latest: bool = True) -> Path:
+    """Make a new folder inside `out`, named after the local time; `out/latest` leads to it unless `latest` is false."""
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    with writing(f"to {out}"):
+        out.mkdir(parents=True, exist_ok=True)
+        names = (stamp if number == 1 else f"{stamp}_{number}" for number in count(1))
+        folder = next(folder for name in names if _is_new(folder := out / name))
+        if latest:  # in one step, so that it always leads to a folder
+            fresh = out / f".latest-{os.getpid()}"
+            fresh.symlink_to(folder.name, target_is_directory=True)
+            fresh.replace(out / "latest")
+    return folder
+
+
+def _is_new(folder: Path) -> bool:
+    """Make a folder; returns false where there is one of this name."""
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        return False
+    return True
 
 
 class FileLock:
@@ -271,17 +303,6 @@ MOST_NODES = 100_000
 """A file of settings has some hundreds; aliases of aliases are how a small one stands for a thousand million."""
 
 
-class _OnceLoader(yaml.SafeLoader):
-    """Refuses a name that is given twice: the first value would be dropped without a word."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        names = [str(getattr(key, "value", "")) for key, _ in node.value]
-        twice = next((name for i, name in enumerate(names) if name in names[:i] and name != "<<"), None)
-        if twice is not None:
-            raise yaml.constructor.ConstructorError(None, None, f"{twice} is given twice", node.start_mark)
-        return dict(super().construct_mapping(node, deep))
-
-
 def is_yaml(path: Path) -> bool:
     """Whether a path names a YAML file, and not data."""
     return path.suffix in (".yaml", ".yml")
@@ -299,7 +320,7 @@ def read_yaml(path: Path) -> Any:
         if len(text) > LARGEST_YAML:
             raise ConfigError(f"{path} is not valid YAML: larger than {LARGEST_YAML >> 20} MB")
         _count_nodes(yaml.compose(text, yaml.SafeLoader), {})
-        return yaml.load(text, _OnceLoader)
+        return yaml.safe_load(text)
     except ConfigError:
         raise
     except OSError as error:
@@ -312,7 +333,7 @@ def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
     """Nodes of a document with every alias written out.
 
     Raises:
-        ValueError: they are too many, or a node is its own part.
+        ValueError: they are too many, a node is its own part, or a name is given twice: one value would be lost.
     """
     if id(node) in known:
         if not known[id(node)]:
@@ -322,6 +343,9 @@ def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
     if isinstance(node, yaml.SequenceNode):
         count = sum(_count_nodes(item, known) for item in node.value)
     elif isinstance(node, yaml.MappingNode):
+        for name, times in Counter(str(getattr(key, "value", "")) for key, _ in node.value).items():
+            if times > 1 and name != "<<":
+                raise ValueError(f"{name} is given twice{node.start_mark}")
         count = sum(_count_nodes(item, known) for pair in node.value for item in pair)
     known[id(node)] = count + 1
     if count > MOST_NODES:
@@ -340,13 +364,11 @@ def read_values(path: Path) -> dict[str, Any]:
         return {}
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: expected names and values, found a {type(content).__name__}")
-    _check_names(content, path)
+    groups = [content]
+    while groups:
+        group = groups.pop()
+        wrong = [name for name in group if not isinstance(name, str)]
+        if wrong:
+            raise ConfigError(f"{path}: a name is text, not {wrong[0]!r}")
+        groups += [value for value in group.values() if isinstance(value, dict)]
     return content
-
-
-def _check_names(content: dict[Any, Any], path: Path) -> None:
-    for name, value in content.items():
-        if not isinstance(name, str):
-            raise ConfigError(f"{path}: a name is text, not {name!r}")
-        if isinstance(value, dict):
-            _check_names(value, path)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.config import KeyframePolicy, Loop
+from umf_ros.core.config import KeyframePolicy, Loop, Settings
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array, relative, rotation_angle
 
@@ -15,6 +15,8 @@ Mask = NDArray[np.bool_]
 
 # Odometry noise of a parked rover must not add up to metres: motion counts from this distance on.
 COUNTED_STEP_M = 0.05
+SHARES = 4
+"""A match may be a quarter of the run back, and without odometry a quarter has as many keyframes: by hand."""
 
 
 def is_past(age_ns: NDArray[np.int64], way_m: Array, rules: Loop, same_session: Mask | bool = True) -> Mask:
@@ -29,6 +31,27 @@ def is_past(age_ns: NDArray[np.int64], way_m: Array, rules: Loop, same_session: 
     old = age_ns >= round(rules.min_time_gap_s * 1e9)
     near = way_m < rules.min_travel_m  # False for NaN
     return np.asarray(old & ~(near & same_session), bool)
+
+
+def gap_remedy(seconds: float, metres: float | None, settings: Settings) -> str:
+    """Settings with which a run of this duration has matches that the gap rules allow.
+
+    Args:
+        seconds: duration.
+        metres: path length, 0 without odometry, None where it is unknown.
+        settings: of the run.
+    """
+    changes = {"loop.min_time_gap_s": (settings.loop.min_time_gap_s, seconds / SHARES)}
+    if metres == 0:
+        # time alone selects keyframes, too
+        for name in ("untracked_period_s", "min_period_s"):
+            changes[f"keyframe.{name}"] = getattr(settings.keyframe, name), seconds / (SHARES * SHARES)
+    else:
+        changes["loop.min_travel_m"] = settings.loop.min_travel_m, metres / SHARES if metres else math.inf
+    text = ", ".join(f"{name}: {new:.2g}" for name, (old, new) in changes.items() if new < old)
+    if metres is None:
+        text += ", loop.min_travel_m: a quarter of the path length"
+    return text + (" (or give odometry: --odometry FILE.tum)" if metres == 0 else "")
 
 
 class KeyframeSelector:

@@ -1,4 +1,4 @@
-"""What comes with the package, in a checkout or an installed share folder, and what does not: cheap, for help asks."""
+"""Files that come with the package, in a checkout or an installed share folder. Cheap to import: for `umf --help`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from umf_ros.core.errors import UmfError
 
 DEFAULT_DATASET = "simulated"
 LAB_PACKAGES = {"open3d": ("open3d", "0.19"), "sklearn": ("scikit-learn", "1.4")}
-"""What a rover does without: distribution and first version known to work, by module."""
+"""Packages that a rover does not need: distribution and first version known to work, by module."""
 FLEET_PACKAGES = ("pgvector", "psycopg", "ray")
 """Modules that only a rover of a fleet or a cluster needs."""
 
@@ -43,10 +43,10 @@ def dataset_names() -> list[str]:
 
 
 def check_packages() -> None:
-    """See to it that this Python is one that the package was installed for.
+    """Check that this Python has the packages that are needed: the venv of a workspace may not be activated.
 
     Raises:
-        UmfError: nothing that it needs is there, as in a workspace whose venv is not activated.
+        UmfError: it has none of them.
     """
     if not any(find_spec(name) for name in ("rosbags", "pydantic_core")):
         raise UmfError(f"{sys.executable} has none of the packages that are needed: source venv/bin/activate first")

@@ -10,14 +10,14 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
-from umf_ros.core.errors import UmfError
+from umf_ros.core.errors import UmfError, one_line
 
 Task = TypeVar("Task")
 Done = Callable[[int], None]
 """Told how many tasks are done."""
 
 ATTEMPTS = 3
-"""So often a task may take its worker with it before it is given up: once is bad luck, or somebody's kill -9."""
+"""A task may end its worker so often before it is given up."""
 LOCAL = "local"
 
 
@@ -31,11 +31,11 @@ def spread(
     """Do all tasks, in any order. A worker that dies is replaced, and its task begun again.
 
     Args:
-        work: a function of a module, whose results are files; a task that was begun may be done again.
-        tasks: what it is called with.
-        workers: processes; with one, all is done here. With Ray the cluster says how many there are.
+        work: a function of a module, whose results are files.
+        tasks: its arguments, one each; `work` is called again with one whose worker died.
+        workers: processes; with one, all is done here. With Ray the cluster decides.
         ray: address of a cluster, whose machines see the same files and have this package; or `local`.
-        done: hears of every task that is done.
+        done: called with the number of tasks that are done.
 
     Raises:
         UmfError: a task failed, or took its workers with it time and again; the other tasks are not waited for.
@@ -97,7 +97,7 @@ def _by_ray(work: Callable[[Task], None], tasks: Sequence[Task], address: str, w
             _knock(address)
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (RayError, OSError, ValueError, RuntimeError) as error:
-        raise UmfError(f"no Ray cluster at {address}: {_line(error)}") from None
+        raise UmfError(f"no Ray cluster at {address}: {one_line(error)}") from None
     try:
         remote = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(work)
         pending = [remote.remote(task) for task in tasks]
@@ -110,7 +110,7 @@ def _by_ray(work: Callable[[Task], None], tasks: Sequence[Task], address: str, w
             raise UmfError(str(error.cause)) from None
         raise
     except RayError as error:
-        raise UmfError(f"Ray gave a task up: {_line(error)}") from None
+        raise UmfError(f"Ray gave a task up: {one_line(error)}") from None
     finally:
         ray.shutdown()
 
@@ -120,7 +120,3 @@ def _knock(address: str) -> None:
     host, _, port = address.rpartition("://")[2].partition(":")
     if port.isdigit():
         socket.create_connection((host, int(port)), 5).close()
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]

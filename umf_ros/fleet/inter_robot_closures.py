@@ -5,18 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
 
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Keyframe, LoopClosure
-from umf_ros.core.geometry import invert, relative, rotation_angle
+from umf_ros.core.geometry import Array, invert, relative, rotation_angle
 from umf_ros.fleet.link import Answer, FleetLink
 from umf_ros.places.store import KeyframeStore
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 
-"""Reason of a closure that verification accepted and that is not published yet."""
 APART_M = 8.0
 """Closures nearer to each other show one place and may share one error (*by hand*)."""
 REACH_M = 150.0
@@ -73,12 +73,12 @@ class FleetConsensus:
 
     def confirm(self, pair: InterRobotPair) -> list[InterRobotPair]:
         """Take a closure; returns the closures that are confirmed by it, itself included."""
-        agreeing = [other for other in self._pending if self.agree(pair, other)]
-        if not agreeing and not any(self.agree(pair, other) for other in self._confirmed):
+        agrees = [self.agree(pair, other) for other in self._pending]
+        if not any(agrees) and not any(self.agree(pair, other) for other in self._confirmed):
             self._pending = [*self._pending[-KEPT + 1 :], pair]
             return []
-        self._pending = [other for other in self._pending if not any(other is one for one in agreeing)]
-        new = [*agreeing, pair]
+        new = [*compress(self._pending, agrees), pair]
+        self._pending = list(compress(self._pending, np.logical_not(agrees)))
         self._confirmed = [*self._confirmed, *new][-KEPT:]
         return new
 
@@ -86,21 +86,24 @@ class FleetConsensus:
         """Whether the loop through two closures of different places and both odometries closes."""
         if one.query.session != other.query.session or one.match.session != other.match.session:
             return False
-        poses = one.query.odom_T_body, other.query.odom_T_body, one.match.odom_T_body, other.match.odom_T_body
-        query_one, query_other, match_one, match_other = poses
-        if query_one is None or query_other is None or match_one is None or match_other is None:
+        own_step, other_step = _step(one.query, other.query), _step(one.match, other.match)
+        if own_step is None or other_step is None:
             return False
-        own_step, other_step = relative(query_one, query_other), relative(match_one, match_other)
-        distances = [float(np.linalg.norm(step[:3, 3])) for step in (own_step, other_step)]
         path_m = abs(one.query.path_length_m - other.query.path_length_m)
         path_m += abs(one.match.path_length_m - other.match.path_length_m)
-        if min(distances) < APART_M or path_m > REACH_M:
+        if min(np.linalg.norm(step[:3, 3]) for step in (own_step, other_step)) < APART_M or path_m > REACH_M:
             return False
         predicted = invert(other_step) @ one.closure.match_T_query @ own_step
         gap = relative(predicted, other.closure.match_T_query)
-        most_m = SLACK_M + self._drift * path_m
-        most_rad = SLACK_RAD + DRIFT_RAD_PER_M * path_m
-        return bool(np.linalg.norm(gap[:3, 3]) < most_m and rotation_angle(gap) < most_rad)
+        is_near = np.linalg.norm(gap[:3, 3]) < SLACK_M + self._drift * path_m
+        return bool(is_near and rotation_angle(gap) < SLACK_RAD + DRIFT_RAD_PER_M * path_m)
+
+
+def _step(one: Keyframe, other: Keyframe) -> Array | None:
+    """The motion from one keyframe to another by their odometry."""
+    if one.odom_T_body is None or other.odom_T_body is None:
+        return None
+    return relative(one.odom_T_body, other.odom_T_body)
 
 
 class InterRobotMatcher:

@@ -12,8 +12,7 @@ from typing import NamedTuple
 from umf_ros.core.config import Database
 from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.fleet.server import FleetKey, FleetServer, LinkError
-from umf_ros.places.packing import unpack
-from umf_ros.places.store import KeyframeStore
+from umf_ros.places.store import KeyframeStore, unpack
 
 logger = logging.getLogger(__name__)
 
@@ -126,24 +125,23 @@ class FleetLink:
         if self._server is None:
             self._server = FleetServer(self._settings.server, self._store.store_id, self._identity)
             self.robot, self.connected, self.trouble = self._server.robot, True, ""
-        rows = self._store.outgoing(BATCH)
-        if rows:
+        if rows := self._store.outgoing(BATCH):
             self._server.push([self._store[row] for row in rows])
             self._store.delivered(rows)
             self.pushed += len(rows)
             return True
-        if self._asks and len(self._answers) < ANSWERS_KEPT:
-            self._asking = True
-            row = self._asks.popleft()
-            try:
-                self._ask(self._server, row)
-            except LinkError:
-                self._asks.appendleft(row)
-                raise
-            finally:
-                self._asking = False
-            return True
-        return False
+        if not self._asks or len(self._answers) >= ANSWERS_KEPT:
+            return False
+        self._asking = True
+        row = self._asks.popleft()
+        try:
+            self._ask(self._server, row)
+        except LinkError:
+            self._asks.appendleft(row)
+            raise
+        finally:
+            self._asking = False
+        return True
 
     def _ask(self, server: FleetServer, row: int) -> None:
         keyframe = self._store[row]

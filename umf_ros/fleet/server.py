@@ -16,7 +16,7 @@ from psycopg import Connection, sql
 
 from umf_ros.core.errors import UmfError, one_line
 from umf_ros.core.frames import Keyframe
-from umf_ros.places.packing import pack
+from umf_ros.places.store import pack
 
 ROVERS = "umf_rover"
 """Role of all rovers: its members read every row and add rows of their own name."""
@@ -60,13 +60,8 @@ _DATA = "SELECT data FROM place_data WHERE robot = %s AND store = %s AND session
 def migrate(connection: Connection, embedder: str, dimension: int) -> tuple[int, int]:
     """Bring the tables up to date in one transaction; returns the version before and after.
 
-    Args:
-        connection: of a user who may create roles and tables.
-        embedder: the network of the fleet, for new tables.
-        dimension: numbers per descriptor, for new tables.
-
-    Raises:
-        UmfError: a later version of umf_ros made the tables.
+    The connection is of a user who may create roles and tables; new tables are for descriptors of this embedder with
+    so many numbers. An `UmfError` says that a later version of umf_ros made the tables.
     """
     with connection.transaction():
         # a second administrator waits here, and finds nothing to do
@@ -88,13 +83,7 @@ def migrate(connection: Connection, embedder: str, dimension: int) -> tuple[int,
 
 
 def add_rover(connection: Connection, name: str, password: str) -> None:
-    """Add a rover, or change its password. The server receives the password's verifier only.
-
-    Args:
-        connection: of a user who may create roles.
-        name: of the rover, its role and its rows.
-        password: new password.
-    """
+    """Add a rover, its role and its name for rows, or change its password; the server gets the verifier only."""
     verifier = connection.pgconn.encrypt_password(password.encode(), name.encode(), b"scram-sha-256").decode()
     known = connection.execute("SELECT 1 FROM pg_roles WHERE rolname = %s", (name,)).fetchone()
     verb = sql.SQL("ALTER ROLE" if known else "CREATE ROLE")

@@ -1,1 +1,1 @@
-"""What makes and judges the runtime: simulation, data sets, training, evaluation, playing to the live nodes."""
+"""Tools that make and judge the runtime: simulation, data sets, training, evaluation, playing to the live nodes."""

@@ -16,9 +16,9 @@ import numpy as np
 
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.io import write_atomically
 from umf_ros.places.database import PLACES_OF_MAP
 from umf_ros.runs.run_file import RunFile, StoredOdometry
-from umf_ros.runs.writer import write_atomically
 
 SCHEMA_VERSION = 1
 BETWEEN = "closures_between.csv"
@@ -72,29 +72,23 @@ class MapFolder:
     @classmethod
     def open(cls, path: Path) -> MapFolder:
         """Open an existing map."""
-        folder = cls(path)
-        if not folder.exists:
+        if not (path / "map.json").is_file():
             raise UmfError(f"{path} holds no map: map.json is missing (umf map makes one)")
+        folder = cls(path)
         folder._read()
         return folder
 
     @classmethod
     def open_or_create(cls, path: Path, settings: Settings) -> MapFolder:
         """Open an existing map, or create one with these settings."""
+        if (path / "map.json").is_file():
+            return cls.open(path)
         folder = cls(path)
-        if folder.exists:
-            folder._read()
-            return folder
         with writing(f"to {path}"):
             path.mkdir(parents=True, exist_ok=True)
         write_atomically(path / "config.yaml", dump_settings(settings))
         folder._write()
         return folder
-
-    @property
-    def exists(self) -> bool:
-        """Whether the folder holds a map."""
-        return (self.path / "map.json").is_file()
 
     @property
     def settings(self) -> Settings:
@@ -125,7 +119,7 @@ class MapFolder:
     def knows(self, recording: dict[str, Any]) -> MapSession | None:
         """The session of a recording, whatever the path of its file."""
         keys = "start_ns", "end_ns", "messages"
-        same = (s for s in self.sessions if all(s.recording[key] == recording[key] for key in keys))
+        same = (one for one in self.sessions if all(one.recording[key] == recording[key] for key in keys))
         return next(same, None)
 
     def free_name(self, path: Path, promised: Collection[str] = ()) -> str:

@@ -5,6 +5,8 @@ Three steps, each a function of files alone, so that the first two can run on an
 1. `replay_session`: one recording becomes a run folder with its own place database;
 2. `match_session`: closures between a recording and the earlier ones;
 3. `umf_ros.maps.joint_graph.solve`: one graph of all sessions.
+
+A recording or map that cannot be read raises an `UmfError`, a folder that cannot be written an `OutputError`.
 """
 
 from __future__ import annotations
@@ -22,7 +24,6 @@ from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.config import Database, Settings
 from umf_ros.core.errors import BagError, writing
-from umf_ros.core.frames import Keyframe
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
@@ -58,32 +59,23 @@ class Opening:
     odometry_frame: str = "body"
 
     def settings(self, bag: Bag) -> Settings:
-        """Settings for a recording.
-
-        Raises:
-            UmfError: they are wrong, or the recording's data set is unknown.
-        """
+        """Settings for a recording."""
         overrides = {"embedding__method": self.embedder, "embedding__weights": self.weights}
         return settings_for(bag, self.config, self.dataset, mode="mapping", **overrides)
 
     def odometry_of(self, recording: Path, settings: Settings) -> Trajectory | None:
-        """The odometry of a recording from its TUM file; None where there is none.
-
-        Raises:
-            BagError: the file is damaged, or its frame is unknown.
-        """
-        folder = self.odometry
-        paths = [folder / f"{recording.stem}{ending}" for ending in (".tum", ".odometry.tum")] if folder else []
-        path = next((path for path in paths if path.is_file()), None)
-        return None if path is None else read_odometry(path, self.odometry_frame, settings)
+        """The odometry of a recording from its TUM file; None where there is none."""
+        if self.odometry is None:
+            return None
+        for ending in (".tum", ".odometry.tum"):
+            path = self.odometry / f"{recording.stem}{ending}"
+            if path.is_file():
+                return read_odometry(path, self.odometry_frame, settings)
+        return None
 
 
 def find_recordings(paths: list[Path]) -> list[Path]:
-    """The recordings among files and folders, those of a folder sorted by name.
-
-    Raises:
-        BagError: a path is missing, or a folder holds no recording.
-    """
+    """The recordings among files and folders, those of a folder sorted by name; each path must hold one."""
     found = []
     for path in paths:
         if not path.exists():
@@ -107,9 +99,6 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
         opening: options.
         folder: becomes a run folder with `places.sqlite`, stamped by the recording's own clock.
         on_frame: called for every frame.
-
-    Raises:
-        UmfError: the recording cannot be read, or the folder cannot be written.
     """
     bag = open_bag(recording)
     settings = opening.settings(bag)
@@ -148,11 +137,7 @@ def _track(folder: Path, settings: Settings) -> None:
 def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
     """Add the run folder of a recording to the map: its places move to the map's store, on the map's clock.
 
-    Places that a killed process left behind are removed first.
-
-    Raises:
-        UmfError: the recording was embedded by another network than the earlier ones.
-        OutputError: the map cannot be written.
+    Places that a killed process left behind are removed first. All recordings must be embedded by one network.
     """
     run = target.folder_of(name)
     bag = open_bag(recording)
@@ -165,8 +150,9 @@ def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
             odometry = target.odometry_of(name)
             span = [*stamps, *(one.stamp_ns for one in odometry)]
             shift_ns = target.shift_for(min(span))
-            for keyframe in known:
-                places.add(_moved(keyframe, shift_ns, first_number))
+            for one in known:
+                stamp_ns, number = one.stamp_ns + shift_ns, one.session + first_number
+                places.add(replace(one, stamp_ns=stamp_ns, session=number))
         session = MapSession(
             name=name,
             recording=describe_recording(bag),
@@ -191,10 +177,6 @@ def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Hypot
 
     Writes `closures_between.csv`, complete or not at all. The map's store is only read: several sessions may be
     matched at once.
-
-    Raises:
-        UmfError: the map's store cannot be read.
-        OutputError: the table cannot be written.
     """
     settings = target.settings
     rows = range(session.first_place, session.first_place + session.places)
@@ -218,11 +200,9 @@ def replay_task(task: tuple[Path, Opening, Path]) -> None:
     replay_session(*task)
 
 
-def match_task(task: tuple[Path, str]) -> None:
-    """`match_session` as a task of another process, given the folder of the map and the name of the session."""
-    target = MapFolder.open(task[0])
-    session = next(one for one in target.sessions if one.name == task[1])
-    for _ in match_session(target, session):
+def match_task(task: tuple[Path, MapSession]) -> None:
+    """`match_session` as a task of another process, given the folder of the map."""
+    for _ in match_session(MapFolder.open(task[0]), task[1]):
         pass
 
 
@@ -242,17 +222,9 @@ def _discard_unfinished(target: MapFolder) -> None:
 
 
 def open_places(path: Path) -> PlaceDatabase:
-    """Open a place database of any embedder for reading.
-
-    Raises:
-        UmfError: it cannot be read.
-    """
+    """Open a place database of any embedder for reading."""
     return PlaceDatabase(Database(path=str(path)), *stored_identity(path), read_only=True)
 
 
 def _create(path: Path, embedder: str, dimension: int) -> PlaceDatabase:
     return PlaceDatabase(Database(path=str(path)), embedder, dimension)
-
-
-def _moved(keyframe: Keyframe, shift_ns: int, number: int) -> Keyframe:
-    return replace(keyframe, stamp_ns=keyframe.stamp_ns + shift_ns, session=keyframe.session + number)

@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from umf_ros.core.errors import writing
-from umf_ros.core.io import atomic_write
+from umf_ros.core.io import atomic_write, write_atomically
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.localizer import POSES
 from umf_ros.maps.joint_graph import JointMap, JointSession
@@ -23,15 +23,10 @@ from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.g2o import verdict_table
 from umf_ros.runs.gallery import data_address
 from umf_ros.runs.report import plot_trajectories, render
-from umf_ros.runs.writer import write_atomically
 
 
 def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
-    """Write all results of a solved map; returns the summary.
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
+    """Write all results of a solved map; returns the summary."""
     path = folder.path
     _write_poses(path / POSES, joint)
     trajectories = path / "trajectories"
@@ -69,11 +64,8 @@ def summarise(joint: JointMap) -> dict[str, Any]:
 
 def sentence(summary: dict[str, Any]) -> str:
     """Joined sessions and closures between them, in one sentence."""
-    between, joined = summary["closures_between"], summary["joined"]
-    return (
-        f"{joined} of {len(summary['sessions'])} sessions in one frame; closures between them: "
-        f"{between['accepted']} of {between['found']} accepted"
-    )
+    between, joined = summary["closures_between"], f"{summary['joined']} of {len(summary['sessions'])} sessions"
+    return f"{joined} in one frame; closures between them: {between['accepted']} of {between['found']} accepted"
 
 
 def crispness(summary: dict[str, Any]) -> str:

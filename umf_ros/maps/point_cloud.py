@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,9 +65,18 @@ class MapCloud:
 def gather(folder: MapFolder, joint: JointMap, optimised: bool = True) -> MapCloud:
     """The scans of all joined recordings at their poses in the map, or at those of their odometry alone."""
     points, sessions = [np.empty((0, 3), np.float32)], [np.empty(0, np.uint8)]
-    for number, scan in _scans(folder, joint, optimised):
-        points.append(scan)
-        sessions.append(np.full(len(scan), number % 256, np.uint8))
+    with closing(PlaceDatabase.of_map(folder.path, *stored_identity(folder.places))) as places:
+        for number, one in enumerate(joint.sessions):
+            poses = one.poses
+            if len(poses) and not optimised:
+                poses = poses[0] @ invert(one.odometry[0]) @ one.odometry
+            known = dict(zip((one.stamps + one.session.shift_ns).tolist(), poses, strict=True))
+            for row in range(one.session.first_place, one.session.first_place + one.session.places):
+                keyframe = places[row]
+                if keyframe.stamp_ns in known:
+                    near = keyframe.points[np.linalg.norm(keyframe.points, axis=1) < REACH_M]
+                    points.append(transform(known[keyframe.stamp_ns], near))
+                    sessions.append(np.full(len(near), number % 256, np.uint8))
     return MapCloud(np.concatenate(points), np.concatenate(sessions))
 
 
@@ -77,10 +85,6 @@ def write_cloud(folder: MapFolder, joint: JointMap) -> tuple[float, float]:
 
     Returns:
         Thickness of surfaces in m by the odometry of every session alone, and by the joint graph.
-
-    Raises:
-        OutputError: a file cannot be written.
-        UmfError: the map's places cannot be read.
     """
     cloud = gather(folder, joint)
     thin = cloud.thinned()
@@ -98,11 +102,7 @@ def write_cloud(folder: MapFolder, joint: JointMap) -> tuple[float, float]:
 
 
 def write_ply(path: Path, cloud: MapCloud) -> None:
-    """Write a binary PLY file of x, y, z and session.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write a binary PLY file of x, y, z and session."""
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud.points)}\nproperty float x\n"
         "property float y\nproperty float z\nproperty uchar session\nend_header\n"
@@ -111,11 +111,7 @@ def write_ply(path: Path, cloud: MapCloud) -> None:
 
 
 def write_pcd(path: Path, cloud: MapCloud) -> None:
-    """Write a binary PCD file of x, y, z and session.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write a binary PCD file of x, y, z and session."""
     count = len(cloud.points)
     header = (
         "VERSION 0.7\nFIELDS x y z session\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 1\n"
@@ -130,20 +126,3 @@ def _write(path: Path, header: str, cloud: MapCloud) -> None:
     records["session"] = cloud.sessions
     with atomic_write(path) as part:
         part.write_bytes(header.encode("ascii") + records.tobytes())
-
-
-def _scans(folder: MapFolder, joint: JointMap, optimised: bool) -> Iterator[tuple[int, Points]]:
-    """Number of the recording and (N, 3) points in the map's frame, keyframe by keyframe."""
-    identity = stored_identity(folder.places)
-    with closing(PlaceDatabase.of_map(folder.path, *identity)) as places:
-        for number, one in enumerate(joint.sessions):
-            poses = one.poses
-            if len(poses) and not optimised:
-                poses = poses[0] @ invert(one.odometry[0]) @ one.odometry
-            known = dict(zip((one.stamps + one.session.shift_ns).tolist(), poses, strict=True))
-            for row in range(one.session.first_place, one.session.first_place + one.session.places):
-                keyframe = places[row]
-                pose = known.get(keyframe.stamp_ns)
-                if pose is not None:
-                    near = keyframe.points[np.linalg.norm(keyframe.points, axis=1) < REACH_M]
-                    yield number, transform(pose, near)

@@ -31,8 +31,8 @@ STATIC_QOS = latched(100)
 """Every broadcaster of static transforms has its own part of the tree."""
 WATCH_S = 1.0
 HEARTBEAT_S = 0.05
-CLOCK_PATIENCE_S = 10.0
-"""A player that starts beside the node takes so long at most."""
+CLOCK_PATIENCE_S = 30.0
+"""A player that starts beside the node, and waits for the other one, takes so long at most on a busy machine."""
 SIM_TIME_SILENT = "use_sim_time is set, but nothing comes on /clock: stamps of messages count, the pose's age does not"
 
 
@@ -56,8 +56,7 @@ class BaseNode(LifecycleNode, ABC):
         self._results = own["results_dir"]
         self._watches: list[InputWatch] = []
         self._own: list[Any] = []
-        self._faults: Counter[str] = Counter()
-        self._last_fault = ""
+        self._faults, self._last_fault = Counter[str](), ""
         self._throttle = Throttle()
         self._clockless_s = 0.0
         self._active = self._opened = self._leaving = False
@@ -123,7 +122,7 @@ class BaseNode(LifecycleNode, ABC):
         """
         self._leaving = True
         if self._opened and rclpy.ok(context=self.context):
-            self.trigger_shutdown()  # who waits for our last words hears when they begin and when all are said
+            self.trigger_shutdown()  # listeners hear when the last messages begin and when they are out
         self._close()
         error, self._unwritten = self._unwritten, None
         if error is not None:
@@ -184,11 +183,13 @@ class BaseNode(LifecycleNode, ABC):
     def _watch(self) -> None:
         if not self._opened:
             return
+        self._clockless_s = self._clockless_s + WATCH_S if self._lacks_clock() else 0.0
+        for watch in self._watches if 0 < self._clockless_s < CLOCK_PATIENCE_S else ():
+            watch.begin()  # the player is still starting: its topics are silent for that reason alone
         self._tick()
         for watch in self._watches:
             if watch.warning and self._throttle.lets_pass(f"input {watch.name}", 30.0):
                 self.get_logger().warning(watch.warning)
-        self._clockless_s = self._clockless_s + WATCH_S if self._lacks_clock() else 0.0
         if self._clockless_s >= CLOCK_PATIENCE_S and self._throttle.lets_pass("clock", 30.0):
             self.get_logger().warning(SIM_TIME_SILENT)
 

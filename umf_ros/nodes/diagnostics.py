@@ -89,6 +89,10 @@ class InputWatch:
         self._born_s = time.monotonic()  # not the bag's clock: silence is silence even when /clock stands still
         self._window: tuple[float, int, int] = (self._born_s, 0, 0)
 
+    def begin(self) -> None:
+        """Wait for the first message from now on."""
+        self._born_s = time.monotonic()
+
     def saw(self, stamp_ns: int) -> None:
         """Count one message."""
         self.received += 1

@@ -1,4 +1,4 @@
-"""What `ros2 launch` asks before it starts anything. The system's Python runs it: nothing but YAML is imported."""
+"""Checks of `ros2 launch` before it starts anything. The system's Python runs it: nothing but YAML is imported."""
 
 from __future__ import annotations
 
@@ -14,11 +14,7 @@ PARAMETERS = "ros__parameters"
 
 
 def check_parameter_file(path: Path, nodes: Sequence[str]) -> None:
-    """See to it that a parameter file says something to at least one node: ROS passes over what it cannot place.
-
-    Args:
-        path: the file.
-        nodes: full names, such as `/red/loop_closure_node`.
+    """Check that a parameter file has a section for one of the nodes (full names): ROS ignores all others.
 
     Raises:
         ConfigError: there is no such file, it is no YAML, or nothing in it is for any of the nodes.

@@ -1,4 +1,4 @@
-"""The live front-end: sensor topics in, loop closures out. Thin: every decision is the core's."""
+"""The live front-end: sensor topics in, loop closures out."""
 
 from __future__ import annotations
 
@@ -51,14 +51,9 @@ if TYPE_CHECKING:
 
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
 INTAKE_QUEUE = 400
-MESSAGE_TYPES = {
-    "left_image": Image,
-    "right_image": Image,
-    "left_info": CameraInfo,
-    "right_info": CameraInfo,
-    "cloud": PointCloud2,
-    "odometry": Odometry,
-}
+MESSAGE_TYPES = {"cloud": PointCloud2, "odometry": Odometry}
+MESSAGE_TYPES |= dict.fromkeys(("left_image", "right_image"), Image)
+MESSAGE_TYPES |= dict.fromkeys(("left_info", "right_info"), CameraInfo)
 
 
 class LoopClosureNode(BaseNode):
@@ -78,20 +73,21 @@ class LoopClosureNode(BaseNode):
         self._detector = LoopDetector(settings, embedder)
         self._synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(topics), warn)
         transforms = StaticTransforms()
-        self._odometry_frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
-        mounting = (
-            TfExtrinsics(calibration, transforms, settings.frames.base, warn) if settings.uses_transforms else None
+        self._odometry_frames = frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
+        mounting = TfExtrinsics(calibration, transforms, settings.frames.base, warn)
+        self._router = MessageRouter(
+            self._synchronizer,
+            topics,
+            warn,
+            mounting=mounting if settings.uses_transforms else None,
+            odometry_frames=frames,
         )
-        frames = self._odometry_frames
-        self._intake = MessageRouter(self._synchronizer, topics, warn, mounting=mounting, odometry_frames=frames)
-        folder = Path(self._results)
-        self._recorder = RunRecorder(folder, settings, embedder.name) if self._results else None
-        self._announcer = ClosurePublisher(self, settings.frames)
+        self._recorder = RunRecorder(Path(self._results), settings, embedder.name) if self._results else None
+        self._publisher = ClosurePublisher(self, settings.frames)
         self._lock = threading.Lock()
         self._paused = False
         self._wanted: Settings | None = None
-        self._closures = 0
-        self._between = 0
+        self._closures = self._between = 0
         self._last: Detection | None = None
         self._worker: Worker[Frame] = Worker(self._detect, self._complain, settings.worker.queue_size)
         self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._complain, 1)
@@ -113,7 +109,7 @@ class LoopClosureNode(BaseNode):
             self._worker.submit(frame)
         self._worker.close(timeout_s=30.0)
         self._writer.close()
-        self._announcer.wait_until_heard()
+        self._publisher.wait_until_heard()
         try:
             self._write_summary()
             if self._recorder is not None:
@@ -129,7 +125,7 @@ class LoopClosureNode(BaseNode):
             self._decoder.submit((topic, message))
 
     def _take(self, item: tuple[str, Any]) -> None:
-        self._intake.take(*item)
+        self._router.take(*item)
         for frame in self._synchronizer.pop():
             self._worker.submit(frame)
 
@@ -139,11 +135,11 @@ class LoopClosureNode(BaseNode):
             if wanted is not None:
                 self._detector.retune(wanted)
             detection = self._detector.process(frame)
-            # before anybody forgets them
+            # before the database forgets them
             matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
         self._last = detection
-        self._announcer.odom = self._odometry_frames.odom
-        self._announcer.announce(detection, matches)
+        self._publisher.odom = self._odometry_frames.odom
+        self._publisher.announce(detection, matches)
         for closure in detection.closures:
             self._closures += 1
             self.get_logger().info(describe(self._closures, closure))
@@ -154,14 +150,10 @@ class LoopClosureNode(BaseNode):
         with self._lock:
             inter_closure = self._detector.meet()
         if inter_closure is not None:
-            self._meet(inter_closure)
-
-    def _meet(self, inter_closure: InterRobotClosure) -> None:
-        """Tell of the closures with another rover of the fleet."""
-        self._announcer.announce_encounter(inter_closure)
-        self._between += len(inter_closure.closures)
-        if self._recorder is not None:
-            self._recorder.record_encounter(inter_closure)
+            self._publisher.announce_encounter(inter_closure)
+            self._between += len(inter_closure.closures)
+            if self._recorder is not None:
+                self._recorder.record_encounter(inter_closure)
 
     def _drops(self) -> dict[str, int]:
         return count_drops(self._synchronizer.counters, self._worker.dropped + self._decoder.dropped)
@@ -192,17 +184,17 @@ class LoopClosureNode(BaseNode):
             **_counts(self._synchronizer),
             **self._fleet(),
         }
-        text = f"{self._closures} closures among {len(self._detector.database)} places"
+        level, text = OK, f"{self._closures} closures among {len(self._detector.database)} places"
         if self._paused:
-            return status(WARN, "detector", "paused", values)
-        if self._cannot_write:
-            return status(ERROR, "detector", text, values)
-        if self._worker.dropped or self._decoder.dropped:
-            return status(WARN, "detector", "too slow: messages are being dropped", values)
-        return status(OK, "detector", text, values)
+            level, text = WARN, "paused"
+        elif self._cannot_write:
+            level = ERROR
+        elif self._worker.dropped or self._decoder.dropped:
+            level, text = WARN, "too slow: messages are being dropped"
+        return status(level, "detector", text, values)
 
     def _fleet(self) -> dict[str, Any]:
-        """How the fleet's server is doing, where there is one."""
+        """State of the link to the fleet's server, where there is one."""
         if self._detector.inter_robot is None:
             return {}
         link = self._detector.inter_robot.link

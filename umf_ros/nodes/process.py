@@ -26,20 +26,16 @@ Item = TypeVar("Item")
 
 
 class Worker(Generic[Item]):
-    """Runs `work(item)` in a thread of its own, so that whoever submits never waits.
+    """Runs `work(item)` in a thread of its own, so that `submit` never waits.
 
-    When the queue is full the oldest waiting item is dropped and counted. An exception in `work`
-    is handed to `on_error` and the thread goes on.
+    When the queue is full the oldest waiting item is dropped and counted. Exceptions of `work` go to `on_error`.
     """
 
     def __init__(self, work: Callable[[Item], None], on_error: Callable[[Exception], None], queue_size: int) -> None:
-        self._work = work
-        self._on_error = on_error
-        self._queue_size = queue_size
+        self._work, self._on_error, self._queue_size = work, on_error, queue_size
         self._queue: deque[Item] = deque()
         self._wake = threading.Condition()
-        self._closing = False
-        self._busy = False
+        self._closing = self._busy = False
         self.dropped = 0
         self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
         self._thread.start()
@@ -109,9 +105,11 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     """
     # a thread that comes back from a library waits this long for another that computes in Python: it comes back often
     sys.setswitchinterval(SWITCH_S)
-    _share_memory()
+    with suppress(OSError, AttributeError):
+        # two heaps for all threads: glibc gives each its own, and memory that one frees another cannot use
+        ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
     asked: list[int] = []
-    # our own handlers, before anything else: rclpy's would shut the context down before the node's last words
+    # before anything else: rclpy's handlers would shut the context down before the node's last words
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: asked.append(number))
     try:
@@ -129,8 +127,10 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
         with watchdog.watching():
             while not asked and rclpy.ok():
                 _spin_once(node, executor, 0.2)
-                watchdog.feed()
-            _wait_until_ready(node, executor, asked)
+            ready: Callable[[], bool] = getattr(node, "ready_to_close", lambda: True)
+            deadline, first = time.monotonic() + LONGEST_WAIT_S, len(asked)
+            while not ready() and len(asked) == first and time.monotonic() < deadline and rclpy.ok():
+                _spin_once(node, executor, 0.05)
     except ExternalShutdownException:
         pass
     finally:
@@ -168,16 +168,9 @@ def leave(status: int) -> NoReturn:
     os._exit(status)
 
 
-def _wait_until_ready(node: Node, executor: SingleThreadedExecutor, asked: list[int]) -> None:
-    ready: Callable[[], bool] = getattr(node, "ready_to_close", lambda: True)
-    deadline, first = time.monotonic() + LONGEST_WAIT_S, len(asked)
-    while not ready() and len(asked) == first and time.monotonic() < deadline and rclpy.ok():
-        _spin_once(node, executor, 0.05)
-        watchdog.feed()
-
-
 def _spin_once(node: Node, executor: SingleThreadedExecutor, timeout_s: float) -> None:
-    """Let the executor work; whatever leaves a callback, ours or one of the library's own, does not end the node."""
+    """Let the executor work; no exception of a callback, the library's own included, ends the node."""
+    watchdog.feed()
     try:
         executor.spin_once(timeout_sec=timeout_s)
     except ExternalShutdownException:
@@ -186,12 +179,6 @@ def _spin_once(node: Node, executor: SingleThreadedExecutor, timeout_s: float) -
         node.get_logger().error(f"{type(error).__name__}: {one_line(error)}; the node goes on")
 
 
-def _share_memory() -> None:
-    """Let all threads take memory from two heaps: glibc gives each its own, and what one let go another cannot use."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
-
-
 def complain(error: UmfError) -> None:
-    """Tell an error as the command line does: one line on stderr."""
+    """Report an error as the command line does: one line on stderr."""
     sys.stderr.write(f"umf: {error}\n")

@@ -9,12 +9,9 @@ from importlib import import_module
 
 
 def start(module: str) -> None:
-    """Load the module of a node and run its `main`; a signal that comes before it can be heard ends the process, as 0.
+    """Load the module of a node and run its `main`; a signal that comes meanwhile ends the process with status 0.
 
-    What is not installed is one line on stderr and status 1.
-
-    Args:
-        module: its name.
+    A missing package is one line on stderr and status 1.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))  # nothing is made yet that could be lost

@@ -37,18 +37,14 @@ PLACES_OF_MAP = "places.sqlite"
 class PlaceDatabase:
     """Keyframes of all sessions by index, and the search among their descriptors.
 
-    Keyframes are only added. Beside a large file lies `<path>.faiss`, the index; it is built again where it is missing
-    or does not match the store.
+    Keyframes are only added. Beside a large file lies `<path>.faiss`, the index of their descriptors; it is built again
+    where it is missing or does not match the store.
 
     Args:
         settings: where to keep the keyframes.
         embedder: name of the embedder; a stored database of another one is refused.
         dimension: numbers per descriptor.
         read_only: only read the file; another process may write it.
-
-    Attributes:
-        store: the keyframes.
-        index: of their descriptors.
 
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use.
@@ -146,11 +142,7 @@ class PlaceDatabase:
         return [Candidate(row, int(stamps[row]), similarity) for row, similarity in chosen]
 
     def save(self, path: Path) -> None:
-        """Write a copy of the keyframes to `path`.
-
-        Raises:
-            OutputError: the copy cannot be written.
-        """
+        """Write a copy of the keyframes to `path`."""
         self.store.save(path)
 
     def close(self) -> None:

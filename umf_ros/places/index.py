@@ -83,18 +83,12 @@ class PlaceIndex:
 
     def descriptors(self, rows: Rows) -> Descriptors:
         """(N, D) descriptors of some rows, in half precision."""
-        found: Descriptors = self._flat.reconstruct_batch(rows)
-        return found
+        return np.asarray(self._flat.reconstruct_batch(rows))
 
     def search(self, descriptor: Descriptors, count: int, admissible: Admissible) -> Rows:
-        """Rows of the most similar descriptors, best first.
+        """Rows of the `count` descriptors that are most similar to a unit vector (D,), best first.
 
         A large index is searched through its shortlist, and exhaustively where too few of the list are admissible.
-
-        Args:
-            descriptor: (D,) unit vector.
-            count: how many rows at most.
-            admissible: selects the rows that may be returned.
         """
         if not self.is_exact:
             with _one_thread():
@@ -113,15 +107,10 @@ class PlaceIndex:
             selector = faiss.IDSelectorBitmap(np.packbits(admissible(slice(None)), bitorder="little"))
             rules = faiss.SearchParameters(sel=selector)
             _, found = self._flat.search(descriptor[None], min(count, len(self)), params=rules)
-        rows: Rows = found[0][found[0] >= 0]
-        return rows
+        return np.asarray(found[0][found[0] >= 0])
 
     def save(self, path: Path) -> None:
-        """Write the index to a file for `load`.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Write the index to a file for `load`."""
         with atomic_write(path, RuntimeError) as part, _one_thread() as faiss:
             faiss.write_index(self._index, str(part))
 

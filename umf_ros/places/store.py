@@ -1,4 +1,4 @@
-"""Durable storage of keyframes in SQLite, and the sessions of a stored database."""
+"""Durable storage of keyframes in SQLite, each as safetensors without loss, and the sessions of a stored database."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 from uuid import UUID
@@ -15,11 +16,11 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
+from safetensors.numpy import load, save
 
 from umf_ros.core.errors import UmfError
-from umf_ros.core.frames import Keyframe
+from umf_ros.core.frames import Embedding, Keyframe, LocalFeatures, ScanMotion, StereoCamera, SuperFeatures
 from umf_ros.core.io import Schema, SqliteFile
-from umf_ros.places.packing import pack, unpack
 
 SCHEMA = Schema(
     "place database",
@@ -51,6 +52,15 @@ OUTBOX = Schema(
     unversioned=lambda tables: int({"fleet", "outbox"} <= tables),
 )
 LARGEST_NUMBER = 2**53
+MOTION = "motion"
+FEATURES: dict[str, type[LocalFeatures] | type[SuperFeatures]] = {
+    "image": LocalFeatures,
+    "cloud": LocalFeatures,
+    "super_image": SuperFeatures,
+    "super_cloud": SuperFeatures,
+}
+_SHAPES = {"points": (3,), "body_T_camera": (4, 4), "body_T_lidar": (4, 4), "odom_T_body": (4, 4)}
+"""Ends of the shapes of what geometry is done with."""
 _KEYS = np.dtype([("id", np.int64), ("stamp_ns", np.int64), ("session", np.int64), ("travelled_m", np.float64)])
 
 
@@ -67,12 +77,8 @@ class KeyframeStore:
         read_only: the file must exist and is only read; another process may write it.
         outgoing: whether every keyframe has to be sent to a fleet's server.
 
-    Attributes:
-        path: the file, or None.
-        read_only: as above.
-
     Raises:
-        UmfError: the file is no place database, belongs to another embedder, or is in use.
+        UmfError: the file is no place database, belongs to another embedder, or is in use; any method: it is damaged.
         OutputError: the file cannot be written.
     """
 
@@ -107,11 +113,7 @@ class KeyframeStore:
         return self._keys[: self._count]
 
     def __getitem__(self, index: int) -> Keyframe:
-        """The keyframe of an index.
-
-        Raises:
-            UmfError: the file is damaged.
-        """
+        """The keyframe of an index."""
         row = int(self.keys["id"][index])
         with self._lock:
             if row not in self._cache:
@@ -120,11 +122,7 @@ class KeyframeStore:
             return self._cache[row]
 
     def descriptors(self, rows: NDArray[np.intp]) -> NDArray[np.float32]:
-        """(N, D) float32 descriptors of some indices, 30,000 at most, in their order.
-
-        Raises:
-            UmfError: the file is damaged.
-        """
+        """(N, D) float32 descriptors of some indices, 30,000 at most, in their order."""
         ids = self.keys["id"][rows].tolist()
         statement = f"SELECT id, descriptor FROM keyframe WHERE id IN ({','.join('?' * len(ids))})"
         with self._reading() as connection:
@@ -133,19 +131,11 @@ class KeyframeStore:
             return np.frombuffer(content, np.float32).reshape(len(ids), self._dimension)
 
     def rows_at(self, stamp_ns: int) -> list[int]:
-        """Indices of the keyframes of a stamp, in order.
-
-        Raises:
-            UmfError: the file is damaged.
-        """
+        """Indices of the keyframes of a stamp, in order."""
         return self._rows("SELECT id FROM keyframe WHERE stamp_ns = ? ORDER BY id", stamp_ns)
 
     def add(self, keyframe: Keyframe) -> int:
-        """Append a keyframe and return its index.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Append a keyframe and return its index."""
         with self._lock:
             row = int(self.keys["id"][-1]) + 1 if len(self) else 1
             key = row, keyframe.stamp_ns, keyframe.session, keyframe.path_length_m
@@ -178,21 +168,13 @@ class KeyframeStore:
             return int(connection.execute("SELECT count(*) FROM outbox JOIN keyframe USING (id)").fetchone()[0])
 
     def delivered(self, rows: Sequence[int]) -> None:
-        """Remove keyframes that the fleet's server has from the outbox.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Remove keyframes that the fleet's server has from the outbox."""
         ids = [(one,) for one in self.keys["id"][list(rows)].tolist()]
         with self._lock, self._file.writing() as connection:
             connection.executemany("DELETE FROM outbox WHERE id = ?", ids)
 
     def save(self, path: Path) -> None:
-        """Write a copy to `path` while the store stays in use.
-
-        Raises:
-            OutputError: the copy cannot be written.
-        """
+        """Write a copy to `path` while the store stays in use."""
         with self._lock:
             self._file.copy(path)
 
@@ -224,6 +206,62 @@ class KeyframeStore:
             yield connection
 
 
+def pack(keyframe: Keyframe) -> bytes:
+    """All of a keyframe in one safetensors blob."""
+    embedding = keyframe.embedding
+    arrays: dict[str, Any] = {
+        "stamp_session": np.array([keyframe.stamp_ns, keyframe.session], np.int64),
+        "camera": np.array(astuple(keyframe.camera), np.float64),
+        "body_T_camera": keyframe.body_T_camera,
+        "body_T_lidar": keyframe.body_T_lidar,
+        "points": keyframe.points,
+        "travelled_m": np.array([keyframe.path_length_m]),
+        "descriptor": embedding.descriptor,
+    }
+    if keyframe.odom_T_body is not None:
+        arrays["odom_T_body"] = keyframe.odom_T_body
+    groups = {group: getattr(embedding, group) for group in FEATURES} | {MOTION: keyframe.motion}
+    for group, found in groups.items():
+        if found is not None:
+            arrays |= {f"{group}.{item.name}": getattr(found, item.name) for item in fields(found)}
+    return save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
+
+
+def unpack(blob: bytes) -> Keyframe:
+    """The keyframe that `pack` was given.
+
+    Raises:
+        SafetensorError, ValueError, LookupError, TypeError: they are other bytes.
+    """
+    arrays = load(blob)
+    for name, shape in _SHAPES.items():
+        found = arrays.get(name)
+        if found is not None and (found.shape[-len(shape) :] != shape or not np.isfinite(found).all()):
+            raise ValueError(f"{name} is not what it should be")
+    stamp_ns, session = (int(number) for number in arrays["stamp_session"])
+    width, height, *rest = (float(number) for number in arrays["camera"])
+    features = {group: _group(arrays, group, kind) for group, kind in FEATURES.items()}
+    return Keyframe(
+        stamp_ns=stamp_ns,
+        embedding=Embedding(arrays["descriptor"], **features),
+        camera=StereoCamera(int(width), int(height), *rest),
+        body_T_camera=arrays["body_T_camera"],
+        body_T_lidar=arrays["body_T_lidar"],
+        points=arrays["points"],
+        odom_T_body=arrays.get("odom_T_body"),
+        path_length_m=float(arrays["travelled_m"][0]),
+        session=session,
+        motion=_group(arrays, MOTION, ScanMotion),
+    )
+
+
+def _group(arrays: dict[str, Any], group: str, kind: Any) -> Any:
+    names = [item.name for item in fields(kind)]
+    if f"{group}.{names[0]}" not in arrays:
+        return None
+    return kind(**{name: arrays[f"{group}.{name}"] for name in names})
+
+
 class StoredSession(NamedTuple):
     """A session of a place database: its number, number of keyframes, first and last stamp in ns."""
 
@@ -234,44 +272,28 @@ class StoredSession(NamedTuple):
 
 
 def stored_sessions(path: Path) -> list[StoredSession]:
-    """The sessions of a place database; another process may write it.
-
-    Raises:
-        UmfError: the file is missing or no place database.
-    """
+    """The sessions of a place database; another process may write it."""
     columns = "SELECT session, count(*), min(stamp_ns), max(stamp_ns) FROM keyframe GROUP BY session"
     with _looking(path) as connection:
         return [StoredSession(*row) for row in connection.execute(columns)]
 
 
 def stored_identity(path: Path) -> tuple[str, int]:
-    """Embedder and numbers per descriptor of a place database; another process may write it.
-
-    Raises:
-        UmfError: the file is missing or no place database.
-    """
+    """Embedder and numbers per descriptor of a place database; another process may write it."""
     with _looking(path) as connection:
         stored = _identity(connection)
         return stored["embedder"], int(stored["dimension"])
 
 
 def check_sessions(path: Path, numbers: Collection[int]) -> None:
-    """Check that a place database has these sessions.
-
-    Raises:
-        UmfError: the file is no place database, or lacks one of them.
-    """
+    """Raise an `UmfError` if a place database lacks one of these sessions."""
     unknown = set(numbers) - {session.number for session in stored_sessions(path)}
     if unknown:
         raise UmfError(f"{path} has no session {', '.join(map(str, sorted(unknown)))}")
 
 
 def delete_sessions(path: Path, numbers: Collection[int]) -> int:
-    """Delete whole sessions for good; returns how many keyframes they had.
-
-    Raises:
-        UmfError: the file is no place database, is in use, or lacks one of the sessions.
-    """
+    """Delete whole sessions for good and return the number of their keyframes."""
     check_sessions(path, numbers)
     with closing(SqliteFile(path, SCHEMA)) as file, file.writing() as connection:
         index_path(path).unlink(missing_ok=True)

@@ -107,13 +107,10 @@ class GraphSolver:
 
     def marginal(self, vertex: Hashable) -> Array | None:
         """(6, 6) covariance of a vertex of the last solved graph in its tangent space; None where it is unknown."""
-        if self._tree is None:
-            return None
         try:
-            found: Array = self._tree.marginalCovariance(self._numbers[vertex])
+            return None if self._tree is None else self._tree.marginalCovariance(self._numbers[vertex])
         except (RuntimeError, IndexError, KeyError):
             return None
-        return found
 
     def _factor(self, key: Hashable, row: int, graph: Graph, numbers: list[int]) -> gtsam.NonlinearFactor:
         known = self._factors.get(key)

@@ -163,9 +163,7 @@ def walk(
         odometry: that the run took from a file instead of the recording's.
         known_odometry: at any rate, where the recording has none.
     """
-    check = SensorCheck()
-    stamps: list[int] = [-1]
-    poses: list[Array] = [np.eye(4)]
+    check, stamps, poses = SensorCheck(), [-1], list[Array]([np.eye(4)])
     for item in FrameReader(bag, settings, odometry, warn=lambda _: None).stream():
         if isinstance(item, Frame):
             check.take(item)

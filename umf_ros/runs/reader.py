@@ -26,6 +26,7 @@ from umf_ros.sensors.sessions import Input
 from umf_ros.verification.hypothesis import Hypothesis
 
 Severity = Literal["fault", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("fault", "warning", "note")
 _ABSENT: dict[str, tuple[Severity, str]] = {
     "left_image": ("warning", "no images on {}: places are told apart by scans alone"),
     "right_image": ("note", "no right images on {}: depth of images comes from the scans alone"),

@@ -26,14 +26,15 @@ from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Image, LoopClosure
-from umf_ros.core.geometry import Array, rotation_angle
+from umf_ros.core.geometry import Array
+from umf_ros.core.io import write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import GateDiagnosis
 from umf_ros.runs.findings import ExaminedRun, RunVerdict, conclude, look_first
 from umf_ros.runs.gallery import Gallery, walk
 from umf_ros.runs.reader import Advice, FinishedRun, read_run
-from umf_ros.runs.scene import build_scene, by_need, drawn_trajectory, named_curves, pairs_of
+from umf_ros.runs.scene import build_scene, by_need, drawn_trajectory, named_curves, pairs_of, size_of
 from umf_ros.runs.tables import INLIERS, Endpoints, read_table
 from umf_ros.runs.truth import (
     MEDIAN_EXPECTED,
@@ -44,7 +45,7 @@ from umf_ros.runs.truth import (
     in_words,
     judge_run,
 )
-from umf_ros.runs.writer import write_atomically, write_summary
+from umf_ros.runs.writer import write_summary
 
 
 def render(template: str, **values: Any) -> str:
@@ -66,10 +67,7 @@ MAX_LINES = 60
 
 
 def plot_trajectories(
-    path: Path,
-    curves: list[tuple[str, str, Array]],
-    closures: Array,
-    verdicts: list[bool | None],
+    path: Path, curves: list[tuple[str, str, Array]], closures: Array, verdicts: list[bool | None]
 ) -> None:
     """Draw trajectories from above, and the closures between keyframes of the last one.
 
@@ -106,12 +104,12 @@ def plot_trajectories(
 
 
 def draw_match(query: Image, match: Image, inliers: Array, caption: str) -> Image:
-    """Query (left) and match (right) side by side with a line for every inlier.
+    """Query (left) and match (right) side by side below a caption, with lines for some of the inliers.
 
     Args:
         query: (H, W) uint8.
         match: (H, W) uint8.
-        inliers: (K, 4) pixels u, v in the query and u, v in the match; a spread subset is drawn.
+        inliers: (K, 4) pixels u, v in the query and u, v in the match.
         caption: written above the pictures.
 
     Returns:
@@ -205,7 +203,7 @@ def final_verdicts(about: ExaminedRun) -> list[str]:
 
 def describe(closure: LoopClosure, inliers: int, judged: JudgedClosure | None) -> str:
     """One line for the picture of a closure."""
-    shift_m, turn_deg = _size(closure)
+    shift_m, turn_deg = size_of(closure.match_T_query)
     text = f"{shift_m:.2f} m, {turn_deg:.1f} deg apart   p {closure.probability:.3f}   {inliers} image inliers"
     if judged is None:
         return text
@@ -219,7 +217,7 @@ def closure_rows(about: ExaminedRun) -> list[ClosureRow]:
     rows = []
     for number, closure in enumerate(about.run.closures, 1):
         at_s, back_s = ((closure.query_stamp_ns - other) * 1e-9 for other in (start, closure.match_stamp_ns))
-        shift_m, turn_deg = _size(closure)
+        shift_m, turn_deg = size_of(closure.match_T_query)
         verdict, judged = about.run.verdicts.get(endpoints(closure)), known.get(endpoints(closure))
         figures = [f"{at_s:.1f}", f"{back_s:.1f}", f"{shift_m:.2f}", f"{turn_deg:.1f}", f"{closure.probability:.4f}"]
         errors, word, mark = ["", "", ""], "", ""
@@ -274,35 +272,21 @@ def _consistency(truth: Summary) -> str:
     )
 
 
-def _size(closure: LoopClosure) -> tuple[float, float]:
-    """Metres and degrees between the endpoints."""
-    pose = closure.match_T_query
-    return float(np.linalg.norm(pose[:3, 3])), float(np.degrees(rotation_angle(pose)))
-
-
 MAX_SHOWN = 400
 """Keyframes that are photographed; the page shows as many as find room."""
 
 
 def finish_run(
-    folder: Path,
-    bag: Bag,
-    console: Console,
-    ground_truth: Path | None = None,
-    told: frozenset[str] = frozenset(),
+    folder: Path, bag: Bag, console: Console, ground_truth: Path | None = None, told: frozenset[str] = frozenset()
 ) -> RunVerdict:
     """Judge a run, write its pictures and its report, print its summary, and return the verdict.
 
     Args:
         folder: of the run.
-        bag: the recording the run was made on.
+        bag: the recording the run was made on; with another one an `UmfError` is raised and nothing is written.
         console: where the summary is printed.
         ground_truth: RTKLIB .pos or TUM file; None takes that of the recording, if there is one.
         told: lines that were printed before the run, and are not repeated.
-
-    Raises:
-        UmfError: the folder holds no run, the truth cannot be read, or the recording is another one; then nothing
-            is written.
     """
     run = read_run(folder, bag, ground_truth)
     with console.status("Judging, drawing and writing the report"):
@@ -311,7 +295,8 @@ def finish_run(
         inliers = _read_inliers(folder / "inliers.csv")
         pairs = pairs_of(about)
         shown = [stamp for pair in by_need(pairs)[:MAX_SHOWN] for stamp in pair.endpoints]
-        chosen = _spread(run.closures)
+        rows = np.linspace(0, len(run.closures) - 1, min(len(run.closures), MAX_PICTURES)).astype(int)
+        chosen = [run.closures[row] for row in rows]
         gallery = Gallery(shown, (s for one in chosen for s in endpoints(one)), drawn_trajectory(about))
         about = replace(about, sensors=walk(bag, run.settings, gallery, _odometry_file(run), run.odometry))
         _draw_matches(about, chosen, gallery, inliers)
@@ -325,8 +310,7 @@ def finish_run(
 def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> ExaminedRun:
     """Hold the run against the truth, if there is one, and fill in the `ground_truth` of its summary, to keep or not.
 
-    Raises:
-        UmfError: the truth covers nothing of a run that was judged before.
+    A truth that covers nothing of a run that was judged before raises an `UmfError`.
     """
     judged = JudgedRun()
     if run.truth is not None:
@@ -366,11 +350,6 @@ def _draw_matches(
         lines = inliers.get(key, np.empty((0, 4)))
         picture = draw_match(query, match, lines, describe(closure, len(lines), known.get(key)))
         cv2.imwrite(str(target / f"{key[0]}_{key[1]}.png"), picture)
-
-
-def _spread(closures: list[LoopClosure]) -> list[LoopClosure]:
-    count = min(len(closures), MAX_PICTURES)
-    return [closures[i] for i in np.linspace(0, len(closures) - 1, count).astype(int)]
 
 
 def _odometry_file(run: FinishedRun) -> Trajectory | None:

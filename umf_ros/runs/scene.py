@@ -14,7 +14,7 @@ from umf_ros.core.geometry import Array, align, relative, rotation_angle
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis
-from umf_ros.runs.findings import PENDING, ExaminedRun
+from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.gallery import SCAN_UNIT_M, Gallery, Photograph
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.tables import Endpoints
@@ -89,7 +89,7 @@ def _kind(about: ExaminedRun, key: Endpoints, judged: JudgedClosure | None) -> K
     verdict = about.run.verdicts.get(key)
     if verdict is None or verdict.state == State.ACCEPTED:
         return "accepted"
-    return "pending" if verdict.state in PENDING else "rejected"
+    return "pending" if verdict.state == State.PENDING else "rejected"
 
 
 def _missed(about: ExaminedRun, tested: dict[Endpoints, Hypothesis]) -> list[Pair]:
@@ -151,9 +151,14 @@ def describe(about: ExaminedRun, pair: Pair, full: bool) -> dict[str, Any]:
     if pair.pose is not None:
         told["pose"] = [round(float(value), 4) for value in pair.pose[:3].ravel()]
         told["pose_source"] = pair.pose_source
-        told["shift_m"] = round(float(np.linalg.norm(pair.pose[:3, 3])), 2)
-        told["turn_deg"] = round(float(np.degrees(rotation_angle(pair.pose))), 1)
+        shift_m, turn_deg = size_of(pair.pose)
+        told |= {"shift_m": round(shift_m, 2), "turn_deg": round(turn_deg, 1)}
     return told
+
+
+def size_of(pose: Array) -> tuple[float, float]:
+    """Metres and degrees of a pose (4, 4)."""
+    return float(np.linalg.norm(pose[:3, 3])), float(np.degrees(rotation_angle(pose)))
 
 
 def _truth_words(pair: Pair) -> str:

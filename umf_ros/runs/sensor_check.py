@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import nan
 from typing import Any
 
@@ -37,13 +37,13 @@ class Step:
     """Motion between two consecutive measurements of one sensor.
 
     Attributes:
-        start_s, end_s: their stamps, s since an arbitrary moment.
+        start_ns, end_ns: their stamps.
         turn: (3,) rotation vector, rad, body axes as the calibration has them.
         shift: (3,) m, or a direction of length 1 where one camera cannot tell the length; likewise.
     """
 
-    start_s: float
-    end_s: float
+    start_ns: int
+    end_ns: int
     turn: Array
     shift: Array
 
@@ -64,30 +64,6 @@ class Disagreement:
     mounting_deg: Array | None
     residual_deg: float
     steps: int
-
-
-@dataclass(frozen=True, slots=True)
-class MeasuredScan:
-    """A scan as it was measured, ready to be aligned.
-
-    Attributes:
-        cloud: its points, thinned, with covariances; None where there are too few.
-        tree: their neighbours.
-        moment_s: their mean moment, after the frame's stamp.
-    """
-
-    cloud: small_gicp.PointCloud | None
-    tree: small_gicp.KdTree | None
-    moment_s: float
-
-    @classmethod
-    def of(cls, frame: Frame) -> MeasuredScan:
-        """The scan of a frame that has one."""
-        points, moment_s = as_measured(frame)
-        if len(points) < MIN_SCAN_POINTS:
-            return cls(None, None, moment_s)
-        cloud, tree = small_gicp.preprocess_points(points.astype(float), SCAN_CELL_M, SCAN_NEIGHBOURS, 1)
-        return cls(cloud, tree, moment_s)
 
 
 def as_measured(frame: Frame) -> tuple[Points, float]:
@@ -113,26 +89,25 @@ def _one_per_cell(points: Points) -> NDArray[np.intp]:
     return np.asarray(np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)[1])
 
 
-def scan_turn(earlier: MeasuredScan, later: MeasuredScan) -> Array | None:
-    """Pose (4, 4) of the later body in the earlier one from their scans; None where they do not align."""
-    if earlier.cloud is None or later.cloud is None:
+def scan_step(earlier: Frame, later: Frame) -> Step | None:
+    """The motion of the body between two scans; None where they do not align."""
+    (before, before_s), (after, after_s) = as_measured(earlier), as_measured(later)
+    if min(len(before), len(after)) < MIN_SCAN_POINTS:
         return None
-    found = small_gicp.align(
-        earlier.cloud,
-        later.cloud,
-        earlier.tree,
-        np.eye(4),
-        "GICP",
-        max_correspondence_distance=SCAN_REACH_M,
-        num_threads=1,
-    )
-    pose: Array = found.T_target_source
-    return pose if found.converged else None
+    clouds = [
+        small_gicp.preprocess_points(one.astype(float), SCAN_CELL_M, SCAN_NEIGHBOURS, 1) for one in (before, after)
+    ]
+    (target, tree), (source, _) = clouds
+    found = small_gicp.align(target, source, tree, max_correspondence_distance=SCAN_REACH_M, num_threads=1)
+    turn = Rotation.from_matrix(found.T_target_source[:3, :3]).as_rotvec()
+    stamps = earlier.stamp_ns + round(before_s * 1e9), later.stamp_ns + round(after_s * 1e9)
+    return Step(*stamps, turn, found.T_target_source[:3, 3]) if found.converged else None
 
 
-def view_turn(earlier: Frame, later: Frame) -> tuple[Array, Array] | None:
-    """Rotation (3, 3) of the later body in the earlier one and direction (3,) of its way, from left images alone."""
+def view_step(earlier: Frame, later: Frame) -> Step | None:
+    """The motion of the body between two left images, its shift a direction; None where they tell none."""
     assert earlier.left is not None and later.left is not None
+    assert earlier.image_stamp_ns is not None and later.image_stamp_ns is not None
     pairs = _tracked(earlier.left, later.left)
     if pairs is None:
         return None
@@ -141,11 +116,12 @@ def view_turn(earlier: Frame, later: Frame) -> tuple[Array, Array] | None:
     essential, inliers = cv2.findEssentialMat(*pairs, matrix, method=cv2.RANSAC, prob=0.999, threshold=1.0)
     if essential is None or essential.shape != (3, 3):
         return None
-    count, turn, way, _ = cv2.recoverPose(essential, *pairs, matrix, mask=inliers)
+    count, turn, shift, _ = cv2.recoverPose(essential, *pairs, matrix, mask=inliers)
     if count < MIN_CORNERS:
         return None
     mounted = earlier.body_T_camera[:3, :3]
-    return mounted @ turn.T @ mounted.T, mounted @ (-turn.T @ way).ravel()
+    turned = Rotation.from_matrix(mounted @ turn.T @ mounted.T).as_rotvec()
+    return Step(earlier.image_stamp_ns, later.image_stamp_ns, turned, mounted @ (-turn.T @ shift).ravel())
 
 
 def _tracked(earlier: Image, later: Image) -> tuple[Any, Any] | None:
@@ -159,46 +135,47 @@ def _tracked(earlier: Image, later: Image) -> tuple[Any, Any] | None:
     return (corners[kept], there[kept]) if kept.sum() >= MIN_CORNERS else None
 
 
-def compare_motion(steps: list[Step], odometry: Trajectory, epoch_ns: int) -> Disagreement | None:
+def compare_motion(steps: list[Step], odometry: Trajectory) -> Disagreement | None:
     """Clock and mounting of a sensor against the odometry; None where the motion does not tell.
 
     Every lag is tried; at each the one rotation that turns all of the sensor's motion into the odometry's is found,
-    from turns and directions of the way together, and what is left of the turns says how well the lag fits.
+    from turns and directions of the path together. The turns that remain say how well the lag fits.
 
     Args:
         steps: motion of the sensor.
         odometry: poses of the body, as stated.
-        epoch_ns: what the steps' times count from.
     """
     if len(steps) < MIN_PAIRS or len(odometry) < MIN_PAIRS:
         return None
-    times = (odometry.stamps_ns - epoch_ns) * 1e-9
+    first_ns = int(odometry.stamps_ns[0])
+    times = (odometry.stamps_ns - first_ns) * 1e-9
     turns = Slerp(times, Rotation.from_matrix(odometry.poses[:, :3, :3]))
-    starts: Array = np.array([step.start_s for step in steps])
-    ends: Array = np.array([step.end_s for step in steps])
-    seen = np.array([step.turn for step in steps]), _directions(np.array([step.shift for step in steps]))
+    spans: Array = np.array([(step.start_ns - first_ns, step.end_ns - first_ns) for step in steps]) * 1e-9
+    seen_turns = np.array([step.turn for step in steps])
+    seen_ways = _directions(np.array([step.shift for step in steps]))
     tried: list[tuple[float, float, Array, bool]] = []
     for lag in LAGS_S:
-        inside = (starts + lag >= times[0]) & (ends + lag <= times[-1])
+        inside = (spans[:, 0] + lag >= times[0]) & (spans[:, 1] + lag <= times[-1])
         if inside.sum() < MIN_PAIRS:
             continue
-        first, last = starts[inside] + lag, ends[inside] + lag
+        first, last = (spans[inside] + lag).T
         stated = (turns(first).inv() * turns(last)).as_rotvec()
         driven = _positions(last, times, odometry) - _positions(first, times, odometry)
-        way = _directions(turns(first).inv().apply(driven))
-        rotation, residuals, known = _one_rotation(seen[0][inside], stated, seen[1][inside], way)
+        ways = _directions(turns(first).inv().apply(driven))
+        rotation, residuals, known = _one_rotation(seen_turns[inside], stated, seen_ways[inside], ways)
         tried.append((_spread(residuals), float(lag), rotation, known))
     if not tried:
         return None
+    sizes = [size for size, *_ in tried]
     in_step = min(range(len(tried)), key=lambda at: abs(tried[at][1]))
-    best = min(range(len(tried)), key=lambda at: tried[at][0])
-    if tried[best][0] > BETTER * tried[in_step][0]:  # a clock is right until the motion clearly says otherwise
+    best = int(np.argmin(sizes))
+    if sizes[best] > BETTER * sizes[in_step]:  # a clock is right until the motion clearly says otherwise
         best = in_step
     residual, lag, rotation, known = tried[best]
-    if residual > CONTRAST * float(np.median([one[0] for one in tried])):
+    if residual > CONTRAST * float(np.median(sizes)):
         return None
     if best != in_step and 0 < best < len(tried) - 1:
-        lag += _lowest([one[0] for one in tried[best - 1 : best + 2]]) * (tried[best + 1][1] - lag)
+        lag += _lowest(sizes[best - 1 : best + 2]) * (tried[best + 1][1] - lag)
     mounting = np.degrees(Rotation.from_matrix(rotation).as_rotvec()) if known else None
     return Disagreement(round(lag, 2), mounting, float(np.degrees(residual)), len(steps))
 
@@ -238,7 +215,7 @@ def _positions(at: Array, times: Array, odometry: Trajectory) -> Array:
 
 def _directions(vectors: Array) -> Array:
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.where(length > 0.02, vectors / np.maximum(length, 1e-9), 0.0)  # who stands goes nowhere
+    return np.where(length > 0.02, vectors / np.maximum(length, 1e-9), 0.0)  # none while it stands
 
 
 MIN_STEP_S, MAX_STEP_S = 0.18, 1.0  # between frames whose motion is compared, by hand
@@ -251,7 +228,7 @@ MIN_DEPTHS = 200  # by hand
 
 @dataclass(frozen=True, slots=True)
 class SensorReport:
-    """What was measured; NaN and None where there was nothing to measure it on.
+    """Measurements of a recording; NaN and None where there was nothing to measure them on.
 
     Attributes:
         frames: that were looked at.
@@ -261,7 +238,7 @@ class SensorReport:
         stereo_scale: median of stereo's depth by the LiDAR's.
         stereo_spread: half of the ratios are nearer to their median than this, as a logarithm.
         lidar, camera: how their motion differs from the odometry's.
-        forward: (3,) mean direction of the way by odometry, body axes.
+        forward: (3,) mean direction of motion by odometry, body axes.
     """
 
     frames: int = 0
@@ -276,33 +253,21 @@ class SensorReport:
     forward: Array | None = None
 
 
-@dataclass
-class _Seen:
-    """Numbers of the frames so far."""
-
-    left: list[float] = field(default_factory=list)
-    right: list[float] = field(default_factory=list)
-    returns: list[float] = field(default_factory=list)
-    intensity: float = nan
-    depths: list[Array] = field(default_factory=list)
-
-
 class SensorCheck:
-    """Looks at the frames of a recording as they pass; `report` says what was seen."""
+    """Looks at the frames of a recording as they pass, for a report at the end."""
 
     def __init__(self) -> None:
-        self._seen = _Seen()
+        self._contrasts: dict[str, list[float]] = {"left": [], "right": []}
+        self._returns: list[float] = []
+        self._intensity_max = nan
+        self._depth_ratios: list[Array] = []
         self._frames = 0
         self._last: Frame | None = None
-        self._epoch_ns = 0
         self._steps: dict[str, list[Step]] = {"lidar": [], "camera": []}
-        self._ready: tuple[Frame, MeasuredScan] | None = None
 
     def take(self, frame: Frame) -> None:
         """Look at one frame, in the order of their stamps."""
         self._frames += 1
-        if self._last is None:
-            self._epoch_ns = frame.stamp_ns
         self._look(frame)
         if self._frames % DEPTH_EVERY == 1:
             self._compare_depths(frame)
@@ -314,41 +279,35 @@ class SensorCheck:
         self._last = frame
 
     def report(self, odometry: Trajectory | None) -> SensorReport:
-        """What was seen, held against the odometry as it was recorded."""
-        seen = self._seen
-        ratios = np.concatenate(seen.depths) if seen.depths else np.empty(0)
+        """Hold the measurements against the odometry as it was recorded."""
+        ratios = np.concatenate(self._depth_ratios) if self._depth_ratios else np.empty(0)
         scale = float(np.median(ratios)) if len(ratios) >= MIN_DEPTHS else nan
-        spread = float(np.median(np.abs(np.log(ratios / scale)))) if scale > 0 else nan
-        against = {
-            name: compare_motion(steps, odometry, self._epoch_ns) if odometry else None
-            for name, steps in self._steps.items()
-        }
         return SensorReport(
-            self._frames,
-            _median(seen.left),
-            _median(seen.right),
-            _median(seen.returns),
-            seen.intensity,
-            scale,
-            spread,
-            against["lidar"],
-            against["camera"],
-            _forward(odometry) if odometry else None,
+            frames=self._frames,
+            left_contrast=_median(self._contrasts["left"]),
+            right_contrast=_median(self._contrasts["right"]),
+            returns=_median(self._returns),
+            intensity_max=self._intensity_max,
+            stereo_scale=scale,
+            stereo_spread=float(np.median(np.abs(np.log(ratios / scale)))) if scale > 0 else nan,
+            lidar=compare_motion(self._steps["lidar"], odometry) if odometry else None,
+            camera=compare_motion(self._steps["camera"], odometry) if odometry else None,
+            forward=_forward(odometry) if odometry else None,
         )
 
     def _look(self, frame: Frame) -> None:
         if self._frames % 4 == 1:
-            for image, told in ((frame.left, self._seen.left), (frame.right, self._seen.right)):
+            for image, contrasts in zip((frame.left, frame.right), self._contrasts.values(), strict=True):
                 if image is not None:
-                    told.append(float(image[::4, ::4].std()))
+                    contrasts.append(float(image[::4, ::4].std()))
         if frame.points is not None:
-            self._seen.returns.append(float(len(frame.points)))
+            self._returns.append(float(len(frame.points)))
             if frame.intensity is not None and len(frame.intensity):
-                self._seen.intensity = float(np.fmax(self._seen.intensity, frame.intensity.max()))
+                self._intensity_max = float(np.fmax(self._intensity_max, frame.intensity.max()))
 
     def _compare_depths(self, frame: Frame) -> None:
         """Stereo's depth by the LiDAR's, where both look."""
-        if frame.left is None or frame.right is None or frame.points is None or len(self._seen.depths) >= DEPTH_FRAMES:
+        if frame.left is None or frame.right is None or frame.points is None or len(self._depth_ratios) >= DEPTH_FRAMES:
             return
         camera = frame.camera
         pixels, depth = camera.project(frame.points.astype(float), frame.body_T_camera)
@@ -358,35 +317,17 @@ class SensorCheck:
         if len(chosen) and camera.baseline > 0:
             disparity = disparities(frame.left, frame.right, pixels[chosen], camera)
             ratio = camera.fx * camera.baseline / disparity / depth[chosen]
-            self._seen.depths.append(ratio[np.isfinite(ratio)])
+            self._depth_ratios.append(ratio[np.isfinite(ratio)])
 
     def _step(self, earlier: Frame, later: Frame) -> None:
-        if len(self._steps["lidar"]) + len(self._steps["camera"]) >= 2 * MAX_STEPS or _stands(earlier, later):
+        if sum(map(len, self._steps.values())) >= 2 * MAX_STEPS or _stands(earlier, later):
             return
         if earlier.points is not None and later.points is not None:
-            before, after = self._scan(earlier), self._scan(later)
-            pose = scan_turn(before, after)
-            if pose is not None:
-                turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
-                stamps = (
-                    self._seconds(earlier.stamp_ns) + before.moment_s,
-                    self._seconds(later.stamp_ns) + after.moment_s,
-                )
-                self._steps["lidar"].append(Step(*stamps, turn, pose[:3, 3]))
+            found = scan_step(earlier, later)
+            self._steps["lidar"] += [found] if found else []
         if earlier.image_stamp_ns and later.image_stamp_ns:
-            view = view_turn(earlier, later)
-            if view is not None:
-                stamps = self._seconds(earlier.image_stamp_ns), self._seconds(later.image_stamp_ns)
-                self._steps["camera"].append(Step(*stamps, Rotation.from_matrix(view[0]).as_rotvec(), view[1]))
-
-    def _scan(self, frame: Frame) -> MeasuredScan:
-        """Made ready once, though it is aligned with the one before and the one after."""
-        if self._ready is None or self._ready[0] is not frame:
-            self._ready = frame, MeasuredScan.of(frame)
-        return self._ready[1]
-
-    def _seconds(self, stamp_ns: int) -> float:
-        return (stamp_ns - self._epoch_ns) * 1e-9
+            found = view_step(earlier, later)
+            self._steps["camera"] += [found] if found else []
 
 
 def _stands(earlier: Frame, later: Frame) -> bool:
@@ -396,7 +337,7 @@ def _stands(earlier: Frame, later: Frame) -> bool:
 
 
 def _forward(odometry: Trajectory) -> Array | None:
-    """Mean direction of the way, body axes, from poses half a second apart or more."""
+    """Mean direction of motion, body axes, from poses half a second apart or more."""
     if len(odometry) < 2:
         return None
     kept = np.searchsorted(odometry.stamps_ns, np.arange(odometry.stamps_ns[0], odometry.stamps_ns[-1], 500_000_000))

@@ -171,11 +171,7 @@ def _judge_closures(closures: list[LoopClosure], truth: Trajectory) -> list[Judg
     stamps = np.array([endpoints(closure) for closure in closures], np.int64)
     poses, known = truth.at(stamps.reshape(-1))
     ends = zip(closures, poses.reshape(-1, 2, 4, 4), known.reshape(-1, 2), strict=True)
-    return [
-        judge_closure(one, query, match, truth.has_orientation)
-        for one, (query, match), covered in ends
-        if covered.all()
-    ]
+    return [judge_closure(one, pair[0], pair[1], truth.has_orientation) for one, pair, covered in ends if covered.all()]
 
 
 def judge_closure(
@@ -183,9 +179,8 @@ def judge_closure(
 ) -> JudgedClosure:
     """Hold one closure against the truth.
 
-    True means: both keyframes within 12 m of each other [UMF 5.1.2], whatever their headings (who recognises a place
-    from another side is not wrong), and the published relative pose within 0.5 m and 5 deg. A truth of positions
-    alone (RTKLIB) checks distances only.
+    True means: both keyframes within 12 m of each other [UMF 5.1.2], whatever their headings, and the published
+    relative pose within 0.5 m and 5 deg. A truth of positions alone (RTKLIB) checks distances only.
     """
     truth = relative(world_T_match, world_T_query)
     distance_m = float(np.linalg.norm(truth[:3, 3]))
@@ -276,12 +271,9 @@ class TruePlaces:
         self.stamps = run.stamps
         self._path_length: Array = np.array([row.path_length_m for row in run.keyframes], float)
         self._sessions = np.array([row.session for row in run.keyframes], int)
-        self._has_orientation = run.truth is not None and run.truth.has_orientation
-        self.poses: Array
-        if run.truth is None:
-            self.poses, self.known = np.tile(np.eye(4), (len(self.stamps), 1, 1)), np.zeros(len(self.stamps), bool)
-        else:
-            self.poses, self.known = run.truth.at(self.stamps)
+        truth = run.truth or Trajectory(np.empty(0, np.int64), np.empty((0, 4, 4)), has_orientation=False)
+        self._has_orientation = truth.has_orientation
+        self.poses, self.known = truth.at(self.stamps)
         self._row = {int(stamp): row for row, stamp in enumerate(self.stamps)}
 
     def row(self, stamp_ns: int) -> int | None:

@@ -6,14 +6,11 @@ A folder or file that cannot be written raises an `OutputError`.
 from __future__ import annotations
 
 import json
-import os
 import resource
 import time
 from array import array
 from collections.abc import Mapping
 from contextlib import closing, suppress
-from datetime import datetime
-from itertools import count
 from math import isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,10 +19,10 @@ import numpy as np
 
 from umf_ros import __version__
 from umf_ros.core.config import Settings, dump_settings, load_settings
-from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array
-from umf_ros.core.io import atomic_write
+from umf_ros.core.io import create_run_folder, write_atomically
 from umf_ros.runs import tables
 from umf_ros.runs.run_file import NAME, RunFile, StoredOdometry
 from umf_ros.sensors.buffers import InputCounter
@@ -34,35 +31,6 @@ from umf_ros.sensors.sessions import Input
 if TYPE_CHECKING:
     from umf_ros.detector import Detection
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure
-
-
-def create_run_folder(out: Path, latest: bool = True) -> Path:
-    """Make a new folder inside `out`, named after the local time; `out/latest` leads to it unless `latest` is false."""
-    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    with writing(f"to {out}"):
-        out.mkdir(parents=True, exist_ok=True)
-        names = (stamp if number == 1 else f"{stamp}_{number}" for number in count(1))
-        folder = next(folder for name in names if _is_new(folder := out / name))
-        if latest:  # in one step, so that it always leads to a folder
-            fresh = out / f".latest-{os.getpid()}"
-            fresh.symlink_to(folder.name, target_is_directory=True)
-            fresh.replace(out / "latest")
-    return folder
-
-
-def _is_new(folder: Path) -> bool:
-    """Make a folder; returns false where there is one of this name."""
-    try:
-        folder.mkdir()
-    except FileExistsError:
-        return False
-    return True
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file that is never seen half-written."""
-    with atomic_write(path) as part:
-        part.write_text(text, encoding="utf-8")
 
 
 PLACES = "places.sqlite"
@@ -79,9 +47,7 @@ class ReplayFolder:
     """
 
     def __init__(self, path: Path, settings: Settings, resumed: bool = False) -> None:
-        self.path = path
-        self.resumed = resumed
-        self._settings = settings
+        self.path, self._settings, self.resumed = path, settings, resumed
 
     @classmethod
     def create(cls, out: Path, bag: Path, settings: Settings) -> ReplayFolder:
@@ -92,14 +58,15 @@ class ReplayFolder:
 
     @classmethod
     def resume(cls, out: Path, bag: Path, settings: Settings) -> ReplayFolder:
-        """Find the newest folder inside `out` of a replay of `bag` that was not finished; make one where there is none.
+        """Find the newest folder inside `out` of an unfinished replay of `bag`; make one where there is none.
 
-        Raises:
-            UmfError: it was begun with other settings.
+        A replay that was begun with other settings raises an `UmfError`.
         """
         begun = [path.parent for path in sorted(out.glob(f"*/{NAME}"), reverse=True) if not path.parent.is_symlink()]
         for path in begun:
-            facts = _facts(path)
+            facts: dict[str, Any] = {}
+            with suppress(UmfError), closing(RunFile(path, read_only=True)) as file:
+                facts = file.facts()
             if facts.get("bag") != str(bag.resolve()) or facts.get("finished"):
                 continue
             # without settings, the process was killed before its first row
@@ -130,12 +97,6 @@ def _note(folder: Path, **values: Any) -> None:
         file.note(**values)
 
 
-def _facts(folder: Path) -> dict[str, Any]:
-    with suppress(UmfError), closing(RunFile(folder, read_only=True)) as file:
-        return file.facts()
-    return {}
-
-
 class RunRecorder:
     """Writes a run: `config.yaml` at once, `run.sqlite` keyframe by keyframe, CSV tables and `summary.json` at the end.
 
@@ -154,13 +115,10 @@ class RunRecorder:
 
     Raises:
         UmfError: another process writes the folder, or its file is damaged.
-        OutputError: the folder cannot be written.
     """
 
     def __init__(self, folder: Path, settings: Settings, weights: str, resume: bool = False) -> None:
-        self.folder = folder
-        self._settings = settings
-        self._weights = weights
+        self.folder, self._settings, self._weights = folder, settings, weights
         write_atomically(folder / "config.yaml", dump_settings(settings))
         self._file = RunFile(folder)
         self.recorded = {(int(row[0]), int(row[1])) for row in self._file.rows("keyframes")}
@@ -187,9 +145,8 @@ class RunRecorder:
         if keyframe is None or (keyframe.stamp_ns, keyframe.session) in self.recorded:
             return
         stamp_ns = keyframe.stamp_ns
-        new = [
-            one for one in detection.verdicts if one.closure and (stamp_ns, one.candidate.stamp_ns) not in self._pairs
-        ]
+        accepted = [one for one in detection.verdicts if one.closure]
+        new = [one for one in accepted if (stamp_ns, one.candidate.stamp_ns) not in self._pairs]
         times = [f"{detection.latency_ms.get(stage, nan):.1f}" for stage in tables.STAGES]
         closures = [tables.closure_row(one.closure, one.candidate.similarity) for one in new if one.closure]
         with self._file.writing():
@@ -202,7 +159,7 @@ class RunRecorder:
             self._file.note(**self._facts())
         self._counts["keyframes"] += 1
         self._counts["queries"] += bool(detection.verdicts)
-        self._counts["closures_rejected"] += sum(verdict.closure is None for verdict in detection.verdicts)
+        self._counts["closures_rejected"] += len(detection.verdicts) - len(accepted)
         self._counts["closures_published"] += len(new)
         self._pairs.update((stamp_ns, one.candidate.stamp_ns) for one in new)
         self.recorded.add((stamp_ns, keyframe.session))
@@ -216,9 +173,8 @@ class RunRecorder:
 
     def record_encounter(self, inter_closure: InterRobotClosure) -> None:
         """Write the closures with another rover of a fleet."""
-        closures = inter_closure.closures
+        rows = [[inter_closure.robot, *tables.closure_row(one, nan)] for one in inter_closure.closures]
         with self._file.writing():
-            rows = [[inter_closure.robot, *tables.closure_row(closure, nan)] for closure in closures]
             self._file.append("closures_between", rows)
 
     def record_pose(self, row: list[Any]) -> None:
@@ -267,13 +223,13 @@ class RunRecorder:
     def _earlier_counts(self, resume: bool) -> dict[str, int]:
         """Count the rows in the file; all frames of a recording that is resumed pass again."""
         facts = self._file.facts() if not resume else {}
-        candidates, closures = self._file.rows("candidates"), len(self.earlier_closures)
+        candidates = self._file.rows("candidates")
         return {
             "frames": int(facts.get("frames", 0)),
             "pairs": int(facts.get("pairs", 0)),
             "keyframes": len(self.recorded),
             "queries": len({row[0] for row in candidates}),
-            "closures_published": closures,
+            "closures_published": len(self.earlier_closures),
             "closures_rejected": sum(row[3] != "accepted" for row in candidates),
         }
 

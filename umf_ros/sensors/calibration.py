@@ -17,6 +17,8 @@ from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose
 from umf_ros.core.io import read_values
 from umf_ros.core.resources import dataset_names
 
+TO_BE_MEASURED = "TO BE MEASURED"
+"""Marks an entry of a file that `umf inspect` or `umf import` could only guess."""
 LARGEST_IMAGE = 20_000
 """Pixels of a side."""
 
@@ -98,6 +100,7 @@ class Calibration:
         lidar_time_offset_s: seconds to add to the stamp of a scan.
         min_intensity: returns up to this intensity, in the sensor's unit, are dropped; 0: none.
         max_height_m: returns further than this from the LiDAR's horizontal plane are dropped; infinite: none.
+        guesses: entries of the file that are marked as guesses.
         rectifier: makes the pair of `camera` from raw images; None where they arrive rectified.
     """
 
@@ -109,6 +112,7 @@ class Calibration:
     min_intensity: float = 0.0
     max_height_m: float = math.inf
     rectifier: StereoRectifier | None = None
+    guesses: tuple[str, ...] = ()
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -135,13 +139,24 @@ def load_calibration(source: str | Path) -> Calibration:
     """
     path = load_preset(str(source)).calibration if source in dataset_names() else Path(source)
     try:
-        return _File.model_validate(read_values(path)).calibration()
+        calibration = _File.model_validate(read_values(path)).calibration()
+        return replace(calibration, guesses=_guesses(path))
     except ConfigError as error:
         raise CalibrationError(str(error)) from None
     except ValidationError as error:
         raise CalibrationError(f"{path}: {problems(error)}") from None
     except Exception as error:  # OpenCV raises anything on a pair that cannot be rectified
         raise CalibrationError(f"{path} is no calibration of real sensors: {one_line(error)}") from None
+
+
+def _guesses(path: Path) -> tuple[str, ...]:
+    """Entries marked as guesses: keys, or the text of a comment that stands alone."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return tuple(
+        line.partition(TO_BE_MEASURED)[2].strip(": ") if line.startswith("#") else line.partition(":")[0].strip()
+        for line in lines
+        if TO_BE_MEASURED in line.partition("#")[2]
+    )
 
 
 class _Pose(Group):

@@ -56,6 +56,8 @@ class Synchronizer:
         self._settings = settings
         self._calibration = calibration
         self._limits = ScanLimits(calibration, warn)
+        if calibration.guesses:
+            warn(f"the calibration holds guesses, measure them: {', '.join(calibration.guesses)}")
         self._inputs = set(inputs)
         self._absent: set[Input] = set()
         self._slop_ns = round(settings.slop_s * 1e9)

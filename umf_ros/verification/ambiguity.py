@@ -1,9 +1,10 @@
-"""Whether two scans of a passage fit as well elsewhere along it, measured between surfaces.
+"""Ambiguity of a pose: whether two scans fit as well elsewhere.
 
 The pattern of one sensor lies on floor, walls and ceiling of a passage in the same way wherever it stands. Points of
 two scans therefore coincide at the identity pose although the places differ, and a test that measures from point to
-point finds every other pose worse. Here a point's distance is that to a plane, and the points of one half of a scan,
-every second band of elevations, are compared with planes of the other half alone: no ring meets itself.
+point finds every other pose worse. In a passage a point's distance is therefore that to a plane, and the points of
+one half of a scan, every second band of elevations, are compared with planes of the other half alone: no ring meets
+itself.
 """
 
 from __future__ import annotations
@@ -13,8 +14,68 @@ import numpy as np
 from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan, joint_blur
-from umf_ros.verification.surroundings import Sight
+from umf_ros.verification.scan_alignment import SEARCHED
+from umf_ros.verification.scan_consistency import counterpart_reach
+from umf_ros.verification.surroundings import Sight, visible
 from umf_ros.verification.yaw_search import alternatives
+
+
+def scan_ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> tuple[float, float]:
+    """How much worse the scans fit at poses beside this one, along the way that is known least: near and far.
+
+    A corridor fits anywhere along it; where it repeats, it fits better at the right place than at the wrong ones.
+    Where the place looks alike a few metres to any side, likewise.
+
+    Args:
+        match: the matched scan.
+        query: the query's scan.
+        pose: (4, 4) `match_T_query`.
+        information: (6, 6) of the alignment.
+
+    Returns:
+        Logarithm of the ratio of the mean misfits, half a metre away and at the best of the places further away: 0
+        when another place fits as well, negative when it fits better.
+    """
+    way = _least_known(information)
+    here, beside, along = (
+        _shifted(pose, way, shifts) for shifts in (np.zeros(1), const.RIVAL_NEAR_M, const.RIVAL_FAR_M)
+    )
+    fit = _point_fit(match, query, np.stack([*here, *beside, *along, *_other_peaks(match, query, pose)]))
+    far = 1 + len(beside)
+    return float(fit[1:far].min() - fit[0]), float(fit[far:].min() - fit[0])
+
+
+def _point_fit(match: PreparedScan, query: PreparedScan, poses: Array) -> Array:
+    """(K,) logarithms of the mean misfit of both ways at poses (K, 4, 4)."""
+    ours, theirs = query.sample[:: const.RIVAL_EVERY], match.sample[:: const.RIVAL_EVERY]
+    back = np.linalg.inv(poses)
+    here = _point_misfits(match, query, ours @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3])
+    there = _point_misfits(query, match, theirs @ back[:, :3, :3].swapaxes(1, 2) + back[:, None, :3, 3])
+    found: Array = np.log(np.maximum((here + there) / 2, 0.05))
+    return found
+
+
+def _point_misfits(scan: PreparedScan, other: PreparedScan, moved: Array) -> Array:
+    """(K,) mean misfit of the visible ones of points (K, N, 3); as bad as can be where few are."""
+    points = moved.reshape(-1, 3)
+    reach = np.tile(counterpart_reach(other.spacing[:: const.RIVAL_EVERY], joint_blur(scan, other)), len(moved))
+    misfit = np.minimum(np.sqrt(scan.nearest(points)[1]) / reach, const.RIVAL_MISFIT)
+    seen = visible(scan.look_at(points)).reshape(len(moved), -1)
+    count = seen.sum(axis=1)
+    mean = (misfit.reshape(seen.shape) * seen).sum(axis=1) / np.maximum(count, 1)
+    return np.where(count >= const.MEETING_POINTS, mean, const.RIVAL_MISFIT)
+
+
+def _least_known(information: Array) -> Array:
+    """(3,) the horizontal direction in which the position is known least."""
+    across = np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1]
+    return np.append(across, 0.0)
+
+
+def _other_peaks(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
+    """Poses at the other peaks of the search at the heading of a pose."""
+    peaks = alternatives(match, query, pose)
+    return [one for one in peaks if np.linalg.norm((one - pose)[:3, 3]) > const.DISTINCT_M]
 
 
 def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> float:
@@ -36,13 +97,14 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
     if way is None:
         return float("nan")
     needed = const.NARROW_PASSAGE_RIVAL if _is_fan(match) or _is_fan(query) else const.PASSAGE_RIVAL
-    near = _rival(match, query, np.stack([pose, *_shifted(pose, way, const.RIVAL_NEAR_M)]), const.PASSAGE_SAMPLE)
+    near = _surface_rival(
+        match, query, np.stack([pose, *_shifted(pose, way, const.RIVAL_NEAR_M)]), const.PASSAGE_SAMPLE
+    )
     if near.min() < needed:
         return float(near.min()) / needed
-    others = [one for one in alternatives(match, query, pose) if np.linalg.norm((one - pose)[:3, 3]) > const.DISTINCT_M]
-    poses = np.stack([pose, *_shifted(pose, way, const.PASSAGE_FAR_M), *others])
-    best = np.argsort(_rival(match, query, poses, const.PASSAGE_SCOUTS))[: const.PASSAGE_KEPT] + 1
-    far = _rival(match, query, poses[[0, *best]], const.PASSAGE_SAMPLE)
+    poses = np.stack([pose, *_shifted(pose, way, const.PASSAGE_FAR_M), *_other_peaks(match, query, pose)])
+    best = np.argsort(_surface_rival(match, query, poses, const.PASSAGE_SCOUTS))[: const.PASSAGE_KEPT] + 1
+    far = _surface_rival(match, query, poses[[0, *best]], const.PASSAGE_SAMPLE)
     return float(min(near.min(), far.min())) / needed
 
 
@@ -83,15 +145,15 @@ def _shifted(pose: Array, way: Array, shifts: Array) -> Array:
     return shifted
 
 
-def _rival(match: PreparedScan, query: PreparedScan, poses: Array, sample: int) -> Array:
+def _surface_rival(match: PreparedScan, query: PreparedScan, poses: Array, sample: int) -> Array:
     """(K,) logarithm of the misfit at all but the first of poses (1 + K, 4, 4), against that at the first."""
-    there = _misfits(query, match, np.linalg.inv(poses), sample)
-    logarithm = np.log((_misfits(match, query, poses, sample) + there) / 2 + const.PLANE_MISFIT_FLOOR)
+    there = _surface_misfits(query, match, np.linalg.inv(poses), sample)
+    logarithm = np.log((_surface_misfits(match, query, poses, sample) + there) / 2 + const.PLANE_MISFIT_FLOOR)
     found: Array = logarithm[1:] - logarithm[0]
     return found
 
 
-def _misfits(scan: PreparedScan, other: PreparedScan, poses: Array, sample: int) -> Array:
+def _surface_misfits(scan: PreparedScan, other: PreparedScan, poses: Array, sample: int) -> Array:
     """(K,) mean misfit, 0 to 1, of the other scan's points with the scan's planes; 1 where few can be compared.
 
     Points of every second band of elevations are compared with planes of the bands between: a ring never meets itself.

@@ -19,7 +19,6 @@ SUPERFEATURE_RATIO = 0.9  # [UMF eq. 4.1]
 SAME_PLACE_M = 3.0  # by hand: candidates nearer than this to a chosen one show the same place
 
 # ransac
-MIN_TRIANGLE = 1e-3  # by hand: of a sampled triangle, twice its area; the points fill the unit square
 MAX_TILT_RAD = 0.5  # by hand: a rover does not lie on its side
 
 # hypotheses: which poses are worth a closer look?

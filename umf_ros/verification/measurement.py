@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.ambiguity import passage_rival
+from umf_ros.verification.ambiguity import passage_rival, scan_ambiguity
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypothesis import IMAGE, SCAN, Hypothesis, Measurement
 from umf_ros.verification.pose_search import TemporalMemory, near, prior_sigmas
@@ -31,7 +31,7 @@ from umf_ros.verification.scan_alignment import (
     nominal_deviations,
     scan_covariance,
 )
-from umf_ros.verification.scan_consistency import meet, rivalry
+from umf_ros.verification.scan_consistency import meet
 from umf_ros.verification.view_alignment import ViewAlignment
 
 
@@ -66,7 +66,7 @@ def measure_ambiguity(hypothesis: Hypothesis) -> Measurement:
     if not hypothesis.scans or not isinstance(hypothesis.alignment, Alignment):
         return hypothesis.measurement
     match, query = hypothesis.scans
-    near_by, far = rivalry(match, query, hypothesis.pose, hypothesis.alignment.information)
+    near_by, far = scan_ambiguity(match, query, hypothesis.pose, hypothesis.alignment.information)
     return replace(hypothesis.measurement, rival_near=near_by, rival_far=far)
 
 

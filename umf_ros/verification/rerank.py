@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cache
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, LocalFeatures, SuperFeatures
-from umf_ros.core.geometry import Array, align, relative
+from umf_ros.core.geometry import Array, align, relative, transform
 from umf_ros.verification import constants as const
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,12 +21,12 @@ class Consensus:
     """A model and the pairs that agree with it.
 
     Attributes:
-        model: (3, 3) homography or (4, 4) pose taking the first set to the second.
+        model: (3, 3) homography or (4, 4) pose that takes the first set to the second.
         inliers: (N,) mask over the pairs.
     """
 
     model: Array
-    inliers: Mask
+    inliers: NDArray[np.bool_]
 
     @property
     def count(self) -> int:
@@ -37,164 +35,54 @@ class Consensus:
 
 
 def fit_homography(a: Array, b: Array, threshold: float, iterations: int, seed: int) -> Consensus | None:
-    """Homography from pixels `a` (N, 2) to `b` (N, 2), or None.
+    """Homography from pixels `a` (N, 2) to `b` (N, 2) by USAC (Raguram et al., PAMI 2013), or None.
 
-    Inliers are transferred nearer than `threshold`, in the unit of the points. Models that mirror
-    the image are refused: no rigid scene in front of a camera looks like that.
+    Inliers are transferred nearer than `threshold`, in pixels. A model that mirrors the image is refused: no rigid
+    scene in front of a camera looks like that.
     """
     if len(a) < 4:
         return None
-    samples = _samples(len(a), 4, iterations, seed)
-    to_unit, unit_a, unit_b = _shared_unit(a, b)
-    models = _homographies(unit_a[samples], unit_b[samples])
-    if not len(models):
+    options = cv2.UsacParams()
+    options.threshold, options.maxIterations, options.randomGeneratorState = threshold, iterations, seed
+    options.score, options.loMethod = cv2.SCORE_METHOD_RANSAC, cv2.LOCAL_OPTIM_INNER_LO
+    options.isParallel = False  # the same on every machine
+    model, mask = cv2.findHomography(a, b, options)
+    if model is None or not np.linalg.det(model) > 0 or mask.sum() < 4:
         return None
-    inliers = _transfers(models, unit_a, unit_b, threshold * to_unit[0, 0])
-    best = int(inliers.sum(axis=1).argmax())
-    model, agrees = models[best], inliers[best]
-    if agrees.sum() < 4:
-        return None
-    refined = _least_squares(unit_a[agrees], unit_b[agrees])
-    wider = _transfers(refined[None], unit_a, unit_b, threshold * to_unit[0, 0])[0]
-    if wider.sum() > agrees.sum() and np.linalg.det(refined) > 0:
-        model, agrees = refined, wider
-    return Consensus(np.linalg.inv(to_unit) @ model @ to_unit, agrees)
+    return Consensus(np.asarray(model, float), mask.ravel().astype(bool))
 
 
 def fit_rigid(a: Array, b: Array, threshold: float, iterations: int, seed: int) -> Consensus | None:
-    """Rigid motion from points `a` (N, 3) to `b` (N, 3), or None; refined on its inliers.
+    """Rigid motion from points `a` (N, 3) to `b` (N, 3) by RANSAC, or None; refined on its inliers.
 
     Inliers lie nearer than `threshold` (m). The vertical axes may differ by half a radian: a
     rover does not lie on its side.
     """
-    samples = _samples(len(a), 3, iterations, seed)
-    rotations, translations = _triads(a[samples], b[samples], threshold)
+    if len(a) < 3:
+        return None
+    samples = np.random.default_rng(seed).integers(len(a), size=(iterations, 3))
+    triangles = np.stack([a[samples], b[samples]])
+    sides = np.linalg.norm(triangles - triangles[:, :, [2, 0, 1]], axis=3)
+    alike = (np.abs(sides[0] - sides[1]) < 2 * threshold).all(axis=1) & (sides[0].min(axis=1) > 3 * threshold)
+    triangles = triangles[:, alike]
+    centres = triangles.mean(axis=2)
+    ours, theirs = triangles - centres[:, :, None]
+    u, _, vt = np.linalg.svd(theirs.transpose(0, 2, 1) @ ours)  # [Kabsch 1976]
+    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+    rotations = u @ vt
     upright = rotations[:, 2, 2] > np.cos(const.MAX_TILT_RAD)
     if not upright.any():
         return None
-    rotations, translations = rotations[upright], translations[upright]
-    moved = (rotations.reshape(-1, 3) @ a.T).reshape(len(rotations), 3, -1)
-    inliers = ((moved + translations[..., None] - b.T) ** 2).sum(axis=1) < threshold**2
+    moved = (rotations[upright] @ (a.T - centres[0, upright][..., None])) + centres[1, upright][..., None]
+    inliers = ((moved - b.T) ** 2).sum(axis=1) < threshold**2
     best = inliers[int(inliers.sum(axis=1).argmax())]
     if best.sum() < 3:
         return None
-    pose = kabsch(a[best], b[best])
-    if pose is None or pose[2, 2] < np.cos(const.MAX_TILT_RAD):
+    pose, spread = align(a[best], b[best])
+    if spread[1] < 1e-6 * spread[0] or pose[2, 2] < np.cos(const.MAX_TILT_RAD):  # a line leaves a turn open
         return None
-    agrees = np.linalg.norm(a @ pose[:3, :3].T + pose[:3, 3] - b, axis=1) < threshold
+    agrees = np.linalg.norm(transform(pose, a) - b, axis=1) < threshold
     return Consensus(pose, agrees) if agrees.sum() >= 3 else None
-
-
-def kabsch(a: Array, b: Array) -> Array | None:
-    """Pose that takes the points `a` (N, 3) to `b` (N, 3) with least squared distance; None if they lie on a line."""
-    if len(a) < 3:
-        return None
-    pose, spread = align(a, b)
-    return None if spread[1] < 1e-6 * max(spread[0], 1e-12) else pose
-
-
-@cache
-def _samples(count: int, size: int, iterations: int, seed: int) -> NDArray[np.intp]:
-    """Index tuples (S, size) without repetition inside a tuple."""
-    picks = (_draws(iterations, seed)[:, :size] * count).astype(np.intp)
-    ordered = np.sort(picks, axis=1)
-    return picks[(ordered[:, 1:] > ordered[:, :-1]).all(axis=1)]
-
-
-@cache
-def _draws(iterations: int, seed: int) -> Array:
-    """Uniform numbers (iterations, 4) in [0, 1), the same for every call with one seed."""
-    return np.random.default_rng(seed).random((iterations, 4))
-
-
-def _shared_unit(a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Similarity that brings both sets near the unit square, and the sets under it."""
-    both = np.concatenate([a, b]).astype(float)
-    centre, scale = both.mean(axis=0), 1.0 / max(float(both.std()), 1e-9)
-    to_unit = np.array([[scale, 0, -scale * centre[0]], [0, scale, -scale * centre[1]], [0, 0, 1.0]])
-    return to_unit, (a - centre) * scale, (b - centre) * scale
-
-
-def _homographies(a: Array, b: Array) -> Array:
-    """Homographies (S', 3, 3) through those of the four point pairs, (S, 4, 2), that one view of a plane can explain.
-
-    Three points that run clockwise in one image do so in the other: most wrong samples fail this,
-    and so does every mirrored one. The models have positive depths at their samples.
-    """
-    quads = np.stack([a, b])
-    turns = _turns(quads)
-    plausible = (turns[0] * turns[1] > 0).all(axis=1) & (np.abs(turns[0]).min(axis=1) > const.MIN_TRIANGLE)
-    (turns_a, turns_b), corners = turns[:, plausible], _homogeneous(quads[:, plausible, :3])
-    # both quadrilaterals as images of the canonical one; the scale of a column follows from the fourth point
-    to_b = corners[1].transpose(0, 2, 1) * (turns_b[:, :3] / turns_a[:, :3] / turns_a[:, 3:])[:, None]
-    from_a = _cross(corners[0][:, [1, 2, 0]], corners[0][:, [2, 0, 1]])
-    return to_b @ from_a
-
-
-def _turns(quads: Array) -> Array:
-    """Twice the signed areas (..., 4) of the triangles 423, 143, 124 and 123 of quadrilaterals (..., 4, 2)."""
-    first, second, third = quads[..., [3, 0, 0, 0], :], quads[..., [1, 3, 1, 1], :], quads[..., [2, 2, 3, 2], :]
-    one, other = second - first, third - first
-    found: Array = one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
-    return found
-
-
-def _homogeneous(points: Array) -> Array:
-    return np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
-
-
-def _least_squares(a: Array, b: Array) -> Array:
-    """The homography (3, 3) that fits pairs (N, 2) best."""
-    x, y, u, v = a[:, 0], a[:, 1], b[:, 0], b[:, 1]
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    rows_u = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=1)
-    rows_v = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=1)
-    rows, right = np.concatenate([rows_u, rows_v]), np.concatenate([u, v])
-    free = np.linalg.solve(rows.T @ rows + 1e-9 * np.eye(8), rows.T @ right)
-    return np.append(free, 1.0).reshape(3, 3)
-
-
-def _transfers(models: Array, a: Array, b: Array, threshold: float) -> Mask:
-    """Which pairs (S, N) each model takes to their counterpart."""
-    mapped = (models.reshape(-1, 3) @ _homogeneous(a).T).reshape(len(models), 3, -1)
-    depth = mapped[:, 2]
-    across, down = mapped[:, 0] - b[:, 0] * depth, mapped[:, 1] - b[:, 1] * depth
-    found: Mask = (across**2 + down**2 < (threshold * depth) ** 2) & (depth > 0)
-    return found
-
-
-def _triads(a: Array, b: Array, threshold: float) -> tuple[Array, Array]:
-    """Motions between triangles (S, 3, 3) of equal side lengths: rotations (R, 3, 3), translations (R, 3)."""
-    triangles = np.stack([a, b])
-    sides = np.sqrt(_squared(triangles - triangles[:, :, [2, 0, 1]]))
-    alike = (np.abs(sides[0] - sides[1]) < 2 * threshold).all(axis=1) & (sides[0].min(axis=1) > 3 * threshold)
-    triangles = triangles[:, alike]
-    frames, valid = _triangle_frames(triangles)
-    keep = valid.all(axis=0)
-    rotations = frames[1, keep] @ frames[0, keep].transpose(0, 2, 1)
-    centres = triangles[:, keep].mean(axis=2)
-    return rotations, centres[1] - np.einsum("sij,sj->si", rotations, centres[0])
-
-
-def _triangle_frames(triangles: Array) -> tuple[Array, Mask]:
-    """Right-handed orthonormal frames (..., 3, 3), axes as columns, and which triangles are not degenerate."""
-    first = triangles[..., 1, :] - triangles[..., 0, :]
-    normal = _cross(first, triangles[..., 2, :] - triangles[..., 0, :])
-    squared, area = _squared(first), np.sqrt(_squared(normal))
-    x = first / np.sqrt(np.maximum(squared, 1e-24))[..., None]
-    z = normal / np.maximum(area, 1e-12)[..., None]
-    return np.stack([x, _cross(z, x), z], axis=-1), area > 0.05 * np.maximum(squared, 1e-18)
-
-
-def _squared(vectors: Array) -> Array:
-    squared: Array = np.einsum("...i,...i->...", vectors, vectors)
-    return squared
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Cross product of rows (..., 3); numpy's own spends most of its time on axes."""
-    product: Array = a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
-    return product
 
 
 Indices = NDArray[np.intp]

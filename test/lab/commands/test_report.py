@@ -88,7 +88,7 @@ def run(bag: Path, tmp_path: Path) -> Path:
 
 
 def scene_of(run: Path) -> dict[str, Any]:
-    """What the page draws."""
+    """The data that the page draws."""
     page = (run / "report.html").read_text(encoding="utf-8")
     found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
     assert found

@@ -1,4 +1,4 @@
-"""What each sensor finds, by stretches of a drive."""
+"""Closures of each sensor, by stretches of a drive."""
 
 from __future__ import annotations
 

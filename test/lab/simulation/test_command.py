@@ -1,4 +1,4 @@
-"""What `umf simulate` refuses, each with one clear line and nothing left behind."""
+"""`umf simulate` refuses wrong arguments with one clear line and leaves no file."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ def test_an_unknown_preset_is_refused_by_name():
 def test_sessions_of_one_world_drive_parts_of_one_way() -> None:
     relief = ground(10_005, "etna", 1.0)
     clearing = SESSION.clearing(relief, 10_006)
-    assert np.array_equal(clearing, SESSION.clearing(relief, 10_007))  # the same world, whoever drives
+    assert np.array_equal(clearing, SESSION.clearing(relief, 10_007))  # the same world on every drive
     starts = []
     for seed in (10_006, 10_007, 10_008):
         path = SESSION.route(relief, seed).path

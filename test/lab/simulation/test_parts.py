@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import from_quaternion, heading, make_pose
 from umf_ros.lab.simulation.bag_writer import fix_message, imu_message, odometry_message, pose_message
-from umf_ros.lab.simulation.camera import _smeared
+from umf_ros.lab.simulation.camera import _smeared, ahead
 from umf_ros.lab.simulation.lidar import ETNA, POINTS, VULCANO, Scan
 from umf_ros.lab.simulation.motion_sensors import ORIGIN, to_geodetic
-from umf_ros.lab.simulation.pool import ahead
 from umf_ros.lab.simulation.presets import PRESETS
 from umf_ros.lab.simulation.route import resample, stand
 

@@ -1,4 +1,4 @@
-"""What a bag holds, byte for byte."""
+"""Contents of a bag, byte for byte."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.lab.simulation.bag_writer import BagWriter
-from umf_ros.lab.simulation.recording import describe, record, write_side_files
+from umf_ros.lab.simulation.simulator import describe, record, write_side_files
 from umf_ros.sensors.decode import decode_cloud, stamp_ns
 
 

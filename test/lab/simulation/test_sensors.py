@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.geometry import invert, relative, transform
 from umf_ros.embedding.inputs import is_blank
 from umf_ros.lab.simulation import motion_sensors
-from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, resized
+from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, Sun, resized
 from umf_ros.lab.simulation.lidar import PERIOD_NS, POINTS, VULCANO, Lidar, eyes, mosaic
-from umf_ros.lab.simulation.shading import Sun
 from umf_ros.lab.simulation.world import ROCK
 
 

@@ -6,11 +6,9 @@ import pytest
 from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import invert, transform
 from umf_ros.lab.simulation.camera import resized
-from umf_ros.lab.simulation.contact_sheet import contact_sheet
 from umf_ros.lab.simulation.presets import first_samples
 from umf_ros.lab.simulation.route import SETTINGS, plan_passes
-from umf_ros.lab.simulation.shards import save, write_shard
-from umf_ros.lab.simulation.survey import Survey, shard_plan
+from umf_ros.lab.simulation.survey import Survey, contact_sheet, save, shard_plan, write_shard
 
 
 @pytest.fixture(scope="module")

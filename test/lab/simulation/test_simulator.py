@@ -14,15 +14,13 @@ from umf_ros.core.errors import ConfigError, OutputError
 from umf_ros.lab.commands.simulate import command
 from umf_ros.lab.datasets.simulated import SimulatedWorld
 from umf_ros.lab.simulation.bag_writer import BagWriter
+from umf_ros.lab.simulation.camera import ahead
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.lidar import PERIOD_NS
-from umf_ros.lab.simulation.pool import ahead
 from umf_ros.lab.simulation.presets import DEMO, first_samples
-from umf_ros.lab.simulation.recording import record
 from umf_ros.lab.simulation.route import SETTINGS, plan_passes
-from umf_ros.lab.simulation.shards import save, write_shard
-from umf_ros.lab.simulation.simulator import START_NS, Simulator
-from umf_ros.lab.simulation.survey import Survey, shard_plan
+from umf_ros.lab.simulation.simulator import START_NS, Simulator, record
+from umf_ros.lab.simulation.survey import Survey, save, shard_plan, write_shard
 
 
 def test_scans_follow_each_other_and_images_keep_near_them(drive):

@@ -1,4 +1,4 @@
-"""What camera and LiDAR measure, against the ground they stand on."""
+"""Measurements of camera and LiDAR, against the ground they stand on."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from umf_ros.core.geometry import invert, make_pose, transform
-from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, resized
+from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, Sun, resized
 from umf_ros.lab.simulation.lidar import (
     LINES,
     PERIOD_NS,
@@ -22,7 +22,6 @@ from umf_ros.lab.simulation.lidar import (
     pulse_times,
 )
 from umf_ros.lab.simulation.relief import SIZE_M
-from umf_ros.lab.simulation.shading import Sun
 from umf_ros.lab.simulation.world import GROUND, HORIZON, ROCK
 
 SUN = Sun(30, 35)

@@ -8,11 +8,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from umf_ros.core.geometry import make_pose
-from umf_ros.lab.simulation.camera import Camera
+from umf_ros.lab.simulation.camera import Camera, Shader, Sun, cast
 from umf_ros.lab.simulation.relief import SIZE_M
-from umf_ros.lab.simulation.rocks import scatter_rocks
-from umf_ros.lab.simulation.shading import Shader, Sun, cast
-from umf_ros.lab.simulation.world import GROUND, HORIZON, ROCK, grid_triangles
+from umf_ros.lab.simulation.world import GROUND, HORIZON, ROCK, grid_triangles, scatter_rocks
 
 NOWHERE = np.empty((0, 2))
 

@@ -17,9 +17,8 @@ from typer.testing import CliRunner
 from umf_ros.core.config import dump_settings
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.lab.commands import adapt as command
-from umf_ros.lab.fit.adaptation import Adaptation, Lesson, Recall, adapt, measure
+from umf_ros.lab.fit.adaptation import Adaptation, Drive, Lesson, Recall, adapt, measure
 from umf_ros.lab.fit.scene import with_scene
-from umf_ros.lab.training.drives import Drive
 from umf_ros.lab.training.networks import read_card, save_weights
 from umf_ros.networks.efficientnet import DEPTH, EfficientNetLite0
 from umf_ros.networks.umf import UMF

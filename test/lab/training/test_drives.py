@@ -1,4 +1,4 @@
-"""What a drive says of places, and what it leaves open."""
+"""Labels of a drive: same place, different places, unknown."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from tiny_worlds import CAMERA, TINY, pose_at, some_scan
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame
+from umf_ros.lab.fit.adaptation import Drive, DriveReader, label_drive
 from umf_ros.lab.fit.scene import with_scene
-from umf_ros.lab.training.drives import Drive, DriveReader, label_drive
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.efficientnet import DEPTH, EfficientNetLite0
 from umf_ros.networks.umf import UMF

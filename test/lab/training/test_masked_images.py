@@ -6,6 +6,7 @@ import torch
 from tiny_worlds import TINY
 
 from umf_ros.lab.training.masked_objectives import (
+    MaskedBatch,
     MaskedImagesObjective,
     hide,
     normalised,
@@ -16,7 +17,6 @@ from umf_ros.lab.training.masked_objectives import (
     unpatch,
     visible_patches,
 )
-from umf_ros.lab.training.pretraining import MaskedBatch
 from umf_ros.lab.training.trainer import load_run
 from umf_ros.networks.encoders import Backbone
 from umf_ros.networks.umf import UMF

@@ -7,13 +7,13 @@ from tiny_worlds import TINY
 
 from umf_ros.embedding.inputs import voxelise
 from umf_ros.lab.training.masked_objectives import (
+    MaskedBatch,
     MaskedScansObjective,
     hidden_voxels,
     occupancy,
     unfold,
     voxel_ranges,
 )
-from umf_ros.lab.training.pretraining import MaskedBatch
 from umf_ros.lab.training.trainer import load_run
 from umf_ros.networks.umf import UMF
 

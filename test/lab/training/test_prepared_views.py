@@ -1,4 +1,4 @@
-"""Views that are prepared once: what is kept is what was seen, and nobody looks twice."""
+"""Views are prepared once, and the kept ones are the views as they were made."""
 
 from __future__ import annotations
 

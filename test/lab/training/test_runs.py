@@ -1,4 +1,4 @@
-"""What surrounds a run: settings, schedule, log, checkpoints, judgement and the command."""
+"""Parts of a run: settings, schedule, log, checkpoints, judgement and the command."""
 
 from __future__ import annotations
 
@@ -22,11 +22,10 @@ from umf_ros.core.errors import ConfigError, OutputError, UmfError, WeightsError
 from umf_ros.lab.commands import pretrain as pretrain_command
 from umf_ros.lab.commands import train as train_command
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
-from umf_ros.lab.training.metric_objective import MetricObjective
+from umf_ros.lab.training.metric_objective import MetricObjective, describe, figures, mean_of, validate
 from umf_ros.lab.training.networks import PRESETS, make_network, read_card, save_weights
 from umf_ros.lab.training.objective import Progress, append_row, learning_rate, resuming, save_checkpoint
 from umf_ros.lab.training.trainer import Team, Trainer, choose_device, join_team, load_run
-from umf_ros.lab.training.validation import describe, figures, mean_of, validate
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
 

@@ -1,4 +1,4 @@
-"""Who meets whom in a batch."""
+"""Pairs of a batch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RULE = Rule(positive_m=5)
 
 @dataclass
 class Drive:
-    """Poses of a drive whose samples nobody asks for."""
+    """Poses of a drive whose samples are never read."""
 
     world_T_body: np.ndarray
     pass_index: np.ndarray

@@ -19,10 +19,9 @@ from umf_ros.lab.datasets.sample import Rule
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.lab.datasets.views import Augmentation, ViewMaker
 from umf_ros.lab.training.batches import BatchMaker, PairSampler, places_drawn
-from umf_ros.lab.training.metric_objective import MetricObjective, rule_of
+from umf_ros.lab.training.metric_objective import MetricObjective, rule_of, validate
 from umf_ros.lab.training.networks import read_card
 from umf_ros.lab.training.trainer import Team, Trainer, load_run, train
-from umf_ros.lab.training.validation import validate
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
 

@@ -14,8 +14,7 @@ from umf_ros.core.errors import ConfigError, UmfError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.lab.fit.adaptation import Lesson
-    from umf_ros.lab.training.drives import Drive
+    from umf_ros.lab.fit.adaptation import Drive, Lesson
     from umf_ros.networks.umf import UMF
 
 
@@ -70,10 +69,10 @@ def command(
 def _drive(
     bag: Path, network: UMF, weights: Path, config: Path | None, dataset: str, kept_in: Path, console: Console
 ) -> Drive:
-    """What one recording teaches, from the folder where it is there."""
+    """The labels of one recording, from the folder if they are there."""
     from umf_ros.commands.console import WARNING, FrameProgress
     from umf_ros.core.errors import writing
-    from umf_ros.lab.training.drives import Drive, DriveReader
+    from umf_ros.lab.fit.adaptation import Drive, DriveReader
 
     rules = config.read_bytes() if config and config.is_file() else b""
     digest = hashlib.sha256(f"{bag.resolve()} {dataset}".encode() + rules + weights.read_bytes()).hexdigest()[:8]

@@ -32,9 +32,9 @@ def places(
     """
     from rich.console import Console
 
+    from umf_ros.core.io import write_atomically
     from umf_ros.lab.evaluation.places_bench import measure_places
     from umf_ros.runs.run_file import all_descriptors
-    from umf_ros.runs.writer import write_atomically
 
     console = Console(stderr=True)
     largest = 150_000 if quick else 1_000_000

@@ -25,12 +25,11 @@ def command(
 
     from umf_ros.bags.reader import open_bag
     from umf_ros.commands.console import undisturbed
-    from umf_ros.core.io import check_writable
+    from umf_ros.core.io import check_writable, create_run_folder
     from umf_ros.lab.commands import simulate
     from umf_ros.lab.live.live_graph import LiveGraph
     from umf_ros.runs.reader import remember_recording
     from umf_ros.runs.report import finish_run
-    from umf_ros.runs.writer import create_run_folder
 
     console = Console()
     check_writable(out)

@@ -49,7 +49,7 @@ class OpenRecording:
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """What the command line says of a recording."""
+    """Options of the command line for a recording."""
 
     bag: Path
     config: Path | None
@@ -97,7 +97,7 @@ def choose_worlds(name: str, seed: int | None, quick: bool, count: int) -> list[
 
 
 def note_on_worlds(worlds: Sequence[TestWorld], quick: bool) -> str:
-    """What a report says of the worlds."""
+    """Figures of the worlds, for the report."""
     names = ", ".join(world.name for world in worlds)
     return (
         f"Worlds: {names}; hard setting (offset path up to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing)"
@@ -198,8 +198,8 @@ class EveryMethod:
         return self._compare(console, [places], note)
 
     def _compare(self, console: Console, sets: Iterable[FrameSet], note: str) -> Figures:
+        from umf_ros.core.io import create_run_folder
         from umf_ros.lab.evaluation.methods_run import compare_methods
-        from umf_ros.runs.writer import create_run_folder
 
         with progress_bar(console) as bar:
             task = bar.add_task("reading", total=None)
@@ -252,7 +252,7 @@ def command(
     odometry: OdometryPath = None,
     odometry_frame: OdometryFrame = "",
     ground_truth: TruthPath = None,
-    rule: Annotated[str, Optional(help="What is the same place in listed sequences: s3li or robotcar.")] = "s3li",
+    rule: Annotated[str, Optional(help="Rule of the same place in listed sequences: s3li or robotcar.")] = "s3li",
 ) -> None:
     """Recall, precision, rerankers, lost modalities and cost.
 
@@ -291,13 +291,13 @@ def command(
     if json_file is not None:
         import json
 
-        from umf_ros.runs.writer import write_atomically
+        from umf_ros.core.io import write_atomically
 
         write_atomically(json_file, json.dumps(figures, indent=2) + "\n")
 
 
 def _check(data: Path | None, worlds: str | None, methods: str, trained: Path | None) -> None:
-    """What cannot be is said before anything that takes time to import."""
+    """Refuse wrong arguments before the slow imports."""
     if (data is None) == (worlds is None):
         raise ConfigError("expected either a recording or --worlds test|validation")
     if methods not in ("umf", "all"):
@@ -316,8 +316,8 @@ def _refuse(data: str, options: Mapping[str, object]) -> None:
 def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
+    from umf_ros.core.io import create_run_folder
     from umf_ros.lab.evaluation.worlds import WorldsRun, work
-    from umf_ros.runs.writer import create_run_folder
 
     console = Console()
     chosen = choose_worlds(name, seed, quick, count)
@@ -340,9 +340,9 @@ def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Pa
 def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
+    from umf_ros.core.io import create_run_folder
     from umf_ros.embedding import make_embedder
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
-    from umf_ros.runs.writer import create_run_folder
 
     console = Console()
     opened = options.open(console, weights)
@@ -376,13 +376,13 @@ def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) ->
 def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
+    from umf_ros.core.io import create_run_folder
     from umf_ros.lab.datasets.listed import SequenceList
     from umf_ros.lab.evaluation.results import EvaluationReport
     from umf_ros.lab.evaluation.retrieval import RULES
-    from umf_ros.lab.training.validation import answerable, means, table, validate
+    from umf_ros.lab.training.metric_objective import answerable, means, table, validate
     from umf_ros.networks.config import locate_weights
     from umf_ros.networks.weights import load_weights
-    from umf_ros.runs.writer import create_run_folder
 
     if rule not in RULES:
         raise ConfigError(f"--rule: expected {' or '.join(RULES)}, not {rule!r}")
@@ -406,8 +406,8 @@ def _on_places(listing: Path, config: Path | None, embedder: str | None, weights
     from rich.console import Console
 
     from umf_ros.core.config import load_settings
+    from umf_ros.core.io import create_run_folder
     from umf_ros.lab.evaluation.places import evaluate_place_sets
-    from umf_ros.runs.writer import create_run_folder
 
     console = Console()
     chosen = {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}

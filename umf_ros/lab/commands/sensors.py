@@ -33,11 +33,10 @@ def command(
 
     from rich.console import Console
 
-    from umf_ros.core.io import check_writable
+    from umf_ros.core.io import check_writable, create_run_folder, write_atomically
     from umf_ros.lab.commands import simulate
     from umf_ros.lab.evaluation.results import print_table
     from umf_ros.lab.evaluation.sensors_run import replay_all, score, stretches_of, table_of
-    from umf_ros.runs.writer import create_run_folder, write_atomically
 
     console = Console()
     check_writable(out)

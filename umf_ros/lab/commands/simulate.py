@@ -85,8 +85,7 @@ def _write_bag(
 ) -> None:
     from umf_ros.lab.simulation.bag_writer import BagWriter
     from umf_ros.lab.simulation.presets import find_preset
-    from umf_ros.lab.simulation.recording import record, write_side_files
-    from umf_ros.lab.simulation.simulator import Simulator
+    from umf_ros.lab.simulation.simulator import Simulator, record, write_side_files
 
     if out.suffix != ".mcap":
         raise OutputError(f"cannot write {out}: the name must end in .mcap")
@@ -128,7 +127,7 @@ def _spread_shards(
     folder: Path, worlds: str, every: int, sequences: str, workers: int, ray: str, console: Console
 ) -> None:
     from umf_ros.core.tasks import spread
-    from umf_ros.lab.simulation.shards import write_world
+    from umf_ros.lab.simulation.survey import write_world
 
     if sequences:
         raise ConfigError("--ray spreads --worlds, not --sequences")
@@ -140,15 +139,14 @@ def _spread_shards(
 
 
 def _write_shard(path: Path, survey: Survey, setting: str, workers: int, progress: Progress) -> None:
-    from umf_ros.lab.simulation.shards import write_shard
+    from umf_ros.lab.simulation.survey import write_shard
 
     task = progress.add_task(path.stem, total=len(survey))
     write_shard(path, survey, setting, workers, lambda done: progress.update(task, completed=done))
 
 
 def _write_contact_sheet(path: Path, seed: int, family: str, console: Console) -> None:
-    from umf_ros.lab.simulation.contact_sheet import contact_sheet
-    from umf_ros.lab.simulation.survey import survey_world
+    from umf_ros.lab.simulation.survey import contact_sheet, survey_world
 
     with console.status(f"drawing {family} {seed}"):
         contact_sheet(survey_world(seed, family, "hard"), path)

@@ -18,7 +18,7 @@ def command(
     validation: Annotated[str | None, typer.Option(help="The same, for validation.")] = None,
     method: Annotated[
         str | None,
-        typer.Option(help="What learns: metric (UMF), netvlad, minkloc_fusion, dbow2, ... (docs/training.md)."),
+        typer.Option(help="Training method: metric (UMF), netvlad, minkloc_fusion, dbow2, ... (docs/training.md)."),
     ] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of training settings.")] = None,
     preset: Annotated[str | None, typer.Option(help="Network: umf_light, umf_scene, umf_lite0, umf_resnet50.")] = None,

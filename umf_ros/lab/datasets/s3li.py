@@ -147,7 +147,7 @@ def _settled(value: Any, done: dict[int, Any]) -> Any:
 
 
 def load_pickle(path: Path, known: Names | None = None) -> Any:
-    """What a pickle holds.
+    """Contents of a pickle.
 
     Args:
         path: the file.

@@ -136,7 +136,7 @@ class WorldFolder:
 
 
 DETOUR_M = 60.0
-"""What lies less than this back along the way is no revisit."""
+"""A place less than this path length back is no revisit."""
 BASELINE_M = 1.0
 """Way before and after a place that says where the rover was heading."""
 

@@ -24,7 +24,7 @@ FIGURES = {
     "auc_pr": "auc_pr",
     "recall_at_precision1": "recall_at_precision1",
 }
-"""What they are called in the JSON, and in `Scores`."""
+"""Their names in the JSON, and in `Scores`."""
 
 ETNA = {
     # [UMF table 5.4]: recall@1 on the real data of Mt Etna, in per cent
@@ -62,7 +62,7 @@ SENSES = {
     "scan_context": "scan",
     "solid": "scan",
 }
-"""What a method looks at; the others at both."""
+"""The sensor of a method; others use both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ def ask(task: RetrievalTask, ranking: Ranking, unanswerable_count: bool = False)
 
 @dataclass(frozen=True, slots=True)
 class MethodCost:
-    """What a method costs [UMF table 5.9].
+    """Cost of a method [UMF table 5.9].
 
     Attributes:
         parameters: of its network; 0 without one.

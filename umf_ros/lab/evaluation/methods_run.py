@@ -180,7 +180,7 @@ class MethodsRun:
         self._answers.setdefault(name, {})[place] = answers
 
     def results(self, repeats: int) -> list[MethodResult]:
-        """What was found, the costs taken now; the thesis's order."""
+        """Results and costs, measured now, in the thesis's order."""
         self._report("taking times", 0)
         found = [MethodResult(name, sets, None, self._xfeat.get(name, ())) for name, sets in self._answers.items()]
         return sorted(with_costs(found, self._costs(repeats)), key=lambda one: one.of("recall1"))

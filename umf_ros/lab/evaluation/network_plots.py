@@ -1,4 +1,4 @@
-"""What the network makes of places: descriptors in the plane, attention and key-points [UMF figures 5.5 to 5.11]."""
+"""Pictures of the network's output: descriptors in the plane, attention and key-points [UMF figures 5.5 to 5.11]."""
 
 from __future__ import annotations
 

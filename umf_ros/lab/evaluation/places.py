@@ -52,7 +52,7 @@ class PlaceSet(Group):
 
 
 class PlaceScores(NamedTuple):
-    """What was found in one set.
+    """Results of one set.
 
     Attributes:
         name: of the set.

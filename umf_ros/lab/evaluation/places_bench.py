@@ -21,7 +21,7 @@ from umf_ros.core.config import Database, Loop
 from umf_ros.core.frames import Embedding, Keyframe, Points, StereoCamera
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.index import PlaceIndex, Rows
-from umf_ros.places.packing import pack
+from umf_ros.places.store import pack
 
 DIMENSION = 768
 PER_DRIVE = 250

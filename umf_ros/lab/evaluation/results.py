@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.table import Table as Grid
 
 from umf_ros.core.geometry import Array
+from umf_ros.core.io import write_atomically
 from umf_ros.lab.evaluation.retrieval import THESIS_RULE, Indices, Mask, Ranking, RetrievalTask
-from umf_ros.runs.writer import write_atomically
 
 CURVE = 25
 """Candidates up to which recall is reported."""

@@ -142,7 +142,7 @@ class PairInliers:
         return ranking.reordered(scores)
 
     def _of(self, row: int, reference: int) -> float:
-        """What a pair's inliers add to its similarity."""
+        """Share of a pair's inliers that is added to its similarity."""
         if np.isnan(self._worth[row, reference]):
             keyframe = self._references[reference]
             alone = [(Candidate(0, keyframe.stamp_ns, 0.0), keyframe)]
@@ -165,7 +165,7 @@ PARTS = {"image": "image", "lidar": "cloud", "both": "both"}
 """Which local features a reranker uses: what it is called here and in the settings."""
 
 METHODS = {f"{reranker} {part}": (reranker, modalities) for reranker in RERANKERS for part, modalities in PARTS.items()}
-"""What is compared: the settings `rerank` and `modalities` of every way to rerank."""
+"""The settings `rerank` and `modalities` of every way to rerank."""
 
 NO_POINTS = np.empty((0, 3), np.float32)
 
@@ -176,7 +176,7 @@ MODES: dict[str, Callable[[Frame], Frame]] = {
     "image black": lambda frame: replace(frame, left=np.zeros_like(frame.left), right=None),
     "cloud empty": lambda frame: replace(frame, points=NO_POINTS, intensity=np.empty(0, np.float32)),
 }
-"""What a frame looks like when a sensor is not used, or failed."""
+"""A frame without the sensors that are not used or failed."""
 
 
 class PlaceCollection:
@@ -218,7 +218,7 @@ def as_keyframe(frame: Frame, embedding: Embedding) -> Keyframe:
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """What each query retrieved.
+    """References that each query retrieved.
 
     Attributes:
         order: (Q, N) references, best first, `NOTHING` where a query has no more.
@@ -262,7 +262,7 @@ def rank(similarity: Array, admissible: Mask | None = None) -> Ranking:
 
 @dataclass(frozen=True, slots=True)
 class Reranking:
-    """What the local features make of a ranking.
+    """A ranking after reranking by local features.
 
     Attributes:
         before: the ranking by descriptors alone.

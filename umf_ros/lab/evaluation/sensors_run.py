@@ -1,4 +1,4 @@
-"""What each sensor finds on one recording: LiDAR and camera together, and either alone."""
+"""Closures of each sensor on one recording: LiDAR and camera together, and either alone."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class StretchScore:
-    """What was found on a stretch.
+    """Closures on a stretch.
 
     Attributes:
         revisits: keyframes that saw a place again, in about the same direction.
@@ -115,7 +115,7 @@ def replay(task: SensorTask) -> None:
 
 
 def score(about: ExaminedRun, stretches: Sequence[Stretch]) -> dict[str, StretchScore]:
-    """What a run found on every stretch, by its name.
+    """Closures of a run on every stretch, by its name.
 
     Raises:
         UmfError: there is no ground truth.

@@ -1,4 +1,4 @@
-"""What an evaluation on worlds found, and what the networks cost."""
+"""Results of an evaluation on worlds, and the cost of the networks."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ETNA_RECALL1 = {
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What a network costs [UMF table 5.9].
+    """Cost of a network [UMF table 5.9].
 
     Attributes:
         name: for people.
@@ -66,7 +66,7 @@ class Cost:
 
 @dataclass(frozen=True, slots=True)
 class WorldResult:
-    """What was found in one world.
+    """Results of one world.
 
     Attributes:
         name: family and seed.

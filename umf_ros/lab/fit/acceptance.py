@@ -72,7 +72,7 @@ def load_examples(path: Path) -> list[Example]:
 
 RIDGE = 0.03  # measured: leaving domains out, a tenth of it accepts less at no wrong one
 SAFETY = 0.25  # by hand: log-odds between the most probable wrong pose and the threshold
-# numbers that describe the scans rather than how well they fit; beyond what was fitted nobody knows what they mean
+# numbers that describe the scans rather than how well they fit; beyond the fitted range their meaning is unknown
 BOUNDED = {SCAN: ("noise_m", "residual_m", "points", "common", "position_std_m", "heading_std_deg"), IMAGE: ()}
 # however well all the rest fits
 NECESSARY = {SCAN: ("contradiction", "unexplained"), IMAGE: ()}
@@ -166,7 +166,7 @@ def made_safe(model: Logistic, wrong_odds: Array, threshold: float) -> Logistic:
 
 
 def bounds_of(examples: list[Example], kind: str) -> dict[str, tuple[float, float]]:
-    """What right poses of a kind measured at least and at most, with some room, by the name of the number."""
+    """Smallest and largest values of right poses of a kind, with some margin, by the name of the number."""
     mine = [example.measurement for example in examples if example.measurement.kind == kind and example.right]
     bounds = {}
     for name in (*BOUNDED[kind], *NECESSARY[kind]):
@@ -186,7 +186,7 @@ def inside_ellipsoid(errors: Array, covariances: Array, confidence: float = 0.95
 def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: dict[str, str], results: dict[str, float]) -> None:
     """Write a fitted decision for `load_acceptance`.
 
-    What a file there says of other parts, and of how they did, stays.
+    Other parts of a file there, and their results, stay.
 
     Args:
         model: all of it.

@@ -80,7 +80,7 @@ def sample_of(match: Keyframe, query: Keyframe, alignment: Alignment, true: Arra
 
 
 def covariances_of(samples: Sequence[PoseSample], model: CovarianceModel) -> Array:
-    """What the model states of samples: (N, 6, 6)."""
+    """Covariances (N, 6, 6) that the model states for samples."""
     information, overlap, walked, grown = (
         np.array([getattr(sample, name) for sample in samples])
         for name in ("information", "overlap", "walked", "grown")
@@ -217,7 +217,7 @@ def right_sample(match: Keyframe, query: Keyframe, guess: Array, true: Array) ->
 
 
 def remembered(folder: Path | None, name: str, find: Callable[[], Iterable[PoseSample]]) -> list[PoseSample]:
-    """What an earlier call left in the folder, else what is found now."""
+    """Samples that an earlier call left in the folder, else new ones."""
     path = None if folder is None else folder / f"{name}.samples.pkl"
     if path is not None and path.exists():
         samples: list[PoseSample] = pickle.loads(path.read_bytes())

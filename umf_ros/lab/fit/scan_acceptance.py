@@ -112,7 +112,7 @@ def examples_of(domain: Domain, seeds: range, pairs: int, scans: Path | None, em
 
 
 def _examples(tried: Tried, verifier: Verifier, domain: Domain, rng: np.random.Generator) -> Iterator[Example]:
-    """What verification finds of itself, and what it would make of poses that it may find another time."""
+    """Poses that verification finds, and its measurements at poses that it may find another time."""
     verifier.reset()
     candidates = [(Candidate(0, tried.match.stamp_ns, tried.pair.similarity), tried.match)]
     found = [
@@ -127,7 +127,7 @@ def _examples(tried: Tried, verifier: Verifier, domain: Domain, rng: np.random.G
     kept: list[Array] = []
     for pose, measurement in found:
         right = tried.is_right(pose)
-        # nobody can know a pose that is right where the scans see nothing of each other
+        # scans that share no view cannot show that a pose is right
         if right is None or (right and measurement.common < 0.1) or any(_same_basin(pose, other) for other in kept):
             continue
         kept.append(pose)
@@ -167,7 +167,7 @@ def _between_worlds(places: list[ScannedPlace], rng: np.random.Generator) -> Sca
 
 
 def _seen(keyframe: Keyframe, view: str, all_round: bool) -> Keyframe:
-    """What another sensor would have seen: one without time stamps, a narrow, a short-sighted, a sparse one."""
+    """The keyframe of another sensor: one without time stamps, a narrow, a short-sighted, a sparse one."""
     if view == "untimed":
         return replace(keyframe, motion=None)
     points = transform(invert(keyframe.body_T_lidar), keyframe.points.astype(float))
@@ -257,7 +257,7 @@ def _in_domain(
 def fit(examples: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
     """The model that explains the examples, and how it does in domains left out.
 
-    What the shipped model says of other kinds than scans stays.
+    The shipped model's parts for other kinds than scans stay.
     """
     shipped = load_acceptance()
     mine = [example for example in examples + _sprung_traps() if example.measurement.kind == SCAN]
@@ -304,7 +304,7 @@ def _choose(drive: SurveyedDrive, query: int, candidates: list[Candidate], rng: 
 
 
 def _degraded(keyframe: Keyframe, strength: float, rng: np.random.Generator) -> Keyframe:
-    """What real scans suffer and simulated ones do not: range noise and motion that odometry did not remove."""
+    """Errors of real scans that simulated ones lack: range noise and motion that odometry did not remove."""
     points = keyframe.points.astype(float)
     reach = np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1.0)
     points *= 1 + strength * 0.01 * rng.standard_normal((len(points), 1)) / reach

@@ -44,7 +44,7 @@ GRADED = 0.3
 
 @dataclass(frozen=True, slots=True)
 class PooledWorld:
-    """What the fit needs of the images of one world.
+    """Input of the fit from the images of one world.
 
     Attributes:
         cells: (N, C * rows * columns) pooled maps, centred.

@@ -2,8 +2,8 @@
 
 python -m umf_ros.lab.fit.submap_acceptance [--drives FOLDER] [--out FILE]
 
-Only LiDAR and odometry are simulated: a drive takes about a minute of one core. What a single scan would have found
-(revisits in the same direction) is taken from the truth.
+Only LiDAR and odometry are simulated: a drive takes about a minute of one core. Closures of single scans
+(revisits in the same direction) are taken from the truth.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def drive_of(preset: str, seed: int, family: str, aliasing: float, folder: Path 
 
 
 def examples_of(number: int, drive: SubmapDrive) -> Iterator[SubmapExample]:
-    """What the finder tests along a drive when all that is right is accepted, and wrong answers on top."""
+    """Hypotheses of the finder along a drive when every right one is accepted, and wrong answers on top."""
     database = PlaceDatabase(Database(), "none", 1)
     finder = SubmapFinder(Verification(), Loop(), database)
     truth = {one.stamp_ns: pose for one, pose in zip(drive.keyframes, drive.truth, strict=True)}
@@ -148,7 +148,7 @@ def _found_by_scan(drive: SubmapDrive) -> dict[int, list[tuple[Keyframe, Array]]
 
 
 def _wrong_answers(number: int, truth: Truth, finder: SubmapFinder, query: Keyframe) -> Iterator[SubmapExample]:
-    """What looks alike and is another place, poses beside the right ones, and poses anywhere."""
+    """Similar views of other places, poses beside the right ones, and poses anywhere."""
     if query.path_length_m < const.SUBMAP_BEFORE_M:
         return
     rng = np.random.default_rng([number, query.stamp_ns % 2**32])
@@ -216,7 +216,7 @@ def fit_covariance(examples: list[SubmapExample]) -> tuple[float, OdometryError]
 
 
 def results(examples: list[SubmapExample], model: SubmapAcceptance, threshold: float) -> dict[str, float]:
-    """What the decision makes of examples."""
+    """Results of the decision on examples."""
     accepted = [one for one in examples if model.probability(one.measurement) >= threshold]
     right = [one for one in accepted if one.right]
     squared = [float(normalised_errors(one.error, model.covariance(one.information, one.way_m))) for one in right]

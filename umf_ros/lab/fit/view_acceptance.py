@@ -4,8 +4,8 @@ python -m umf_ros.lab.fit.view_acceptance BAG... [--keyframes FOLDER] [--out FIL
 
 The recordings (`umf simulate`, validation seeds) are read without their scans, as a rover without a LiDAR sees them.
 Right and wrong examples are hypotheses about what retrieval offers, about nearer places that it missed, and about
-places of the other recordings, which are all wrong; each with odometry and without. What is written is the model of
-views alone; everything else in the file stays.
+places of the other recordings, which are all wrong; each with odometry and without. Only the model of views is
+written; everything else in the file stays.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class ViewFinding:
 
     @property
     def example(self) -> Example:
-        """What the acceptance model is fitted to."""
+        """Data that the acceptance model is fitted to."""
         return Example(self.examined.measurement, self.right)
 
 
@@ -138,7 +138,7 @@ def fit(findings: list[ViewFinding]) -> tuple[AcceptanceModel, dict[str, float]]
     findings = [finding for finding in findings if finding.right or finding.wrong]
     right = np.array([finding.right for finding in findings])
     odds = _held_out(findings)
-    # the highest that a wrong one climbs in a recording nobody fitted to stays below the threshold
+    # the highest that a wrong one climbs in a recording that was left out stays below the threshold
     strictness = max(0.0, float(odds[~right].max(initial=-np.inf)) - THRESHOLD_ODDS + MARGIN)
     accepted = odds - strictness >= THRESHOLD_ODDS
     tracked = np.array([finding.tracked for finding in findings])

@@ -13,10 +13,9 @@ from pydantic import Field, ValidationError
 from umf_ros.baselines.dbow2 import METHOD, Binary, Indices, OrbFeatures, Vocabulary
 from umf_ros.core.config import Group, problems
 from umf_ros.core.errors import ConfigError
-from umf_ros.core.io import read_values
+from umf_ros.core.io import read_values, write_atomically
 from umf_ros.lab.datasets.listed import open_source
 from umf_ros.lab.datasets.sample import SampleSequence
-from umf_ros.runs.writer import write_atomically
 
 Signs = NDArray[np.float32]
 """(N, 256) bits as -1 and 1: of two such rows, the product is 256 less twice the Hamming distance."""

@@ -56,7 +56,7 @@ class BagPlayer(Node):
         """Wait until somebody takes images and scans (as far as there are any) and all subscriptions are connected.
 
         Raises:
-            UmfError: nobody came.
+            UmfError: no subscriber within the time.
         """
         sensors = [
             [topic for topic in self._topic_publishers if self._bag.topics[topic].type == kind] for kind in SENSOR_TYPES
@@ -70,7 +70,7 @@ class BagPlayer(Node):
                 settled_since = time.monotonic()
             if time.monotonic() > deadline:
                 names = " and ".join(" or ".join(self._names(topics)) for topics in sensors if topics)
-                raise UmfError(f"nobody subscribed to {names} within {SUBSCRIBER_TIMEOUT_S:.0f} s")
+                raise UmfError(f"no node subscribed to {names} within {SUBSCRIBER_TIMEOUT_S:.0f} s")
             time.sleep(0.02)
 
     def play(self, on_progress: Callable[[float], None]) -> None:

@@ -31,7 +31,7 @@ WHOLE = ("qos.reliability:=reliable", "qos.depth:=200", "frames.extrinsics:=cali
 class NodeProcess:
     """A node in a process of its own; its output goes to a file in the folder `logs` and line by line to `on_line`.
 
-    It does not see the terminal's Ctrl-C: whoever started it decides the order in which nodes end.
+    It does not see the terminal's Ctrl-C: its parent decides the order in which nodes end.
     """
 
     def __init__(self, module: str, arguments: list[str], logs: Path, on_line: Callable[[str], None]) -> None:

@@ -21,7 +21,7 @@ from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, resized
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.route import SETTINGS, plan_passes
-from umf_ros.lab.simulation.shards import Survey
+from umf_ros.lab.simulation.survey import Survey
 from umf_ros.lab.simulation.world import World, ground
 from umf_ros.sensors.calibration import Calibration, load_calibration
 

@@ -13,16 +13,15 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.frames import Image, StereoCamera
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose
 from umf_ros.core.resources import find
-from umf_ros.lab.simulation.camera import Camera
+from umf_ros.lab.simulation.camera import Camera, cast
 from umf_ros.lab.simulation.noise import Field
-from umf_ros.lab.simulation.shading import cast
 from umf_ros.lab.simulation.world import ROCK, World
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What a data set's cameras publish.
+    """Topics and encoding of a data set's cameras.
 
     Attributes:
         calibration: file of the sensors, relative to the share folder.

@@ -120,7 +120,7 @@ class ImuData:
 
 
 def measure_imu(motion: Motion, body_T_imu: Array, duration_s: float, seed: int) -> ImuData:
-    """What the IMU says along a motion at 400 Hz: lever arm, constant biases and white noise included."""
+    """Measurements of the IMU along a motion at 400 Hz: lever arm, constant biases and white noise included."""
     rng = np.random.default_rng([seed, 8])
     times = np.arange(0, duration_s, 1 / IMU_RATE_HZ)
     poses, rate, turning = motion.poses(times), motion.angular(times), motion.angular(times, 2)
@@ -260,7 +260,7 @@ def drifting(motion: Motion, drift: Drift, times: Array, seed: int) -> Odometry:
 
 
 def _deviations(drift: Drift, metres: Array) -> Array:
-    """What an honest odometry would say of its own error."""
+    """Standard deviations that a consistent odometry states: position (m) and heading (rad)."""
     driven = np.concatenate([[0], np.cumsum(metres)])
     turn = np.radians(drift.turn_deg_m) * driven + np.radians(drift.walk_deg_sqrt_m) * np.sqrt(driven)
     return np.stack([0.01 + drift.scale * driven + 0.5 * turn * driven, 1e-3 + turn], 1)

@@ -11,11 +11,11 @@ from scipy.interpolate import CubicSpline
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation import lidar as rig
+from umf_ros.lab.simulation.camera import Sun
 from umf_ros.lab.simulation.lidar import Layout
 from umf_ros.lab.simulation.motion_sensors import Drift
 from umf_ros.lab.simulation.relief import Pan, Relief
 from umf_ros.lab.simulation.route import NIGHT, SETTINGS, Pass, Route, Walker, plan_passes
-from umf_ros.lab.simulation.shading import Sun
 from umf_ros.lab.simulation.survey import Survey
 from umf_ros.lab.simulation.world import World, check_seed, ground
 from umf_ros.sensors.calibration import Calibration

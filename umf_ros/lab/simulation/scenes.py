@@ -229,7 +229,7 @@ TRAPS: dict[str, Callable[[int], Pair]] = {
 
 
 def spring(verifier: Verifier, trap: Callable[[int], Pair], seed: int) -> Hypothesis:
-    """What the verifier says of one trap, similarity of the global descriptors pretended to be high."""
+    """The verifier's decision on one trap, similarity of the global descriptors pretended to be high."""
     query, match = trap(seed)
     verifier.reset()
     return verifier.verify(query, [(Candidate(0, match.stamp_ns, 0.97), match)])[0]

@@ -33,8 +33,8 @@ class Draw:
 class PairSampler:
     """Anchor-positive pairs of two worlds, half of each world's along one stretch of it.
 
-    What a place is taken for lies in its own world: its neighbours along the way, and what looks alike
-    farther off; a pair of another world is told apart by its ground alone. Hard worlds are drawn twice
+    A place is confused with places of its own world: its neighbours along the path, and similar views
+    farther off; a pair of another world differs by its ground alone. Hard worlds are drawn twice
     as often as easy ones. Positives come from another pass.
 
     Args:
@@ -221,7 +221,7 @@ class _ByStep(Dataset[Item | UmfError], Generic[Item]):
 
 
 def made_ahead(make: Callable[[int], Item], steps: range, workers: int) -> Iterator[Item]:
-    """What `make` makes of every step, in order.
+    """Batches of `make` for every step, in order.
 
     Args:
         make: must depend on nothing but the step; called in a copy of this process.

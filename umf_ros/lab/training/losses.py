@@ -43,7 +43,7 @@ def multi_similarity(
 def neighbourhood_components(similarity: Tensor, wanted: Tensor, unwanted: Tensor, temperature: float = 0.05) -> Tensor:
     """Neighbourhood components analysis [Goldberger 2004]: recall at one, softly counted.
 
-    What is maximised is the chance that a reference drawn by its similarity is a wanted one; of several
+    Maximises the chance that a reference drawn by its similarity is a wanted one; of several
     wanted ones the most similar is enough.
 
     Args:

@@ -25,12 +25,12 @@ Precision = Literal["half", "int8"]
 
 
 class RunSettings(Group):
-    """What every run has, whatever it learns; an objective's own settings are a subclass of these."""
+    """Settings of every run; an objective's own settings are a subclass of these."""
 
     weights_suffix: ClassVar[str] = ""
     """Follows the network's name in the name of the weights file."""
 
-    method: str = Field("metric", description="what is learned: NAME of a module NAME_objective.py of this folder")
+    method: str = Field("metric", description="what is learned: a name in `OBJECTIVES`")
     preset: str = Field("umf_light", description="network, by name")
     image_size: tuple[int, int] | None = Field(None, description="height and width of the input; null: the preset's")
     train: str = Field(description="folder of simulated worlds, or YAML file that lists sequences")
@@ -57,8 +57,19 @@ class RunSettings(Group):
         return f"{self.preset}{self.weights_suffix}"
 
 
+PUBLISHED: dict[str, dict[str, Any]] = {
+    "adafusion": {"learning_rate": 5e-4},
+    "minkloc_fusion": {"learning_rate": 5e-4},
+    "minkloc_lidar": {"learning_rate": 1e-3},
+    "minkloc_visual": {"learning_rate": 3e-4},
+    "netvlad": {"learning_rate": 2e-4, "loss": "triplet"},
+    "pointnet2": {"learning_rate": 1e-3},
+}
+"""Defaults of single methods, by the field of `DescriptorSettings`."""
+
+
 class DescriptorSettings(RunSettings):
-    """Training of another method's network."""
+    """Training of another method's network; defaults in `PUBLISHED` come before those of the fields."""
 
     method: str = Field(description="whose network")
     validation: str = Field("", description="as train, for validation; empty: the latest weights are kept")
@@ -78,6 +89,11 @@ class DescriptorSettings(RunSettings):
     variants: int = Field(2, ge=1, description="augmentations of every sample, prepared once; as many of it mirrored")
     views: str = Field("", description="folder that keeps what was prepared, for other runs; empty: for this run alone")
     half: bool = Field(False, description="bfloat16 mixed precision")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _defaults_of_the_method(cls, values: dict[str, Any]) -> dict[str, Any]:
+        return PUBLISHED.get(values.get("method", ""), {}) | values
 
     @property
     def weights_name(self) -> str:
@@ -179,7 +195,7 @@ PRESETS: dict[str, NetworkConfig] = {
 
 
 def branch_layers(network: UMF, branch: Literal["image", "cloud"]) -> list[nn.Module]:
-    """What belongs to one modality alone on the way to the descriptor."""
+    """Layers of one modality alone that lead to the descriptor."""
     names = ["image_encoder" if branch == "image" else "voxel_encoder", f"{branch}_tokens"]
     names += [f"fusion.layers.{layer}.{branch}_self" for layer in range(network.config.layers)]
     names += [f"fusion.{branch}_{part}" for part in ("norm", "pool", "head")]
@@ -189,7 +205,7 @@ def branch_layers(network: UMF, branch: Literal["image", "cloud"]) -> list[nn.Mo
 
 
 def fine_layers(network: UMF) -> list[nn.Module]:
-    """What of both encoders only the fine maps need: without local features nothing teaches it."""
+    """Layers of both encoders that only the fine maps need: without local features no loss reaches them."""
     pyramid, voxels = network.image_encoder.pyramid, network.voxel_encoder
     return [pyramid.fine, pyramid.laterals[0], pyramid.laterals[1], voxels.fine, voxels.up_fine]
 

@@ -100,17 +100,17 @@ OBJECTIVES = {
     "masked_images": ("masked_objectives", "MaskedImagesObjective"),
     "masked_scans": ("masked_objectives", "MaskedScansObjective"),
     "netvlad": ("baseline_objectives", "NetVladObjective"),
-    "pointnet2": ("baseline_objectives", "PointNet2Objective"),
-    "minkloc_visual": ("baseline_objectives", "MinkLocVisualObjective"),
-    "minkloc_lidar": ("baseline_objectives", "MinkLocLidarObjective"),
-    "minkloc_fusion": ("baseline_objectives", "MinkLocFusionObjective"),
-    "adafusion": ("baseline_objectives", "AdaFusionObjective"),
+    "pointnet2": ("baseline_objectives", "DescriptorObjective"),
+    "minkloc_visual": ("baseline_objectives", "DescriptorObjective"),
+    "minkloc_lidar": ("baseline_objectives", "DescriptorObjective"),
+    "minkloc_fusion": ("baseline_objectives", "DescriptorObjective"),
+    "adafusion": ("baseline_objectives", "DescriptorObjective"),
 }
 """Module and class of every way of training."""
 
 
 class Batch(Protocol):
-    """What one step learns from."""
+    """Input of one step."""
 
     def to(self, device: torch.device) -> Self:
         """The batch on the device that computes."""
@@ -135,7 +135,7 @@ class Judgement:
 class Objective(nn.Module, ABC):
     """Losses of a batch, and where the batches come from; a module, so that it can be distributed whole.
 
-    What is not to be learned has its gradient switched off. Everything random in a batch follows from the
+    Parameters that are not trained have their gradient switched off. Everything random in a batch follows from the
     seed, the step and the rank: a resumed run repeats an uninterrupted one, and so does one whose batches
     are made by other processes.
 
@@ -171,7 +171,7 @@ class Objective(nn.Module, ABC):
 
     @abstractmethod
     def batch_maker(self, sequences: Sequence[SampleSequence], rank: int) -> Callable[[int], Batch]:
-        """What makes the batch of a step; it must depend on nothing but the step.
+        """Return the function that makes the batch of a step; it must depend on the step alone.
 
         Args:
             sequences: the data there is now; asked again at every epoch.
@@ -195,7 +195,7 @@ class Objective(nn.Module, ABC):
         return Judgement()
 
     def card(self) -> dict[str, Any]:
-        """What the card of the weights says beyond what every card does."""
+        """Entries of the weights' card besides those of every card."""
         return {}
 
 
@@ -213,5 +213,5 @@ def find_objective(method: str) -> type[Objective]:
 
 
 def generator(seed: int, step: int, rank: int = 0, purpose: int = 0) -> np.random.Generator:
-    """What draws everything random in a step of one process; another purpose is another stream."""
+    """Random generator for a step of one process; another purpose is another stream."""
     return np.random.default_rng([seed, step, rank, purpose])

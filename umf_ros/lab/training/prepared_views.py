@@ -40,7 +40,7 @@ from umf_ros.networks.config import NetworkConfig
 
 @dataclass(frozen=True, slots=True)
 class CameraLook:
-    """What one camera makes of the light.
+    """Response of one camera to the light.
 
     Attributes:
         gamma: exponent of the response; 1 leaves the picture as it is.
@@ -186,12 +186,12 @@ class PreparedViews:
         )
 
     def _row(self, world: SampleSequence, index: int, variant: int, sense: Sense) -> Row:
-        """What is kept of one sense in one view."""
+        """Stored input of one modality in one view."""
         rows = self._rows(world, variant, sense)
         if not rows["made"][index]:
             for name, value in self._see(self._view(world, index, variant, sense), sense).items():
                 rows[name][index] = value
-            rows["made"][index] = True  # last: whoever is interrupted begins this row anew
+            rows["made"][index] = True  # last: after an interruption this row is made again
         found: Row = rows[index]
         return found
 

@@ -184,7 +184,7 @@ class Trainer:
         return learning_rate(settings.learning_rate, settings.warmup_steps, self.progress.step, settings.steps)
 
     def _shared(self, stop: bool) -> bool:
-        """What the leader decided."""
+        """The leader's decision."""
         if self._team.size == 1:
             return stop
         decided = torch.tensor(int(stop), device=self._team.device)
@@ -264,7 +264,7 @@ def train(settings: RunSettings, output: Path, resume: bool, report: Callable[[P
 
 
 def _open_data(where: str) -> Source:
-    """What to learn from, of which there is some."""
+    """The training data; there is some."""
     source = open_source(Path(where))
     if not source.refresh():
         raise ConfigError(f"train: there are no worlds in {where}")
@@ -288,7 +288,7 @@ def earlier_runs(start: str) -> list[dict[str, Any]]:
 
 
 def _card(settings: RunSettings, name: str, network: nn.Module, data: Source, progress: Progress) -> dict[str, Any]:
-    """What every card says; of folders and files only the names, in the command too."""
+    """Entries of every card; of folders and files only the names, in the command too."""
     words = [re.sub(r"[^=]*/", "", word.rstrip("/")) for word in sys.argv[1:]]
     said = settings.model_dump()
     places = {place: Path(said[place]).name for place in ("train", "validation", "start", "views") if place in said}

@@ -184,7 +184,7 @@ function drawSweep() {
     ? `from ${now.toFixed(3)} on${asRun}: ${here.found} closures, precision ${percent(here.precision)}, recall ${percent(here.recall)} (${here.closed} of ${here.revisits} revisits)`
     : `from ${now.toFixed(3)} on${asRun}: ${here.found} closures; there is no truth to judge them by`;
   const traces = all.some((one) => one.judged) ? [
-    { mode: "lines", name: "precision", x: steps, y: all.map((one) => one.precision), line: { color: "#2da44e", width: 2 } },
+    { mode: "lines", name: "precision", x: steps, y: all.map((one) => one.precision), line: { color: "#2da44e", width: 5 } },
     { mode: "lines", name: "recall", x: steps, y: all.map((one) => one.recall), line: { color: curveColour("optimised"), width: 2 } },
   ] : [{ mode: "lines", name: "closures", x: steps, y: all.map((one) => one.found), line: { color: curveColour("optimised"), width: 2 } }];
   draw("sweep", traces, { xaxis: { title: "verification.min_probability", range: [0, 1.01] }, yaxis: { title: "", rangemode: "tozero" },
@@ -208,7 +208,7 @@ function drawErrors() {
   hide("errors-section", !scene.errors);
   if (!scene.errors) return;
   draw("errors", Object.entries(scene.errors).map(([name, [x, y]]) => ({ mode: "lines", name, x, y, line: { color: curveColour(name), width: 2 } })),
-    { xaxis: { title: "way [m]" }, yaxis: { title: "error [m]", rangemode: "tozero" } });
+    { xaxis: { title: "path length [m]" }, yaxis: { title: "error [m]", rangemode: "tozero" } });
 }
 function drawSimilarity() {
   const matrix = scene.similarity;

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from umf_ros.lab.simulation.domains.patterns import dome, eye, rosette, spinning
-from umf_ros.lab.simulation.domains.scanners import SCANNERS
+from umf_ros.lab.simulation.domains.scanners import SCANNERS, dome, eye, rosette, spinning
 
 
 def azimuth_deg(pattern):

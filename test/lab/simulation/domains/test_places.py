@@ -7,9 +7,9 @@ import open3d as o3d
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.lab.simulation.domains.landscape import Landscape
-from umf_ros.lab.simulation.domains.places import PLACES
+from umf_ros.lab.simulation.domains.outdoors import Landscape
 from umf_ros.lab.simulation.domains.solids import cast_into
+from umf_ros.lab.simulation.domains.survey import PLACES
 
 BUILT = ("corridor", "rooms", "street", "orchard", "woods", "quarry")
 ALL_AROUND = np.float32(Rotation.random(300, np.random.default_rng(5)).as_matrix()[:, 0])

@@ -9,9 +9,8 @@ import pytest
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.geometry import heading, transform, wrap_angle
 from umf_ros.lab.simulation.domains import DOMAINS, Domain, survey
-from umf_ros.lab.simulation.domains.mounts import MOUNTS
-from umf_ros.lab.simulation.domains.places import PLACES
 from umf_ros.lab.simulation.domains.scanners import SCANNERS
+from umf_ros.lab.simulation.domains.survey import MOUNTS, PLACES
 
 SEED = 10_003
 

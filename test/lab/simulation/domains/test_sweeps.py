@@ -10,9 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import interpolate, make_pose, transform
-from umf_ros.lab.simulation.domains.scanners import SCANNERS
+from umf_ros.lab.simulation.domains.scanners import SCANNERS, stamp_moment, sweep
 from umf_ros.lab.simulation.domains.solids import Solids
-from umf_ros.lab.simulation.domains.sweeps import stamp_moment, sweep
 
 START = make_pose(np.eye(3), [0.0, 0.0, 1.5])
 END = START @ make_pose(Rotation.from_euler("z", 8, degrees=True).as_matrix(), [0.8, 0.0, 0.0])

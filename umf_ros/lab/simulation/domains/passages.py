@@ -14,11 +14,9 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
 from umf_ros.core.geometry import Array, make_pose
-from umf_ros.lab.simulation.domains.mounts import Mount
-from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner
+from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner, stamp_moment, sweep
 from umf_ros.lab.simulation.domains.solids import Scene, Solids
-from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, SAME_WAY, DomainScan, SweepMotion
-from umf_ros.lab.simulation.domains.sweeps import stamp_moment, sweep
+from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, SAME_WAY, DomainScan, Mount, SweepMotion
 from umf_ros.lab.simulation.world import check_seed
 
 HALF_LENGTH_M = 60.0

@@ -18,7 +18,7 @@ _BOX_QUADS = np.array([[0, 1, 2, 3], [4, 6, 5, 7], [0, 4, 1, 5], [2, 3, 6, 7], [
 
 @dataclass(frozen=True)
 class Scene:
-    """What rays can meet.
+    """Bodies that rays can meet.
 
     Attributes:
         rays: Open3D's scene.
@@ -118,7 +118,7 @@ class Solids:
         self.add(corners.reshape(-1, 3), np.arange(3 * len(places)).reshape(-1, 3), reflectance)
 
     def scene(self) -> Scene:
-        """What has been put together so far."""
+        """The scene of all bodies so far."""
         rays = o3d.t.geometry.RaycastingScene()
         vertices = np.concatenate(self._vertices).astype(np.float32)
         triangles = np.concatenate(self._triangles).astype(np.uint32)

@@ -1,21 +1,121 @@
-"""Domains: a sensor in a kind of place on a mount, and the scans that it takes there with their true poses."""
+"""Domains: a LiDAR in a kind of place on a mount, and the scans that it takes there with their true poses.
+
+A new mount is a row in `MOUNTS`, a new kind of place a class and a row in `PLACES`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import cast
+from functools import partial
+from typing import Protocol, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
-from umf_ros.core.geometry import Array, interpolate, transform
-from umf_ros.lab.simulation.domains.mounts import MOUNTS, Mount
-from umf_ros.lab.simulation.domains.places import PLACES, Place
-from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner
-from umf_ros.lab.simulation.domains.sweeps import Sweep, stamp_moment, sweep
+from umf_ros.core.geometry import Array, interpolate, make_pose, transform
+from umf_ros.lab.simulation.domains.indoors import Corridor, Rooms
+from umf_ros.lab.simulation.domains.outdoors import Landscape, Quarry, Trees
+from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner, Sweep, stamp_moment, sweep
+from umf_ros.lab.simulation.domains.solids import Scene
+from umf_ros.lab.simulation.domains.street import Street
 from umf_ros.lab.simulation.relief import Relief
 from umf_ros.lab.simulation.route import Setting, plan_passes, stand
-from umf_ros.lab.simulation.world import check_seed
+from umf_ros.lab.simulation.world import World, check_seed
+
+
+@dataclass(frozen=True, slots=True)
+class Mount:
+    """Where the LiDAR sits on its carrier, and how the carrier moves.
+
+    Attributes:
+        height_m: of the LiDAR above the ground.
+        tilt_deg: largest roll and pitch of the LiDAR, drawn once per world.
+        speed_m_s: of the carrier.
+        sway_deg: amplitude of the carrier's rolling and pitching while it drives.
+        calibrated: whether scans come in the upright body frame on the ground, rather than the LiDAR's own.
+    """
+
+    height_m: float
+    tilt_deg: float
+    speed_m_s: float
+    sway_deg: float
+    calibrated: bool
+
+    def body_T_lidar(self, rng: np.random.Generator) -> Array:
+        """Pose of the LiDAR on one carrier."""
+        roll, pitch = np.radians(self.tilt_deg) * rng.uniform(-1, 1, 2)
+        return make_pose(Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_matrix(), [0.0, 0.0, self.height_m])
+
+    def sway(self, time_s: float, phase: float) -> Array:
+        """The carrier's rolling and pitching (4, 4) at a time, about its place on the ground."""
+        cycle = 2 * np.pi * (time_s + phase)
+        roll, pitch = np.radians(self.sway_deg) * np.array([np.sin(1.1 * cycle), np.sin(0.8 * cycle + 1)])
+        return make_pose(Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_matrix(), np.zeros(3))
+
+
+MOUNTS: dict[str, Mount] = {
+    "rover": Mount(1.3, 0.0, 1.0, 0.5, calibrated=True),
+    "low": Mount(0.3, 2.0, 0.5, 0.3, calibrated=False),
+    "car": Mount(1.8, 1.0, 6.0, 0.3, calibrated=False),
+    "mast": Mount(2.5, 5.0, 1.0, 1.0, calibrated=False),
+    "tilted": Mount(1.0, 20.0, 1.0, 0.5, calibrated=False),
+    "rolling": Mount(0.8, 3.0, 1.5, 4.0, calibrated=False),
+}
+
+
+ALIASING = 0.6  # of the landscapes: most of their rocks and lumps come again elsewhere
+
+
+class Place(Protocol):
+    """A world that a carrier can drive through more than once."""
+
+    @property
+    def trail(self) -> Array:
+        """(N, 2) dense closed curve that stays clear, m."""
+
+    @property
+    def lateral_m(self) -> float:
+        """How far beside the trail it can be driven."""
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Height of the ground under points, m."""
+
+    def scene(self, visit: int) -> Scene:
+        """The scene of one visit: cars and chairs move between visits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One kind of place.
+
+    Attributes:
+        build: the place of a seed.
+        scale: of distances, 1 in the open: indoors the same step shows another place sooner.
+    """
+
+    build: Callable[[int], Place]
+    scale: float
+
+
+def _landscape(seed: int, family: str) -> Landscape:
+    return Landscape(World(seed, family, ALIASING))
+
+
+PLACES: dict[str, Kind] = {
+    "corridor": Kind(Corridor, 0.5),
+    "rooms": Kind(Rooms, 0.4),
+    "street": Kind(Street, 1.0),
+    "orchard": Kind(partial(Trees, regular=True), 0.8),
+    "woods": Kind(partial(Trees, regular=False), 0.8),
+    "quarry": Kind(Quarry, 1.0),
+    "etna": Kind(partial(_landscape, family="etna"), 1.0),
+    "moon": Kind(partial(_landscape, family="moon"), 1.0),
+    "canyon": Kind(partial(_landscape, family="canyon"), 1.0),
+    "dunes": Kind(partial(_landscape, family="dunes"), 1.0),
+}
+
 
 SWING_DEG = 8.0  # how far a revisit's heading swings to either side
 TILT_DEG = 1.0  # of the ground under single wheels

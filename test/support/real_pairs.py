@@ -1,0 +1,98 @@
+"""Pairs of real scans: read, drawn, and counted by their decisions."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.progress import track
+
+from umf_ros.core.frames import Keyframe
+from umf_ros.core.geometry import Array, from_quaternion
+from umf_ros.lab.fit.acceptance import inside_ellipsoid
+from umf_ros.lab.simulation.domains.pairs import error_vector, is_wrong
+from umf_ros.sensors.decode import Cloud
+from umf_ros.verification import Hypothesis
+
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+@dataclass(frozen=True)
+class RealPair:
+    """Two scans and what is known of them.
+
+    Attributes:
+        match: path relative to the folder.
+        query: likewise.
+        same_place: whether they show the same place.
+        match_T_query: the true pose, or None.
+    """
+
+    match: str
+    query: str
+    same_place: bool
+    match_T_query: Array | None = None
+
+
+def cropped(cloud: Cloud, half_width_deg: float) -> Cloud:
+    """The part of a scan that a LiDAR sees which looks forward and no further than this to either side."""
+    ahead = np.abs(np.degrees(np.arctan2(cloud.points[:, 1], cloud.points[:, 0]))) <= half_width_deg
+    return Cloud(cloud.points[ahead], None if cloud.intensity is None else cloud.intensity[ahead])
+
+
+def read_pairs(path: Path) -> Iterator[RealPair]:
+    """Rows of a list of pairs."""
+    with path.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            pose = [row.get(name) or "" for name in POSE_COLUMNS]
+            known = all(pose)
+            numbers = [float(value) for value in pose] if known else []
+            match_T_query = from_quaternion(numbers[:3], numbers[3:]) if known else None
+            yield RealPair(row["match_scan"], row["query_scan"], row["same_place"] == "1", match_T_query)
+
+
+def draw_pairs(
+    folder: Path, keyframe: Callable[[str], Keyframe], count: int, apart: int, seed: int = 0
+) -> Iterator[RealPair]:
+    """Pairs of a drive without revisits: every one shows two places."""
+    names = sorted(str(path.relative_to(folder)) for path in (folder / "scans").iterdir())
+    rng = np.random.default_rng(seed)
+    descriptors = np.array([keyframe(name).embedding.descriptor for name in track(names, "embedding", transient=True)])
+    similarity = descriptors @ descriptors.T
+    order = np.arange(len(names))
+    similarity[order[:, None] - order[None] <= apart] = -np.inf
+    queries = rng.permutation(order[apart + 1 :])[: count // 2]
+    for query in queries:
+        yield RealPair(names[int(rng.integers(query - apart))], names[query], False)
+        yield RealPair(names[int(similarity[query].argmax())], names[query], False)
+
+
+def summary(verdicts: list[tuple[RealPair, Hypothesis]]) -> dict[str, float]:
+    """Counts, and for true pairs with a known pose how far off and how honest the closures are."""
+    accepted = [(pair, verdict) for pair, verdict in verdicts if verdict.closure is not None]
+    true = [pair for pair, _ in verdicts if pair.same_place]
+    right = [one for one in accepted if one[0].same_place and not is_misplaced(*one)]
+    errors, covariances = [], []
+    for pair, verdict in right:
+        if pair.match_T_query is not None and verdict.closure is not None:
+            errors.append(error_vector(verdict.closure.match_T_query, pair.match_T_query))
+            covariances.append(verdict.closure.covariance)
+    nan = float("nan")
+    return {
+        "true_pairs": len(true),
+        "true_accepted": len(right),
+        "true_misplaced": sum(pair.same_place for pair, _ in accepted) - len(right),
+        "false_pairs": len(verdicts) - len(true),
+        "false_accepted": sum(not pair.same_place for pair, _ in accepted),
+        "error_median_m": float(np.median(np.linalg.norm(np.array(errors)[:, :3], axis=1))) if errors else nan,
+        "inside_95": inside_ellipsoid(np.array(errors), np.array(covariances)) if errors else nan,
+    }
+
+
+def is_misplaced(pair: RealPair, verdict: Hypothesis) -> bool:
+    if pair.match_T_query is None or verdict.closure is None:
+        return False
+    return is_wrong(verdict.closure.match_T_query, pair.match_T_query)

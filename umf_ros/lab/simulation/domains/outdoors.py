@@ -1,0 +1,154 @@
+"""Places in the open: orchards and woods, a quarry, and the rover's own landscapes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.ndimage import map_coordinates
+
+from umf_ros.core.geometry import Array
+from umf_ros.lab.simulation.domains.solids import Scene, Solids
+from umf_ros.lab.simulation.domains.trails import distance_to, rounded_rectangle, wobbly_ring
+from umf_ros.lab.simulation.noise import Field, smooth_step, spectral_noise
+from umf_ros.lab.simulation.world import GROUND, HORIZON, ROCK, World
+
+
+class Undulation:
+    """Heights (C, C), indexed [y, x], around the origin; beyond the border as at the border.
+
+    Attributes:
+        heights: (C, C) float32, m.
+    """
+
+    def __init__(self, heights: Field, cell_m: float) -> None:
+        self.heights = heights
+        self._heights, self._cell_m = heights.astype(float), cell_m
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Height under points, bilinear, m."""
+        places = np.stack(np.broadcast_arrays(np.asarray(y, float), np.asarray(x, float)))
+        cells = places.reshape(2, -1) / self._cell_m + (len(self.heights) - 1) / 2
+        found: Array = map_coordinates(self._heights, cells, order=1, mode="nearest").reshape(places.shape[1:])
+        return found
+
+
+FOREST_CELLS, FOREST_CELL_M = 241, 0.5
+SWAY_M = 0.04
+LEAVES = 220
+
+
+class Trees:
+    """Trunks under crowns of loose leaves, on uneven ground."""
+
+    def __init__(self, seed: int, regular: bool) -> None:
+        self._seed = seed
+        rng = np.random.default_rng([seed, 32, int(regular)])
+        relief = rng.uniform(0.3, 1.0) * spectral_noise(FOREST_CELLS, 4.2, rng, 1, 20)
+        self._ground = Undulation(relief + 0.03 * spectral_noise(FOREST_CELLS, 2.6, rng, 20), FOREST_CELL_M)
+        self.lateral_m = 0.8 if regular else 1.5
+        if regular:
+            gap = rng.uniform(4.0, 5.0)
+            self.trail = rounded_rectangle(rng.uniform(44, 56), 4 * gap, 1.9)
+            places = self._rows(gap, rng)
+        else:
+            self.trail = wobbly_ring(rng.uniform(18, 24), 0.2, rng)
+            places = rng.uniform(-45, 45, (420, 2))
+        clear = np.array([distance_to(self.trail, place) > self.lateral_m + 0.7 for place in places])
+        self._places = places[clear]
+        self._sizes = rng.uniform(0.75, 1.25, len(self._places)) * (1.0 if regular else 1.8)
+        self._alike = regular
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Height of the ground under points, m."""
+        return self._ground.height(x, y)
+
+    def scene(self, visit: int) -> Scene:
+        """Trunks stay, leaves move in the wind."""
+        solids, wind = Solids(), np.random.default_rng([self._seed, 33, visit])
+        solids.ground(self._ground.heights, FOREST_CELL_M)
+        for number, (place, size) in enumerate(zip(self._places, self._sizes, strict=True)):
+            rng = np.random.default_rng([self._seed, 34, number])
+            foot = np.array([*place, float(self.height(*place)) - 0.1])
+            lean = rng.normal(0, 0.05, 2)
+            solids.post(foot, 0.11 * size, 1.6 * size)
+            centre = foot + size * np.array([*lean, 2.2])
+            crown = centre + size * rng.normal(0, 1, (LEAVES, 3)) * [0.6, 0.6, 0.45]
+            solids.leaves(crown + wind.normal(0, SWAY_M, crown.shape), 0.16, rng)
+        return solids.scene()
+
+    @staticmethod
+    def _rows(gap: float, rng: np.random.Generator) -> Array:
+        spacing = rng.uniform(2.6, 3.6)
+        along, across = np.arange(-35, 35, spacing), (np.arange(-7, 8) + 0.5) * gap
+        x, y = np.meshgrid(along, across)
+        grid = np.column_stack([x.ravel(), y.ravel()])
+        missing = rng.random(len(grid)) < 0.04
+        return (grid + rng.normal(0, 0.12, grid.shape))[~missing]
+
+
+QUARRY_CELLS, QUARRY_CELL_M = 361, 0.4
+
+
+class Quarry:
+    """A terraced pit with a track on its floor."""
+
+    lateral_m = 2.0
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng([seed, 31])
+        self.trail = wobbly_ring(rng.uniform(16, 24), 0.15, rng)
+        self._ground = Undulation(self._heights(rng), QUARRY_CELL_M)
+        solids = Solids()
+        solids.ground(self._ground.heights, QUARRY_CELL_M, rng.uniform(0.3, 0.5))
+        self._blocks(solids, rng)
+        self._scene = solids.scene()
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Height of the ground under points, m."""
+        return self._ground.height(x, y)
+
+    def scene(self, visit: int) -> Scene:
+        """The same at every visit."""
+        return self._scene
+
+    def _heights(self, rng: np.random.Generator) -> Array:
+        axis = (np.arange(QUARRY_CELLS) - QUARRY_CELLS // 2) * QUARRY_CELL_M
+        x, y = np.meshgrid(axis, axis)
+        ragged = spectral_noise(QUARRY_CELLS, 3.4, rng, 2, 40)
+        away = np.hypot(x, y) + 4 * ragged
+        bench, rise = rng.uniform(7, 11), rng.uniform(3, 6)
+        terraces = rise * sum(smooth_step(away, 32 + k * bench, 33.5 + k * bench) for k in range(3))
+        rough = 0.3 * spectral_noise(QUARRY_CELLS, 3.6, rng, 3, 30) + 0.04 * spectral_noise(QUARRY_CELLS, 2.5, rng, 30)
+        return np.asarray(terraces + rough, np.float32)
+
+    def _blocks(self, solids: Solids, rng: np.random.Generator) -> None:
+        for place in rng.uniform(-34, 34, (90, 2)):
+            size = 0.25 * rng.random() ** -0.6
+            if size > 3 or distance_to(self.trail, place) < self.lateral_m + 0.8 + size:
+                continue
+            centre = [*place, float(self.height(*place)) + 0.2 * size]
+            solids.blob(centre, size * rng.uniform(0.6, 1.1, 3), rng, rng.uniform(0.3, 0.5))
+
+
+class Landscape:
+    """A world of one of `families.FAMILIES`, for the domains."""
+
+    lateral_m = 3.0
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.trail = self._world.relief.trail
+        albedo = self._world.traits.albedo
+        cells = len(self._world.relief.heights) - 1
+        reflectance = {GROUND: np.full(2 * cells**2, albedo, np.float32)}
+        for number in (HORIZON, ROCK):
+            reflectance[number] = (albedo * np.exp(self._world.solids[number].brightness)).astype(np.float32)
+        self._scene = Scene(self._world.scene, reflectance)
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Height of the ground under points, m."""
+        return self._world.relief.height(x, y)
+
+    def scene(self, visit: int) -> Scene:
+        """The same at every visit: nothing moves here."""
+        return self._scene
