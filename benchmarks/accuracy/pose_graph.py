@@ -54,7 +54,6 @@ MOST_CLOSURES_OF_A_FILE = 1500
 MOST_SOLUTIONS_OF_A_FILE = 150
 SETTINGS = PoseGraphSettings(keyframe_spacing_m=1e-6, max_gap_s=1.5, max_closure_m=1e7)
 BELIEVING = SETTINGS.model_copy(update={"reject_outliers": False})
-STATED = NoiseScale()
 KINDS: tuple[Kind, ...] = ("random", "groups", "near")
 # per metre; a tenth of it is what the stated noise makes of a hundred metres
 BIAS = np.array([0, 0, np.deg2rad(0.1), 0.01, 0, 0])
@@ -272,7 +271,7 @@ def optimum_near_truth(world: GraphWorld) -> Array:
 
 
 class Cell(NamedTuple):
-    """What a world is tried with: share and kind of wrong closures, and the factor on the stated odometry noise."""
+    """Conditions of a drive: share and kind of wrong closures, and the factor on the stated odometry noise."""
 
     share: float
     kind: Kind
@@ -427,7 +426,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="worlds that are driven at a time")
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
-    # the cost first, while nothing else of ours runs
+    # the cost first, while no other world is driven
     costs = cost(arguments.seed)
     trials = generated(arguments.seed, arguments.quick)
     files = [from_file(path, arguments.quick) for path in arguments.files]

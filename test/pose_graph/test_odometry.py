@@ -23,7 +23,7 @@ def test_a_chain_sorts_drops_duplicates_and_keeps_the_first() -> None:
     chain, poses = OdometryChain(SETTINGS), line(6)
     for k in (3, 1, 5):
         chain.add(k, poses[k])
-    assert not chain.update() and chain.newest_ns == 5
+    assert not chain.update() and chain.span == (1, 5)
     chain.add(3, poses[0])
     assert not chain.update()
     chain.add(2, poses[2])

@@ -29,7 +29,7 @@ from umf_ros.pose_graph.closures import (
 )
 from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.g2o import verdict_table, write_g2o, write_vertex_table
-from umf_ros.pose_graph.odometry import OdometryChain, Stamps
+from umf_ros.pose_graph.odometry import POINT, PathPoints, Stamps
 from umf_ros.pose_graph.rejection import OutlierRejection
 from umf_ros.pose_graph.sessions import Sessions
 from umf_ros.pose_graph.solver import Edge
@@ -66,16 +66,13 @@ class PoseGraph:
         self._sessions.begin()
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
-        """Take one odometry message; any order, a second message of one stamp is dropped.
+        """Take one odometry message, in any order; a second one of a stamp is dropped. False when it was refused.
 
         Args:
             stamp_ns: its stamp.
             odom_T_body: (4, 4) pose.
             covariance: (6, 6) in ROS order of the motion since the previous message, axes of the
                 previous body; None: the settings' odometry model.
-
-        Returns:
-            False when the message was refused and counted.
         """
         try:
             check_pose(odom_T_body)
@@ -107,10 +104,9 @@ class PoseGraph:
         self._held += self._take_waiting()[1]
 
     def resume(self, verdicts: Mapping[tuple[int, int], Decision]) -> None:
-        """Give the closures that are held their earlier verdicts, and decide about those without.
+        """Give the closures that are held their earlier verdicts, by the stamps of match and query.
 
-        Args:
-            verdicts: by the stamps of match and query; closures that share both stamps are decided anew.
+        Closures without one, and closures that share both stamps, are decided anew.
         """
         self._refresh()
         held, self._held = self._held + self._take_waiting()[1], []
@@ -138,12 +134,11 @@ class PoseGraph:
         self._refresh()
         order, chains = self._in_order(), self._sessions.chains
 
-        def is_passed(placed: PlacedClosure) -> bool:
-            match, query, closure = placed
-            ends = (match, closure.match_stamp_ns), (query, closure.query_stamp_ns)
-            return all(chains[session].stamps[-1] > stamp for session, stamp in ends)
+        def is_complete(placed: PlacedClosure) -> bool:
+            sessions, stamps = (placed.match, placed.query), _endpoints(placed.closure)
+            return all(chains[session].stamps[-1] > stamp for session, stamp in zip(sessions, stamps, strict=True))
 
-        self._reprocess(order, len(list(takewhile(is_passed, order))), within_s)
+        self._reprocess(order, len(list(takewhile(is_complete, order))), within_s)
 
     def settle(self, within_s: float = float("inf")) -> list[ClosureVerdict] | None:
         """Decide finally and solve for the exact optimum, as at the end of a mission.
@@ -230,7 +225,7 @@ class PoseGraph:
             check_closure(closure, self._settings.max_closure_m)
         except GraphError as error:
             return self._refuse(closure, error.args[0])
-        self._waiting.append((closure, self._sessions.newest_ns))
+        self._waiting.append((closure, max((last for _, last in self._spans()), default=None)))
         return None
 
     def _refuse(self, closure: LoopClosure, reason: ClosureReason) -> ClosureVerdict:
@@ -241,7 +236,8 @@ class PoseGraph:
     def _take_waiting(self) -> tuple[list[ClosureVerdict], list[PlacedClosure]]:
         """Refusals of closures that waited too long for odometry, and closures whose odometry has arrived."""
         refused, arrived, waiting = [], [], []
-        newest_ns, oldest_ns = self._sessions.newest_ns, self._sessions.oldest_ns
+        oldest_ns = min((first for first, _ in self._spans()), default=None)
+        newest_ns = max((last for _, last in self._spans()), default=None)
         for closure, known_ns in self._waiting:
             since_ns = newest_ns if known_ns is None else known_ns
             waited_s = 0.0 if newest_ns is None or since_ns is None else (newest_ns - since_ns) / 1e9
@@ -289,21 +285,17 @@ class PoseGraph:
         """How many closures have which verdict."""
         return Counter(verdict.state for verdict in self.closures())
 
-    def trajectory(self) -> tuple[Stamps, Array]:
-        """Stamps (N,) in ns and `map_T_body` (N, 4, 4) of every keyframe that is joined to the map."""
-        stamps, chains = self._keyframes()
-        return stamps, np.concatenate([np.empty((0, 4, 4)), *(self._sessions.at(one.at(one.stamps)) for one in chains)])
+    def trajectory(self, optimized: bool = True) -> tuple[Stamps, Array]:
+        """Stamps (N,) in ns and `map_T_body` or `odom_T_body` (N, 4, 4) of every keyframe joined to the map."""
+        self._refresh()
+        chains = [self._sessions.chains[session] for session in self._sessions.members(0)]
+        poses = [self._sessions.at(chain.at(chain.stamps)) if optimized else chain.poses for chain in chains]
+        stamps = [np.empty(0, np.int64), *(chain.stamps for chain in chains)]
+        return np.concatenate(stamps), np.concatenate([np.empty((0, 4, 4)), *poses])
 
     def odometry(self) -> tuple[Stamps, Array]:
         """Stamps (N,) in ns and `odom_T_body` (N, 4, 4) of the same keyframes as `trajectory`."""
-        stamps, chains = self._keyframes()
-        return stamps, np.concatenate([np.empty((0, 4, 4)), *(chain.poses for chain in chains)])
-
-    def _keyframes(self) -> tuple[Stamps, list[OdometryChain]]:
-        """Stamps (N,) of the keyframes that are joined to the map, and the odometry of their sessions."""
-        self._refresh()
-        chains = [self._sessions.chains[session] for session in self._sessions.members(0)]
-        return np.concatenate([np.empty(0, np.int64), *(chain.stamps for chain in chains)]), chains
+        return self.trajectory(optimized=False)
 
     def poses_at(self, stamps: Stamps) -> tuple[Array, NDArray[np.bool_]]:
         """(N, 4, 4) `map_T_body` at stamps, in the frame of the largest part of the map, and (N,) whether it has them.
@@ -326,26 +318,28 @@ class PoseGraph:
     def session_spans(self) -> list[tuple[int, int] | None]:
         """First and last stamp of the odometry of every session; None without any."""
         self._refresh()
-        spans = ((chain.oldest_ns, chain.newest_ns) for chain in self._sessions.chains)
-        return [None if first is None or last is None else (first, last) for first, last in spans]
+        return [chain.span for chain in self._sessions.chains]
+
+    def _spans(self) -> list[tuple[int, int]]:
+        return [chain.span for chain in self._sessions.chains if chain.span is not None]
 
     def map_T_odom(self) -> Array:
         """(4, 4) pose of the newest session's odometry frame in the map: where its newest pose went."""
-        self._refresh()
-        chain = self._sessions.chains[-1]
-        if chain.newest_ns is None:
-            return np.eye(4)
-        last = np.array([chain.newest_ns])
-        return self._sessions.at(chain.at(last))[0] @ invert(chain.poses_at(last)[0])
+        last, chain = self._newest(), self._sessions.chains[-1]
+        return self._sessions.at(last)[0] @ invert(chain.poses_at(last["stamp"])[0]) if len(last) else np.eye(4)
 
     def covariance(self) -> Array:
         """(6, 6) marginal covariance of the newest pose in ROS order about the map's axes; zero without odometry."""
+        last = self._newest()
+        if not len(last):
+            return np.zeros((6, 6))
+        return gtsam_to_ros_covariance(self._sessions.covariance(last), self._sessions.at(last)[0])
+
+    def _newest(self) -> PathPoints:
+        """(1,) the newest odometry of the newest session; (0,) without any."""
         self._refresh()
         chain = self._sessions.chains[-1]
-        if chain.newest_ns is None:
-            return np.zeros((6, 6))
-        last = chain.at(np.array([chain.newest_ns]))
-        return gtsam_to_ros_covariance(self._sessions.covariance(last), self._sessions.at(last)[0])
+        return np.empty(0, POINT) if chain.span is None else chain.at(np.array(chain.span[1:]))
 
     def write_tum(self, path: str | Path, optimized: bool = True) -> None:
         """Write the trajectory, or the odometry, of all joined sessions in order of their stamps as a TUM file.
@@ -353,23 +347,22 @@ class PoseGraph:
         Raises:
             OutputError: the file cannot be written.
         """
-        stamps, poses = self.trajectory() if optimized else self.odometry()
+        stamps, poses = self.trajectory(optimized)
         order = np.argsort(stamps, kind="stable")
         write_tum(path, Trajectory(stamps[order], poses[order]))
 
     def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
         """Verdicts of the N closures with known endpoints, and (N, 2, 3) map positions of match and query."""
         self._refresh()
-        return list(self._rejection.verdicts), self._rejection.endpoint_positions()
+        ends = (self._rejection.closures["match"], self._rejection.closures["query"])
+        positions = [self._sessions.at(end)[:, :3, 3] for end in ends]
+        return list(self._rejection.verdicts), np.stack(positions, axis=1)
 
     def write_g2o(self, path: str | Path, planar: bool = False, vertex_of: Callable[[int], int] | None = None) -> None:
         """Write keyframes, odometry and accepted closures, with the covariances that the solution used.
 
-        Args:
-            path: the file.
-            planar: two-dimensional.
-            vertex_of: gives the vertex id of a stamp; None counts from 0 and writes `<name>.csv` beside the
-                file, with vertex, session and stamp.
+        Vertices get the ids that `vertex_of` gives their stamps; without it they are counted from 0, and `<name>.csv`
+        beside the file has vertex, session and stamp.
 
         Raises:
             OutputError: a file cannot be written.
@@ -384,14 +377,12 @@ class PoseGraph:
     def write_results(self, folder: str | Path, within_s: float = float("inf")) -> bool:
         """Settle, and write trajectories (TUM), the graph (g2o and id-stamp table) and all verdicts (CSV).
 
-        Returns:
-            Whether there was time to settle; otherwise all is written as it stands.
+        Without the time to settle all is written as it stands, and the result is False.
 
         Raises:
             OutputError: the folder cannot be written.
         """
-        folder = Path(folder)
-        settled = self.settle(within_s) is not None
+        folder, settled = Path(folder), self.settle(within_s) is not None
         with writing(f"to {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "graph_verdicts.csv").write_text(verdict_table(self.closures()), encoding="utf-8")

@@ -123,7 +123,7 @@ def check_closure(closure: LoopClosure, max_length_m: float) -> Array:
     """Return the (6, 6) covariance of a usable closure in GTSAM's order, tangent space of the query.
 
     Raises:
-        GraphError: of a `ClosureReason`.
+        GraphError: of a `ClosureReason`; of the other checks too.
     """
     if closure.query_stamp_ns == closure.match_stamp_ns:
         raise GraphError(ClosureReason.ITSELF)
@@ -135,7 +135,7 @@ def check_closure(closure: LoopClosure, max_length_m: float) -> Array:
 
 
 def check_pose(pose: Array) -> None:
-    """Raise a `GraphError` of a `ClosureReason` for a matrix that is not a rigid transform."""
+    """Refuse a matrix that is not a rigid transform."""
     if np.shape(pose) != (4, 4):
         raise GraphError(ClosureReason.POSE_SHAPE)
     if not np.isfinite(pose).all():
@@ -148,7 +148,7 @@ def check_pose(pose: Array) -> None:
 
 
 def check_covariance(covariance: Array) -> None:
-    """Raise a `GraphError` of a `ClosureReason` for a matrix that is not a covariance of a full pose."""
+    """Refuse a matrix that is not a covariance of a full pose."""
     if np.shape(covariance) != (6, 6):
         raise GraphError(ClosureReason.COVARIANCE_SHAPE)
     if not np.isfinite(covariance).all():

@@ -1,7 +1,7 @@
 """Consistency of closures with each other, its evidence, and the noise scale estimated from it.
 
 Two closures close to each other and the odometry between their endpoints form a loop, whose residual has to fit the
-stated covariances: then both are consistent (pairwise consistency maximisation, kept up incrementally). The evidence
+stated covariances: then both are consistent [Mangelson 2018], kept up with each new closure. The evidence
 is the larger, the smaller the area that the prediction leaves open within the area in which wrong closures to similar
 places are found. Closures of one place count once.
 
@@ -23,7 +23,7 @@ from scipy.stats import chi2
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, adjoint, invert, logmap, propagate
 from umf_ros.pose_graph.closures import CLOSURE, Closures
-from umf_ros.pose_graph.odometry import Table, noise_between
+from umf_ros.pose_graph.odometry import Rows, Table, noise_between
 
 Loops = NDArray[np.void]
 LOOP = np.dtype([("residual", "f8", 6), ("odometry", "f8", (6, 6)), ("closures", "f8", (6, 6))])
@@ -170,8 +170,7 @@ class ConsistencyGraph:
     def companions(self, row: int, members: NDArray[np.bool_]) -> list[int]:
         """Closures out of `members` of the same place that are consistent with this one."""
         others = [other for other in self._consistent[row] if members[other]]
-        elsewhere = self._elsewhere(others, row)
-        return [other for other in others if other not in elsewhere]
+        return [other for other, same in zip(others, self._same_place(others, row), strict=True) if same]
 
     def opponents(self, row: int, members: NDArray[np.bool_]) -> list[int]:
         """Closures out of `members` that are inconsistent with this one."""
@@ -188,9 +187,8 @@ class ConsistencyGraph:
         one = self.closures[row : row + 1]
         near = np.flatnonzero(paths_between(self.closures[:row], one).max(axis=0) <= self.settings.support_range_m)
         near = near[-_MOST_COMPARED:]
-        places = sorted({self.place_of[other] for other in near})
-        elsewhere = self._elsewhere(places, row)
-        self.place_of.append(next((place for place in places if place not in elsewhere), row))
+        places = np.unique([self.place_of[other] for other in near]).astype(int)
+        self.place_of.append(int(min(places[self._same_place(places, row)], default=row)))
         self._consistent.append({})
         self._inconsistent.append(set())
         loops = loops_between(one, self.closures[near])
@@ -208,12 +206,14 @@ class ConsistencyGraph:
                 self._inconsistent[other].add(row)
         return loops
 
-    def _elsewhere(self, rows: Sequence[int], other: int) -> list[int]:
+    def _same_place(self, rows: Sequence[int] | Rows, other: int) -> NDArray[np.bool_]:
+        """(N,) whether closures are of the place of another one."""
+        paths_m = paths_between(self.closures[np.array(rows, np.int64)], self.closures[other : other + 1])
+        return np.isfinite(paths_m).all(axis=0) & (paths_m.min(axis=0) < self.settings.place_m)
+
+    def _elsewhere(self, rows: list[int], other: int) -> list[int]:
         """Those of other places than one closure."""
-        at = np.array(rows, np.int64)
-        paths_m = paths_between(self.closures[at], self.closures[other : other + 1])
-        same = np.isfinite(paths_m).all(axis=0) & (paths_m.min(axis=0) < self.settings.place_m)
-        return [int(row) for row in at[~same]]
+        return [row for row, same in zip(rows, self._same_place(rows, other), strict=True) if not same]
 
 
 class NoiseScaleEstimator:

@@ -18,12 +18,7 @@ _ROTATION_LAST, _IN_PLANE = np.array([3, 4, 5, 0, 1, 2]), np.array([3, 4, 2])
 
 
 def verdict_table(verdicts: list[ClosureVerdict], vertex_of: Callable[[int], int] | None = None) -> str:
-    """All verdicts as CSV.
-
-    Args:
-        verdicts: one line each.
-        vertex_of: gives the vertex id of a stamp, where the closures are edges of a g2o file.
-    """
+    """All verdicts as CSV; `vertex_of` gives vertex ids of stamps, where the closures are edges of a g2o file."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(VERDICT_COLUMNS if vertex_of is None else ("match", "query", *VERDICT_COLUMNS[2:]))
@@ -42,12 +37,12 @@ def write_g2o(
     planar: bool = False,
     ids: Sequence[int] | None = None,
 ) -> None:
-    """Write vertices and edges.
+    """Write a g2o file of (4, 4) poses and of edges between them by their rows.
 
     Args:
         path: the file.
-        poses: (4, 4) of each vertex.
-        edges: between vertices by their place in `poses`.
+        poses: of the vertices.
+        edges: their measurements.
         planar: keep x, y and heading only.
         ids: of the vertices in the file; None: 0, 1, ...
 
@@ -72,11 +67,7 @@ def write_g2o(
 
 
 def write_vertex_table(path: str | Path, vertices: Iterable[tuple[int, int]]) -> None:
-    """Write which vertex of a g2o file is which stamp: `id,session,stamp_ns` lines.
-
-    Args:
-        path: the file.
-        vertices: session and stamp of vertices 0, 1, ...
+    """Write `id,session,stamp_ns` lines of the vertices 0, 1, ... of a g2o file.
 
     Raises:
         OutputError: the file cannot be written.

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -33,32 +31,8 @@ JOURNAL = "pose_graph.sqlite"
 """Name of the file in a folder of results."""
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
-    """One event of the graph.
-
-    Attributes:
-        kind: an odometry message came, a closure came, a pair of keyframes was revoked, the process was started anew,
-            or it ended before the graph was settled.
-        first_ns: stamp of the odometry, or of the match.
-        second_ns: stamp of the query.
-        data: (16,) pose of the odometry; of a closure the pose, the covariance (36,) and the probability.
-    """
-
-    kind: str
-    first_ns: int
-    second_ns: int
-    data: Array
-
-    @property
-    def closure(self) -> LoopClosure:
-        """The closure that came."""
-        pose, covariance = self.data[:16].reshape(4, 4), self.data[16:52].reshape(6, 6)
-        return LoopClosure(self.second_ns, self.first_ns, pose, covariance, float(self.data[52]))
-
-
 class GraphJournal:
-    """Events in the order in which they came to a graph, and the latest verdict about every closure.
+    """Events in the order in which they came to a graph, and the latest decision about every closure.
 
     Every event is written when it comes: a process that is killed loses none. One process at a time writes it; others
     may read it.
@@ -67,54 +41,48 @@ class GraphJournal:
         path: the file, opened when it exists.
 
     Raises:
-        UmfError: the file is something else, or another process writes it.
-        OutputError: the file cannot be written.
+        UmfError: the file is something else, is damaged, or another process writes it; of every method.
+        OutputError: the file cannot be written; of every method.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = SqliteFile(path, _SCHEMA)
 
-    def events(self) -> Iterator[Event]:
-        """All events so far, in order.
+    def events(self) -> Iterator[tuple[str, int, int, Array]]:
+        """All events so far, in order: kind, two stamps, and the numbers.
 
-        Raises:
-            UmfError: the file is damaged.
+        The first stamp is that of the odometry or of a match, the second that of a query; the numbers are the pose of
+        the odometry (16,); of a closure the pose, the covariance (36,) and the probability.
         """
         with self._file.reading() as connection:
-            for row in connection.execute("SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"):
-                yield _event(*row)
+            rows = connection.execute("SELECT kind, first_ns, second_ns, data FROM event ORDER BY id")
+            for kind, first_ns, second_ns, data in rows:
+                numbers = np.frombuffer(data, np.float64)
+                if len(numbers) != _NUMBERS.get(kind, -1):
+                    raise ValueError(f"an event {str(kind)[:40]!r} of {len(numbers)} numbers")
+                if not (isinstance(first_ns, int) and isinstance(second_ns, int)):
+                    raise ValueError("a stamp that is no number")
+                yield kind, first_ns, second_ns, numbers
 
     def is_unsettled(self) -> bool:
-        """Whether the last process ended before the graph was settled.
-
-        Raises:
-            UmfError: the file is damaged.
-        """
+        """Whether the last process ended before the graph was settled."""
         with self._file.reading() as connection:
             last = connection.execute("SELECT kind FROM event ORDER BY id DESC LIMIT 1").fetchone()
             return last is not None and last[0] == UNSETTLED
 
     def verdicts(self) -> dict[tuple[int, int], Decision]:
-        """The latest decision about every closure, by the stamps of match and query.
-
-        Raises:
-            UmfError: the file is damaged.
-        """
+        """The latest decision about every closure, by the stamps of match and query."""
         with self._file.reading() as connection:
             rows = connection.execute("SELECT match_ns, query_ns, state, reason, residual, residual_m FROM verdict")
-            return {
-                (match, query): (State(state), ClosureReason(reason), _number(residual), _number(residual_m))
-                for match, query, state, reason, residual, residual_m in rows
-            }
+            found = {}
+            for match, query, state, reason, *numbers in rows:  # SQLite has no NaN
+                sigmas, metres = (np.nan if number is None else float(number) for number in numbers)
+                found[match, query] = State(state), ClosureReason(reason), sigmas, metres
+            return found
 
-    @property
     def settings_mark(self) -> int:
-        """Mark of the settings that the verdicts were decided by, 0 without one.
-
-        Raises:
-            UmfError: the file is damaged.
-        """
+        """Mark of the settings that the verdicts were decided by, 0 without one."""
         with self._file.reading() as connection:
             return int(connection.execute("PRAGMA user_version").fetchone()[0])
 
@@ -125,16 +93,19 @@ class GraphJournal:
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
         """Write an odometry message."""
-        self._add(ODOMETRY, stamp_ns, 0, odom_T_body.ravel())
+        self.add(ODOMETRY, stamp_ns, 0, odom_T_body)
 
     def add_closure(self, closure: LoopClosure) -> None:
         """Write a closure."""
-        numbers = np.concatenate([closure.match_T_query.ravel(), closure.covariance.ravel(), [closure.probability]])
-        self._add(CLOSURE, closure.match_stamp_ns, closure.query_stamp_ns, numbers)
+        numbers = np.hstack([closure.match_T_query.ravel(), closure.covariance.ravel(), closure.probability])
+        self.add(CLOSURE, closure.match_stamp_ns, closure.query_stamp_ns, numbers)
 
-    def add(self, kind: str, match_ns: int = 0, query_ns: int = 0) -> None:
-        """Write an event without numbers."""
-        self._add(kind, match_ns, query_ns, np.empty(0))
+    def add(self, kind: str, first_ns: int = 0, second_ns: int = 0, numbers: Array | None = None) -> None:
+        """Write an event; see `events`."""
+        data = b"" if numbers is None else np.ascontiguousarray(numbers, np.float64).tobytes()
+        with self._file.writing() as connection:
+            columns = "INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)"
+            connection.execute(columns, (kind, first_ns, second_ns, data))
 
     def put_verdicts(self, verdicts: list[ClosureVerdict]) -> None:
         """Write verdicts."""
@@ -164,47 +135,18 @@ class GraphJournal:
         """Close the file."""
         self._file.close()
 
-    def _add(self, kind: str, first_ns: int, second_ns: int, numbers: Array) -> None:
-        values = (kind, first_ns, second_ns, np.ascontiguousarray(numbers, np.float64).tobytes())
-        with self._file.writing() as connection:
-            connection.execute("INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)", values)
-
-
-def _number(value: Any) -> float:
-    return float("nan") if value is None else float(value)  # SQLite has no NaN
-
-
-def _event(kind: Any, first_ns: Any, second_ns: Any, data: Any) -> Event:
-    """Return a row of the table as an event.
-
-    Raises:
-        ValueError: it is none.
-        TypeError: its numbers are text.
-    """
-    numbers = np.frombuffer(data, np.float64)
-    if len(numbers) != _NUMBERS.get(kind, -1):
-        raise ValueError(f"an event {str(kind)[:40]!r} of {len(numbers)} numbers")
-    if not all(isinstance(stamp, int) for stamp in (first_ns, second_ns)):
-        raise ValueError("a stamp that is no number")
-    return Event(kind, first_ns, second_ns, numbers)
-
 
 class DurableGraph:
     """A pose graph with a write-ahead log, and its odometry split into sessions.
 
     After a restart the closures get their logged verdicts, and the map is solved once; with other settings they are
-    decided anew. When the disk is full, the graph goes on without its log.
-
-    Args:
-        settings: of the graph.
-        path: of the journal; None keeps none.
-        on_fault: called with errors of writing.
+    decided anew. When the disk is full, the graph goes on without its log, and `on_fault` is called with the error.
 
     Attributes:
         graph: the graph.
         feed: splits odometry into sessions and passes it to the graph.
         taken_up: number of closures that were found in the journal.
-        changed: of these, how many now have another verdict than was written.
+        changed: number of these that now have another verdict than was written.
         unsettled: whether the process before had no time to settle the graph at its end.
 
     Raises:
@@ -286,23 +228,24 @@ class DurableGraph:
 
     def _resume(self, journal: GraphJournal) -> None:
         verdicts, self.unsettled = journal.verdicts(), journal.is_unsettled()
-        events, revoked = 0, []
-        for events, event in enumerate(journal.events(), 1):  # noqa: B007 (their number)
-            if event.kind == ODOMETRY:
-                self.feed.take(event.first_ns, event.data.reshape(4, 4))
-            elif event.kind == CLOSURE:
-                self.graph.hold(event.closure)
-            elif event.kind == REVOKED:
-                revoked.append((event.first_ns, event.second_ns))
-            elif event.kind == STARTED:
+        kind, revoked = "", []
+        for kind, first_ns, second_ns, numbers in journal.events():
+            if kind == ODOMETRY:
+                self.feed.take(first_ns, numbers.reshape(4, 4))
+            elif kind == CLOSURE:
+                pose, covariance = numbers[:16].reshape(4, 4), numbers[16:52].reshape(6, 6)
+                self.graph.hold(LoopClosure(second_ns, first_ns, pose, covariance, float(numbers[52])))
+            elif kind == REVOKED:
+                revoked.append((first_ns, second_ns))
+            elif kind == STARTED:
                 self.feed.interrupted()
-        self.graph.resume(verdicts if journal.settings_mark == self._mark else {})
+        self.graph.resume(verdicts if journal.settings_mark() == self._mark else {})
         for pair in revoked:
             try:
                 self.graph.revoke(*pair)
             except GraphError:
                 self.graph.counts["revoked closure not found"] += 1
-        if events:
+        if kind:  # there were events
             self.feed.interrupted()
             self._write(lambda journal: journal.add(STARTED))
         self._write(lambda journal: journal.mark_settings(self._mark))

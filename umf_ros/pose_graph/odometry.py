@@ -100,14 +100,10 @@ class OdometryChain:
         return self._keyframes["pose"]
 
     @property
-    def newest_ns(self) -> int | None:
-        """Stamp of the last message, None without one."""
-        return int(self._messages["stamp"][-1]) if len(self._messages) else None
-
-    @property
-    def oldest_ns(self) -> int | None:
-        """Stamp of the first message, None without one."""
-        return int(self._messages["stamp"][0]) if len(self._messages) else None
+    def span(self) -> tuple[int, int] | None:
+        """Stamps of the first and the last message; None without any."""
+        stamps = self._messages["stamp"]
+        return (int(stamps[0]), int(stamps[-1])) if len(stamps) else None
 
     def add(self, stamp_ns: int, pose: Array, covariance: Array | None = None) -> None:
         """Remember a message; see `PoseGraph.add_odometry`."""
@@ -117,11 +113,11 @@ class OdometryChain:
 
     def update(self) -> bool:
         """Take the new messages in; True when the past changed, not only the end grew."""
-        newest, changed = self.newest_ns, self._sort_in()
+        span, changed = self.span, self._sort_in()
         if changed is None:
             return False
         self._choose_keyframes(changed)
-        return newest is not None and changed < newest
+        return span is not None and changed < span[1]
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether a stamp is a message's own or lies in a gap between two that is short enough to trust."""
@@ -137,11 +133,11 @@ class OdometryChain:
 
     def at(self, stamps: Stamps) -> PathPoints:
         """(N,) the path at stamps the odometry covers."""
-        poses, collected = self.poses_at(stamps), self._keyframes["noise"]
+        poses, travel, collected = self.poses_at(stamps), self._keyframes["travel"], self._keyframes["noise"]
         lower, upper, share = bracket(self.stamps, stamps)
         points = np.zeros(len(stamps), POINT)
         points["session"], points["stamp"], points["pose"] = self._session, stamps, self._from_origin(poses)
-        points["travel"] = np.interp(stamps.astype(float), self.stamps.astype(float), self._keyframes["travel"])
+        points["travel"] = (1 - share) * travel[lower] + share * travel[upper]
         shares = share[:, None, None]
         points["noise"] = (1 - shares) * collected[lower] + shares * collected[upper]
         beyond = stamps > self.stamps[-1]
@@ -227,7 +223,7 @@ class CorrectedPath:
 
     def at(self, points: PathPoints) -> Array:
         """(M, 4, 4) `map_T_body` at points of the session."""
-        after = np.searchsorted(self._stamps, points["stamp"], side="right")
+        after = np.searchsorted(self.points["stamp"], points["stamp"], side="right")
         lower = np.maximum(after - 1, 0)
         twists = np.zeros((len(points), 6))
         inside = (after > 0) & (after < len(self.points))
@@ -236,10 +232,6 @@ class CorrectedPath:
             twists[inside] = (walked @ self._multipliers[lower[inside]][..., None])[..., 0]
         start = self.poses[lower] @ invert(self.points["pose"][lower])
         return start @ expmap(twists) @ points["pose"]
-
-    @cached_property
-    def _stamps(self) -> Stamps:
-        return np.ascontiguousarray(self.points["stamp"])
 
     @cached_property
     def _multipliers(self) -> Array:

@@ -71,7 +71,6 @@ class OutlierRejection:
         self._map: RelativeCovariances | None = None
         self._ratios: list[float] = []  # likelihood of how closures fit the map if wrong over that if right
         self._joined: list[bool] = []  # whether the map joins both endpoints
-        self._compared: set[int] = set()  # rows, with the map as it was last solved
         self._brought_close: list[int] = []
 
     @property
@@ -87,17 +86,16 @@ class OutlierRejection:
     @property
     def accepted(self) -> Closures:
         """(M,) closures that shape the map."""
-        return self.closures[self._in_state(State.ACCEPTED)]
+        return self.closures[self._of(State.ACCEPTED)]
 
     @property
     def revoked(self) -> NDArray[np.bool_]:
         """(N,) which closures were taken out for good."""
-        return self._of_reason(ClosureReason.BY_HAND)
+        return self._of(ClosureReason.BY_HAND)
 
     def retune(self, settings: PoseGraphSettings) -> None:
         """Use other gates from now on."""
         self.settings = self._consistency.settings = settings
-        self._compared = set()
 
     def consider(self, arrived: Sequence[PlacedClosure]) -> list[ClosureVerdict]:
         """Take closures in; returns the verdicts that are new or changed.
@@ -119,11 +117,10 @@ class OutlierRejection:
             self.verdicts[self._take(placed)] = ClosureVerdict(placed.closure, *decision)
         self._rescale()
         self._solve()
-        rows = np.flatnonzero(~self._in_state(State.ACCEPTED))
-        joined, ratios = self._compare(rows)[2:4]
-        for row, known, ratio in zip(rows.tolist(), joined, ratios, strict=True):
-            self._joined[row] = bool(known)
-            self._ratios[row] = float(ratio) if self.verdicts[row].state is State.PENDING else 1.0
+        rows = np.flatnonzero(~self._of(State.ACCEPTED))
+        for row, joined, ratio in zip(rows.tolist(), *self._compare(rows)[2:4], strict=True):
+            is_pending = self.verdicts[row].state is State.PENDING
+            self._joined[row], self._ratios[row] = joined, ratio if is_pending else 1.0
 
     def settle(self) -> list[ClosureVerdict]:
         """Decide about pending closures and bring the map to its exact optimum; returns changed verdicts."""
@@ -158,11 +155,6 @@ class OutlierRejection:
             self._solve()
         return self._changed_since(before)
 
-    def endpoint_positions(self) -> Array:
-        """(N, 2, 3) map positions of the match and query endpoints of all closures."""
-        both = (self.closures["match"], self.closures["query"])
-        return np.stack([self._sessions.at(end)[:, :3, 3] for end in both], axis=1)
-
     def _decide_all(self) -> None:
         rows: Iterable[int] = range(len(self.placed))
         for _ in range(_MOST_ROUNDS):
@@ -182,7 +174,7 @@ class OutlierRejection:
             reasons = dict.fromkeys(self._unopposed(), ClosureReason.UNOPPOSED)
         self._brought_close = []
         if self._accept(reasons):  # closures not accepted that the moved map comes close to are compared again
-            rows = np.flatnonzero(~self._in_state(State.ACCEPTED) & ~self.revoked)
+            rows = np.flatnonzero(~self._of(State.ACCEPTED) & ~self.revoked)
             self._brought_close = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
         return bool(reasons)
 
@@ -206,27 +198,24 @@ class OutlierRejection:
 
     def _gate(self, rows: Iterable[int]) -> list[int]:
         """Compare closures with the map; returns those whose consistency with it suffices."""
-        closed = self._in_state(State.ACCEPTED) | self.revoked
+        closed = self._of(State.ACCEPTED) | self.revoked
         at = np.array([row for row in rows if not closed[row]], np.int64)
         if not len(at):
             return []
-        self._compared.update(at.tolist())
         # without outlier rejection, all that is not too far
         most = self.settings.max_chance if self.settings.reject_outliers else 1.0
         agreed = []
         for row, distance, misfit_m, joined, ratio, false_alarm in zip(at.tolist(), *self._compare(at), strict=True):
             state, reason = self._judge(distance, misfit_m)
-            self.verdicts[row] = ClosureVerdict(
-                self.placed[row].closure, state, reason, float(np.sqrt(distance)), float(misfit_m)
-            )
-            self._joined[row] = bool(joined)
-            self._ratios[row] = float(ratio) if state is State.PENDING else 1.0
+            closure, sigmas = self.placed[row].closure, float(np.sqrt(distance))
+            self.verdicts[row] = ClosureVerdict(closure, state, reason, sigmas, float(misfit_m))
+            self._joined[row], self._ratios[row] = joined, ratio if state is State.PENDING else 1.0
             if state is State.PENDING and false_alarm <= most:
                 agreed.append(row)
         return agreed
 
     def _judge(self, distance: float, misfit_m: float) -> tuple[State, ClosureReason]:
-        """What the map says to a closure, by its squared Mahalanobis distance and its misfit."""
+        """Decision about a closure by its squared Mahalanobis distance from the map, and its misfit."""
         if self.settings.reject_outliers and distance > self.settings.gate_chi2:
             return State.REJECTED, ClosureReason.CONTRADICTS
         if self.settings.max_correction_m and misfit_m > self.settings.max_correction_m:
@@ -259,7 +248,7 @@ class OutlierRejection:
 
     def _supported_sets(self, rows: Iterable[int], state: State) -> list[list[int]]:
         """Consistency sets among the closures of one state, each with one of `rows`, that no chance explains."""
-        members = self._in_state(state) & ~self.revoked & ~self._of_reason(ClosureReason.TOO_FAR)
+        members = self._of(state) & ~self.revoked & ~self._of(ClosureReason.TOO_FAR)
         sets: list[list[int]] = []
         for row in rows:
             if members[row] and not any(row in found for found in sets):
@@ -272,7 +261,7 @@ class OutlierRejection:
 
     def _overrule(self, rows: Iterable[int]) -> list[int]:
         """A set that the map contradicts, of more places than what it is inconsistent with, which is revoked."""
-        accepted = self._in_state(State.ACCEPTED)
+        accepted = self._of(State.ACCEPTED)
         for found in self._supported_sets(rows, State.REJECTED):
             losers = sorted({loser for row in found for loser in self._consistency.opponents(row, accepted)})
             if self._consistency.count_places(losers) < self._consistency.count_places(found):
@@ -286,7 +275,7 @@ class OutlierRejection:
 
         Where enough supports a closure, the odometry between is wrong, not the closure.
         """
-        members, outvoted = self._in_state(State.ACCEPTED), dict[int, ClosureVerdict]()
+        members, outvoted = self._of(State.ACCEPTED), dict[int, ClosureVerdict]()
         for row in np.flatnonzero(members).tolist():
             opponents = self._consistency.count_places(self._consistency.opponents(row, members))
             found, evidence = self._consistency.consistency_set(row, members) if opponents else ([], np.inf)
@@ -312,14 +301,16 @@ class OutlierRejection:
         set is not accepted by chance. The decision at the end does not wait, and counts how many closures were wrong
         and the evidence of other places.
         """
-        waiting = self._in_state(State.PENDING)
-        if not at_last:
-            waiting &= self._waited_m() >= self.settings.patience_m
-        companions = ~self._in_state(State.ACCEPTED) & ~self.revoked
+        waiting = self._of(State.PENDING)
+        if not at_last and len(waiting):
+            queries = self.closures["query"]
+            waited_m = queries["travel"][-1] - queries["travel"]
+            waiting &= (queries["session"] != queries["session"][-1]) | (waited_m >= self.settings.patience_m)
+        companions = ~self._of(State.ACCEPTED) & ~self.revoked
         places = [[row, *self._consistency.companions(row, companions)] for row in np.flatnonzero(waiting).tolist()]
-        self._gate(sorted({member for place in places for member in place} - self._compared))
+        self._gate(sorted({member for place in places for member in place}))
         # those that the map itself finds wrong rather than right do not speak against others
-        against = self._in_state(State.ACCEPTED) | (np.array(self._ratios) < _EVEN)
+        against = self._of(State.ACCEPTED) | (np.array(self._ratios) < _EVEN)
         best: list[int] = []
         most_odds = _MOST_ODDS_AT_LAST if at_last else _MOST_ODDS
         for place in places:
@@ -335,26 +326,16 @@ class OutlierRejection:
         odds = np.array([self._ratios[row] for row in place])
         if not at_last:
             return odds
-        rejected, accepted = (int(self._in_state(state).sum()) for state in (State.REJECTED, State.ACCEPTED))
+        rejected, accepted = (int(self._of(state).sum()) for state in (State.REJECTED, State.ACCEPTED))
         prior = (_WRONG_BEFORE + rejected) / (_RIGHT_BEFORE + accepted)
-        odds = odds * np.exp(-self._consistency.consistency_set(place[0], self._in_state(State.PENDING))[1])
+        odds = odds * np.exp(-self._consistency.consistency_set(place[0], self._of(State.PENDING))[1])
         if not self._joined[place[0]]:
             return odds * max(prior, _WRONG_BEFORE / _RIGHT_BEFORE) * _WRONG_BETWEEN
         return odds * prior * (_WRONG_ALONE if len(place) == 1 else 1.0)
 
-    def _in_state(self, state: State) -> NDArray[np.bool_]:
-        """(N,) which closures have a verdict."""
-        return np.array([verdict.state is state for verdict in self.verdicts], bool)
-
-    def _of_reason(self, reason: ClosureReason) -> NDArray[np.bool_]:
-        """(N,) which closures have a verdict for a reason."""
-        return np.array([verdict.reason is reason for verdict in self.verdicts], bool)
-
-    def _waited_m(self) -> Array:
-        """(N,) metres driven since each closure's query; infinite where that was in another session than the newest."""
-        queries = self.closures["query"]
-        last = queries[-1:]
-        return np.where(queries["session"] == last["session"], last["travel"] - queries["travel"], np.inf)
+    def _of(self, decision: State | ClosureReason) -> NDArray[np.bool_]:
+        """(N,) which closures have verdicts of a state or a reason."""
+        return np.array([decision in (verdict.state, verdict.reason) for verdict in self.verdicts], bool)
 
     def _accept(self, reasons: dict[int, ClosureReason]) -> bool:
         """Accept closures and solve the map with them; False without any."""
@@ -366,7 +347,7 @@ class OutlierRejection:
 
     def _solve(self) -> None:
         self._sessions.solve(self.accepted, self.scale)
-        self._map, self._compared = RelativeCovariances(self._sessions), set()
+        self._map = RelativeCovariances(self._sessions)
 
     def _reject(self, row: int, reason: ClosureReason) -> None:
         self.verdicts[row] = ClosureVerdict(self.placed[row].closure, State.REJECTED, reason)

@@ -74,16 +74,6 @@ class Sessions:
         return [session for session, chain in enumerate(self.chains) if len(chain.stamps)]
 
     @property
-    def newest_ns(self) -> int | None:
-        """Stamp of the newest odometry of all sessions; None without."""
-        return max((chain.newest_ns for chain in self.chains if chain.newest_ns is not None), default=None)
-
-    @property
-    def oldest_ns(self) -> int | None:
-        """Stamp of the oldest odometry of all sessions; None without."""
-        return min((chain.oldest_ns for chain in self.chains if chain.oldest_ns is not None), default=None)
-
-    @property
     def outgrown(self) -> bool:
         """Whether a session has odometry but no pose in the last solution."""
         return not set(self.begun) <= set(self.vertices["session"].tolist())
