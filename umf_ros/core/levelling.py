@@ -17,9 +17,9 @@ from umf_ros.core.geometry import Array, make_pose
 
 CONES = np.radians([32.0, 24.0, 16.0, 12.0])  # measured: rights LiDARs tilted by 28 deg to 1 or 2
 MIN_GROUND = 10  # by hand: normals of ground that a direction is worth
-# measured: gap between the two largest eigenvalues, as a share of the normals (single facades .02 to .12, ground and
-# rooms .25 to .98) and in normals, below which no direction is found and at twice which it is trusted
-LEAST_SHARE, LEAST_GAP = 0.12, 40.0
+# measured: gap between the two largest eigenvalues as a share of the normals; single facades have .02 to .12, corridors
+# .18 to .27, ground and rooms .25 to .98; between these a direction is trusted in part, as between so many normals
+SHARES, GAPS = (0.12, 0.17), (40.0, 80.0)
 CELL_M, NEIGHBOURS = 0.4, 10  # by hand: coarse normals do, and small_gicp's own default
 GROUND_M, GROUND_COS, GROUND_SHARE = 15.0, 0.9, 0.2  # by hand: how near and how level ground is; how low among that
 OWN_TILT_DEG, MOUNT_TILT_DEG = 12.0, 24.0  # measured: of ground in scans by which networks were trained; of brackets
@@ -82,7 +82,7 @@ def _upright(normals: Array) -> tuple[Array, float]:
         values, axes = np.linalg.eigh(ground.T @ ground - walls.T @ walls)
         if cone == CONES[0]:
             gap = float(values[2] - values[1])
-            trust = float(np.clip(min(gap / len(normals) / LEAST_SHARE, gap / LEAST_GAP) - 1, 0, 1))
+            trust = float(np.interp(gap / len(normals), SHARES, (0, 1)) * np.interp(gap, GAPS, (0, 1)))
         up = axes[:, -1] * np.sign(axes[2, -1])
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
