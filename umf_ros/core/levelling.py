@@ -17,9 +17,9 @@ from umf_ros.core.geometry import Array, make_pose
 
 CONES = np.radians([32.0, 24.0, 16.0, 12.0])  # measured: rights LiDARs tilted by 28 deg to 1 or 2
 MIN_GROUND = 10  # by hand: normals of ground that a direction is worth
-# measured: gap between the two largest eigenvalues as a share of the normals; single facades have .02 to .12, corridors
+# measured: gap between the two largest eigenvalues as a share of the normals; single facades have .02 to .13, corridors
 # .18 to .27, ground and rooms .25 to .98; between these a direction is trusted in part, as between so many normals
-SHARES, GAPS = (0.12, 0.17), (40.0, 80.0)
+SHARES, GAPS = (0.13, 0.17), (40.0, 80.0)
 CELL_M, NEIGHBOURS = 0.4, 10  # by hand: coarse normals do, and small_gicp's own default
 GROUND_M, GROUND_COS, GROUND_SHARE = 15.0, 0.9, 0.2  # by hand: how near and how level ground is; how low among that
 OWN_TILT_DEG, MOUNT_TILT_DEG = 12.0, 24.0  # measured: of ground in scans by which networks were trained; of brackets
