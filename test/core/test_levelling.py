@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.geometry import heading, transform
+from umf_ros.core.geometry import heading, rotation_angle, transform
 from umf_ros.core.levelling import level, upright
 
 
@@ -83,3 +83,24 @@ def test_between_a_slope_and_a_mount_there_is_no_step() -> None:
 @pytest.mark.parametrize("count", [0, 20])
 def test_of_a_few_points_nobody_knows_what_is_up(count: int) -> None:
     assert level(yard()[:count]) == pytest.approx(np.eye(4))
+
+
+def bare_wall(seed: int, pitch_deg: float) -> np.ndarray:
+    """(N, 3) a wall 9 m ahead with ivy before it, seen by a LiDAR that looks up, noisy and with flying pixels."""
+    rng, scene = np.random.default_rng(seed), np.random.default_rng(0)
+    across = scene.uniform(-0.6, 0.6, 9000), scene.uniform(-0.26, 0.26, 9000)
+    wall = np.column_stack(
+        [np.full(9000, 9.0), 9.0 * np.tan(across[0]), 9.0 * np.tan(across[1] + np.radians(pitch_deg))]
+    )
+    ivy = scene.normal([7.5, 2.0, 4.0], 0.8, (200, 3))
+    points = np.concatenate([wall, ivy])
+    ranges = 1 + rng.normal(0, 0.05, (len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    points = points * ranges * np.where(rng.random((len(points), 1)) < 0.02, rng.uniform(0.9, 1.1), 1)
+    return transform(mounted([0.0, np.radians(pitch_deg), 0.0]), points[rng.random(len(points)) > 0.15])
+
+
+@pytest.mark.parametrize("pitch_deg", [10.0, 25.0, 33.0])
+def test_a_bare_wall_leaves_scans_as_the_mount_holds_them(pitch_deg: float) -> None:
+    poses = [level(bare_wall(seed, pitch_deg)) for seed in range(5)]
+    assert max(np.degrees(rotation_angle(pose)) for pose in poses) < 1.0
+    assert np.ptp([pose[2, 3] for pose in poses]) < 0.1

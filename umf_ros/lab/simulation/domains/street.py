@@ -26,7 +26,7 @@ class Street:
         rng = np.random.default_rng([seed, 35])
         self._length, self._width = rng.uniform(60, 80), rng.uniform(40, 50)
         self.trail = rounded_rectangle(self._length, self._width, 5.0)
-        self._designs = [_Facade(rng) for _ in range(3)]
+        self._designs = [Facade(rng) for _ in range(3)]
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
         """The road is level."""
@@ -97,7 +97,7 @@ class Street:
                 _car(solids, start + along * (at + shift) - 1.1 * side, yaw, shape)
 
 
-class _Facade:
+class Facade:
     """How one kind of building looks from the street."""
 
     def __init__(self, rng: np.random.Generator) -> None:
