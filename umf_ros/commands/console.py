@@ -124,7 +124,7 @@ def undisturbed() -> AbstractContextManager[object]:
 
 @contextmanager
 def _handled_by(handler: Handler) -> Iterator[dict[signal.Signals, Handler]]:
-    """Give both signals to a handler; yields those they had before and shall have again."""
+    """Give both signals to a handler; yields their handlers of before, which they get again at the end."""
     before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield before
