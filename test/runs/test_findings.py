@@ -11,12 +11,12 @@ import pytest
 from finished_runs import BELOW, START_NS, accepted, candidate, closure, examined, stamp, trajectory
 from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, traverse, write_mcap
 
+from umf_ros.bags.inputs import Advice, useless_inputs
 from umf_ros.bags.reader import open_bag
+from umf_ros.bags.sensor_check import Disagreement, SensorReport
 from umf_ros.core.config import load_settings
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.findings import USELESS, ExaminedRun, conclude, look_first
-from umf_ros.runs.reader import Advice, useless_inputs
-from umf_ros.runs.sensor_check import Disagreement, SensorReport
 from umf_ros.verification import RejectReason
 
 
