@@ -69,7 +69,7 @@ def test_nothing_found_without_a_truth_is_not_green(tmp_path: Path) -> None:
     mark, status, sentence = verdict(examined(tmp_path, candidates=tested))
     assert (mark, status) == ("warn", 0)
     assert sentence.startswith(
-        "None of 1 candidates became a closure; the best (probability below verification.min_probability: 0.60 < 0.9) is"
+        "None of 1 candidates became a closure; the best (probability below verification.min_probability: 0.60 < 0.9)"
     )
 
 
