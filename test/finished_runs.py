@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from umf_ros.bags.sensor_check import SensorReport
 from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative
@@ -14,7 +15,6 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.diagnosis import GateDiagnosis
 from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.sensor_check import SensorReport
 from umf_ros.runs.tables import GraphVerdict, KeyframeRow
 from umf_ros.runs.truth import JudgedRun, TruePlaces, judge_closure
 from umf_ros.verification import Hypothesis, Measurement, RejectReason

@@ -6,6 +6,7 @@ import csv
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -142,7 +143,7 @@ class KeyframeSource:
     ) -> None:
         self._embedder = embedder
         self._rules = rules
-        self._warn = _once(warn)
+        self._warn = cache(warn)
         self._calibration = UNCALIBRATED if rules.calibration is None else load_calibration(str(rules.calibration))
         self._cache: OrderedDict[PlaceView, Keyframe | UmfError] = OrderedDict()
         self._expected: dict[Path, list[PlaceView]] = {}
@@ -321,15 +322,3 @@ def _listed(role: str, row: dict[str, str | None], base: Path) -> PlaceView:
 def _relative(name: str, base: Path) -> str:
     path = Path(name)
     return str(path.relative_to(base)) if name and path.is_relative_to(base) else name
-
-
-def _once(warn: Callable[[str], None]) -> Callable[[str], None]:
-    """Pass every distinct line on once."""
-    told: set[str] = set()
-
-    def tell(text: str) -> None:
-        if text not in told:
-            told.add(text)
-            warn(text)
-
-    return tell

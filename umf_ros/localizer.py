@@ -125,10 +125,13 @@ class Localizer:
             check_pose(odom_T_body)
         except GraphError:
             return False
-        last = self._samples[-1] if self._samples else None
-        if last is not None and stamp_ns <= last.stamp_ns:
-            return False
-        path_m = 0.0 if last is None else last.path_m + _path_length(last.pose, odom_T_body)
+        path_m = 0.0
+        if self._samples:
+            last = self._samples[-1]
+            if stamp_ns <= last.stamp_ns:
+                return False
+            step = relative(last.pose, odom_T_body)
+            path_m = last.path_m + float(np.linalg.norm(step[:3, 3])) + _TURN_M_PER_RAD * rotation_angle(step)
         self._samples.append(_Sample(stamp_ns, np.asarray(odom_T_body, float), path_m))
         for _ in range(len(self._pending)):
             self.add_closure(self._pending.popleft())
@@ -233,11 +236,6 @@ class Localizer:
         return _Sample(stamp_ns, pose[0], path_m)
 
 
-def _path_length(a: Array, b: Array) -> float:
-    step = relative(a, b)
-    return float(np.linalg.norm(step[:3, 3])) + _TURN_M_PER_RAD * rotation_angle(step)
-
-
 def _logit(probability: float) -> float:
     """Odds in nats; an unknown probability counts as 0.9, that of a closure that is just accepted."""
     known = min(max(probability, 0.5), 0.9999) if np.isfinite(probability) else 0.9
@@ -267,15 +265,9 @@ class MapFollower:
 
     It keeps the trajectory only; closures are counted by their state.
 
-    Args:
-        settings: all settings, mode localization.
-
     Attributes:
         feed: splits the odometry into sessions.
         counts: odometry messages and closures, by their state.
-
-    Raises:
-        UmfError: there is no such map, or it has not been solved.
     """
 
     taken_up = changed = 0
@@ -370,8 +362,7 @@ class MapFollower:
 
     def write_results(self, folder: str | Path, within_s: float = float("inf")) -> bool:
         """Write the trajectory, `trajectory_in_map.tum`; returns true, there is nothing to settle before."""
-        stamps, poses = self.trajectory()
         with writing(f"to {folder}"):
             Path(folder).mkdir(parents=True, exist_ok=True)
-        write_tum(Path(folder) / "trajectory_in_map.tum", Trajectory(stamps, poses))
+        write_tum(Path(folder) / "trajectory_in_map.tum", Trajectory(*self.trajectory()))
         return True

@@ -11,12 +11,12 @@ import pytest
 from finished_runs import BELOW, START_NS, accepted, candidate, closure, examined, stamp, trajectory
 from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, traverse, write_mcap
 
+from umf_ros.bags.inputs import Advice, useless_inputs
 from umf_ros.bags.reader import open_bag
+from umf_ros.bags.sensor_check import Disagreement, SensorReport
 from umf_ros.core.config import load_settings
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.findings import USELESS, ExaminedRun, conclude, look_first
-from umf_ros.runs.reader import Advice, useless_inputs
-from umf_ros.runs.sensor_check import Disagreement, SensorReport
 from umf_ros.verification import RejectReason
 
 
@@ -69,7 +69,7 @@ def test_nothing_found_without_a_truth_is_not_green(tmp_path: Path) -> None:
     mark, status, sentence = verdict(examined(tmp_path, candidates=tested))
     assert (mark, status) == ("warn", 0)
     assert sentence.startswith(
-        "None of 1 candidates became a closure; the best (probability 0.60 is below 0.9) is at 50"
+        "None of 1 candidates became a closure; the best (probability below verification.min_probability: 0.60 < 0.9)"
     )
 
 

@@ -13,9 +13,9 @@ import pytest
 from finished_runs import accepted, candidate, closure, examined, trajectory
 from rich.console import Console
 
+from umf_ros.bags.inputs import Advice
 from umf_ros.runs.findings import ExaminedRun, conclude, look_first
 from umf_ros.runs.gallery import Gallery
-from umf_ros.runs.reader import Advice
 from umf_ros.runs.report import closure_rows, describe, final_verdicts, print_summary, write_page
 from umf_ros.runs.scene import build_scene, pairs_of
 from umf_ros.runs.truth import JudgedClosure

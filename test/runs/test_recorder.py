@@ -48,7 +48,7 @@ def detection(stamp_s: float, verdicts: list[Hypothesis]) -> Detection:
 
 def record_a_little(folder: Path) -> RunRecorder:
     recorder = RunRecorder(folder, Settings(), "some_weights")
-    rejected = Hypothesis(9, Candidate(1, 5, 0.4), MEASUREMENT, RejectReason.NO_POSE)
+    rejected = Hypothesis(40, Candidate(1, 5, 0.4), MEASUREMENT, RejectReason.NO_POSE)
     recorder.record(make_frame(1), Detection(10**9))
     recorder.record(make_frame(2), detection(2, []))
     recorder.record(
@@ -81,7 +81,7 @@ def test_tables_are_exported_at_the_end(tmp_path: Path) -> None:
     record_a_little(tmp_path).close()
     with (tmp_path / "candidates.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["reason"] for row in rows] == ["accepted", "few inliers"]
+    assert [row["reason"] for row in rows] == ["accepted", RejectReason.NO_POSE.value]
     assert json.loads(rows[1]["numbers"]) == MEASUREMENT.numbers
     with (tmp_path / "inliers.csv").open() as file:
         assert [float(row["match_v"]) for row in csv.DictReader(file)] == [4, 8]
@@ -135,7 +135,7 @@ def test_the_summary_can_be_written_again_as_the_run_goes_on(tmp_path: Path) -> 
 
 def test_a_keyframe_that_was_asked_and_found_nothing_is_no_query(tmp_path: Path) -> None:
     recorder = RunRecorder(tmp_path, Settings(), "w")
-    rejected = Hypothesis(9, Candidate(1, 5, 0.4), MEASUREMENT, RejectReason.NO_POSE)
+    rejected = Hypothesis(40, Candidate(1, 5, 0.4), MEASUREMENT, RejectReason.NO_POSE)
     recorder.record(make_frame(1), detection(1, []))
     recorder.record(make_frame(2), detection(2, [rejected, rejected]))
     recorder.record(make_frame(60), detection(60, [accepted(60, 2), accepted(60, 3), rejected]))

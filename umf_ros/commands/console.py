@@ -12,10 +12,11 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from umf_ros.bags.inputs import absent_inputs, input_counts
 from umf_ros.bags.reader import Bag
 from umf_ros.core.config import Settings
 from umf_ros.detector import Detection
-from umf_ros.runs.reader import absent_inputs, input_counts, remember_recording
+from umf_ros.runs.reader import remember_recording
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
@@ -124,7 +125,7 @@ def undisturbed() -> AbstractContextManager[object]:
 
 @contextmanager
 def _handled_by(handler: Handler) -> Iterator[dict[signal.Signals, Handler]]:
-    """Give both signals to a handler; yields those they had before and shall have again."""
+    """Give both signals to a handler; yields their handlers of before, which they get again at the end."""
     before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield before

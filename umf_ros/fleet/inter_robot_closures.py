@@ -13,7 +13,7 @@ import numpy as np
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, invert, relative, rotation_angle
-from umf_ros.fleet.link import Answer, FleetLink
+from umf_ros.fleet.link import FleetLink
 from umf_ros.places.store import KeyframeStore
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 
@@ -126,7 +126,21 @@ class InterRobotMatcher:
     def next(self) -> InterRobotClosure | None:
         """Verify the oldest answer of the server; None while there is none."""
         answer = self.link.answer()
-        return self._verify(answer) if answer is not None else None
+        if answer is None:
+            return None
+        if answer.robot not in self._verifiers:
+            self._verifiers[answer.robot] = Verifier(self._settings), FleetConsensus(self._settings.odometry_drift)
+        verifier, consensus = self._verifiers[answer.robot]
+        matches = {candidate.stamp_ns: match for candidate, match in answer.found}
+        verdicts, closures = verifier.verify(answer.keyframe, answer.found), []
+        for verdict in verdicts:
+            if verdict.closure is not None:
+                pair = InterRobotPair(answer.keyframe, matches[verdict.candidate.stamp_ns], verdict.closure)
+                confirmed = consensus.confirm(pair)
+                closures += [one.closure for one in confirmed]
+                if not confirmed:
+                    verdict.reason = RejectReason.UNCONFIRMED
+        return InterRobotClosure(answer.keyframe, self.link.robot, answer.robot, verdicts, closures)
 
     def rest(self, timeout_s: float) -> Iterator[InterRobotClosure]:
         """Finish pushing and asking within a time limit, and verify all answers."""
@@ -141,20 +155,3 @@ class InterRobotMatcher:
     def close(self) -> None:
         """Disconnect from the server."""
         self.link.close()
-
-    def _verify(self, answer: Answer) -> InterRobotClosure:
-        robot = answer.robot
-        if robot not in self._verifiers:
-            self._verifiers[robot] = Verifier(self._settings), FleetConsensus(self._settings.odometry_drift)
-        verifier, consensus = self._verifiers[robot]
-        matches = {candidate.stamp_ns: match for candidate, match in answer.found}
-        verdicts, closures = [], []
-        for verdict in verifier.verify(answer.keyframe, answer.found):
-            if verdict.closure is not None:
-                pair = InterRobotPair(answer.keyframe, matches[verdict.candidate.stamp_ns], verdict.closure)
-                confirmed = consensus.confirm(pair)
-                closures += [one.closure for one in confirmed]
-                if not confirmed:
-                    verdict.reason = RejectReason.UNCONFIRMED
-            verdicts.append(verdict)
-        return InterRobotClosure(answer.keyframe, self.link.robot, robot, verdicts, closures)

@@ -78,10 +78,8 @@ def solve(folder: MapFolder) -> JointMap:
     # after all odometry, as a closure may refer to any session
     for session in folder.sessions:
         run = folder.folder_of(session.name)
-        graph.add_closures(
-            [_shifted(one, session.shift_ns) for one in read_closures(run / "closures.csv")]
-            + read_closures(run / BETWEEN)
-        )
+        within = [_shifted(one, session.shift_ns) for one in read_closures(run / "closures.csv")]
+        graph.add_closures(within + read_closures(run / BETWEEN))
     graph.settle()
     verdicts: tuple[list[ClosureVerdict], list[ClosureVerdict]] = ([], [])
     for verdict in graph.closures():

@@ -38,8 +38,8 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     joint.graph.write_g2o(path / "graph.g2o")
     _draw(path / "trajectories.png", joint)
     thickness = write_cloud(folder, joint) if folder.places.is_file() else (nan, nan)
-    rounded = (None if isnan(value) else round(value, 4) for value in thickness)
-    summary = summarise(joint) | {"thickness_m": dict(zip(("before", "after"), rounded, strict=True))}
+    before, after = (None if isnan(value) else round(value, 4) for value in thickness)
+    summary = summarise(joint) | {"thickness_m": {"before": before, "after": after}}
     write_atomically(path / "summary.json", json.dumps(summary, indent=2) + "\n")
     _write_report(path, summary)
     return summary

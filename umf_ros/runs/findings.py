@@ -9,96 +9,17 @@ from typing import Literal
 
 import numpy as np
 
+from umf_ros.bags.inputs import SEVERITIES, Advice, Severity, absent_inputs, useless_inputs
 from umf_ros.bags.reader import Bag
-from umf_ros.core.geometry import Array
+from umf_ros.bags.sensor_check import SensorReport, about_sensors
 from umf_ros.core.keyframes import gap_remedy
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, GateDiagnosis
-from umf_ros.runs.reader import SEVERITIES, Advice, FinishedRun, Severity, absent_inputs, useless_inputs
-from umf_ros.runs.sensor_check import SensorReport
+from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.truth import JudgedRun, TruePlaces, in_words
 
-BLANK, DIM = 3.0, 8.0
-"""Grey values, by hand: standard deviations of an image that shows nothing, and next to nothing."""
-FEW_RETURNS = 500
-"""Of a scan, by hand: a place takes more to be told by."""
-LAG_S = 0.1
-"""By hand: twice the step that lags are tried in."""
-MOUNTING_DEG = 6.0
-"""Measured on simulated drives: right mountings come out within 3.3 deg, the worst about the vertical."""
-SCALE = 0.08
-"""Measured on simulated drives: a right baseline comes out within 1 %."""
-SAME_DEG = 5.0
-"""By hand: two sensors that differ from the odometry alike: it is the odometry."""
 REFUSED = ("size", "encoding", "step", "truncated", "compressed", "fields", "datatype", "unusable", "stamp")
 """Reasons why a message is of no use by itself, whatever the others are."""
-ACROSS = 0.5
-"""Share of the motion, by hand: a body drives along its x, or its y where it can."""
-_SENSORS = {"lidar": "LiDAR", "camera": "camera"}
-
-
-def about_sensors(seen: SensorReport) -> Iterator[Advice]:
-    """Findings about light, returns, baseline, clocks and mountings."""
-    yield from _measurements(seen)
-    if seen.forward is not None and abs(seen.forward[2]) >= max(ACROSS, np.abs(seen.forward[:2]).max()):
-        what = "the odometry is not of the body: by its poses the way goes along the body's z axis, and z is up"
-        remedy = "--odometry-frame camera, imu or lidar says whose poses the file holds (of the camera z looks ahead)"
-        yield Advice("fault", what, remedy)
-    known = {name: one for name in _SENSORS if (one := getattr(seen, name)) is not None}
-    yield from _clocks({name: one.lag_s for name, one in known.items()})
-    yield from _mountings({name: one.mounting_deg for name, one in known.items() if one.mounting_deg is not None})
-    if abs(seen.stereo_scale - 1) > SCALE:
-        what = f"stereo sees everything {seen.stereo_scale:.2f} times as far as the LiDAR"
-        remedy = f"baseline of the calibration, or P[3] of the right camera_info: divide by {seen.stereo_scale:.3f}"
-        yield Advice("fault", f"{what}: the baseline is wrong by that factor", remedy)
-
-
-def _measurements(seen: SensorReport) -> Iterator[Advice]:
-    for name, contrast in (("left", seen.left_contrast), ("right", seen.right_contrast)):
-        vary = f"their grey values vary by {contrast:.1f} in the median"
-        if contrast < BLANK:
-            remedy = f"is the camera covered, or the topic another one's? topics.{name}_image"
-            yield Advice("fault", f"the {name} images are empty: {vary}", remedy)
-        elif contrast < DIM:
-            yield Advice("warning", f"the {name} images show little: {vary}", "exposure and gain of the camera")
-    if seen.returns < FEW_RETURNS:
-        remedy = "places take a few thousand: merge scans, or see min_intensity and max_height_m of the calibration"
-        yield Advice("warning", f"scans have {seen.returns:.0f} returns in the median", remedy)
-    if seen.intensity_max == 0:
-        yield Advice("warning", "all intensities are 0: the descriptor does without them", "a field named intensity")
-
-
-def _clocks(lags: dict[str, float]) -> Iterator[Advice]:
-    off = {name: lag for name, lag in lags.items() if abs(lag) >= LAG_S}
-    if off and len(lags) == 2 and abs(lags["lidar"] - lags["camera"]) < LAG_S:
-        what = f"the odometry's clock is about {lags['lidar']:+.1f} s off those of camera and LiDAR"
-        yield Advice("fault", what, "correct its stamps: closures and scans are placed by it")
-        return
-    for name, lag in off.items():
-        what = f"the {_SENSORS[name]}'s clock is about {-lag:+.1f} s off the odometry's, by its motion"
-        yield Advice("fault", what, "the stamps of its driver (PTP, or a constant): no parameter corrects them")
-
-
-def _mountings(known: dict[str, Array]) -> Iterator[Advice]:
-    off = {name: turn for name, turn in known.items() if np.linalg.norm(turn) > MOUNTING_DEG}
-    if len(off) == 2 and np.linalg.norm(off["lidar"] - off["camera"]) < SAME_DEG:
-        turned = _turn(off["lidar"])
-        what = f"the odometry is not of the body frame: camera and LiDAR both say it is turned by {turned}"
-        remedy = "--odometry-frame camera, imu or lidar says whose poses the file holds; a topic must be of the body"
-        yield Advice("fault", what, remedy)
-        return
-    for name, turn in off.items():
-        off_by = f"the {_SENSORS[name]}'s mounting is off by {_turn(turn)}"
-        what = f"{off_by}: so its motion says, held against the odometry's"
-        yield Advice("fault", what, f"body_T_{name} of the calibration")
-
-
-def _turn(mounting_deg: Array) -> str:
-    """As "10 deg about y"."""
-    axis = int(np.abs(mounting_deg).argmax())
-    return f"{np.linalg.norm(mounting_deg):.0f} deg, mostly about {'xyz'[axis]} ({mounting_deg[axis]:+.0f} deg)"
-
-
 MUCH_MISSED, MUCH_REJECTED, WELL_COVERED = 0.3, 0.2, 0.5
 """Shares, by hand: of revisits, of closures, of keyframes."""
 SLOW = 1.0

@@ -12,11 +12,11 @@ import numpy as np
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import Bag
+from umf_ros.bags.sensor_check import SensorCheck, SensorReport
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Frame, Image, Points
 from umf_ros.core.geometry import Array, transform
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.runs.sensor_check import SensorCheck, SensorReport
 from umf_ros.verification import thin_scan
 
 MAP_CELLS, MAP_REACH_M = 700, 25.0  # by hand: bounds the picture

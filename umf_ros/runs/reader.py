@@ -1,120 +1,25 @@
-"""Read the folder of a finished run, and what its inputs lacked."""
+"""Read the folder of a finished run."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
-from umf_ros.core.config import Settings, load_settings, topics_of
+from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure, Points
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs import tables
 from umf_ros.runs.run_file import read_descriptors
 from umf_ros.runs.writer import read_summary, write_summary
-from umf_ros.sensors.buffers import InputCounter
-from umf_ros.sensors.decode import TYPES
-from umf_ros.sensors.sessions import Input
 from umf_ros.verification.hypothesis import Hypothesis
-
-Severity = Literal["fault", "warning", "note"]
-SEVERITIES: tuple[Severity, ...] = ("fault", "warning", "note")
-_ABSENT: dict[str, tuple[Severity, str]] = {
-    "left_image": ("warning", "no images on {}: places are told apart by scans alone"),
-    "right_image": ("note", "no right images on {}: depth of images comes from the scans alone"),
-    "cloud": ("warning", "no scans on {}: everything rests on the images"),
-    "odometry": ("warning", "no odometry on {}: closures only, the pose graph is skipped"),
-}
-_NAMES: dict[str, str] = {"left": "left images", "right": "right images", "cloud": "scans", "odometry": "odometry"}
-_HELP = {
-    "size": "the calibration is for images of another size: width, height, fx, fy, cx, cy",
-    "encoding": "umf inspect names the encodings that can be read",
-    "fields": "the cloud needs fields x, y and z",
-    "stamp": "the driver must set header.stamp",
-    "pose": "the odometry must send unit quaternions",
-    "late": "sync.max_wait_s waits longer",
-    "queue full": "sync.queue_size keeps more",
-}
-"""Remedy by the reason for which messages are dropped."""
-MUCH_LOST = 0.2
-"""Share of an input's messages; more of them lost than this is worth a line."""
-
-
-@dataclass(frozen=True, slots=True)
-class Advice:
-    """Something a person should know.
-
-    Attributes:
-        severity: a fault spoils the result, a warning may, a note is good to know.
-        what: the problem, with its number; a sentence without a full stop.
-        remedy: what helps; likewise, or empty.
-    """
-
-    severity: Severity
-    what: str
-    remedy: str = ""
-
-    @property
-    def line(self) -> str:
-        """Both on one line."""
-        return f"{self.what}; {self.remedy}" if self.remedy else self.what
-
-
-def absent_inputs(bag: Bag, settings: Settings, odometry_from_file: bool = False) -> list[Advice]:
-    """Inputs that the settings name and the recording lacks."""
-    topics = topics_of(settings).model_dump()
-    absent = [name for name in _ABSENT if not (topics[name] in bag.topics and bag.topics[topics[name]].count)]
-    found: list[Advice] = []
-    for name in absent:
-        severity, text = _ABSENT[name]
-        if name == "cloud" and topics["right_image"] and "right_image" in absent:
-            severity = "fault"  # neither a scan nor a second image: no depth at all
-        if topics[name] and not (name == "odometry" and odometry_from_file):
-            found.append(Advice(severity, text.format(topics[name]), _remedy(name, bag)))
-        elif name == "odometry" and not odometry_from_file:
-            found.append(Advice("note", text.replace(" on {}", ""), _remedy(name, bag)))
-    return found
-
-
-def _remedy(name: str, bag: Bag) -> str:
-    others = sorted(topic for topic, info in bag.topics.items() if info.type in TYPES[name] and info.count)
-    if name == "odometry":
-        return f"name yours: topics.odometry ({', '.join(others)})" if others else "--odometry FILE.tum supplies it"
-    if not others:
-        return f"the recording has no {TYPES[name][0]} at all"
-    return f"name yours in a --config: topics.{name} ({', '.join(others)})"
-
-
-def input_counts(counters: Mapping[Input, InputCounter]) -> dict[str, Any]:
-    """The `inputs` entry of a summary: messages received, used and dropped, with reasons."""
-    return {
-        name: {"received": counter.received, "used": counter.used, "dropped": dict(counter.dropped)}
-        for name, counter in counters.items()
-    }
-
-
-def useless_inputs(inputs: Mapping[str, Any]) -> list[Advice]:
-    """Inputs whose messages came and could not be used, all or many of them."""
-    found = []
-    for name, count in inputs.items():
-        lost = Counter({reason: number for reason, number in count["dropped"].items() if reason != "surplus"})
-        if not count["received"] or lost.total() <= MUCH_LOST * count["received"]:
-            continue
-        reasons = ", ".join(f"{reason} {number}" for reason, number in lost.most_common())
-        messages = f"{lost.total()} of {count['received']} messages of the {_NAMES.get(name, name)}"
-        remedy = _HELP.get(lost.most_common(1)[0][0], "umf inspect looks closer")
-        what = f"{messages} could not be used ({reasons})"
-        found.append(Advice("warning" if count["used"] else "fault", what, remedy))
-    return found
-
 
 CLOCK_SLACK_NS = 5_000_000_000
 """Stamps of sensors may lie this far from the times of recording."""

@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as Grid
 
+from umf_ros.bags.inputs import Advice
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.errors import UmfError
@@ -33,7 +34,7 @@ from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import GateDiagnosis
 from umf_ros.runs.findings import ExaminedRun, RunVerdict, conclude, look_first
 from umf_ros.runs.gallery import Gallery, walk
-from umf_ros.runs.reader import Advice, FinishedRun, read_run
+from umf_ros.runs.reader import FinishedRun, read_run
 from umf_ros.runs.scene import build_scene, by_need, drawn_trajectory, named_curves, pairs_of, size_of
 from umf_ros.runs.tables import INLIERS, Endpoints, read_table
 from umf_ros.runs.truth import (
