@@ -18,6 +18,7 @@ import numpy as np
 import typer
 from rich.console import Console
 from scipy.spatial.transform import Rotation
+from umf_ros.lab.simulation.domains.sweeps import Sweep, sweep
 
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.geometry import Array, make_pose, rotation_angle
@@ -28,7 +29,6 @@ from umf_ros.lab.simulation.domains import DOMAINS, survey
 from umf_ros.lab.simulation.domains.scanners import SCANNERS
 from umf_ros.lab.simulation.domains.solids import Scene, Solids
 from umf_ros.lab.simulation.domains.street import Facade
-from umf_ros.lab.simulation.domains.sweeps import Sweep, sweep
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.scan_files import make_snapshot
