@@ -189,3 +189,14 @@ def test_losses_of_an_input_are_told_with_their_reasons_and_surplus_images_are_n
 
 def test_the_keyframes_of_the_helper_start_where_they_say() -> None:
     assert stamp(0) == START_NS
+
+
+@pytest.mark.parametrize(
+    ("bias_px", "words"), [(0.8, "0.8 px too little disparity"), (-0.6, "0.6 px too much"), (0.1, "")]
+)
+def test_a_bias_of_the_disparities_is_told(tmp_path: Path, bias_px: float, words: str) -> None:
+    numbers = {"pose_inliers": 40.0, "disparity_bias_px": bias_px, "probability": 0.97}
+    tested = [candidate(50 + n, 10 + n, None, **numbers) for n in range(6)]
+    closures = [closure(50 + n, 10 + n) for n in range(6)]
+    told = " ".join(one.what for one in look_first(examined(tmp_path, closures, tested)))
+    assert ("disparity" in told) == bool(words) and words in told

@@ -22,6 +22,8 @@ REFUSED = ("size", "encoding", "step", "truncated", "compressed", "fields", "dat
 """Reasons why a message is of no use by itself, whatever the others are."""
 MUCH_MISSED, MUCH_REJECTED, WELL_COVERED = 0.3, 0.2, 0.5
 """Shares, by hand: of revisits, of closures, of keyframes."""
+FEW_VIEWS, BIAS_PX = 5, 0.35
+"""Closures by images whose bias of the disparities is worth a word, and least bias, by hand."""
 SLOW = 1.0
 """Recorded time by the time it took, below which a rover runs ahead of the detector."""
 MOST_EXPLAINED = 200
@@ -161,6 +163,15 @@ def _unjudged(about: ExaminedRun) -> Iterator[Advice]:
     yield Advice("warning", what, f"umf why {run.folder.name} {best.query_stamp_ns}")
 
 
+def _disparity(about: ExaminedRun) -> Iterator[Advice]:
+    found = [one.measurement.disparity_bias_px for one in about.run.candidates if one.accepted]
+    known = np.array([bias for bias in found if np.isfinite(bias)])
+    if len(known) >= FEW_VIEWS and abs(median := float(np.median(known))) > BIAS_PX:
+        more, less = ("too little", "far") if median > 0 else ("too much", "near")
+        what = f"stereo measures {abs(median):.1f} px {more} disparity: distant features seem too {less}"
+        yield Advice("warning", what, "rectification of the calibration, or R and P of both camera_info")
+
+
 def _stated_errors(about: ExaminedRun) -> Iterator[Advice]:
     truth = about.run.summary["ground_truth"] or {}
     median, inside = truth.get("nees_median"), truth.get("inside_95")
@@ -194,7 +205,7 @@ def _end(about: ExaminedRun) -> Iterator[Advice]:
         yield Advice("note", "the run was interrupted: it covers what was done until then")
 
 
-_CAUSES = (_truth, _gaps, lambda about: about_sensors(about.sensors), _pairs, _inputs)
+_CAUSES = (_truth, _gaps, lambda about: about_sensors(about.sensors), _disparity, _pairs, _inputs)
 _EFFECTS = (_graph, _closures, _unjudged, _map, _stated_errors, _speed, _end)
 
 
