@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,6 +44,7 @@ def find_hypotheses(
     turned: RotatedElevationMap | None,
     match: PreparedScan,
     settings: Verification,
+    guess: Array | None = None,
 ) -> list[Hypothesis]:
     """Distinct poses for one candidate, best first; where scans tell places apart, those at which elevation maps fit.
 
@@ -53,6 +54,7 @@ def find_hypotheses(
         turned: the query's surroundings at every heading; None without a usable scan.
         match: the candidate's scan, usable or not.
         settings: RANSAC iterations and seed.
+        guess: `match_T_query` (4, 4) as odometry has it.
     """
     views = None
     if settings.modalities != "cloud":
@@ -65,6 +67,8 @@ def find_hypotheses(
     poses = [pose for pose in guesses if pose is not None]
     fits = [fit for pose in poses if (fit := scout(match, turned.scan, pose)).telling] + search(match, turned)
     fits.sort(key=lambda fit: -fit.score)
+    if guess is not None and (fit := scout(match, turned.scan, guess)).telling:
+        fits.insert(0, replace(fit, share=1.0))  # submaps that share little would not rank it first
     return [Hypothesis(ranked, fit.pose, fit.score, views) for fit in _distinct(fits)]
 
 

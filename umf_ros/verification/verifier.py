@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Frame, Keyframe, LoopClosure, Points
-from umf_ros.core.geometry import heading
+from umf_ros.core.geometry import Array, heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
 from umf_ros.verification.hypotheses import Hypothesis, TemporalMemory, find_hypotheses, near
@@ -104,6 +105,7 @@ class Verifier:
         self._threshold = settings.min_probability
         self._memory = TemporalMemory()
         self._scans = ScanCache()
+        self._guesses: Mapping[int, Array] = {}
         self.latency_ms: dict[str, float] = {}
 
     def retune(self, settings: Verification) -> None:
@@ -119,13 +121,20 @@ class Verifier:
         """Make ready what is asked of a scan whose keyframe is verified next."""
         self._scans.prefetch(frame)
 
-    def verify(self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]) -> list[Verdict]:
+    def verify(
+        self,
+        query: Keyframe,
+        candidates: Sequence[tuple[Candidate, Keyframe]],
+        guesses: Mapping[int, Array] = MappingProxyType({}),
+    ) -> list[Verdict]:
         """One verdict per candidate, accepted ones first, then in the order of the reranking.
 
         Args:
             query: the newest keyframe.
             candidates: what the database returned, with their keyframes.
+            guesses: poses `match_T_query` worth a look, by the stamp of the match.
         """
+        self._guesses = guesses
         self.latency_ms = {"rerank": 0.0, "refine": 0.0}
         with self._timed("refine"):
             turned = self._turned(query) if candidates else None
@@ -195,7 +204,8 @@ class Verifier:
         """Hypotheses about the given candidates, the most promising first."""
         found: list[Hypothesis] = []
         for item in ranked:
-            found += find_hypotheses(query, item, turned, self._scans[item.keyframe], self._settings)
+            guess = self._guesses.get(item.keyframe.stamp_ns)
+            found += find_hypotheses(query, item, turned, self._scans[item.keyframe], self._settings, guess)
         return sorted(found, key=lambda one: -one.score)
 
     def _judge(self, query: Keyframe, hypotheses: list[Hypothesis], hopeless: float) -> list[JudgedHypothesis]:
