@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.frames import Embedding, Keyframe, StereoCamera
+from umf_ros.core.frames import Embedding, Keyframe, ScanMotion, StereoCamera
 from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.verification import thin_scan
 
@@ -44,8 +44,8 @@ def there_and_back() -> list[Array]:
     return out + [make_pose(turned, [x, ASIDE_M, 0]) for x in metres[::-1]]
 
 
-def drive(ground: Array, drift: float = 0.01) -> Drive:
-    """Keyframes with a LiDAR 70 deg wide and odometry that thinks every step too long."""
+def drive(ground: Array, drift: float = 0.01, half_width_rad: float = 0.61) -> Drive:
+    """Keyframes with a LiDAR, 70 deg wide unless told otherwise, and odometry that thinks every step too long."""
     truth, rng = there_and_back(), np.random.default_rng(0)
     keyframes, odom, path_length = [], np.eye(4), 0.0
     for i, pose in enumerate(truth):
@@ -56,10 +56,13 @@ def drive(ground: Array, drift: float = 0.01) -> Drive:
             path_length += float(np.linalg.norm(step[:3, 3]))
         points = transform(invert(pose), ground)
         reach = np.linalg.norm(points[:, :2], axis=1)
-        seen = (np.abs(np.arctan2(points[:, 1], points[:, 0])) < 0.61) & (reach < 28) & (reach > 2)
+        seen = (np.abs(np.arctan2(points[:, 1], points[:, 0])) < half_width_rad) & (reach < 28) & (reach > 2)
         seen &= rng.random(len(points)) < np.minimum(1, 8 / np.maximum(reach, 1))
         scan = (points[seen] + rng.normal(0, 0.01, (seen.sum(), 3))).astype(np.float32)
         stamp = round(path_length / SPEED_M_S * 1e9)
         looks = Embedding(np.array([1.0, 0.0], np.float32))
-        keyframes.append(Keyframe(stamp, looks, CAMERA, np.eye(4), thin_scan(scan), odom.copy(), path_length))
+        thin = thin_scan(scan)
+        still = ScanMotion.none(len(thin))
+        keyframe = Keyframe(stamp, looks, CAMERA, np.eye(4), thin, odom.copy(), path_length, motion=still)
+        keyframes.append(keyframe)
     return Drive(keyframes, truth)

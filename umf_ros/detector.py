@@ -209,14 +209,8 @@ class LoopDetector:
         return verdicts
 
     def match_submaps(self, keyframe: Keyframe, verdicts: list[Hypothesis]) -> list[Hypothesis]:
-        """The verdicts, accepted ones first, with those about what a narrow sensor saw before from another side."""
-        accepted = [
-            (self.database[verdict.candidate.index], verdict.closure.match_T_query)
-            for verdict in verdicts
-            if verdict.closure is not None
-        ]
-        found = self._submaps.find(keyframe, accepted)
-        return sorted(verdicts + found, key=lambda verdict: verdict.closure is None)
+        """The verdicts, accepted ones first, with those about submaps where the scans have found nothing."""
+        return sorted(self._submaps.find(keyframe, verdicts), key=lambda verdict: verdict.closure is None)
 
     def remember(self, keyframe: Keyframe, stored: bool = False) -> None:
         """Make a keyframe, unless it is stored already, a place that later ones may find.

@@ -78,11 +78,11 @@ def test_verdicts_are_counted_by_their_truth():
     outcome.judge(same, None)
     outcome.judge(far, closure(np.eye(4)))
     outcome.judge(far, None)
-    outcome.refine_ms.append(5.0)
+    outcome.verify_ms.append(5.0)
     figures = summary([outcome])
     assert figures["accepted"] == 5
     assert figures["wrong"] == 3
     assert outcome.figures["wrong_elsewhere"] == 1
     assert figures["recall_worst"] == pytest.approx(2 / 5)
     assert figures["inside_95_mean"] == pytest.approx(0.5)
-    assert figures["refine_ms"] == 5
+    assert figures["verify_ms"] == 5

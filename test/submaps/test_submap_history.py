@@ -2,12 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from submaps_drives import Drive
+from submaps_drives import SPEED_M_S, Drive
 
 from umf_ros.core.config import Loop
-from umf_ros.core.geometry import invert, transform
+from umf_ros.core.geometry import invert
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.submaps.submap_history import SubmapHistory, merge
+from umf_ros.submaps.submap_history import SubmapHistory
 from umf_ros.submaps.submap_index import Expectation, Found
 from umf_ros.verification import constants as const
 
@@ -21,30 +21,43 @@ def trail(outing: Drive, database: PlaceDatabase) -> SubmapHistory:
     return made
 
 
-def test_stops_lie_apart(trail: SubmapHistory) -> None:
-    steps = np.diff([stop.path_length_m for stop in trail.stops])
-    assert steps.min() >= const.SUBMAP_STEP_M and steps.max() < 2 * const.SUBMAP_STEP_M
+def test_anchors_lie_apart(trail: SubmapHistory) -> None:
+    steps = np.diff([anchor.path_length_m for anchor in trail.anchors])
+    assert steps.min() >= const.MERGE_STEP_M and steps.max() < 2 * const.MERGE_STEP_M
 
 
 def test_a_submap_knows_what_lies_behind_and_beside(trail: SubmapHistory, outing: Drive) -> None:
-    submap = trail.around(14, trail.stops[14].path_length_m + const.SUBMAP_AFTER_M)
-    assert (submap.keyframe.points[:, 0] > 0).all()
-    assert (submap.scan.points[:, 0] < -8).sum() > 100
-    assert submap.first_m == trail.stops[1].path_length_m and submap.way_m > 30
-    assert trail.around(14, trail.stops[14].path_length_m + const.SUBMAP_AFTER_M) is submap
+    keyframe = outing.keyframes[28]
+    submap = trail.around(keyframe, np.inf)
+    assert submap is not None and (keyframe.points[:, 0] > 0).all()
+    assert (submap.points[:, 0] < -4).sum() > 100
+    assert trail.around(keyframe, np.inf) is submap
 
 
-def test_a_submap_stops_where_it_is_told(trail: SubmapHistory) -> None:
-    submap = trail.around(14, trail.stops[16].path_length_m)
-    assert submap.last_m == trail.stops[16].path_length_m
+def test_the_scan_of_the_keyframe_itself_is_kept(trail: SubmapHistory, outing: Drive) -> None:
+    keyframe = outing.keyframes[28]
+    submap = trail.around(keyframe, np.inf)
+    assert submap is not None and submap.motion is not None
+    own = submap.points[submap.motion.moments_s == 0]
+    assert len(own) == pytest.approx(len(keyframe.points), rel=0.05)
+    assert len(submap.points) <= const.MERGED_POINTS
 
 
-def test_scans_are_joined_by_odometry(outing: Drive) -> None:
-    one, other = outing.keyframes[10], outing.keyframes[14]
-    alone, both = merge(one, [other]), merge(one, [one, other])
-    moved = transform(invert(one.odom_T_body) @ other.odom_T_body, other.points)
-    assert np.median(alone.scan.points, axis=0) == pytest.approx(np.median(moved, axis=0), abs=1.0)
-    assert len(both.scan.points) > len(alone.scan.points)
+def test_a_submap_stops_where_it_is_told(trail: SubmapHistory, outing: Drive) -> None:
+    keyframe = outing.keyframes[28]
+    submap = trail.around(keyframe, keyframe.path_length_m + 3.0)
+    assert submap is not None and submap.motion is not None
+    assert submap.motion.moments_s.max() <= 3.0 / SPEED_M_S
+
+
+def test_scans_are_joined_by_odometry(trail: SubmapHistory, outing: Drive) -> None:
+    submap = trail.around(outing.keyframes[28], np.inf)
+    assert submap is not None and submap.motion is not None
+    moments = np.unique(submap.motion.moments_s)
+    assert len(moments) == len(submap.motion.body_T_lidars) > 3
+    # the rover drives straight ahead
+    ahead = submap.motion.body_T_lidars[:, 0, 3]
+    assert ahead == pytest.approx(moments * SPEED_M_S, abs=0.1)
 
 
 def test_odometry_carries_a_closure_to_the_next_keyframes(trail: SubmapHistory, outing: Drive) -> None:
@@ -56,7 +69,7 @@ def test_odometry_carries_a_closure_to_the_next_keyframes(trail: SubmapHistory, 
     expectation.latest = Found(query, match, off)
     proposal = expectation.propose(later)
     assert proposal is not None
-    where = trail.stops[proposal.row].odom_T_body @ proposal.pose
+    where = trail.anchors[proposal.row].odom_T_body @ proposal.pose
     assert where[:3, 3] == pytest.approx(match.odom_T_body[:3, :3] @ [2, 2, 2] + later.odom_T_body[:3, 3], abs=0.1)
 
 
@@ -66,5 +79,5 @@ def test_without_a_closure_odometry_alone_is_believed_for_a_while(trail: SubmapH
     late = outing.keyframes[-5]
     last = Expectation(trail, Loop()).propose(late)
     assert last is not None  # the stops at the start would be nearer
-    way_m = late.path_length_m - trail.stops[last.row].path_length_m
+    way_m = late.path_length_m - trail.anchors[last.row].path_length_m
     assert const.ODOMETRY_ALONE_M - 2 < way_m <= const.ODOMETRY_ALONE_M

@@ -32,14 +32,16 @@ class Outcome:
     wrong: dict[str, int] = field(default_factory=lambda: dict.fromkeys((SAME, TURNED, ELSEWHERE), 0))
     errors: list[Array] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
-    refine_ms: list[float] = field(default_factory=list)
+    verify_ms: list[float] = field(default_factory=list)
+    by_submaps: int = 0
     left_out: Outcome | None = None
 
-    def judge(self, pair: ScanPair, closure: LoopClosure | None) -> None:
+    def judge(self, pair: ScanPair, closure: LoopClosure | None, by_submaps: bool = False) -> None:
         """Count one verdict."""
         self.pairs[pair.kind] += 1
         if closure is None:
             return
+        self.by_submaps += by_submaps
         if pair.kind == ELSEWHERE or is_wrong(closure.match_T_query, pair.match_T_query):
             self.wrong[pair.kind] += 1
             return
@@ -65,6 +67,8 @@ class Outcome:
             "recall": self.share(SAME),
             "turned_recall": self.share(TURNED),
             "inside_95": inside,
+            "by_submaps": self.by_submaps,
+            "verify_ms": float(np.median(self.verify_ms)) if self.verify_ms else float("nan"),
         }
 
 
@@ -83,5 +87,5 @@ def summary(outcomes: list[Outcome]) -> dict[str, float]:
         "inside_95_mean": float(np.mean(known)) if known else float("nan"),
         "inside_95_worst": float(np.min(known)) if known else float("nan"),
         "turned_recall": turned[0] / max(turned[1], 1),
-        "refine_ms": float(np.median(np.concatenate([outcome.refine_ms for outcome in outcomes]))),
+        "verify_ms": float(np.median(np.concatenate([outcome.verify_ms for outcome in outcomes]))),
     }

@@ -12,10 +12,11 @@ from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 from umf_ros.verification import Verifier, thin_frame
 from umf_ros.verification.constants import SCANS_KEPT
 from umf_ros.verification.prepared_scan import PreparedScan, ScanCache, prepare, prepare_frame
+from umf_ros.verification.surroundings import Sight
 
 GROUND = landscape(20)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
-READY = ("elevation", "range_image", "spacing", "coarse_cloud", "sample_cloud", "cloud", "up")
+READY = ("elevation", "range_images", "spacing", "coarse_cloud", "sample_cloud", "cloud", "up")
 
 
 def frame_and_keyframe(stamp_s: float) -> tuple[Frame, Keyframe]:
@@ -81,3 +82,17 @@ def test_the_cache_is_bounded() -> None:
     for keyframe in keyframes[1 : SCANS_KEPT + 1]:
         assert scans[keyframe] is not first
     assert scans[keyframes[0]] is not first  # gave way to newer ones
+
+
+def test_the_rays_of_merged_scans_start_where_each_was_taken() -> None:
+    across, up = np.meshgrid(np.arange(-6, 6, 0.2), np.arange(-3, 3, 0.2))
+    wall = np.column_stack([np.full(across.size, 8.0), across.ravel(), up.ravel()])  # ahead of the second place
+    behind, here = np.eye(4), np.eye(4)
+    behind[0, 3] = -6.0
+    owner = np.arange(len(wall)) % 2
+    merged = PreparedScan(wall.astype(np.float32), np.stack([behind, here]), owner=owner)
+    alone = PreparedScan(wall.astype(np.float32), here)
+    free = np.array([[-2.0, 0.1, 0.1]])  # between the two places
+    assert merged.look_at(free) == Sight.PASSED and alone.look_at(free) == Sight.UNSEEN
+    assert merged.look_at(wall[:1]) == Sight.MET
+    assert merged.look_at(np.array([[12.0, 0.1, 0.1]])) == Sight.HIDDEN

@@ -56,11 +56,16 @@ class ScanMotion:
         moments_s: (N,) float32, s after the frame's stamp, one for every point.
         rates: (6,) x y z rx ry rz, m/s and rad/s about the body's axes.
         noise: (6,) m^2/s and rad^2/s: the variance that the odometry's error gains in a second.
+        removed: whether the motion during each scan was removed; else only that between merged scans was.
+        body_T_lidars: (K, 4, 4) where the scans that were merged into one were seen from, in order of their moments;
+            none of a single scan.
     """
 
     moments_s: Points
     rates: Array
     noise: Array
+    removed: bool = True
+    body_T_lidars: Array = field(default_factory=lambda: np.empty((0, 4, 4)))
 
     @classmethod
     def none(cls, count: int) -> ScanMotion:

@@ -259,7 +259,8 @@ def _group(arrays: dict[str, Any], group: str, kind: Any) -> Any:
     names = [item.name for item in fields(kind)]
     if f"{group}.{names[0]}" not in arrays:
         return None
-    return kind(**{name: arrays[f"{group}.{name}"] for name in names})
+    # an older file has no fields with a default
+    return kind(**{name: arrays[f"{group}.{name}"] for name in names if f"{group}.{name}" in arrays})
 
 
 class StoredSession(NamedTuple):

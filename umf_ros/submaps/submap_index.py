@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from umf_ros.core.config import Loop
 from umf_ros.core.frames import Keyframe
-from umf_ros.core.geometry import Array, make_pose, relative
-from umf_ros.submaps.submap_history import Submap, SubmapHistory
+from umf_ros.core.geometry import Array, relative
+from umf_ros.submaps.submap_history import SubmapHistory
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import Grid
+from umf_ros.verification.prepared_scan import prepare
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,17 +147,15 @@ class KeypointIndex:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """A stop that may show the query's place.
+    """An anchor where the rover should be.
 
     Attributes:
-        row: of the stop.
-        pose: (4, 4) `match_T_query`.
-        planar: whether height and tilt are still to be found.
+        row: of the anchor.
+        pose: (4, 4) `match_T_query`, as odometry has it.
     """
 
     row: int
     pose: Array
-    planar: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,16 +170,16 @@ class Found:
 class Expectation:
     """Where odometry puts the rover: from the latest closure on, and over a short way alone."""
 
-    def __init__(self, trail: SubmapHistory, rules: Loop) -> None:
-        self._trail, self.rules = trail, rules
+    def __init__(self, history: SubmapHistory, rules: Loop) -> None:
+        self._history, self.rules = history, rules
         self.latest: Found | None = None
 
     def propose(self, query: Keyframe) -> Proposal | None:
         """The nearest stop where the rover should be again, if there is one."""
         for session, odom_T_query, first_m, last_m in self._predictions(query):
-            rows = self._trail.rows(session, first_m, last_m)
-            rows = rows[self._trail.past(query, rows, self.rules)]
-            poses = [relative(self._trail.stops[row].odom_T_body, odom_T_query) for row in rows]
+            rows = self._history.rows(session, first_m, last_m)
+            rows = rows[self._history.past(query, rows, self.rules)]
+            poses = [relative(self._history.anchors[row].odom_T_body, odom_T_query) for row in rows]
             away = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
             if away and min(away) < const.SUBMAP_NEAR_M:
                 best = int(np.argmin(away))
@@ -204,40 +203,38 @@ class Expectation:
 
 
 class Lookalikes:
-    """Stops whose submaps show the same keypoints of the ground, whatever the heading."""
+    """Anchors whose submaps show the same keypoints of the ground, whatever the heading."""
 
-    def __init__(self, trail: SubmapHistory, rules: Loop) -> None:
-        self._trail, self.rules = trail, rules
+    def __init__(self, history: SubmapHistory, rules: Loop) -> None:
+        self._history, self.rules = history, rules
         self._index = KeypointIndex()
         self._rows = np.empty(0, np.intp)
 
     def describe(self) -> None:
-        """Take up the stops whose submaps are complete now."""
-        stops = self._trail.stops
-        first = int(self._rows[-1]) + const.DESCRIBED_STOPS if len(self._rows) else 0
-        for row in range(first, len(stops), const.DESCRIBED_STOPS):
-            last_m = stops[row].path_length_m + const.SUBMAP_AFTER_M
-            if stops[row].session == stops[-1].session and stops[-1].path_length_m < last_m:
+        """Take up the anchors whose submaps are complete now."""
+        anchors = self._history.anchors
+        first = int(self._rows[-1]) + const.DESCRIBED_ANCHORS if len(self._rows) else 0
+        for row in range(first, len(anchors), const.DESCRIBED_ANCHORS):
+            last_m = anchors[row].path_length_m + const.SUBMAP_AFTER_M
+            if anchors[row].session == anchors[-1].session and anchors[-1].path_length_m < last_m:
                 return
-            submap = self._trail.around(row, last_m)
-            self._index.add(find_keypoints(submap.scan.elevation.relief))
-            self._rows = np.append(self._rows, row)
+            index = self._history.index_of(anchors[row])
+            submap = None if index is None else self._history.around(self._history.database[index], last_m)
+            if submap is not None:
+                self._index.add(find_keypoints(prepare(submap).elevation.relief))
+                self._rows = np.append(self._rows, row)
 
-    def propose(self, query: Submap) -> list[Proposal]:
-        """The most alike, best first."""
-        stops = [self._trail.stops[row] for row in self._rows]
-        admissible = self._trail.past(query.keyframe, self._rows, self.rules)
+    def propose(self, query: Keyframe, path_length_m: float) -> list[int]:
+        """Rows of the most alike, best first.
+
+        Args:
+            query: the newest keyframe's submap.
+            path_length_m: metres driven up to it.
+        """
+        anchors = [self._history.anchors[row] for row in self._rows]
+        admissible = self._history.past(query, self._rows, self.rules)
         # scans that both submaps hold are alike for no other reason
-        apart = [
-            stop.session != query.keyframe.session or stop.path_length_m + const.SUBMAP_AFTER_M < query.first_m
-            for stop in stops
-        ]
-        guesses = self._index.search(find_keypoints(query.scan.elevation.relief), admissible & np.array(apart, bool))
-        return [
-            Proposal(int(self._rows[guess.row]), _planar(guess.heading, guess.shift), planar=True) for guess in guesses
-        ]
-
-
-def _planar(heading: float, shift: Array) -> Array:
-    cos, sin = np.cos(heading), np.sin(heading)
-    return make_pose([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], [*shift, 0.0])
+        first_m = path_length_m - const.SUBMAP_BEFORE_M - const.SUBMAP_AFTER_M
+        apart = [one.session != query.session or one.path_length_m < first_m for one in anchors]
+        found = self._index.search(find_keypoints(prepare(query).elevation.relief), admissible & np.array(apart, bool))
+        return [int(self._rows[guess.row]) for guess in found]

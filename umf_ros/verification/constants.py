@@ -161,29 +161,27 @@ ODOMETRY_REACH_M = 15.0  # by hand: odometry is trusted over this distance
 PRIOR_M = 1.0  # by hand: standard deviation of what odometry predicts before any way is driven
 AGREE_M, AGREE_RAD = 0.5, 0.05  # by hand: two findings this near are one
 
-# submaps: what a narrow sensor saw along some metres of way
-NARROW_DEG = 270.0  # geometry: a sensor that sees more recognises a place from any side without submaps
-SUBMAP_BEFORE_M, SUBMAP_AFTER_M = 20.0, 15.0  # measured: way before and behind a keyframe; 10 and 10 find less
-MIN_SUBMAP_M = 5.0  # by hand: way below which a submap is hardly more than a scan
-MIN_COMMON = 0.1  # by hand: of a submap that must have counterparts: a strip at its edge fits many places
-MIN_TERRAIN = 0.3  # by hand: correlation of the terrain without which nothing else speaks for a place
-SUBMAP_CELL_M = 0.3  # by hand: coarser than a scan, for odometry drifts inside
-SUBMAP_STEP_M = 1.5  # measured: between the scans that are merged; 1 and 2 m are as good
-# of two keyframes whose submaps are compared; measured: on a drive of 1.5 km, of 780 errors all beyond 0.36 m were of
-# keyframes further apart, for what odometry turns inside a submap counts by the distance (crater_inout, seed 20101)
-SUBMAP_NEAR_M = 5.0
-# by hand: steps that the drift of odometry is judged by, at least and at most, and scans that tell it
+# submaps: what is seen on the metres around a keyframe
+SUBMAP_BEFORE_M, SUBMAP_AFTER_M = 20.0, 15.0  # measured: path before and behind a keyframe; 10 and 10 find less
+MERGE_STEP_M = 1.5  # measured: between the scans that are merged; 1 and 2 m are as good
+ENOUGH_SEEN, MOST_SEEN = 0.6, 0.85  # of what all these scans show nearby: one scan is enough, and where merging stops
+MERGED_POINTS = 12_000  # measured: 8,000 find less, 16,000 hardly more
+MAX_BLUR_M = (
+    0.3  # by hand: standard deviation by which a merged point may lie beside its place: half a cell of the maps
+)
+NEED_ASKED_EVERY = 4  # anchors; by hand: bounds the time for a sensor that needs none
+SUBMAP_CELL_M = 0.5  # by hand: of what the drift of odometry is measured against
+SUBMAP_NEAR_M = 5.0  # by hand: from where odometry expects the rover to a keyframe that is compared
+PROMISING = 0.05  # by hand: probability of a scan's hypothesis from which on submaps are compared
+# by hand: scans that the drift of odometry is judged by, at least and at most, and their overlap with those before
 DRIFT_KNOWN, DRIFT_STEPS, DRIFT_OVERLAP = 6, 24, 0.7
-# by hand: over the way inside two submaps; half of it is a closure that nobody wants
-MAX_DRIFT_M, MAX_DRIFT_RAD = 0.8, 0.09
-SUBMAPS_KEPT = 12  # prepared submaps in memory: bounds it, changes no result
-ODOMETRY_ALONE_M = 80.0  # by hand: way over which odometry without a closure is worth a look
+SUBMAPS_KEPT = 12  # submaps in memory: bounds it, changes no result
+ODOMETRY_ALONE_M = 80.0  # by hand: path over which odometry without a closure is worth a look
 ASKED_EVERY_M = 2.0  # by hand: way between two searches for what looks alike; bounds the time
-DESCRIBED_STOPS = 2  # by hand: every second stop can be found by its looks
+DESCRIBED_ANCHORS = 2  # by hand: every second anchor can be found by its looks
 LOOKALIKES = 2  # that get a metric pose; bounds the time
 KEYPOINTS, KEYPOINT_CONTRAST = 120, 0.01  # measured: 80 and .02 find less
 MIN_KEYPOINTS = 4  # by hand: two of them make a motion, and two more confirm it
 KEYPOINT_M, KEYPOINT_SCALE = 1.0, 0.1  # geometry: two cells; odometry that is off by a tenth is useless
 KEYPOINT_VOTES = 15  # measured: stored keypoints that each of the query's votes for
 SUBMAPS_COMPARED = 10  # measured: the right one is among the ten most voted for in four of five
-RIVAL_TERRAIN_M = (1.5, 3.0)  # geometry: beyond the error of a right pose, within a wrong one's

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ def find_hypotheses(
     turned: RotatedElevationMap | None,
     match: PreparedScan,
     settings: Verification,
+    guess: Array | None = None,
 ) -> list[Hypothesis]:
     """Distinct poses for one candidate, best first; where scans tell places apart, those at which elevation maps fit.
 
@@ -36,6 +37,7 @@ def find_hypotheses(
         turned: the query's surroundings at every heading; None without a usable scan.
         match: the candidate's scan, usable or not.
         settings: RANSAC iterations and seed.
+        guess: `match_T_query` (4, 4) as odometry has it.
     """
     views = None
     if settings.modalities != "cloud":
@@ -49,6 +51,8 @@ def find_hypotheses(
     fits = [scout(match, turned.scan, pose) for pose in guesses if pose is not None]
     fits = [fit for fit in fits if fit.telling] + search(match, turned)
     fits.sort(key=lambda fit: -fit.score)
+    if guess is not None and (fit := scout(match, turned.scan, guess)).telling:
+        fits.insert(0, replace(fit, share=1.0))  # submaps that share little would not rank it first
     return [
         Hypothesis.of(query, candidate, keyframe, pose=fit.pose, score=fit.score, views=views)
         for fit in _distinct(fits)

@@ -49,16 +49,24 @@ def cell_means(points: Points, values: Points, cell_m: float) -> Points:
 class PreparedScan:
     """A keyframe's scan made ready for comparison, each part when it is first asked for."""
 
-    def __init__(self, points: Points, body_T_lidar: Array | None = None, blur_m: float = 0.0) -> None:
+    def __init__(
+        self,
+        points: Points,
+        body_T_lidar: Array | None = None,
+        blur_m: float = 0.0,
+        owner: NDArray[np.intp] | None = None,
+    ) -> None:
         """Prepare nothing yet.
 
         Args:
             points: (M, 3) m, body frame, thinned.
-            body_T_lidar: where they were seen from; without it the origin.
+            body_T_lidar: where they were seen from, (4, 4), or (K, 4, 4) of merged scans; without it the origin.
             blur_m: how far points may be off because the LiDAR moved during the scan, standard deviation.
+            owner: (M,) the merged scan of each point, 0 to K - 1.
         """
         self.blur_m = blur_m
-        self._lidar_T_body = np.eye(4) if body_T_lidar is None else invert(body_T_lidar)
+        self._lidars_T_body = invert(np.eye(4)[None] if body_T_lidar is None else body_T_lidar.reshape(-1, 4, 4))
+        self._owner = np.zeros(len(points), np.intp) if owner is None else owner
         self.points: Array = points.astype(float)
         self._around: dict[float, Surroundings] = {}
 
@@ -66,7 +74,15 @@ class PreparedScan:
         """Make at once what a query's scan is asked for in every comparison."""
         if self.usable:
             self.around(self.cell_m)
-            for part in ("elevation", "view", "range_image", "spacing", "scouts_cloud", "coarse_cloud", "sample_cloud"):
+            for part in (
+                "elevation",
+                "view",
+                "range_images",
+                "spacing",
+                "scouts_cloud",
+                "coarse_cloud",
+                "sample_cloud",
+            ):
                 getattr(self, part)
 
     @property
@@ -136,13 +152,23 @@ class PreparedScan:
         return _cloud_of(self.points, self.tree)
 
     @cached_property
-    def range_image(self) -> RangeImage:
-        """How far the LiDAR saw."""
-        return RangeImage(transform(self._lidar_T_body, self.points))
+    def range_images(self) -> list[RangeImage]:
+        """How far the LiDAR saw from where each of the merged scans was taken."""
+        return [
+            RangeImage(transform(lidar_T_body, self.points[self._owner == number]))
+            for number, lidar_T_body in enumerate(self._lidars_T_body)
+        ]
 
     def look_at(self, points: Array) -> NDArray[np.int8]:
-        """(N,) what the rays of this scan say of points (N, 3) of its body frame, each a `Sight`."""
-        return self.range_image.look_at(transform(self._lidar_T_body, points))
+        """(N,) what the rays of this scan say of points (N, 3) of its body frame, each a `Sight`.
+
+        Of merged scans those count first that met a point: next to an edge others pass it by.
+        """
+        views = zip(self._lidars_T_body, self.range_images, strict=True)
+        found: NDArray[np.int8] = np.min(
+            [image.look_at(transform(lidar_T_body, points)) for lidar_T_body, image in views], axis=0
+        )
+        return found
 
     @cached_property
     def picks(self) -> NDArray[np.intp]:
@@ -183,7 +209,8 @@ class PreparedScan:
     @cached_property
     def surfaces(self) -> tuple[Surfaces, Surfaces]:
         """Planes through the points of every second band of elevations, and through those between."""
-        seen = transform(self._lidar_T_body, self.points)
+        poses = self._lidars_T_body[self._owner]
+        seen = np.einsum("nij,nj->ni", poses[:, :3, :3], self.points) + poses[:, :3, 3]
         elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
         odd = (np.floor(elevation / const.BAND_DEG) % 2).astype(bool)
         return Surfaces.of(self.points[~odd]), Surfaces.of(self.points[odd])
@@ -226,7 +253,12 @@ def unlevelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
 
 def prepare(keyframe: Keyframe) -> PreparedScan:
     """The scan of a keyframe; one whose motion was not removed is blurred."""
-    return PreparedScan(keyframe.points, keyframe.body_T_lidar, const.BLUR_M if keyframe.motion is None else 0.0)
+    motion = keyframe.motion
+    blur_m = const.BLUR_M if motion is None or not motion.removed else 0.0
+    if motion is None or not len(motion.body_T_lidars):
+        return PreparedScan(keyframe.points, keyframe.body_T_lidar, blur_m)
+    owner = np.unique(motion.moments_s, return_inverse=True)[1]
+    return PreparedScan(keyframe.points, motion.body_T_lidars, blur_m, owner)
 
 
 def prepare_frame(frame: Frame) -> PreparedScan:

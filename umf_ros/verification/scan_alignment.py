@@ -169,12 +169,14 @@ def motion_covariance(match: Keyframe, query: Keyframe, alignment: Alignment, mo
         return np.zeros((6, 6))
     if match.motion is None or query.motion is None:
         return model.unknown_motion
+    removed = match.motion.removed and query.motion.removed
     ours, theirs = alignment.pairs.T
     turned = np.kron(np.eye(2), alignment.pose[:3, :3])  # errors about the query's axes, seen about the match's
     moved = np.eye(6)  # errors about the match's origin, seen at the query's
     moved[:3, 3:] = -skew(alignment.pose[:3, 3])
     found = _of_one(query.motion, _bends(alignment, query.motion.moments_s[ours]), turned, model.motion)
-    return found + _of_one(match.motion, _bends(alignment, match.motion.moments_s[theirs]), moved, model.motion)
+    found = found + _of_one(match.motion, _bends(alignment, match.motion.moments_s[theirs]), moved, model.motion)
+    return found if removed else found + model.unknown_motion
 
 
 def _bends(alignment: Alignment, moments: Array) -> tuple[Array, Array]:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Frame, Keyframe, LoopClosure
-from umf_ros.core.geometry import heading
+from umf_ros.core.geometry import Array, heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason
@@ -51,6 +52,7 @@ class Verifier:
         self._threshold = settings.min_probability
         self._memory = TemporalMemory()
         self._scans = ScanCache()
+        self._guesses: Mapping[int, Array] = {}
         self.latency_ms: dict[str, float] = {}
 
     def retune(self, settings: Verification) -> None:
@@ -66,13 +68,20 @@ class Verifier:
         """Make ready what is asked of a scan whose keyframe is verified next."""
         self._scans.prefetch(frame)
 
-    def verify(self, query: Keyframe, candidates: Sequence[Offered]) -> list[Hypothesis]:
+    def verify(
+        self,
+        query: Keyframe,
+        candidates: Sequence[Offered],
+        guesses: Mapping[int, Array] = MappingProxyType({}),
+    ) -> list[Hypothesis]:
         """Return one hypothesis per candidate with its reason, accepted ones first, then in the order of the reranking.
 
         Args:
             query: the newest keyframe.
             candidates: of the database, with their keyframes.
+            guesses: poses `match_T_query` from odometry, by the stamp of the match.
         """
+        self._guesses = guesses
         self.latency_ms = {"rerank": 0.0, "refine": 0.0}
         with self._timed("refine"):
             turned = self._turned(query) if candidates else None
@@ -133,7 +142,8 @@ class Verifier:
         """Hypotheses about the given candidates, the most promising first."""
         found: list[Hypothesis] = []
         for candidate, keyframe in ranked:
-            found += find_hypotheses(query, candidate, keyframe, turned, self._scans[keyframe], self._settings)
+            scan, guess = self._scans[keyframe], self._guesses.get(keyframe.stamp_ns)
+            found += find_hypotheses(query, candidate, keyframe, turned, scan, self._settings, guess)
         return sorted(found, key=lambda one: -one.score)
 
     def _judge(self, hypotheses: list[Hypothesis], hopeless: float) -> list[Hypothesis]:

@@ -240,8 +240,15 @@ class Odometry:
 
 def drifting(motion: Motion, drift: Drift, times: Array, seed: int) -> Odometry:
     """Odometry of a motion at (N,) times, s."""
-    rng = np.random.default_rng([seed, 7])
     truth = motion.poses(times)
+    poses, scale = drifted(truth, drift, np.random.default_rng([seed, 7]))
+    metres = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)
+    linear = np.einsum("nji,nj->ni", truth[:, :3, :3], motion.velocity(times)) * (1 + scale)
+    return Odometry(times, poses, np.hstack([linear, motion.angular(times)]), _deviations(drift, metres))
+
+
+def drifted(truth: Array, drift: Drift, rng: np.random.Generator) -> tuple[Array, float]:
+    """Odometry (N, 4, 4) along true poses (N, 4, 4), and the relative error of its distances."""
     steps = np.diff(truth[:, :3, 3], axis=0)
     metres = np.linalg.norm(steps, axis=1)
     scale, turn = rng.choice([-1, 1], 2) * [drift.scale, np.radians(drift.turn_deg_m)]
@@ -252,11 +259,10 @@ def drifting(motion: Motion, drift: Drift, times: Array, seed: int) -> Odometry:
     steps = (1 + scale) * np.einsum("nij,nj->ni", turned, steps)
     steps[:, 2] += climb
     poses = truth.copy()
-    tilt = np.radians(drift.tilt_deg) * rng.standard_normal((len(times), 2))
+    tilt = np.radians(drift.tilt_deg) * rng.standard_normal((len(truth), 2))
     poses[:, :3, :3] = _about_z(error - heading(truth[0])) @ truth[:, :3, :3] @ _small_tilt(tilt)
     poses[:, :3, 3] = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    linear = np.einsum("nji,nj->ni", truth[:, :3, :3], motion.velocity(times)) * (1 + scale)
-    return Odometry(times, poses, np.hstack([linear, motion.angular(times)]), _deviations(drift, metres))
+    return poses, float(scale)
 
 
 def _deviations(drift: Drift, metres: Array) -> Array:

@@ -5,20 +5,26 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.frames import Keyframe, ScanMotion
+from umf_ros.core.frames import Candidate, Embedding, Keyframe, LoopClosure, ScanMotion
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.core.io import atomic_write
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
+from umf_ros.lab.simulation.domains.mounts import MOUNTS
 from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, SAME_WAY
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.scan_files import make_snapshot
+from umf_ros.sensors.scan_files import UNCALIBRATED, make_snapshot
+from umf_ros.submaps.merging import DriftMeter, needed_scans, submap_of
+from umf_ros.verification import Verifier
+from umf_ros.verification import constants as const
+from umf_ros.verification.prepared_scan import thin_scan
 
 SAME_M, ELSEWHERE_M = 4.0, 12.0
 SAME_WAY_DEG, OTHER_WAY_DEG = 25.0, 155.0
@@ -33,25 +39,41 @@ class Extent:
 
     Attributes:
         worlds: of one domain.
-        step_m: between scans in the open; less indoors.
-        longest_m: of the stretch that is driven; less indoors.
+        step_m: between keyframes in the open; less indoors.
+        longest_m: of the stretch that has keyframes; less indoors.
     """
 
     worlds: int
     step_m: float
     longest_m: float
 
+    @property
+    def scans(self) -> int:
+        """Number of scans from one keyframe to the next, about a metre apart."""
+        return round(self.step_m)
+
 
 QUICK, FULL = Extent(2, 4.0, 60.0), Extent(3, 3.0, 120.0)
+LEAD_M = 12.0  # driven before the first keyframe of a visit in the open; less indoors
 
 
 @dataclass(frozen=True)
 class ScannedPlace:
-    """A keyframe, where it was taken and what it was made from."""
+    """A keyframe, where it was taken and what it was made from.
+
+    Attributes:
+        keyframe: without odometry: every pair is verified on its own.
+        scan: what it was made from.
+        world: its seed.
+        before: the keyframe as the submap of what was seen on the last metres; None where its scan is enough.
+        around: the same of the metres before and after it.
+    """
 
     keyframe: Keyframe
     scan: DomainScan
     world: int
+    before: Keyframe | None = None
+    around: Keyframe | None = None
 
     @property
     def position(self) -> Array:
@@ -80,13 +102,14 @@ class ScanPair:
 
 def surveyed(domain: Domain, seed: int, extent: Extent, folder: Path | None) -> list[DomainScan]:
     """The scans of one world, from a file in the folder where an earlier call left it."""
+    step_m, longest_m = extent.step_m / extent.scans, extent.longest_m + LEAD_M
     if folder is None:
-        return survey(domain, seed, extent.step_m, extent.longest_m)
-    path = folder / f"{domain.name}_{seed}_{extent.step_m:g}_{extent.longest_m:g}.pkl"
+        return survey(domain, seed, step_m, longest_m)
+    path = folder / f"{domain.name}_{seed}_{step_m:g}_{longest_m:g}.pkl"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as part:
-            part.write_bytes(pickle.dumps(survey(domain, seed, extent.step_m, extent.longest_m)))
+            part.write_bytes(pickle.dumps(survey(domain, seed, step_m, longest_m)))
     scans: list[DomainScan] = pickle.loads(path.read_bytes())
     return scans
 
@@ -105,16 +128,63 @@ def keyframe_of(
 def places_of(
     domain: Domain, seeds: range, extent: Extent, folder: Path | None, embedder: Embedder
 ) -> list[ScannedPlace]:
-    """Keyframes of all worlds of a domain."""
+    """Keyframes of all worlds of a domain, each also as the submap of what was seen around it."""
     places: list[ScannedPlace] = []
     for seed in seeds:
-        for scan in surveyed(domain, seed, extent, folder):
-            stamp_ns = (len(places) + 1) * 10**9
-            steady = scan.sweep.offset_s is not None
-            keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, stamp_ns, steady)
-            seen_from = relative(scan.world_T_body, scan.world_T_lidar)
-            places.append(ScannedPlace(replace(keyframe, body_T_lidar=seen_from), scan, seed))
+        for _, visit in groupby(surveyed(domain, seed, extent, folder), lambda scan: scan.label):
+            scans = list(visit)
+            drive = [_keyframe_along(scan, domain) for scan in scans]
+            first = round(LEAD_M * extent.scans / extent.step_m)
+            for number, (before, around) in _submaps(drive, range(first, len(drive), extent.scans)).items():
+                scan, stamp_ns = scans[number], (len(places) + 1) * 10**9
+                steady = scan.sweep.offset_s is not None
+                keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, stamp_ns, steady)
+                keyframe = replace(keyframe, body_T_lidar=drive[number].body_T_lidar)
+                parts = [one and replace(keyframe, points=one.points, motion=one.motion) for one in (before, around)]
+                places.append(ScannedPlace(keyframe, scan, seed, *parts))
     return places
+
+
+def _keyframe_along(scan: DomainScan, domain: Domain) -> Keyframe:
+    """The keyframe of a scan with its odometry, which nothing is known of but its points."""
+    stamp_ns = round(scan.path_length_m / MOUNTS[domain.mount].speed_m_s * 1e9)
+    blind, points = Embedding(np.empty(0, np.float32)), thin_scan(scan.sweep.points)
+    return Keyframe(
+        stamp_ns,
+        blind,
+        UNCALIBRATED.camera,
+        np.eye(4),
+        points,
+        scan.odom_T_body,
+        scan.path_length_m,
+        body_T_lidar=relative(scan.world_T_body, scan.world_T_lidar),
+        motion=None if scan.sweep.offset_s is None else ScanMotion.none(len(points)),
+    )
+
+
+def _submaps(drive: list[Keyframe], wanted: range) -> dict[int, tuple[Keyframe | None, Keyframe | None]]:
+    """Submaps of what was seen before and around some keyframes of a visit."""
+    anchors, drift = [drive[0]], DriftMeter()
+    for keyframe in drive:
+        if keyframe.path_length_m - anchors[-1].path_length_m >= const.MERGE_STEP_M:
+            before = _between(anchors, keyframe, -const.SUBMAP_BEFORE_M, 0.0)
+            if needed_scans(keyframe, before):
+                drift.add(keyframe, before)
+            anchors.append(keyframe)
+    found = {}
+    for number in wanted:
+        reaches = (0.0, const.SUBMAP_AFTER_M)
+        others = [_between(anchors, drive[number], -const.SUBMAP_BEFORE_M, last_m) for last_m in reaches]
+        submaps = [submap_of(drive[number], one, drift) for one in others]
+        found[number] = submaps[0], submaps[1]
+    return found
+
+
+def _between(anchors: list[Keyframe], keyframe: Keyframe, first_m: float, last_m: float) -> list[Keyframe]:
+    """Those on a part of the path about a keyframe, the nearest first, without the keyframe itself."""
+    ahead = [(one.path_length_m - keyframe.path_length_m, one) for one in anchors if one is not keyframe]
+    near = [(metres, one) for metres, one in ahead if first_m <= metres <= last_m]
+    return [one for _, one in sorted(near, key=lambda item: abs(item[0]))]
 
 
 def pairs_of(places: list[ScannedPlace], domain: Domain, rng: np.random.Generator) -> Iterator[ScanPair]:
@@ -138,6 +208,17 @@ def pairs_of(places: list[ScannedPlace], domain: Domain, rng: np.random.Generato
             if elsewhere:  # one world of small rooms has no place that far
                 yield max(elsewhere, key=lambda pair: pair.similarity)
                 yield elsewhere[int(rng.integers(len(elsewhere)))]
+
+
+def verified(verifier: Verifier, pair: ScanPair) -> tuple[LoopClosure | None, bool]:
+    """The closure of a pair by its scans or else by its submaps, and whether these were asked."""
+    verifier.reset()
+    candidate = Candidate(0, pair.match.keyframe.stamp_ns, pair.similarity)
+    closure = verifier.verify(pair.query.keyframe, [(candidate, pair.match.keyframe)])[0].closure
+    if closure is not None or pair.query.before is None:
+        return closure, False
+    verifier.reset()
+    return verifier.verify(pair.query.before, [(candidate, pair.match.around or pair.match.keyframe)])[0].closure, True
 
 
 def _distance(query: ScannedPlace, match: ScannedPlace) -> float:

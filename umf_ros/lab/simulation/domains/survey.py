@@ -6,7 +6,7 @@ A new mount is a row in `MOUNTS`, a new kind of place a class and a row in `PLAC
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol, cast
 
@@ -20,6 +20,7 @@ from umf_ros.lab.simulation.domains.outdoors import Landscape, Quarry, Trees
 from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner, Sweep, stamp_moment, sweep
 from umf_ros.lab.simulation.domains.solids import Scene
 from umf_ros.lab.simulation.domains.street import Street
+from umf_ros.lab.simulation.motion_sensors import Drift, drifted
 from umf_ros.lab.simulation.relief import Relief
 from umf_ros.lab.simulation.route import Setting, plan_passes, stand
 from umf_ros.lab.simulation.world import World, check_seed
@@ -161,12 +162,16 @@ class DomainScan:
         world_T_body: (4, 4) true pose of that frame at the scan's stamp.
         world_T_lidar: (4, 4) true pose of the LiDAR then.
         label: first, offset (again, the same way) or opposite.
+        odom_T_body: (4, 4) the same by odometry, which begins anew with each label.
+        path_length_m: driven since the label's first scan.
     """
 
     sweep: Sweep
     world_T_body: Array
     world_T_lidar: Array
     label: str
+    odom_T_body: Array | None = None
+    path_length_m: float = float("nan")
 
 
 DOMAINS: tuple[Domain, ...] = (
@@ -209,8 +214,9 @@ def survey(domain: Domain, seed: int, step_m: float, longest_m: float, place: Pl
     mount, scanner = MOUNTS[domain.mount], domain.scanner
     carrier = np.random.default_rng([seed, 51])
     body_T_lidar = mount.body_T_lidar(carrier)
-    scans = []
+    scans: list[DomainScan] = []
     for visit, label in enumerate((FIRST, SAME_WAY, OTHER_WAY) if scanner.all_round else (FIRST, SAME_WAY)):
+        visited: list[DomainScan] = []
         rng = np.random.default_rng([seed, 52, visit])
         scene = place.scene(visit)
         for world_T_body in _drive(place, label, (step_m * domain.scale, longest_m * domain.scale), rng):
@@ -224,10 +230,20 @@ def survey(domain: Domain, seed: int, step_m: float, longest_m: float, place: Pl
             if mount.calibrated:
                 points = transform(body_T_lidar, found.points)
                 found = Sweep(points, found.intensity, found.offset_s)
-                scans.append(DomainScan(found, motion.world_T_body(stamp), lidar, label))
+                visited.append(DomainScan(found, motion.world_T_body(stamp), lidar, label))
             else:
-                scans.append(DomainScan(found, lidar, lidar, label))
+                visited.append(DomainScan(found, lidar, lidar, label))
+        scans += _with_odometry(visited, np.random.default_rng([seed, 53, visit]))
     return scans
+
+
+def _with_odometry(scans: list[DomainScan], rng: np.random.Generator) -> Iterator[DomainScan]:
+    """The scans of one visit with the odometry of a carrier that drifts as the rover does."""
+    truth = np.stack([scan.world_T_body for scan in scans])
+    poses, _ = drifted(truth, Drift(), rng)
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    for scan, pose, metres in zip(scans, poses, np.append(0.0, np.cumsum(steps)), strict=True):
+        yield replace(scan, odom_T_body=pose, path_length_m=float(metres))
 
 
 class SweepMotion:
