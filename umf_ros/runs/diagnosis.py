@@ -12,7 +12,7 @@ import numpy as np
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.truth import TruePlaces
 from umf_ros.verification.acceptance import load_acceptance
-from umf_ros.verification.hypothesis import SUBMAP, Hypothesis, RejectReason
+from umf_ros.verification.hypothesis import Hypothesis, RejectReason
 
 Gate = Literal["found", "gap rules", "retrieval", "selection", "depth", "pose", "probability", "objection"]
 _LIMITS = {
@@ -76,13 +76,13 @@ class GateDiagnosis:
 
     def contributions(self, candidate: Hypothesis) -> dict[str, float]:
         """Log-odds of each criterion, where a pose was judged by the fitted decision."""
-        if candidate.measurement.kind in ("", SUBMAP):
+        if not candidate.measurement.kind:
             return {}
         return {name: value for name, value in self._acceptance.contributions(candidate.measurement).items() if value}
 
     def missing(self, candidate: Hypothesis) -> dict[str, float]:
         """Log-odds that each criterion could have added and did not, the most first."""
-        if candidate.measurement.kind in ("", SUBMAP):
+        if not candidate.measurement.kind:
             return {}
         return dict(sorted(self._acceptance.lost(candidate.measurement).items(), key=lambda one: -one[1]))
 

@@ -33,10 +33,6 @@ class RejectReason(Enum):
     PASSAGE = "surfaces fit as well elsewhere along the passage"
     AMBIGUOUS = "another pose fits as well"
     OUT_OF_RANGE = "a measurement outside the range of the fitted examples"
-    TERRAIN = "the terrain does not fit"
-    DRIFT_UNKNOWN = "the drift of odometry inside the submaps is not known yet"
-    DRIFT = "odometry drifts too far inside the submaps"
-    LITTLE_IN_COMMON = "too little of the submap in common"
     TURNED = "turned by more than verification.max_turn_deg"
     LITTLE_SHARED_VIEW = "the views share too little"
     TOO_FAR = "farther apart than verification.max_shift_m"
@@ -45,8 +41,8 @@ class RejectReason(Enum):
     UNKNOWN = "rejected by another version"
 
 
-SCAN, IMAGE, SUBMAP = "scan", "image", "submap"
-_MARKS = {SCAN: "noise_m", IMAGE: "pose_inliers", SUBMAP: "terrain_rival"}  # a number of no other kind
+SCAN, IMAGE = "scan", "image"
+_MARKS = {SCAN: "noise_m", IMAGE: "pose_inliers"}  # a number of no other kind
 
 
 def measured(*kinds: str) -> Any:
@@ -61,8 +57,7 @@ class Measurement:
     The name of a field is its name in `candidates.csv` and on `~/candidates`.
 
     Attributes:
-        kind: "scan" when two scans were aligned, "image" when only local features could be, "submap" when what was
-            seen along the way was aligned.
+        kind: "scan" when two scans or submaps were aligned, "image" when only local features could be.
         similarity: cosine similarity of the global descriptors.
         inliers_image: pairs of image features that one homography explains.
         inliers_cloud: pairs of the scan's features that one rigid motion explains.
@@ -76,7 +71,6 @@ class Measurement:
         relief_m: standard deviation of the relief on the ground that both scans saw.
         terrain_correlation: of both elevation maps' relief, -1 to 1.
         terrain_score: the same in standard deviations of chance.
-        terrain_rival: correlation at the best of some poses beside this one.
         common: share of a scan's points that the other should see, the smaller of both ways, as all that follow.
         contradiction: share of these that the other's rays passed by, the larger of both.
         counterparts: share of these that have a counterpart, as near as both scans' points let one expect.
@@ -106,16 +100,15 @@ class Measurement:
     inliers_image: float = 0.0
     inliers_cloud: float = 0.0
     superfeatures: float = 0.0
-    residual_m: float = measured(SCAN, IMAGE, SUBMAP)
+    residual_m: float = measured(SCAN, IMAGE)
     residual_sigmas: float = measured(IMAGE)
     residual_p90_m: float = measured(SCAN)
     noise_m: float = measured(SCAN)
-    overlap: float = measured(SCAN, IMAGE, SUBMAP)
-    points: float = measured(SCAN, SUBMAP)
-    relief_m: float = measured(SCAN, SUBMAP)
-    terrain_correlation: float = measured(SCAN, SUBMAP)
-    terrain_score: float = measured(SCAN, SUBMAP)
-    terrain_rival: float = measured(SUBMAP)
+    overlap: float = measured(SCAN, IMAGE)
+    points: float = measured(SCAN)
+    relief_m: float = measured(SCAN)
+    terrain_correlation: float = measured(SCAN)
+    terrain_score: float = measured(SCAN)
     common: float = measured(SCAN)
     contradiction: float = measured(SCAN)
     counterparts: float = measured(SCAN)
@@ -128,12 +121,12 @@ class Measurement:
     spread: float = measured(IMAGE)
     disparity_bias_px: float = measured(IMAGE)
     two_way_m: float = measured(IMAGE)
-    position_std_m: float = measured(SCAN, IMAGE, SUBMAP)
-    heading_std_deg: float = measured(SCAN, IMAGE, SUBMAP)
+    position_std_m: float = measured(SCAN, IMAGE)
+    heading_std_deg: float = measured(SCAN, IMAGE)
     agreement_image: float = measured(SCAN, IMAGE)
     agreement_cloud: float = measured(SCAN, IMAGE)
-    prior_sigmas: float = measured(SCAN, IMAGE, SUBMAP)
-    support: float = measured(SCAN, IMAGE, SUBMAP)
+    prior_sigmas: float = measured(SCAN, IMAGE)
+    support: float = measured(SCAN, IMAGE)
     runner_up: float = measured(SCAN)
 
     @classmethod
