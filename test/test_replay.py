@@ -9,6 +9,7 @@ import os
 import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,8 +48,12 @@ def frames_of(stream: Stream) -> list[Frame]:
     return [item for item in stream if isinstance(item, Frame)]
 
 
+def changed(item: Frame | OdometrySample, **values: Any) -> Frame | OdometrySample:
+    return replace(item, **values) if isinstance(item, Frame) else item._replace(**values)
+
+
 def later_by(seconds: int, stream: Stream) -> Stream:
-    return [replace(item, stamp_ns=item.stamp_ns + seconds * 10**9) for item in stream]
+    return [changed(item, stamp_ns=item.stamp_ns + seconds * 10**9) for item in stream]
 
 
 @pytest.fixture
@@ -167,7 +172,7 @@ def test_odometry_that_jumps_begins_a_chain_of_its_own_as_it_does_live(
     half, moved = len(stream) // 2, np.eye(4)
     moved[0, 3] = 500.0
     later = [
-        item if item.odom_T_body is None else replace(item, odom_T_body=moved @ item.odom_T_body) for item in stream
+        item if item.odom_T_body is None else changed(item, odom_T_body=moved @ item.odom_T_body) for item in stream
     ]
     replay = replay_of(folder, settings)
     list(replay.run([*stream[:half], *later[half:]]))

@@ -11,34 +11,37 @@ A recording or map that cannot be read raises an `UmfError`, a folder that canno
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
+import numpy as np
+
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.trajectories import read_odometry
-from umf_ros.core.config import Database, Settings
+from umf_ros.core.config import Database, Settings, Verification
 from umf_ros.core.errors import BagError, writing
+from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
-from umf_ros.maps.tracking import track
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
-from umf_ros.runs.run_file import RunFile
+from umf_ros.runs.run_file import RunFile, StoredOdometry
 from umf_ros.runs.tables import CLOSURES, closure_row, write_table
 from umf_ros.runs.writer import PLACES, count_drops
 from umf_ros.verification import Hypothesis, Verifier
 
 OnFrame = Callable[[float, Detection], None]
 """Called for every frame with the share of the recording that is done, 0 to 1, and the detection."""
+_UNKNOWN = np.diag([np.inf] * 6)
 RECORDINGS = (".mcap", ".db3", ".bag")
 
 
@@ -132,6 +135,42 @@ def _track(folder: Path, settings: Settings) -> None:
     with closing(RunFile(folder)) as file:
         for number, one in enumerate(odometry):
             file.append_odometry(number, one)
+
+
+def track(keyframes: Iterable[Keyframe], settings: Verification) -> tuple[list[StoredOdometry], list[Keyframe]]:
+    """Track a recording without odometry by closures between consecutive keyframes.
+
+    Where two consecutive keyframes have no closure, a new session begins, which other closures have to connect.
+
+    Args:
+        keyframes: of one recording, in order, without odometry.
+        settings: of the verification of closures.
+
+    Returns:
+        The poses, and the keyframes with `odom_T_body`, `path_length_m` and `session`, which counts from 0.
+    """
+    odometry: list[StoredOdometry] = []
+    tracked: list[Keyframe] = []
+    pose, path_m, session = np.eye(4), 0.0, 0
+    before: Keyframe | None = None
+    for keyframe in keyframes:
+        closure = None if before is None else _closure(before, keyframe, settings)
+        if closure is None:
+            session += before is not None
+            pose, path_m, covariance = np.eye(4), 0.0, _UNKNOWN
+        else:
+            step, covariance = closure.match_T_query, closure.covariance
+            pose, path_m = pose @ step, path_m + float(np.linalg.norm(step[:3, 3]))
+        odometry.append(StoredOdometry(keyframe.stamp_ns, pose, covariance))
+        tracked.append(replace(keyframe, odom_T_body=pose, path_length_m=path_m, session=session))
+        before = keyframe
+    return odometry, tracked
+
+
+def _closure(before: Keyframe, keyframe: Keyframe, settings: Verification) -> LoopClosure | None:
+    """Verify a keyframe against the one before it, alone: earlier closures would need odometry between them."""
+    similarity = float(before.embedding.descriptor @ keyframe.embedding.descriptor)
+    return Verifier(settings).verify(keyframe, [(Candidate(0, before.stamp_ns, similarity), before)])[0].closure
 
 
 def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
