@@ -1,4 +1,4 @@
-"""What the front-end says on the wire, heard by another node over DDS."""
+"""Messages of the front-end, received by another node over DDS."""
 
 from __future__ import annotations
 

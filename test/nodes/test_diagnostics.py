@@ -1,4 +1,4 @@
-"""What a node says of its inputs: rates, and why nothing arrives."""
+"""Diagnostics of the inputs: rates, and why nothing arrives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a launch checks before it starts anything."""
+"""Checks of a launch before it starts anything."""
 
 from __future__ import annotations
 
