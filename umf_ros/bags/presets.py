@@ -63,14 +63,10 @@ def _match(preset: DatasetPreset, known: set[str]) -> int:
 
 
 def settings_for(bag: Bag, config: Path | None, dataset: str, **overrides: Any) -> Settings:
-    """Settings to read a recording with.
+    """Settings to read a recording with: those of a parameter file and overrides as in `load_settings`.
 
-    Args:
-        bag: the recording.
-        config: parameter file; None gives the defaults.
-        dataset: name of the data set, before whatever the file says; "auto" takes it from the file,
-            or from the recording's topics where the file names neither a data set nor topics.
-        overrides: as in `load_settings`.
+    A data set that is named goes before that of the file; "auto" takes it from the file, or from the recording's topics
+    where the file names neither a data set nor topics.
 
     Raises:
         ConfigError: the file cannot be read, or a name, type or value is wrong.
