@@ -36,6 +36,8 @@ from umf_ros.sensors.scan_files import make_snapshot
 SCANS = 5
 DROPPED, FLYING = 0.15, 0.02
 """Shares of the returns that are lost, and that lie between a surface and the one behind it."""
+FEWEST = 2000
+"""Returns of a scan that shows a facade."""
 TILTED_DEG = (0.0, 8.0, 15.0, 20.0, 28.0)
 
 
@@ -89,7 +91,8 @@ def facade_row(seed: int, embedder: Embedder) -> tuple[float, float]:
     descriptors, tilts = [], []
     for _ in range(SCANS):
         frame = make_snapshot(weathered(sweep(scanner, scene, lambda _: stands, rng), rng))
-        assert frame.points is not None
+        if frame.points is None or len(frame.points) < FEWEST:  # too low a building: another one
+            return facade_row(seed + 100, embedder)
         descriptors.append(embedder.embed(frame).descriptor)
         tilts.append(rotation_angle(level(frame.points, keep_slope=True)))
     return float(np.min(np.stack(descriptors) @ np.stack(descriptors).T)), float(np.degrees(max(tilts)))

@@ -187,12 +187,14 @@ def test_a_data_set_is_not_recognised_where_camera_info_contradicts(tmp_path: Pa
     raw = load_preset("s3li-vulcano").topics.left_image
     entries = [(raw, START_NS, image(START_NS, np.zeros((4, 4), np.uint8), "bayer_rggb8"))]
     entries.append(("/g319c_left/camera_info", START_NS, camera_info(START_NS, 700.0, (1242, 375))))
+    entries.append(next(entry for entry in ENTRIES if entry[0] == CLOUD))  # of other data sets, too
     bag = open_bag(write_mcap(tmp_path / "a.mcap", entries))
     with pytest.raises(BagError, match=r"of s3li-vulcano, but .* 1242 x 375 pixels, .* 2064 x 1544"):
         settings_for(bag, None, "auto")
     own = settings_for(bag, None, "auto", calibration="my_calibration.yaml")
     assert own.dataset == settings_for(bag, None, "s3li-vulcano").dataset == "s3li-vulcano"
-    entries[-1] = ("/g319c_left/camera_info", START_NS, camera_info(START_NS, 700.0, (2064, 1544)))
+    # one that is damaged is no contradiction
+    entries.append(("/g319c_left/camera_info", START_NS, camera_info(START_NS, 700.0, (2064, 1544))))
     assert settings_for(open_bag(write_mcap(tmp_path / "b.mcap", entries)), None, "auto").dataset == "s3li-vulcano"
 
 

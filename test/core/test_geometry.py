@@ -30,7 +30,7 @@ def covariance(seed: int) -> Array:
 
 
 def ros_error(pose: Array, moved: Array) -> Array:
-    """The error that a ROS covariance is of: displacement and rotation vector about the parent's axes."""
+    """Error in the ROS convention: displacement and rotation vector about the parent's axes."""
     turn = gtsam.Rot3.Logmap(gtsam.Rot3(moved[:3, :3] @ pose[:3, :3].T))
     return np.concatenate([moved[:3, 3] - pose[:3, 3], turn])
 

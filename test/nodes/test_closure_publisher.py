@@ -1,4 +1,4 @@
-"""Messages of the front-end on the wire, received by another node over DDS."""
+"""Messages of the front-end, received by another node over DDS."""
 
 from __future__ import annotations
 

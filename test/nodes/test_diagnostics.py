@@ -1,4 +1,4 @@
-"""Diagnostics of a node's inputs: rates, and the reason why nothing arrives."""
+"""Diagnostics of the inputs: rates, and why nothing arrives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of a launch before any process starts."""
+"""Checks of a launch before it starts anything."""
 
 from __future__ import annotations
 

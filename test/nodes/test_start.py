@@ -38,7 +38,7 @@ def test_a_node_that_is_loaded_runs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_without_its_venv_a_workspace_says_so_in_one_line(command: list[str]) -> None:
-    """A terminal in which ROS was not sourced; -S leaves the packages of this Python out."""
+    """A terminal without the venv: -S leaves the packages of this Python out."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, "-S", *command], env=environment, capture_output=True, text=True, check=False, timeout=30

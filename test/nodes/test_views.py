@@ -1,4 +1,4 @@
-"""RViz and Foxglove show topics that the nodes publish, in the frame that needs no transform."""
+"""Views of RViz and Foxglove show topics that the nodes publish, in the frame that needs no transform."""
 
 from __future__ import annotations
 

@@ -33,11 +33,8 @@ IMU_HINT = "; an IMU is no odometry: run one (KISS-ICP, Basalt, FAST-LIO) and gi
 class FrameReader:
     """The frames of a recording, read once, and the fate of its messages.
 
-    Messages that cannot be used are counted and skipped, the first of each kind with a warning. Inputs
-    for which the recording has no topic are not waited for.
-
-    Attributes:
-        progress: part of the recording that was read, 0 to 1.
+    Messages that cannot be used are counted and skipped, the first of each kind with a warning. Inputs without a topic
+    in the recording are not waited for. `progress` is the part of the recording that was read, 0 to 1.
     """
 
     def __init__(
@@ -50,8 +47,7 @@ class FrameReader:
         """Take the odometry from a trajectory instead of the recording's topic, if given.
 
         Raises:
-            BagError: the recording has neither images nor scans on the topics of the settings, or messages
-                of another type there, or the trajectory is of another time.
+            BagError: there are neither images nor scans, or of other types, or the trajectory is of another time.
             CalibrationError: the calibration cannot be read.
         """
         topics = _present(topics_of(settings), bag)
@@ -206,11 +202,7 @@ def split_reference(text: str) -> tuple[Path, str] | None:
 
 
 def nearest_frames(frames: Iterable[Frame], moments: list[Moment]) -> list[FoundFrame]:
-    """The frame nearest to each moment; reads no further than it must.
-
-    Args:
-        frames: of a recording, from its start.
-        moments: in any order.
+    """The frame of a recording nearest to each moment; reads no further than it must.
 
     Raises:
         BagError: the recording has no frame.

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from umf_ros.bags.reader import Bag
+from umf_ros.bags.reader import Bag, decode
 from umf_ros.core.config import DatasetPreset, Settings, load_preset, load_settings
-from umf_ros.core.errors import BagError
+from umf_ros.core.errors import BagError, MessageError
 from umf_ros.core.resources import dataset_names
 from umf_ros.sensors.calibration import load_calibration
 
+SAMPLES = 5
+"""Messages of camera_info that are looked at: a single one may be damaged."""
 GROUND_TRUTH_TOPIC = "/ground_truth/pose"
 
 
@@ -24,15 +28,13 @@ def detect_dataset(bag: Bag, own_calibration: bool = False) -> str:
     """
     known = set(bag.topics)
     scores = {name: _match(load_preset(name), known) for name in dataset_names()}
-    contradiction = ""
-    for name in sorted(scores, key=lambda name: -scores[name]):
-        other = "" if own_calibration or not scores[name] else _contradiction(bag, name)
-        if scores[name] and not other:
-            return name
-        contradiction = contradiction or other
-    names = ", ".join(sorted(known)) or "none"
-    reason = contradiction or f"the recording has no topic of a known data set (topics: {names})"
-    raise BagError(f"{reason}; name yours in a config file: umf inspect {bag.path} --write . writes a first one")
+    best = max(scores, key=lambda name: scores[name])
+    reason = "" if own_calibration or not scores[best] else _contradiction(bag, best)
+    if not scores[best]:
+        reason = f"the recording has no topic of a known data set (topics: {', '.join(sorted(known)) or 'none'})"
+    if reason:
+        raise BagError(f"{reason}; name yours in a config file: umf inspect {bag.path} --write . writes a first one")
+    return best
 
 
 def _contradiction(bag: Bag, name: str) -> str:
@@ -41,13 +43,16 @@ def _contradiction(bag: Bag, name: str) -> str:
     infos = {topics.left_info, f"{topics.left_image.rpartition('/')[0]}/camera_info"}
     kind = "sensor_msgs/msg/CameraInfo"
     infos = {topic for topic in infos if topic in bag.topics and bag.topics[topic].type == kind}
-    for topic, _, info in bag.messages(infos) if infos else ():
-        width, height = load_calibration(name).image_size
-        if (info.width, info.height) == (width, height):
-            break
-        sizes = f"images of {info.width} x {info.height} pixels, and the camera of that data set has {width} x {height}"
-        return f"the recording has topics of {name}, but {topic} is for {sizes}"
-    return ""
+    sizes: list[tuple[int, int]] = []
+    for raw in islice(bag.raw_messages(infos), SAMPLES) if infos else ():
+        with suppress(MessageError):
+            info = decode(raw)
+            sizes.append((info.width, info.height))
+    expected = load_calibration(name).image_size if sizes else (0, 0)
+    if not sizes or expected in sizes:
+        return ""
+    found = f"{sizes[0][0]} x {sizes[0][1]} pixels, and the camera of that data set has {expected[0]} x {expected[1]}"
+    return f"the recording has topics of {name}, but {' or '.join(sorted(infos))} is for images of {found}"
 
 
 def _match(preset: DatasetPreset, known: set[str]) -> int:
@@ -58,14 +63,10 @@ def _match(preset: DatasetPreset, known: set[str]) -> int:
 
 
 def settings_for(bag: Bag, config: Path | None, dataset: str, **overrides: Any) -> Settings:
-    """Settings to read a recording with.
+    """Settings to read a recording with: those of a parameter file and overrides as in `load_settings`.
 
-    Args:
-        bag: the recording.
-        config: parameter file; None gives the defaults.
-        dataset: name of the data set, before whatever the file says; "auto" takes it from the file,
-            or from the recording's topics where the file names neither a data set nor topics.
-        overrides: as in `load_settings`.
+    A data set that is named goes before that of the file; "auto" takes it from the file, or from the recording's topics
+    where the file names neither a data set nor topics.
 
     Raises:
         ConfigError: the file cannot be read, or a name, type or value is wrong.

@@ -15,8 +15,7 @@ class Bag:
     """A recording: its topics by name, and its messages as often as wanted.
 
     Attributes:
-        path: file or folder.
-        start_ns, end_ns: stamps of the recording of the first and the last message.
+        start_ns, end_ns: time of recording of the first and the last message.
         warning: one line when a part of the recording is unreadable, else empty.
     """
 

@@ -232,11 +232,7 @@ class _ReorderBuffer:
 
 
 def _unpacked(chunk: Chunk) -> Iterable[McapRecord]:
-    """The records of a chunk of a size that can be unpacked.
-
-    Raises:
-        ValueError: it is larger than any that recorders write.
-    """
+    """The records of a chunk; raises a `ValueError` if it is larger than any that recorders write."""
     _check_chunk(chunk.uncompressed_size, chunk.compression, chunk.data[:18])
     if chunk.compression == "lz4":
         chunk = replace(chunk, compression="", data=unpack("lz4", chunk.data))
@@ -244,11 +240,7 @@ def _unpacked(chunk: Chunk) -> Iterable[McapRecord]:
 
 
 def _check_chunks(path: Path, indexes: Collection[ChunkIndex]) -> None:
-    """Check the claims of the chunks themselves, and not only those of the index.
-
-    Raises:
-        ValueError: one lies outside of the file, or would be too large.
-    """
+    """Raise a `ValueError` if a chunk, by its own claim or the index', lies outside of the file or is too large."""
     size = path.stat().st_size
     with path.open("rb") as stream:
         for index in indexes:

@@ -17,10 +17,8 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose, stamp_ns
 
-GPS_EPOCH_S = 315_964_800
-"""1980-01-06 in POSIX seconds."""
-LEAP_SECONDS = 18
-"""GPS time is ahead of UTC by this much since 2017."""
+GPS_EPOCH_S, LEAP_SECONDS = 315_964_800, 18
+"""1980-01-06 in POSIX seconds; GPS time is ahead of UTC by this much since 2017."""
 WORST_QUALITY = 2
 """1 is a fixed, 2 a floating ambiguity; the rest is off by metres."""
 
@@ -64,7 +62,6 @@ def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajector
 
     Raises:
         BagError: the file cannot be read, or there is no such frame.
-        CalibrationError: the mounting of the frame is not known.
     """
     calibration = calibration_of(settings)
     mountings = {

@@ -37,12 +37,7 @@ class InputCounter:
 
 @dataclass(slots=True)
 class StampedImage:
-    """An image (H, W) uint8 of the stream and the stamp of its exposure.
-
-    Attributes:
-        late: whether a scan that might have wanted it was given up before it came.
-        used: whether a frame has taken it.
-    """
+    """An image (H, W) uint8, its exposure, and whether it came too late for its scan, or is used in a frame."""
 
     stamp_ns: int
     image: Image

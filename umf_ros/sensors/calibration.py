@@ -54,12 +54,9 @@ class RawCamera(Pinhole):
 
 
 class StereoRectifier:
-    """Rectifies the images of a raw pair and scales them down on the way.
+    """Rectifies raw images of `raw_size` and scales them down to those of the rectified pair `camera`.
 
-    Attributes:
-        camera: the rectified pair.
-        raw_T_rectified: (4, 4) rotation of the rectified left camera in the raw left camera.
-        raw_size: width and height of the raw images.
+    `raw_T_rectified` is the (4, 4) rotation of the rectified left camera in the raw one.
     """
 
     def __init__(self, left: RawCamera, right: RawCamera, left_T_right: Array, size: tuple[int, int]) -> None:

@@ -238,7 +238,7 @@ def decode_camera_info(left: Any, right: Any | None = None) -> StereoCamera:
     """Rectified pair of one or two sensor_msgs/CameraInfo; without the right one the baseline is 0.
 
     Raises:
-        MessageError: of kind "camera_info" when a camera is uncalibrated or the two cannot be a pair.
+        MessageError: of kind "camera_info": no calibrated camera, or no pair.
     """
     matrix = _projection(left, "left")
     baseline = 0.0

@@ -51,10 +51,9 @@ _MOST_NEGATIVE = 0.01
 def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
     """Read the real returns of one scan, in the frame of the file.
 
-    Args:
-        path: .pcd (ascii, binary, binary_compressed), .ply (ascii, binary), or .npy and .bin of (N, 3) or (N, 4)
-            numbers, x y z in metres and intensity; further columns are ignored. The numbers of a .bin are float32.
-        bin_columns: numbers per point of a .bin; 0: 4 as in KITTI, 3 where only that can be.
+    Files are .pcd (ascii, binary, binary_compressed), .ply (ascii, binary), or .npy and .bin of (N, 3) or (N, 4)
+    numbers, x y z in metres and intensity; further columns are ignored. A .bin holds float32 with `bin_columns` numbers
+    per point; 0: 4 as in KITTI, 3 where only that can be.
 
     Raises:
         SensorFileError: the file cannot be read, is none of these, or holds no return; names it.
@@ -158,12 +157,9 @@ def _unpack_by_field(body: bytes, record: Record) -> Columns:
 
 
 def _parse_text(body: bytes, record: Record, points: int) -> Columns:
-    """Return the fields of points in ASCII, at most so many as are to be; 0: all there are.
+    """Return the fields of points in ASCII, at most `points`, 0: all.
 
     Where other fields hold raw bytes (Livox `tag line`), those up to the last of x, y and z are read.
-
-    Raises:
-        SensorFileError: these are no numbers either.
     """
     names = list(record.names or ())
     widths = [int(np.prod(record[name].shape)) for name in names]
@@ -278,11 +274,7 @@ def _parse_ply_header(text: str) -> tuple[str, list[PlyElement]]:
 
 
 def _ply_record(element: PlyElement, form: str) -> Record:
-    """One record of a file.
-
-    Raises:
-        SensorFileError: a property is a list, whose length varies.
-    """
+    """One record of a file; refuses a property that is a list, whose length varies."""
     name, _, properties = element
     if any(kind == "list" for _, kind in properties):
         raise SensorFileError(f"a PLY file whose element {name} has lists")

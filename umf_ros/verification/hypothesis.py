@@ -24,10 +24,10 @@ ACCEPTED = "accepted"
 class RejectReason(Enum):
     """Why a candidate became no loop closure, as a sentence; `Hypothesis.detail` has the figures."""
 
-    NOT_COMPARED = "not compared, a closure was found before"
-    NOT_SELECTED = "other candidates are more promising"
+    NOT_COMPARED = "not compared: a closure was found"
+    NOT_SELECTED = "less promising than others"
     NO_DEPTH = "no depth: neither a scan nor a stereo pair"
-    NO_POSE = "no pose fits, or other poses fit better"
+    NO_POSE = "no pose fits"
     IMPROBABLE = "probability below verification.min_probability"
     MISFIT = "surfaces are several times their noise apart"
     PASSAGE = "surfaces fit as well elsewhere along the passage"
