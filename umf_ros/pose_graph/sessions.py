@@ -25,7 +25,7 @@ _AT_ONCE = 256
 
 
 class Sessions:
-    """Odometry chains that share a map as far as closures join them.
+    """Odometry chains that share a map as far as closures join them; `chains` that grow elsewhere can be given.
 
     Each session begins in a gauge of its own, its odometry frame. Accepted closures join sessions
     to components; the earliest session of a component keeps its gauge, the others are moved.
@@ -52,10 +52,6 @@ class Sessions:
     def begin(self) -> None:
         """Start a session."""
         self.chains.append(OdometryChain(self._settings, len(self.chains)))
-
-    def anew(self) -> Sessions:
-        """The same odometry, which goes on growing, before any closure moved it."""
-        return Sessions(self._settings, self.chains)
 
     def update(self) -> bool:
         """Take new odometry in; True when the past of a session changed."""
