@@ -127,7 +127,8 @@ class Sessions:
             gaps = [np.abs(chain.stamps - own[np.clip(row, 0, len(own) - 1)]) for row in (after - 1, after)]
             stamps.append(np.union1d(own, chain.stamps[np.min(gaps, axis=0) > _TOO_CLOSE_NS]))
         vertices, graph = self._graph(stamps, closures, self.components)
-        self._refined = _paths_through(vertices, self._refiner.solve(graph))
+        refiner = GraphSolver()
+        self._refined, self._refiner = _paths_through(vertices, refiner.solve(graph)), refiner
 
     def expand(self, closures: Closures, extra: Closures) -> Graph:
         """Graph of every keyframe and the endpoints of `extra` closures, odometry and the given closures."""
