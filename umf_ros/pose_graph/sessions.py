@@ -33,7 +33,7 @@ class Sessions:
     Attributes:
         chains: the odometry of each session.
         components: for each session the earliest one that shares its map.
-        vertices: (N,) of `POINT`, what was solved last.
+        vertices: (N,) of `POINT`, the vertices that were solved last.
         solution: the graph that was solved last; None before.
         scale: of the stated noise, in that solution.
     """

@@ -126,7 +126,7 @@ def _ordering(factors: gtsam.NonlinearFactorGraph, anchors: list[int], vertices:
     if vertices < _FEW_VERTICES:
         return gtsam.Ordering.ColamdNonlinearFactorGraph(factors)
     joined = factors.clone()
-    for one, other in pairwise(anchors):  # METIS may look for ever for what parts a graph that is in parts
+    for one, other in pairwise(anchors):  # METIS may not end on a graph in parts
         joined.add(gtsam.BetweenFactorPose3(one, other, gtsam.Pose3(), _ANCHOR))
     return gtsam.Ordering.MetisNonlinearFactorGraph(joined)
 
