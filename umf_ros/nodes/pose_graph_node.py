@@ -51,8 +51,7 @@ SETTLE_S, PREPARE_S = 1.0, 0.2
 """Longest time to settle the graph at the end, and to work ahead for that once per second."""
 UNSETTLED = "no time to settle the graph: results as they stand; they are settled when this folder is used next"
 DRAWING = 20.0
-"""So many times as long as path and markers took to publish they are not published again: on a long way they are
-large."""
+"""Path and markers are published again after this many times the time that they took: long paths are large."""
 GRACE_S = 0.5
 """A front-end that was asked to end together with us says so within this."""
 
@@ -103,7 +102,7 @@ class PoseGraphNode(BaseNode):
         self._offer_in_turn("~/reset", self._reset)
 
     def _finish(self) -> None:
-        """Take in what is queued, settle the graph and write the results."""
+        """Process the queue, settle the graph and write the results."""
         self._worker.close(timeout_s=60.0)
         try:
             if self._results and not self._durable.write_results(Path(self._results), SETTLE_S):
@@ -121,7 +120,7 @@ class PoseGraphNode(BaseNode):
         return not self._front_end_busy and now_s - self._asked_s > GRACE_S
 
     def _settle_left(self) -> None:
-        """Finish what the process before had no time for."""
+        """Settle the graph of the process before."""
         with watchdog.task("settling the graph", watchdog.PATIENT_S):
             self._durable.write_results(Path(self._results))
         self._announce(self._durable.graph.closures())
@@ -199,7 +198,7 @@ class PoseGraphNode(BaseNode):
             return
         self._correct()
         for verdict in verdicts:
-            # a verdict may change until the graph is settled: only what is refused is so for good
+            # a verdict may change until the graph is settled, except a refusal
             final = verdict.state is State.REFUSED
             log = self.get_logger().info if final else self.get_logger().debug
             log(describe(verdict))
@@ -213,7 +212,7 @@ class PoseGraphNode(BaseNode):
         self._covariance = self._durable.graph.covariance()
 
     def _show(self) -> None:
-        """Publish path and markers where they have changed and someone listens; who comes later hears the last ones."""
+        """Publish path and markers where they have changed and have subscribers; later ones get the last (latched)."""
         listeners = self._path_publisher.get_subscription_count() + self._marker_publisher.get_subscription_count()
         newest_ns = self._durable.feed.newest_ns
         if listeners and self._drawn_ns != newest_ns and time.monotonic() >= self._draws_again_s:
@@ -235,7 +234,7 @@ class PoseGraphNode(BaseNode):
         self._diagnose(self._judge(self._own_status()))
 
     def _keep_up(self) -> None:
-        """Decide about closures that waited for odometry, and show what has grown."""
+        """Decide about closures that waited for odometry, and publish the new path."""
         self._keeps_up = False
         self._announce(self._durable.update())
         self._durable.graph.prepare(PREPARE_S)

@@ -181,7 +181,7 @@ class PoseGraph:
             if not same or self._ordered[0] != self._sessions.begun:  # a closure came late, or a session began
                 self._ordered = None
         if self._ordered is None:
-            anew = self._sessions.anew()
+            anew = Sessions(self._settings, self._sessions.chains)  # the same odometry, before any closure moved it
             self._ordered = self._sessions.begun, anew, OutlierRejection(self._settings, anew)
         _, sessions, rejection = self._ordered
         for placed in order[len(rejection.placed) : count]:

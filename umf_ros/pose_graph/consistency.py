@@ -262,7 +262,7 @@ class NoiseScaleEstimator:
         row, column = best[1:] if accepted and _unless_small(_GRID[best[2]]) != 1 else plain[1:]
         odometry_factor, closures_factor = float(_GRID[row]), float(_GRID[column])
         if one not in (row, column) and abs(np.log(odometry_factor / closures_factor)) < _SAME_UNITS:
-            # rather other units than two mistakes: what counts is the ratio, and that is as stated
+            # rather other units than two mistakes: the ratio counts, and that is as stated
             odometry_factor = closures_factor = max(odometry_factor, closures_factor)
         closures_factor = _unless_small(closures_factor)
         least = _LEAST_ODOMETRY * min(closures_factor, 1.0)

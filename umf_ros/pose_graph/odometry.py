@@ -45,7 +45,7 @@ class Table:
     """Named columns that grow at their end in amortised constant time, and can be cut back.
 
     Args:
-        columns: (0, ...) arrays that say what each column holds.
+        columns: (0, ...) arrays of the type of each column.
     """
 
     def __init__(self, **columns: NDArray[Any]) -> None:
@@ -73,9 +73,9 @@ class Table:
 
 
 class OdometryChain:
-    """All messages of one session, and keyframes among them with the noise collected along the way.
+    """All messages of one session, and keyframes among them with the noise of the path so far.
 
-    The noise of the way from a to b is a difference of prefix sums: with `W` the covariance of a
+    The noise of the path from a to b is a difference of prefix sums: with `W` the covariance of a
     step carried to the origin by the adjoint, `cov(a_T_b) = Ad(b)^-1 (sum_b W - sum_a W) Ad(b)^-T`
     in the tangent space of b. So any two stamps of a session are compared in constant time.
     """
@@ -173,14 +173,14 @@ class OdometryChain:
         return int(new[0]) if len(new) else None
 
     def _choose_keyframes(self, changed_ns: int) -> None:
-        """Sample the messages once per period, and keep a sample wherever enough way has been made."""
+        """Sample the messages once per period, and keep a sample after every `keyframe_spacing_m` of path."""
         period = int(self._settings.keyframe_period_s * 1e9)
         self._keyframes.truncate(int(np.searchsorted(self.stamps, changed_ns - changed_ns % period)))
         known = len(self._keyframes)
         start = int(np.searchsorted(self._messages["stamp"], self.stamps[-1])) if known else 0
         messages = self._messages["stamp"][start:]
         given, cells = self._has_covariance(messages), messages // period
-        # what is known ends with the first row: it begins the way
+        # the first row is the last keyframe that is known
         rows = np.flatnonzero(given | (np.diff(cells, prepend=cells[0] - 1) > 0))
         stamps, poses = messages[rows], self._messages["pose"][start + rows]
         steps = self._noise.path_lengths(poses[:-1], poses[1:], np.diff(stamps) / 1e9)
@@ -191,7 +191,7 @@ class OdometryChain:
             self._add_keyframes(stamps[keep], np.concatenate([poses[:1], poses[keep]]), travel[keep], travel[0])
 
     def _add_keyframes(self, stamps: Stamps, poses: Array, travel: Array, start: float) -> None:
-        """Add N keyframes; poses begins with the one before the first, `start` is the way up to that."""
+        """Add N keyframes; `poses` begins with the one before the first, `start` is the path length up to that."""
         steps = self._noise.covariances(np.diff(travel, prepend=start))
         for row in np.flatnonzero(self._has_covariance(stamps)):
             step = relative(poses[row], poses[row + 1])

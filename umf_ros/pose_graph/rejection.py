@@ -260,7 +260,7 @@ class OutlierRejection:
         return sets
 
     def _overrule(self, rows: Iterable[int]) -> list[int]:
-        """A set that the map contradicts, of more places than what it is inconsistent with, which is revoked."""
+        """Revoke accepted closures for a set that the map contradicts, of more places than those; returns the set."""
         accepted = self._of(State.ACCEPTED)
         for found in self._supported_sets(rows, State.REJECTED):
             losers = sorted({loser for row in found for loser in self._consistency.opponents(row, accepted)})
@@ -271,7 +271,7 @@ class OutlierRejection:
         return []
 
     def _revoke_outvoted(self) -> bool:
-        """Revoke what was accepted too early: more places contradict it than support it, and so does the map without.
+        """Revoke closures that were accepted too early: more places contradict than support them, and the map does too.
 
         Where enough supports a closure, the odometry between is wrong, not the closure.
         """

@@ -25,7 +25,7 @@ _AT_ONCE = 256
 
 
 class Sessions:
-    """Odometry chains that share a map as far as closures join them.
+    """Odometry chains that share a map as far as closures join them; `chains` that grow elsewhere can be given.
 
     Each session begins in a gauge of its own, its odometry frame. Accepted closures join sessions
     to components; the earliest session of a component keeps its gauge, the others are moved.
@@ -33,7 +33,7 @@ class Sessions:
     Attributes:
         chains: the odometry of each session.
         components: for each session the earliest one that shares its map.
-        vertices: (N,) of `POINT`, what was solved last.
+        vertices: (N,) of `POINT`, the vertices that were solved last.
         solution: the graph that was solved last; None before.
         scale: of the stated noise, in that solution.
     """
@@ -52,10 +52,6 @@ class Sessions:
     def begin(self) -> None:
         """Start a session."""
         self.chains.append(OdometryChain(self._settings, len(self.chains)))
-
-    def anew(self) -> Sessions:
-        """The same odometry, which goes on growing, before any closure moved it."""
-        return Sessions(self._settings, self.chains)
 
     def update(self) -> bool:
         """Take new odometry in; True when the past of a session changed."""
@@ -131,7 +127,8 @@ class Sessions:
             gaps = [np.abs(chain.stamps - own[np.clip(row, 0, len(own) - 1)]) for row in (after - 1, after)]
             stamps.append(np.union1d(own, chain.stamps[np.min(gaps, axis=0) > _TOO_CLOSE_NS]))
         vertices, graph = self._graph(stamps, closures, self.components)
-        self._refined = _paths_through(vertices, self._refiner.solve(graph))
+        refiner = GraphSolver()
+        self._refined, self._refiner = _paths_through(vertices, refiner.solve(graph)), refiner
 
     def expand(self, closures: Closures, extra: Closures) -> Graph:
         """Graph of every keyframe and the endpoints of `extra` closures, odometry and the given closures."""

@@ -99,8 +99,9 @@ class GraphSolver:
         except (RuntimeError, IndexError, ValueError) as error:
             self._factors = {}
             raise GraphError(f"the pose graph cannot be solved: {one_line(error)}") from None
-        poses = np.empty((len(numbers), 4, 4))
-        poses[np.argsort(numbers)] = _poses(values)
+        poses, order = np.tile(np.eye(4), (len(numbers), 1, 1)), np.argsort(numbers)
+        found = gtsam.utilities.extractPose3(values)  # in the order of their keys
+        poses[order, :3, :3], poses[order, :3, 3] = found[:, :9].reshape(-1, 3, 3), found[:, 9:]
         if not np.isfinite(poses).all():
             raise GraphError("the pose graph cannot be solved: the result is not finite")
         return poses
@@ -125,7 +126,7 @@ def _ordering(factors: gtsam.NonlinearFactorGraph, anchors: list[int], vertices:
     if vertices < _FEW_VERTICES:
         return gtsam.Ordering.ColamdNonlinearFactorGraph(factors)
     joined = factors.clone()
-    for one, other in pairwise(anchors):  # METIS may look for ever for what parts a graph that is in parts
+    for one, other in pairwise(anchors):  # METIS may not end on a graph in parts
         joined.add(gtsam.BetweenFactorPose3(one, other, gtsam.Pose3(), _ANCHOR))
     return gtsam.Ordering.MetisNonlinearFactorGraph(joined)
 
@@ -169,12 +170,3 @@ def _step(
 def _by_qr(parameters: Any) -> Any:
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
     return parameters
-
-
-def _poses(values: gtsam.Values) -> Array:
-    """(N, 4, 4) poses of all N values, in the order of their keys."""
-    rows = gtsam.utilities.extractPose3(values)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
-    poses[:, :3, 3] = rows[:, 9:]
-    return poses
