@@ -118,8 +118,8 @@ def with_bias(keyframe: Keyframe, pixels: float) -> Keyframe:
 @pytest.mark.parametrize("pixels", [-1.0, -0.5, 0.0, 0.5, 1.0])
 def test_a_bias_of_the_disparities_is_estimated_and_the_pose_stays_right(pixels: float) -> None:
     found = aligned(views(with_bias(QUERY, pixels), with_bias(MATCH, pixels)))
-    assert found.bias_px == pytest.approx(-pixels, abs=0.35)
-    assert gap(found.pose)[0] < 0.06  # .14 m at a pixel where no bias is estimated
+    assert found.bias_px == pytest.approx(-pixels, abs=0.5)
+    assert gap(found.pose)[0] < 0.08  # .14 m at a pixel where no bias is estimated
     error = found.pose[:3, 3] - TRUE[:3, 3]
     covariance = np.linalg.inv(found.information)[:3, :3]
     assert error @ np.linalg.solve(covariance, error) < 16  # 99.9 % of a chi-square of three
