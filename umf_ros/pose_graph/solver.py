@@ -93,7 +93,7 @@ class GraphSolver:
         self._factors = {key: self._factor(key, row, graph, numbers) for row, key in enumerate(graph.keys)}
         for factor in self._factors.values():
             factors.add(factor)
-        ordering = _ordering(factors, [numbers[row] for row in graph.anchors], len(numbers))
+        ordering = _ordering(factors, [numbers[row] for row in graph.anchors], numbers)
         try:
             self._tree, values = _descend(factors, values, ordering)
         except (RuntimeError, IndexError, ValueError) as error:
@@ -121,14 +121,21 @@ class GraphSolver:
         return between(Edge(numbers[first], numbers[second], pose, covariance))
 
 
-def _ordering(factors: gtsam.NonlinearFactorGraph, anchors: list[int], vertices: int) -> gtsam.Ordering:
-    """The order of elimination: of many vertices a nested dissection by METIS, which keeps the factorisation sparse."""
-    if vertices < _FEW_VERTICES:
+def _ordering(factors: gtsam.NonlinearFactorGraph, anchors: list[int], numbers: list[int]) -> gtsam.Ordering:
+    """The order of elimination: of many vertices a nested dissection by METIS, which keeps the factorisation sparse.
+
+    The last vertex is eliminated last, so that its covariance is at hand.
+    """
+    if len(numbers) < _FEW_VERTICES:
         return gtsam.Ordering.ColamdNonlinearFactorGraph(factors)
     joined = factors.clone()
     for one, other in pairwise(anchors):  # METIS may not end on a graph in parts
         joined.add(gtsam.BetweenFactorPose3(one, other, gtsam.Pose3(), _ANCHOR))
-    return gtsam.Ordering.MetisNonlinearFactorGraph(joined)
+    dissection, ordering = gtsam.Ordering.MetisNonlinearFactorGraph(joined), gtsam.Ordering()
+    keys = (dissection.at(place) for place in range(dissection.size()))
+    for key in (*(key for key in keys if key != numbers[-1]), numbers[-1]):
+        ordering.push_back(key)
+    return ordering
 
 
 def _descend(
