@@ -18,7 +18,6 @@ import numpy as np
 import typer
 from rich.console import Console
 from scipy.spatial.transform import Rotation
-from umf_ros.lab.simulation.domains.sweeps import Sweep, sweep
 
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.geometry import Array, make_pose, rotation_angle
@@ -26,7 +25,7 @@ from umf_ros.core.levelling import level
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.simulation.domains import DOMAINS, survey
-from umf_ros.lab.simulation.domains.scanners import SCANNERS
+from umf_ros.lab.simulation.domains.scanners import SCANNERS, Sweep, sweep
 from umf_ros.lab.simulation.domains.solids import Scene, Solids
 from umf_ros.lab.simulation.domains.street import Facade
 from umf_ros.lab.simulation.world import TEST
