@@ -128,7 +128,7 @@ class Verification(Group):
         "ransac", description="how local features reorder the candidates"
     )
     rerank_weight: float = Field(
-        0.02,
+        0.05,
         ge=0,
         le=1000,
         description="what e times as many inliers weigh against cosine similarity; 1000: inliers alone [UMF 4.5]",
