@@ -74,7 +74,7 @@ class LoopDetector:
     """Finds loop closures in a stream of frames; the same class in the live node, the replay and the evaluation.
 
     `process` takes a frame through all stages: `select`, `embed`, `query`, `verify`, `match_submaps`, `remember`.
-    The last two are skipped while localising in a map that stays as it is.
+    The last one is skipped while localising in a map that stays as it is.
 
     Args:
         settings: all settings.
@@ -134,13 +134,15 @@ class LoopDetector:
         with latency.measure("verify"):
             verdicts = self.verify(keyframe, candidates)
         fault = None
+        with latency.measure("submaps"):
+            verdicts = self.match_submaps(keyframe, verdicts)
         if self._map is None:
-            with latency.measure("submaps"):
-                verdicts = self.match_submaps(keyframe, verdicts)
             try:
                 self.remember(keyframe, known is not None)
             except OutputError as error:
                 fault = error
+        else:
+            self._submaps.remember(keyframe)
         return Detection(frame.stamp_ns, keyframe, verdicts, latency.milliseconds, fault)
 
     def prefetch(

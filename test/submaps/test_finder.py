@@ -114,3 +114,30 @@ def test_a_camera_alone_leaves_no_stops_and_asks_for_none(
         database.add(blind)
         finder.remember(blind)
     assert finder.history.anchors == [] and capfd.readouterr().out == ""
+
+
+@pytest.mark.parametrize("localizing", [False, True])
+def test_a_stored_session_is_found_by_one_driven_the_other_way(
+    outing: Drive, database: PlaceDatabase, localizing: bool
+) -> None:
+    half = len(outing.keyframes) // 2
+    for keyframe in outing.keyframes[:half]:
+        database.add(keyframe)
+    finder, closed = SubmapFinder(Verification(), Loop(), database), 0
+    start, path_m = outing.keyframes[half].odom_T_body, outing.keyframes[half].path_length_m
+    assert start is not None
+    stamps = {keyframe.stamp_ns: i for i, keyframe in enumerate(outing.keyframes)}
+    for i, seen in enumerate(outing.keyframes[half:], half):
+        assert seen.odom_T_body is not None
+        odometry = relative(start, seen.odom_T_body)  # begins anew
+        query = replace(seen, odom_T_body=odometry, session=1, path_length_m=seen.path_length_m - path_m)
+        for closure in (verdict.closure for verdict in finder.find(query, []) if verdict.closure is not None):
+            error = (
+                invert(relative(outing.truth[stamps[closure.match_stamp_ns]], outing.truth[i])) @ closure.match_T_query
+            )
+            assert np.linalg.norm(error[:3, 3]) < 0.5
+            closed += 1
+        if not localizing:
+            database.add(query)
+        finder.remember(query)
+    assert closed > 10

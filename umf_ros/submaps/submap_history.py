@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +26,13 @@ class SubmapAnchor:
         stamp_ns: its key.
         session: its session.
         path_length_m: metres driven since the start of the session.
-        odom_T_body: its odometry.
+        odom_T_body: its odometry; None until it is first asked for.
     """
 
     stamp_ns: int
     session: int
     path_length_m: float
-    odom_T_body: Array
+    odom_T_body: Array | None = None
 
 
 def _path(anchor: SubmapAnchor) -> tuple[int, float]:
@@ -53,33 +53,44 @@ class SubmapHistory:
 
     def __init__(self, database: PlaceDatabase) -> None:
         self.database = database
-        self.anchors: list[SubmapAnchor] = []
+        self.anchors = _stored(database)
         self._submaps: OrderedDict[tuple[int, int, int], Keyframe] = OrderedDict()
         self.reset()
 
     def reset(self) -> None:
         """Begin a session."""
         self.drift, self.needed = DriftMeter(), False
+        self._recent: list[Keyframe] = []
+        self._added = 0
 
     def add(self, keyframe: Keyframe) -> bool:
-        """Remember a keyframe of the database if it lies far enough from the one before; returns whether it did."""
+        """Take up the newest keyframe if it lies far enough from the one before; returns whether it did.
+
+        One that is not in the database, as while localising, is no anchor.
+        """
         if keyframe.odom_T_body is None or len(keyframe.points) < const.MIN_SCAN_POINTS:
             return False
-        last = self.anchors[-1] if self.anchors else None
-        if last is not None and keyframe.session < last.session:  # an old recording, played again
-            return False
-        same = last is not None and last.session == keyframe.session
-        if last is not None and same and keyframe.path_length_m - last.path_length_m < const.MERGE_STEP_M:
-            return False
         before = self.scans_before(keyframe)
-        if self.needed or len(self.anchors) % const.NEED_ASKED_EVERY == 0:
+        if before and keyframe.path_length_m - before[0].path_length_m < const.MERGE_STEP_M:
+            return False
+        if self.needed or self._added % const.NEED_ASKED_EVERY == 0:
             self.needed = bool(needed_scans(keyframe, before))
         if self.needed:
             self.drift.add(keyframe, before)
-        self.anchors.append(
-            SubmapAnchor(keyframe.stamp_ns, keyframe.session, keyframe.path_length_m, keyframe.odom_T_body)
-        )
+        self._recent = [keyframe, *before]
+        self._added += 1
+        anchor = SubmapAnchor(keyframe.stamp_ns, keyframe.session, keyframe.path_length_m, keyframe.odom_T_body)
+        if self.index_of(anchor) is not None and (not self.anchors or _path(anchor) > _path(self.anchors[-1])):
+            self.anchors.append(anchor)
         return True
+
+    def odometry(self, row: int) -> Array:
+        """Odometry (4, 4) of an anchor."""
+        if self.anchors[row].odom_T_body is None:
+            self.anchors[row] = replace(self.anchors[row], odom_T_body=self._load(row).odom_T_body)
+        found = self.anchors[row].odom_T_body
+        assert found is not None
+        return found
 
     def index_of(self, anchor: SubmapAnchor) -> int | None:
         """Its index in the database; None when it is not there."""
@@ -100,7 +111,8 @@ class SubmapHistory:
     def scans_before(self, keyframe: Keyframe, first_m: float = -np.inf) -> list[Keyframe]:
         """Keyframes on the last metres before the newest one, newest first, none of them before a place of the path."""
         first_m = max(first_m, keyframe.path_length_m - const.SUBMAP_BEFORE_M)
-        return [self._load(row) for row in self.rows(keyframe.session, first_m, keyframe.path_length_m)[::-1]]
+        recent = [one for one in self._recent if one.session == keyframe.session]
+        return [one for one in recent if first_m <= one.path_length_m < keyframe.path_length_m]
 
     def before(self, keyframe: Keyframe, first_m: float = -np.inf) -> Keyframe | None:
         """The newest keyframe as the submap of the last metres; None where there is none."""
@@ -139,3 +151,12 @@ class SubmapHistory:
         if index is None:
             raise KeyError(self.anchors[row].stamp_ns)
         return self.database[index]
+
+
+def _stored(database: PlaceDatabase) -> list[SubmapAnchor]:
+    """Anchors of what is in the database already: with odometry, and apart along the path."""
+    keys = database.store.keys[np.isfinite(database.store.keys["travelled_m"])]
+    keys = keys[np.lexsort((keys["travelled_m"], keys["session"]))]
+    steps = np.column_stack([keys["session"], np.floor(keys["travelled_m"] / const.MERGE_STEP_M)])
+    first = np.sort(np.unique(steps, axis=0, return_index=True)[1])
+    return [SubmapAnchor(int(key["stamp_ns"]), int(key["session"]), float(key["travelled_m"])) for key in keys[first]]

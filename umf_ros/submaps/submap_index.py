@@ -179,7 +179,7 @@ class Expectation:
         for session, odom_T_query, first_m, last_m in self._predictions(query):
             rows = self._history.rows(session, first_m, last_m)
             rows = rows[self._history.past(query, rows, self.rules)]
-            poses = [relative(self._history.anchors[row].odom_T_body, odom_T_query) for row in rows]
+            poses = [relative(self._history.odometry(int(row)), odom_T_query) for row in rows]
             away = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
             if away and min(away) < const.SUBMAP_NEAR_M:
                 best = int(np.argmin(away))
@@ -209,20 +209,27 @@ class Lookalikes:
         self._history, self.rules = history, rules
         self._index = KeypointIndex()
         self._rows = np.empty(0, np.intp)
+        self._next = self._stored = len(history.anchors)
 
     def describe(self) -> None:
-        """Take up the anchors whose submaps are complete now."""
+        """Take up the anchors whose submaps are complete now, and one that was stored before, the latest first."""
         anchors = self._history.anchors
-        first = int(self._rows[-1]) + const.DESCRIBED_ANCHORS if len(self._rows) else 0
-        for row in range(first, len(anchors), const.DESCRIBED_ANCHORS):
-            last_m = anchors[row].path_length_m + const.SUBMAP_AFTER_M
-            if anchors[row].session == anchors[-1].session and anchors[-1].path_length_m < last_m:
-                return
-            index = self._history.index_of(anchors[row])
-            submap = None if index is None else self._history.around(self._history.database[index], last_m)
-            if submap is not None:
-                self._index.add(find_keypoints(prepare(submap).elevation.relief))
-                self._rows = np.append(self._rows, row)
+        while self._next < len(anchors):
+            last_m = anchors[self._next].path_length_m + const.SUBMAP_AFTER_M
+            if anchors[self._next].session == anchors[-1].session and anchors[-1].path_length_m < last_m:
+                break
+            self._take_up(self._next)
+            self._next += const.DESCRIBED_ANCHORS
+        if self._stored > 0:
+            self._stored = max(self._stored - const.DESCRIBED_ANCHORS, 0)
+            self._take_up(self._stored)
+
+    def _take_up(self, row: int) -> None:
+        index = self._history.index_of(self._history.anchors[row])
+        submap = None if index is None else self._history.around(self._history.database[index], np.inf)
+        if submap is not None:
+            self._index.add(find_keypoints(prepare(submap).elevation.relief))
+            self._rows = np.append(self._rows, row)
 
     def propose(self, query: Keyframe, path_length_m: float) -> list[int]:
         """Rows of the most alike, best first.
