@@ -12,10 +12,11 @@ from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State
 from umf_ros.runs.diagnosis import GateDiagnosis
 from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.tables import GraphVerdict, KeyframeRow
+from umf_ros.runs.tables import KeyframeRow
 from umf_ros.runs.truth import JudgedRun, TruePlaces, judge_closure
 from umf_ros.verification import Hypothesis, Measurement, RejectReason
 
@@ -89,15 +90,15 @@ def candidate(
     return Hypothesis(stamp(query_s), place, measurement, reason, detail, probability=probability)
 
 
-def accepted(state: str = "accepted", reason: str = "agrees with the map") -> GraphVerdict:
-    return GraphVerdict(state, reason, 2.0, 0.1)
+def accepted(state: State = State.ACCEPTED, reason: ClosureReason = ClosureReason.AGREES) -> ClosureVerdict:
+    return ClosureVerdict(closure(50, 10), state, reason, 2.0, 0.1)
 
 
 def examined(
     folder: Path,
     closures: list[LoopClosure] | None = None,
     candidates: list[Hypothesis] | None = None,
-    verdict: GraphVerdict | None = None,
+    verdict: ClosureVerdict | None = None,
     truth: Trajectory | None = None,
     settings: Settings | None = None,
     sensors: SensorReport | None = None,

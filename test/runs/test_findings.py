@@ -16,6 +16,7 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.bags.sensor_check import Disagreement, SensorReport
 from umf_ros.core.config import load_settings
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.pose_graph.closures import ClosureReason, State
 from umf_ros.runs.findings import USELESS, ExaminedRun, conclude, look_first
 from umf_ros.verification import RejectReason
 
@@ -114,7 +115,7 @@ def test_a_truth_of_another_clock_is_named_and_judges_nothing(tmp_path: Path) ->
 
 
 def test_closures_that_the_graph_did_not_use_are_pending_not_rejected(tmp_path: Path) -> None:
-    waiting = accepted("pending", "its odometry has not arrived")
+    waiting = accepted(State.PENDING, ClosureReason.NO_ODOMETRY_YET)
     mark, _, sentence = verdict(examined(tmp_path, [closure(50, 10)], verdict=waiting, truth=trajectory()))
     assert mark == "bad" and sentence.startswith("All closures are pending: the graph used none of 1 (its odometry has")
     assert "the graph used none of them (1 pending)" in sentence and "rejected" not in sentence

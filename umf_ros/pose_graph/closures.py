@@ -91,6 +91,11 @@ class ClosureVerdict:
     residual: float = float("nan")
     residual_m: float = float("nan")
 
+    @property
+    def figures(self) -> str:
+        """Distances to the map in brackets; empty where they are unknown."""
+        return f" ({self.residual:.1f} sigma, {self.residual_m:.2f} m)" if np.isfinite(self.residual) else ""
+
 
 class PlacedClosure(NamedTuple):
     """A closure and the sessions of its match and its query."""

@@ -125,7 +125,7 @@ def _graph(about: ExaminedRun) -> Iterator[Advice]:
         remedy = "the odometry must reach the keyframes of the closures; pending is not rejected"
         yield Advice("fault", f"{what}, so the optimised trajectory is the odometry", remedy)
     elif rejected > MUCH_REJECTED * total:
-        sigma = np.nanmedian([one.sigma for one in verdicts if one.state == State.REJECTED] or [np.nan])
+        sigma = np.nanmedian([one.residual for one in verdicts if one.state == State.REJECTED] or [np.nan])
         what = f"the graph rejected {rejected} of {total} closures ({reasons[0][0]}, {sigma:.1f} sigma in the median)"
         settings = "pose_graph.odometry_sigma_m and odometry_sigma_deg"
         yield Advice("warning", what, f"odometry worse than {settings} say, or wrong closures: click some")

@@ -16,6 +16,7 @@ from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure, Points
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.pose_graph.closures import ClosureVerdict
 from umf_ros.runs import tables
 from umf_ros.runs.run_file import read_descriptors
 from umf_ros.runs.writer import read_summary, write_summary
@@ -47,7 +48,7 @@ class FinishedRun:
     closures: list[LoopClosure]
     keyframes: list[tables.KeyframeRow]
     candidates: list[Hypothesis]
-    verdicts: dict[tables.Endpoints, tables.GraphVerdict]
+    verdicts: dict[tables.Endpoints, ClosureVerdict]
     odometry: Trajectory | None
     optimized: Trajectory | None
     truth: Trajectory | None
@@ -75,14 +76,15 @@ def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = N
     Raises:
         UmfError: the folder holds no run, a file is damaged, or the recording is not the one of the run.
     """
+    closures = tables.read_closures(folder / "closures.csv")
     run = FinishedRun(
         folder=folder,
         summary=read_summary(folder),
         settings=load_settings(folder / "config.yaml"),
-        closures=tables.read_closures(folder / "closures.csv"),
+        closures=closures,
         keyframes=tables.read_keyframes(folder / "keyframes.csv"),
         candidates=tables.read_table(folder / "candidates.csv", tables.parse_candidate),
-        verdicts=dict(_optional(folder / "graph_verdicts.csv", tables.GraphVerdict.parse)),
+        verdicts=tables.read_verdicts(folder / "graph_verdicts.csv", closures),
         odometry=_trajectory(folder / "trajectory_odometry.tum"),
         optimized=_trajectory(folder / "trajectory_optimized.tum"),
         truth=read_ground_truth(bag, ground_truth),

@@ -18,7 +18,7 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.core.io import atomic_write
-from umf_ros.pose_graph.closures import VERDICT_COLUMNS, State
+from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureReason, ClosureVerdict, State
 from umf_ros.verification.hypothesis import ACCEPTED, Hypothesis, Measurement, RejectReason
 
 POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
@@ -47,34 +47,6 @@ Row = TypeVar("Row")
 
 Endpoints = tuple[int, int]
 """Stamps in ns of a closure's query and match."""
-
-
-@dataclass(frozen=True, slots=True)
-class GraphVerdict:
-    """A row of `graph_verdicts.csv`: what the pose graph did with a closure in the end.
-
-    Attributes:
-        state: a `pose_graph.closures.State`.
-        reason: a short phrase.
-        sigma: Mahalanobis distance to the map, NaN where unknown.
-        misfit_m: distance in metres between the closure's and the map's opinion, NaN where unknown.
-    """
-
-    state: str
-    reason: str
-    sigma: float
-    misfit_m: float
-
-    @property
-    def figures(self) -> str:
-        """Distances to the map in brackets; empty where they are unknown."""
-        return f" ({self.sigma:.1f} sigma, {self.misfit_m:.2f} m)" if np.isfinite(self.sigma) else ""
-
-    @classmethod
-    def parse(cls, row: dict[str, str]) -> tuple[Endpoints, GraphVerdict]:
-        """Endpoints and verdict in a row by column."""
-        match, query, state, reason, sigma, misfit_m = (row[name] for name in VERDICT_COLUMNS)
-        return (int(query), int(match)), cls(State(state), reason, float(sigma), float(misfit_m))
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +127,21 @@ def parse_candidate(row: dict[str, str]) -> Hypothesis:
     return Hypothesis(
         int(row["query_stamp_ns"]), candidate, measurement, RejectReason(reason), detail, probability=probability
     )
+
+
+def read_verdicts(path: Path, closures: Iterable[LoopClosure]) -> dict[Endpoints, ClosureVerdict]:
+    """The graph's verdicts on closures of a run by their endpoints; none without a graph."""
+    known = {(one.query_stamp_ns, one.match_stamp_ns): one for one in closures}
+
+    def parse(row: dict[str, str]) -> tuple[Endpoints, ClosureVerdict] | None:
+        match, query, state, reason, residual, residual_m = (row[name] for name in VERDICT_COLUMNS)
+        closure = known.get((int(query), int(match)))
+        if closure is None:
+            return None
+        found = ClosureVerdict(closure, State(state), ClosureReason(reason), float(residual), float(residual_m))
+        return (int(query), int(match)), found
+
+    return dict(filter(None, read_table(path, parse))) if path.is_file() else {}
 
 
 def read_keyframes(path: Path) -> list[KeyframeRow]:
