@@ -148,9 +148,9 @@ def run(domain: Domain, seed: int, extent: Extent, folder: Path | None) -> Outco
     outcome, left_out = Outcome(domain.name), Outcome(domain.name)
     verifier, stranger = Verifier(Verification()), _without(domain)
     for pair in pairs_of(places, domain, np.random.default_rng(seed)):
-        start = time.process_time()
+        began_s = time.process_time()
         outcome.judge(pair, *verified(verifier, pair))
-        outcome.verify_ms.append(1e3 * (time.process_time() - start))
+        outcome.verify_ms.append(1e3 * (time.process_time() - began_s))
         left_out.judge(pair, *verified(stranger, pair))
     outcome.left_out = left_out
     return outcome

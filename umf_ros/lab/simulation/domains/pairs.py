@@ -175,8 +175,8 @@ def _submaps(drive: list[Keyframe], wanted: range) -> dict[int, tuple[Keyframe |
     for number in wanted:
         reaches = (0.0, const.SUBMAP_AFTER_M)
         others = [_between(anchors, drive[number], -const.SUBMAP_BEFORE_M, last_m) for last_m in reaches]
-        before, around = (submap_of(drive[number], one, drift) for one in others)
-        found[number] = before, around
+        submaps = [submap_of(drive[number], one, drift) for one in others]
+        found[number] = submaps[0], submaps[1]
     return found
 
 
