@@ -34,10 +34,6 @@ RULES: dict[str, str] = {
 SKIPPED = {"CHANGELOG.rst", "CHANGELOG.md", "tools/style_check.py", "test/test_style_check.py", "LICENSE", "NOTICE"}
 """Files that quote older words, or whose text is fixed."""
 
-PACKAGES = "bags commands comparison core fleet maps nodes pose_graph runs sensors submaps verification".split()
-NOT_YET = (*(f"umf_ros/{name}/" for name in PACKAGES), "umf_ros/detector.py", "benchmarks/accuracy/pose_graph.py")
-"""Paths whose prose is still to be mended: read only if they are named."""
-
 Block = tuple[int, str]
 """Number of the first line, and lines that belong together: a comment, a string, a paragraph."""
 
@@ -83,25 +79,20 @@ def findings(path: Path) -> Iterator[str]:
                 yield f"{path}:{first + number}: {sentence}: {block.splitlines()[number][:80]}"
 
 
-def files(asked: list[str], everything: bool) -> list[Path]:
-    """Python files and pages under version control: those of the paths named, else all but `NOT_YET`."""
-    left_out = () if asked or everything else NOT_YET
+def files(asked: list[str]) -> list[Path]:
+    """Python files and pages under version control: those of the paths named, else all."""
     listed = subprocess.check_output(["git", "ls-files", "--", *asked], text=True).splitlines()
     of_a_kind = [Path(name) for name in listed if name not in SKIPPED and name.endswith((".py", ".md", ".yaml"))]
-    return [path for path in of_a_kind if path.is_file() and not str(path).startswith(left_out)]
+    return [path for path in of_a_kind if path.is_file()]
 
 
 def main() -> int:
     """Print the findings; 1 if there are any."""
     parser = argparse.ArgumentParser(description="Check the prose of docstrings, comments, strings and pages.")
-    parser.add_argument("paths", nargs="*", help="files or folders; by default all that is mended")
-    parser.add_argument(
-        "--baseline", action="store_true", help="print the number of findings by folder, of the whole tree"
-    )
+    parser.add_argument("paths", nargs="*", help="files or folders; by default all")
+    parser.add_argument("--baseline", action="store_true", help="print the number of findings by folder")
     arguments = parser.parse_args()
-    found = [
-        (path, one) for path in files(arguments.paths, arguments.baseline) for one in dict.fromkeys(findings(path))
-    ]
+    found = [(path, one) for path in files(arguments.paths) for one in dict.fromkeys(findings(path))]
     if arguments.baseline:
         for folder, number in sorted(Counter("/".join(path.parts[:2]) for path, _ in found).items()):
             print(f"{folder:40} {number:5}")

@@ -38,7 +38,7 @@ NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """What became of one frame.
+    """Result of one frame.
 
     Attributes:
         frame_stamp_ns: key of the frame.
@@ -353,6 +353,6 @@ class Stopwatch:
         self.add(name, 1e3 * (time.perf_counter() - start))
 
     def add(self, name: str, elapsed_ms: float) -> None:
-        """What was timed elsewhere."""
+        """Add a time that was measured elsewhere."""
         self.milliseconds[name] = elapsed_ms
         self.milliseconds["total"] += elapsed_ms

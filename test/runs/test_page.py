@@ -96,7 +96,9 @@ def test_every_closure_is_a_row_and_a_pair_with_its_number(tmp_path: Path) -> No
 def test_pending_is_not_rejected(tmp_path: Path) -> None:
     about = examined(tmp_path, [closure(50, 10)], verdict=accepted(State.PENDING, ClosureReason.UNSURE))
     assert scene_in(written(about))["pairs"][0]["kind"] == "pending"
-    assert final_verdicts(about) == ["closure 1, 40.0 s back: pending, needs support from another place (2.0 sigma, 0.10 m)"]
+    assert final_verdicts(about) == [
+        "closure 1, 40.0 s back: pending, needs support from another place (2.0 sigma, 0.10 m)"
+    ]
 
 
 def test_the_sweep_counts_what_a_threshold_would_publish(tmp_path: Path) -> None:

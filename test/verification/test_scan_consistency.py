@@ -12,7 +12,7 @@ from umf_ros.verification import thin_scan
 from umf_ros.verification.ambiguity import scan_ambiguity
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import inspect
-from umf_ros.verification.scan_consistency import Meeting, meet
+from umf_ros.verification.scan_consistency import ScanConsistency, compare_scans
 from umf_ros.verification.surroundings import Sight
 
 RNG = np.random.default_rng(5)
@@ -55,7 +55,7 @@ QUERY, MATCH = seen(hall(), THERE), seen(hall(), np.eye(4))
 
 
 def test_nearly_all_of_two_scans_of_a_hall_has_a_counterpart_and_nothing_is_contradicted() -> None:
-    for one in meet(MATCH, QUERY, THERE):
+    for one in compare_scans(MATCH, QUERY, THERE):
         assert one.common > 0.8 and one.contradiction < 0.03
         assert one.counterparts > 0.85 and one.upright_counterparts > 0.85 and one.unexplained < 0.02
 
@@ -63,7 +63,7 @@ def test_nearly_all_of_two_scans_of_a_hall_has_a_counterpart_and_nothing_is_cont
 @pytest.mark.parametrize("shift", [[1.5, 0, 0], [0, 1.0, 0]])
 def test_a_wrong_pose_is_contradicted_and_leaves_walls_unexplained(shift: list[float]) -> None:
     wrong = make_pose(np.eye(3), shift) @ THERE
-    ours, theirs = meet(MATCH, QUERY, wrong)
+    ours, theirs = compare_scans(MATCH, QUERY, wrong)
     assert max(ours.contradiction, theirs.contradiction) > 0.05
     assert min(ours.upright_counterparts, theirs.upright_counterparts) < 0.7
     assert max(ours.unexplained, theirs.unexplained) > 0.15
@@ -72,13 +72,13 @@ def test_a_wrong_pose_is_contradicted_and_leaves_walls_unexplained(shift: list[f
 def test_a_wall_that_one_scan_lacks_speaks_against_the_pose_whichever_scan_it_is() -> None:
     world = hall()
     without = seen(world[world[:, 0] < 9.9], np.eye(4))
-    complete = max(one.unexplained for one in meet(MATCH, QUERY, THERE))
-    for pair in (meet(without, QUERY, THERE), meet(QUERY, without, invert(THERE))):
+    complete = max(one.unexplained for one in compare_scans(MATCH, QUERY, THERE))
+    for pair in (compare_scans(without, QUERY, THERE), compare_scans(QUERY, without, invert(THERE))):
         assert max(one.unexplained for one in pair) > complete + 0.01
 
 
 def test_too_few_visible_points_count_against_the_pose_and_say_nothing_of_what_stands() -> None:
-    unseen = Meeting(np.full(100, Sight.UNSEEN, np.int8), np.zeros(100), np.ones(100, bool))
+    unseen = ScanConsistency(np.full(100, Sight.UNSEEN, np.int8), np.zeros(100), np.ones(100, bool))
     assert unseen.common == 0 and unseen.contradiction == 1 and unseen.counterparts == 0
     assert math.isnan(unseen.upright_counterparts) and math.isnan(unseen.unexplained)
 
@@ -86,8 +86,8 @@ def test_too_few_visible_points_count_against_the_pose_and_say_nothing_of_what_s
 def test_only_what_stands_counts_as_upright() -> None:
     world = hall()
     flat = seen(world[world[:, 2] < 0.01], np.eye(4))
-    assert math.isnan(meet(flat, flat, np.eye(4))[0].upright_counterparts)
-    assert meet(flat, flat, np.eye(4))[0].counterparts == 1
+    assert math.isnan(compare_scans(flat, flat, np.eye(4))[0].upright_counterparts)
+    assert compare_scans(flat, flat, np.eye(4))[0].counterparts == 1
 
 
 def test_a_corridor_fits_anywhere_along_it_and_a_hall_does_not() -> None:

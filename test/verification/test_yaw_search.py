@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, yard_scan
 from umf_ros.verification.prepared_scan import PreparedScan
-from umf_ros.verification.yaw_search import RotatedElevationMap, scout, search
+from umf_ros.verification.yaw_search import RotatedElevationMap, coarse_align, search
 
 GROUND = landscape(3)
 
@@ -96,7 +96,7 @@ def test_scouting_draws_a_rough_pose_to_the_match() -> None:
     there, here = standing(0, 0, 0), standing(1, 0.5, 30)
     true = relative(there, here)
     rough = true @ make_pose(Rotation.from_rotvec([0, 0, 0.04]).as_matrix(), [0.3, -0.3, 0.1])
-    fit = scout(yard(6, there), yard(6, here), rough)
+    fit = coarse_align(yard(6, there), yard(6, here), rough)
     assert missed_by(true, fit.pose)[0] < 0.5 * missed_by(true, rough)[0]
 
 

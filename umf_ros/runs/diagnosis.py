@@ -23,7 +23,7 @@ _LIMITS = {
 
 @dataclass(frozen=True, slots=True)
 class ClosureDiagnosis:
-    """What became of one keyframe's search.
+    """Outcome of one keyframe's search.
 
     Attributes:
         stamp_ns: the keyframe.

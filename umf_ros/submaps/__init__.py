@@ -1,4 +1,4 @@
-"""Submaps: what a narrow sensor saw along some metres of way, to recognise a place from any side."""
+"""Submaps: scans of the last metres merged by odometry, for sensors whose single scans show too little of a place."""
 
 from umf_ros.submaps.finder import SubmapFinder
 

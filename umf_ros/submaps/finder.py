@@ -107,7 +107,7 @@ class SubmapFinder:
     def _candidates(
         self, query: Keyframe, verdicts: Sequence[Hypothesis], expected: Proposal | None
     ) -> list[Candidate]:
-        """What is worth a comparison, no place twice."""
+        """Candidates worth a comparison, no place twice."""
         found = [one.candidate for one in verdicts if (one.probability or 0.0) >= const.PROMISING]
         if expected is not None:
             found.append(self._candidate(query, expected.row))

@@ -13,7 +13,7 @@ import numpy as np
 
 from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
-from umf_ros.verification.prepared_scan import PreparedScan, joint_blur
+from umf_ros.verification.prepared_scan import PreparedScan, common_blur
 from umf_ros.verification.scan_alignment import SEARCHED
 from umf_ros.verification.scan_consistency import counterpart_reach
 from umf_ros.verification.surroundings import Sight, visible
@@ -58,7 +58,7 @@ def _point_fit(match: PreparedScan, query: PreparedScan, poses: Array) -> Array:
 def _point_misfits(scan: PreparedScan, other: PreparedScan, moved: Array) -> Array:
     """(K,) mean misfit of the visible ones of points (K, N, 3); as bad as can be where few are."""
     points = moved.reshape(-1, 3)
-    reach = np.tile(counterpart_reach(other.spacing[:: const.RIVAL_EVERY], joint_blur(scan, other)), len(moved))
+    reach = np.tile(counterpart_reach(other.spacing[:: const.RIVAL_EVERY], common_blur(scan, other)), len(moved))
     misfit = np.minimum(np.sqrt(scan.nearest(points)[1]) / reach, const.RIVAL_MISFIT)
     seen = visible(scan.look_at(points)).reshape(len(moved), -1)
     count = seen.sum(axis=1)
@@ -164,7 +164,7 @@ def _surface_misfits(scan: PreparedScan, other: PreparedScan, poses: Array, samp
         points = (others.points[picks] @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
         index, squared = planes.nearest(points)
         away = np.einsum("ij,ij->i", points - planes.centres[index], planes.normals[index])
-        sigmas = (away / (const.PLANE_SIGMA_M + 2 * joint_blur(scan, other))) ** 2
+        sigmas = (away / (const.PLANE_SIGMA_M + 2 * common_blur(scan, other))) ** 2
         passed = scan.look_at(points) == Sight.PASSED
         misfit = np.where(passed, 1.0, sigmas / (1.0 + sigmas)).reshape(len(poses), -1)
         known = (passed | (planes.planar[index] & (squared < planes.reach_m[index] ** 2))).reshape(misfit.shape)

@@ -41,7 +41,7 @@ VIEW_STEPS, VIEW_TOLERANCE = 8, 1e-4  # of Gauss-Newton; m and rad, far below wh
 VIEW_KERNEL = 9.0  # squared standard deviations: three of them halve the pull of a feature
 VIEW_GATE, VIEW_NEAR = 11.3, 100.0  # likewise; 99 % of a chi-square of three, and what the refinement may draw in
 MIN_VIEW_SIGMAS = 0.5  # no pair of images is better than half the noise assumed
-UNMEASURED = 1e6  # pixels^2: the variance of a disparity nobody measured
+UNMEASURED = 1e6  # pixels^2: the variance of a disparity that was not measured
 NEAREST_SEEN_M = 0.3  # nothing nearer than this is in front of a camera
 NOMINAL_BASELINE_M = 0.2  # S3LI's: how well depths of a camera without a right one are taken to be known
 
@@ -105,7 +105,7 @@ SCANS_SUPPORT, SCANS_CONTRADICT = 0.05, 0.12  # measured: right poses stay below
 # meeting of two scans
 MEETING_POINTS = 20  # by hand: of a kind, below which a share of them means nothing
 COUNTERPART_M, COUNTERPART_SPACINGS = 0.05, 0.5  # measured: .3 m and 1 spacing tell places apart less well
-BLUR_M = 0.04  # by hand: a metre per second in a scan of a tenth to a fifth of one, whose motion nobody removed
+BLUR_M = 0.04  # by hand: a metre per second in a scan of a tenth to a fifth of one, whose motion was not removed
 UNEXPLAINED = 2.0  # measured: in these reaches; of all measures the most alike from one kind of place to another
 SPACING_NEIGHBOURS = 6  # by hand: the point itself and five, so that they reach the next ring
 UPRIGHT = 0.7  # geometry: surfaces steeper than 45 deg
@@ -140,7 +140,7 @@ SAME_M, SAME_RAD = 0.05, 0.01  # geometry: of the error of a right pose; aligned
 
 # covariance
 SEARCH_M, SEARCH_RAD = 3.0, 0.35  # what the search itself knows, standard deviation: nothing is wider than this
-NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG = 20.0, 0.01, 0.05  # by hand: a yardstick of nobody's data
+NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG = 20.0, 0.01, 0.05  # by hand: a yardstick independent of data
 MOMENTS = 6  # parts of a scan whose errors of motion are told apart; by hand: errors change little within a sixth
 MOTION_SHARE = 0.03  # by hand: of the motion during a scan that odometry gets wrong all along, as by its scale
 MIN_RESIDUAL_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanner is better

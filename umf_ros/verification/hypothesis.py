@@ -52,7 +52,7 @@ def measured(*kinds: str) -> Any:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measurement:
-    """What was measured about one hypothesis, or, without a kind, about a candidate that got none.
+    """Results of the tests of one hypothesis, or, without a kind, of a candidate without a pose.
 
     The name of a field is its name in `candidates.csv` and on `~/candidates`.
 
@@ -159,7 +159,7 @@ class Measurement:
 
     @property
     def modality_conflict(self) -> str:
-        """What to say where one modality supports a pose that the other contradicts; else nothing."""
+        """A phrase where one modality supports a pose that the other contradicts; empty otherwise."""
         if self.agreement_image < const.IMAGE_CONTRADICTS and self.contradiction < const.SCANS_SUPPORT:
             return "the scans support it, the image contradicts it"
         if self.agreement_image > const.IMAGE_SUPPORTS and self.contradiction > const.SCANS_CONTRADICT:
@@ -168,7 +168,7 @@ class Measurement:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """What was measured for this kind, by name: for tables, messages and people."""
+        """Results for this kind by name, for tables, messages and people."""
         return {
             one.name: getattr(self, one.name)
             for one in fields(self)

@@ -22,7 +22,7 @@ from umf_ros.verification.ambiguity import passage_rival, scan_ambiguity
 from umf_ros.verification.elevation_map import evaluate, shared_relief
 from umf_ros.verification.hypothesis import IMAGE, SCAN, Hypothesis, Measurement
 from umf_ros.verification.pose_search import TemporalMemory, near, prior_sigmas
-from umf_ros.verification.prepared_scan import PreparedScan, joint_blur, levelled
+from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled
 from umf_ros.verification.rerank import similarities, strongest
 from umf_ros.verification.scan_alignment import (
     Alignment,
@@ -31,7 +31,7 @@ from umf_ros.verification.scan_alignment import (
     nominal_deviations,
     scan_covariance,
 )
-from umf_ros.verification.scan_consistency import meet
+from umf_ros.verification.scan_consistency import compare_scans
 from umf_ros.verification.view_alignment import ViewAlignment
 
 
@@ -137,14 +137,14 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
     pose = alignment.pose
     level = levelled(match, query, pose)
     fit = evaluate(match.elevation, query.elevation, level)
-    ours, theirs = meet(match, query, pose)
+    ours, theirs = compare_scans(match, query, pose)
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     return replace(
         known,
         kind=SCAN,
         residual_m=float(np.median(size)),
         residual_p90_m=float(np.percentile(size, 90)),
-        noise_m=math.hypot(max(match.noise_m, const.MIN_SURFACE_NOISE_M), joint_blur(match, query)),
+        noise_m=math.hypot(max(match.noise_m, const.MIN_SURFACE_NOISE_M), common_blur(match, query)),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),
         relief_m=shared_relief(match.elevation, query.elevation, level),
@@ -183,7 +183,7 @@ def _rank_agreement(
         theirs: (M, D) descriptors.
         squared: (N, M) distances.
         reach: how far away a counterpart may be, in the unit of the distances before they were squared.
-        peers: (N, M) which of theirs each of ours is compared with.
+        peers: (N, M) descriptors of `theirs` that each of `ours` is compared with.
     """
     if 0 in squared.shape:
         return float("nan")

@@ -13,10 +13,10 @@ from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.verification import constants as const
 from umf_ros.verification.hypothesis import Hypothesis
-from umf_ros.verification.prepared_scan import PreparedScan, views_tell
+from umf_ros.verification.prepared_scan import PreparedScan, views_decide
 from umf_ros.verification.rerank import fit_rigid
 from umf_ros.verification.view_alignment import PairedViews
-from umf_ros.verification.yaw_search import Fit, RotatedElevationMap, scout, search
+from umf_ros.verification.yaw_search import Fit, RotatedElevationMap, coarse_align, search
 
 
 def find_hypotheses(
@@ -42,16 +42,16 @@ def find_hypotheses(
     views = None
     if settings.modalities != "cloud":
         views = PairedViews.of(query, keyframe, const.VIEW_NOISE[settings.features])
-    if turned is None or not match.usable or (views is not None and views_tell(match, turned.scan)):
+    if turned is None or not match.usable or (views is not None and views_decide(match, turned.scan)):
         seen = views.best_pose() if views else None
         poses = [(seen[0], float(seen[1]))] if seen else []
         return [Hypothesis.of(query, candidate, keyframe, pose=pose, score=score, views=views) for pose, score in poses]
     from_points = pose_from_points(query, candidate, keyframe, settings.ransac_iterations, settings.seed)
     guesses = (from_points, views.any_pose() if views else None)
-    fits = [scout(match, turned.scan, pose) for pose in guesses if pose is not None]
+    fits = [coarse_align(match, turned.scan, pose) for pose in guesses if pose is not None]
     fits = [fit for fit in fits if fit.telling] + search(match, turned)
     fits.sort(key=lambda fit: -fit.score)
-    if guess is not None and (fit := scout(match, turned.scan, guess)).telling:
+    if guess is not None and (fit := coarse_align(match, turned.scan, guess)).telling:
         fits.insert(0, replace(fit, share=1.0))  # submaps that share little would not rank it first
     return [
         Hypothesis.of(query, candidate, keyframe, pose=fit.pose, score=fit.score, views=views)

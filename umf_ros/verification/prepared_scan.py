@@ -267,12 +267,12 @@ def prepare_frame(frame: Frame) -> PreparedScan:
     return PreparedScan(points, frame.body_T_lidar, const.BLUR_M if motion is None else 0.0)
 
 
-def views_tell(match: PreparedScan, query: PreparedScan) -> bool:
+def views_decide(match: PreparedScan, query: PreparedScan) -> bool:
     """Whether images have to tell the pose, where there are any: a scan is wanting, or both show bare ground alone."""
     return not (match.usable and query.usable) or (match.bare and query.bare)
 
 
-def joint_blur(match: PreparedScan, query: PreparedScan) -> float:
+def common_blur(match: PreparedScan, query: PreparedScan) -> float:
     """How far points of two scans may be off together because a LiDAR moved, m."""
     return max(match.blur_m, query.blur_m)
 

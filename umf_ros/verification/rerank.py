@@ -93,7 +93,7 @@ WITHOUT: dict[str, Any] = {
     "image": {"cloud": None, "super_cloud": None},
     "cloud": {"image": None, "super_image": None},
 }
-"""What the choice of modalities takes out of an embedding."""
+"""Features that a choice of modalities takes out of an embedding."""
 
 
 Offered = tuple[Candidate, Keyframe]
@@ -109,7 +109,7 @@ def rerank(query: Keyframe, candidates: Sequence[Offered], settings: Verificatio
 
 
 def weigh(similarity: float, counts: Iterable[float], settings: Verification) -> float:
-    """What a candidate is ranked by: the global similarity and the number of inliers of each modality."""
+    """Score of a candidate: the global similarity and the number of inliers of each modality."""
     return similarity + settings.rerank_weight * float(np.log1p(list(counts)).sum())
 
 

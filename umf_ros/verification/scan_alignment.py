@@ -16,7 +16,7 @@ from umf_ros.verification.prepared_scan import PreparedScan
 
 @dataclass(frozen=True, slots=True)
 class CovarianceModel:
-    """What residuals do not say about the error of a pose; fitted.
+    """Fitted parts of a pose's error that residuals do not show.
 
     Attributes:
         inflation: factor on the variance, for neighbouring residuals are not independent.
@@ -44,7 +44,7 @@ class CovarianceModel:
 
     @property
     def unknown_motion(self) -> Array:
-        """What motion that was not removed adds to the covariance, (6, 6), m^2 and rad^2."""
+        """Covariance (6, 6) from motion that was not removed, m^2 and rad^2."""
         return _diagonal(self.unknown_motion_m, self.unknown_motion_deg)
 
 
@@ -96,12 +96,12 @@ class Alignment:
 
 def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Alignment:
     """Generalised ICP (Segal, RSS 2009) from the pose `guess`, first far-sighted, then near-sighted."""
-    pose = draw(match, query.coarse_cloud, guess, const.COARSE_REACH_M, const.COARSE_STEPS)
-    pose = draw(match, query.sample_cloud, pose, const.FINE_REACH_M, const.FINE_STEPS)
+    pose = run_gicp(match, query.coarse_cloud, guess, const.COARSE_REACH_M, const.COARSE_STEPS)
+    pose = run_gicp(match, query.sample_cloud, pose, const.FINE_REACH_M, const.FINE_STEPS)
     return inspect(match, query, pose)
 
 
-def draw(match: PreparedScan, query: small_gicp.PointCloud, guess: Array, reach_m: float, steps: int) -> Array:
+def run_gicp(match: PreparedScan, query: small_gicp.PointCloud, guess: Array, reach_m: float, steps: int) -> Array:
     """`match_T_query` after some steps of generalised ICP from a guess; counterparts are nearer than `reach_m`."""
     result = small_gicp.align(
         match.cloud,
@@ -164,7 +164,7 @@ def scan_covariance(match: Keyframe, query: Keyframe, alignment: Alignment, mode
 
 
 def motion_covariance(match: Keyframe, query: Keyframe, alignment: Alignment, model: CovarianceModel) -> Array:
-    """What the motion during the two scans adds, (6, 6); nothing where no scans were aligned."""
+    """Covariance (6, 6) from the motion during the two scans; zero where no scans were aligned."""
     if not len(alignment.pairs):
         return np.zeros((6, 6))
     if match.motion is None or query.motion is None:

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from umf_ros.core.geometry import Array, invert, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.prepared_scan import PreparedScan, joint_blur
+from umf_ros.verification.prepared_scan import PreparedScan, common_blur
 from umf_ros.verification.surroundings import Sight, visible
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Meeting:
-    """What one scan says of points of another.
+class ScanConsistency:
+    """Consistency of points with another scan that they are compared with.
 
     Attributes:
         sight: (N,) a `Sight` for each point.
@@ -58,15 +58,15 @@ class Meeting:
         return _share(self.misfit > const.UNEXPLAINED, visible(self.sight) & self.upright, float("nan"))
 
 
-def meet(match: PreparedScan, query: PreparedScan, pose: Array) -> tuple[Meeting, Meeting]:
-    """What the match says of the query's points under `match_T_query`, and the query of the match's."""
+def compare_scans(match: PreparedScan, query: PreparedScan, pose: Array) -> tuple[ScanConsistency, ScanConsistency]:
+    """Compare the query's points with the match under `match_T_query`, and the match's with the query."""
     moved, back = transform(pose, query.sample), transform(invert(pose), match.sample)
     ours, theirs = match.nearest(moved), query.nearest(back)
-    blur_m = joint_blur(match, query)
+    blur_m = common_blur(match, query)
     reach_ours, reach_theirs = counterpart_reach(query.spacing, blur_m), counterpart_reach(match.spacing, blur_m)
     return (
-        Meeting(match.look_at(moved), np.sqrt(ours[1]) / reach_ours, _upright(match, ours[0])),
-        Meeting(query.look_at(back), np.sqrt(theirs[1]) / reach_theirs, _upright(match, match.picks)),
+        ScanConsistency(match.look_at(moved), np.sqrt(ours[1]) / reach_ours, _upright(match, ours[0])),
+        ScanConsistency(query.look_at(back), np.sqrt(theirs[1]) / reach_theirs, _upright(match, match.picks)),
     )
 
 

@@ -46,7 +46,7 @@ class FieldOfView:
 
 
 class Sight(IntEnum):
-    """What a scan's rays say of a point of another scan."""
+    """Visibility of a point of another scan by a scan's rays."""
 
     MET = 0
     """It lies where rays end."""
@@ -115,7 +115,7 @@ SIDE = const.AROUND_CELLS
 
 
 class Surroundings:
-    """What stands around one scan.
+    """Map of the structure around one scan.
 
     Attributes:
         cell_m: side of a cell, m.

@@ -25,7 +25,7 @@ from umf_ros.verification.measurement import (
     measure_passage,
 )
 from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses, near
-from umf_ros.verification.prepared_scan import ScanCache, levelled, views_tell
+from umf_ros.verification.prepared_scan import ScanCache, levelled, views_decide
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans
 from umf_ros.verification.yaw_search import RotatedElevationMap
@@ -191,7 +191,7 @@ class Verifier:
     def _align(self, hypothesis: Hypothesis) -> None:
         query, match = hypothesis.keyframes
         scans = self._scans[match], self._scans[query]
-        if hypothesis.views is not None and views_tell(*scans):
+        if hypothesis.views is not None and views_decide(*scans):
             hypothesis.alignment = hypothesis.views.align(hypothesis.pose)
         else:
             hypothesis.scans, hypothesis.alignment = scans, align_scans(*scans, hypothesis.pose)

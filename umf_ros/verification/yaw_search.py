@@ -22,7 +22,7 @@ from umf_ros.core.geometry import heading as heading_of
 from umf_ros.verification import constants as const
 from umf_ros.verification.elevation_map import evaluate
 from umf_ros.verification.prepared_scan import PreparedScan, levelled, unlevelled
-from umf_ros.verification.scan_alignment import draw
+from umf_ros.verification.scan_alignment import run_gicp
 from umf_ros.verification.surroundings import SIDE, Spectra, Surroundings
 
 
@@ -44,7 +44,7 @@ class Fit:
 
     @property
     def score(self) -> float:
-        """What fits are ranked by: counterparts, and terrain where they say little."""
+        """Rank of the fit: counterparts, and terrain where they say little."""
         return self.share + const.TERRAIN_WEIGHT * self.terrain
 
     @property
@@ -83,15 +83,15 @@ def search(match: PreparedScan, turned: RotatedElevationMap) -> list[Fit]:
     fits = []
     for index, row, column in _peaks(_correlate(around, turned.spectra(wanted)), wanted, const.PEAKS):
         shift = (np.array([row, column]) - const.AROUND_SHIFT) * turned.cell_m
-        guess = settled(match, turned.scan, turned.cell_m, float(const.ALL_HEADINGS[index]), shift)
-        fits.append(scout(match, turned.scan, guess))
+        guess = fit_ground(match, turned.scan, turned.cell_m, float(const.ALL_HEADINGS[index]), shift)
+        fits.append(coarse_align(match, turned.scan, guess))
     return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
 
 
-def scout(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
+def coarse_align(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
     """Draw a pose to the match by a few points, and see how many of them find a counterpart."""
     cell_m = query.cell_m
-    pose = draw(match, query.scouts_cloud, guess, const.SCOUT_REACH * cell_m, const.SCOUT_STEPS)
+    pose = run_gicp(match, query.scouts_cloud, guess, const.SCOUT_REACH * cell_m, const.SCOUT_STEPS)
     squared = match.nearest(transform(pose, query.scouts))[1]
     near = squared < (const.SCOUT_NEAR * cell_m) ** 2
     terrain = evaluate(match.elevation, query.elevation, levelled(match, query, pose)).score
@@ -110,8 +110,8 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     found = []
     for _, row, column in _peaks(volumes, np.zeros(1, np.intp), const.ALTERNATIVES):
         shift = (np.array([row, column]) - const.AROUND_SHIFT) * cell_m
-        guess = settled(match, query, cell_m, turn, shift)
-        found.append(draw(match, query.scouts_cloud, guess, const.SCOUT_REACH * cell_m, const.SCOUT_STEPS))
+        guess = fit_ground(match, query, cell_m, turn, shift)
+        found.append(run_gicp(match, query.scouts_cloud, guess, const.SCOUT_REACH * cell_m, const.SCOUT_STEPS))
     return found
 
 
@@ -145,12 +145,12 @@ def _peaks(
     return peaks
 
 
-def settled(match: PreparedScan, query: PreparedScan, cell_m: float, heading: float, shift: Array) -> Array:
+def fit_ground(match: PreparedScan, query: PreparedScan, cell_m: float, heading: float, shift: Array) -> Array:
     """`match_T_query` of a planar fit, rad and (2,) m between the upright frames, with the height and tilt it needs."""
-    return unlevelled(match, query, settle(match.around(cell_m), query.around(cell_m), heading, shift))
+    return unlevelled(match, query, planar_to_pose(match.around(cell_m), query.around(cell_m), heading, shift))
 
 
-def settle(match: Surroundings, query: Surroundings, heading: float, shift: Array) -> Array:
+def planar_to_pose(match: Surroundings, query: Surroundings, heading: float, shift: Array) -> Array:
     """Full pose of a planar fit: height and tilt from the height differences of the shared cells."""
     cos, sin = math.cos(heading), math.sin(heading)
     planar = make_pose(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), [*shift, 0.0])
