@@ -19,11 +19,11 @@ import numpy as np
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.resources import find
 from umf_ros.verification import constants as const
-from umf_ros.verification.hypothesis import IMAGE, SCAN, Measurement, RejectReason
+from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, Measurement, RejectReason
 from umf_ros.verification.scan_alignment import CovarianceModel
 
 SHIPPED = "config/verification/calibration.json"
-KINDS = (SCAN, IMAGE)
+KINDS = (SCAN, SUBMAP, IMAGE)
 NO_RIVAL = 10.0  # logarithm of how much worse the fit is elsewhere: beyond the best that any criterion asks for
 
 
@@ -91,13 +91,21 @@ CRITERIA: dict[str, Criterion] = {
     ),
     "similarity": Criterion(lambda m: m.similarity, 0.3, 0.9, (IMAGE,)),
     "odometry_prior": Criterion(lambda m: m.prior_sigmas, 4.0, 1.0, missing=0.7),
-    "support": Criterion(lambda m: m.support, 0.0, 3.0, KINDS),
+    "support": Criterion(lambda m: m.support, 0.0, 3.0, (SCAN, IMAGE)),
     "view_position_known": Criterion(lambda m: math.log(m.position_std_m), math.log(0.5), math.log(0.05), (IMAGE,)),
     "view_heading_known": Criterion(lambda m: math.log(m.heading_std_deg), math.log(2.0), math.log(0.2), (IMAGE,)),
     "pose_inliers": Criterion(lambda m: math.log1p(m.pose_inliers), math.log(12), math.log(60), (IMAGE,)),
     "share": Criterion(lambda m: m.overlap, 0.1, 0.4, (IMAGE,)),
     "spread": Criterion(lambda m: m.spread, 0.03, 0.15, (IMAGE,)),
     "two_way": Criterion(lambda m: -math.log(max(m.two_way_m, 1e-3)), 0.0, -math.log(0.05), (IMAGE,)),
+    "submap_correlation": Criterion(lambda m: m.terrain_correlation, 0.2, 0.8, (SUBMAP,)),
+    "submap_terrain": Criterion(lambda m: m.terrain_score, 5.0, 30.0, (SUBMAP,)),
+    "submap_unique": Criterion(lambda m: m.terrain_correlation - m.terrain_rival, 0.0, 0.6, (SUBMAP,)),
+    "submap_overlap": Criterion(lambda m: m.overlap, 0.6, 0.95, (SUBMAP,)),
+    "submap_position_known": Criterion(lambda m: math.log(m.position_std_m), math.log(1.0), math.log(0.1), (SUBMAP,)),
+    "submap_relief": Criterion(lambda m: log_ratio(m.relief_m, m.residual_m), math.log(1.5), math.log(6.0), (SUBMAP,)),
+    "submap_odometry": Criterion(lambda m: m.prior_sigmas, 4.0, 1.0, (SUBMAP,), missing=0.7),
+    "submap_support": Criterion(lambda m: m.support, 0.0, 2.0, (SUBMAP,)),
 }
 
 
@@ -145,7 +153,7 @@ class AcceptanceModel:
     """Everything that was fitted.
 
     Attributes:
-        models: one logistic model per kind of hypothesis, "scan" or "image" (without a scan).
+        models: one logistic model per kind of hypothesis, "scan", "submap" or "image" (without a scan).
         covariances: likewise, what turns residuals into a covariance.
         bounds: likewise, least and greatest of what right poses measured, by the name of the number.
     """
@@ -155,8 +163,15 @@ class AcceptanceModel:
     bounds: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
 
     def probability(self, measurement: Measurement) -> float:
-        """Probability that the closure with this measurement is right."""
-        return self.models[measurement.kind].probability(scores(measurement))
+        """Probability that the closure with this measurement is right.
+
+        Submaps of narrow sensors are judged as scans and by their terrain, which is what both sides of a place share.
+        """
+        found = self.models[measurement.kind].probability(scores(measurement))
+        if measurement.kind != SUBMAP:
+            return found
+        as_scan = self.probability(replace(measurement, kind=SCAN))
+        return max(as_scan, found) if measurement.terrain_correlation >= const.MIN_TERRAIN else as_scan
 
     def at_best(self, measurement: Measurement) -> float:
         """The same if no other pose fitted the scans: what it cannot exceed before it is held against its rivals."""
@@ -188,7 +203,8 @@ class AcceptanceModel:
 def load_acceptance(path: str = "") -> AcceptanceModel:
     """The fitted decision; an empty path means the shipped one.
 
-    A criterion that is younger than the file has no weight.
+    A criterion that is younger than the file has no weight; submaps are judged by the
+    shipped model where a file has none.
 
     Raises:
         ConfigError: the file cannot be read or does not fit this version's criteria.
@@ -196,15 +212,22 @@ def load_acceptance(path: str = "") -> AcceptanceModel:
     file = Path(path) if path else find(SHIPPED)
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-        models = {kind: _logistic(content["models"][kind], kind) for kind in KINDS}
-        covariances = {kind: CovarianceModel(**content["covariance"][kind]) for kind in KINDS}
+        parts = {SUBMAP: _shipped_submap()} | content["models"]
+        models = {kind: _logistic(parts[kind], kind) for kind in KINDS}
+        covariances = {kind: CovarianceModel(**content["covariance"][kind]) for kind in (SCAN, IMAGE)}
+        covariances[SUBMAP] = covariances[SCAN]
         bounds = {
             kind: {name: (float(least), float(greatest)) for name, (least, greatest) in numbers.items()}
             for kind, numbers in content.get("bounds", {}).items()
         }
-        return AcceptanceModel(models, covariances, bounds)
+        return AcceptanceModel(models, covariances, {SUBMAP: bounds.get(SCAN, {})} | bounds)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{file}: not an acceptance model of this version ({error!r})") from None
+
+
+def _shipped_submap() -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(find(SHIPPED).read_text(encoding="utf-8"))["models"][SUBMAP]
+    return found
 
 
 def _logistic(model: dict[str, Any], kind: str) -> Logistic:

@@ -161,6 +161,11 @@ ODOMETRY_REACH_M = 15.0  # by hand: odometry is trusted over this distance
 PRIOR_M = 1.0  # by hand: standard deviation of what odometry predicts before any way is driven
 AGREE_M, AGREE_RAD = 0.5, 0.05  # by hand: two findings this near are one
 
+# submaps of narrow sensors, judged by their terrain
+RIVAL_TERRAIN_M = (1.5, 3.0)  # geometry: beyond the error of a right pose, within a wrong one's
+MIN_TERRAIN = 0.3  # by hand: correlation of the terrain without which nothing else speaks for a place
+NARROW_DEG = 270.0  # geometry: a sensor that sees more recognises a place from any side by its scans
+
 # submaps: what is seen on the metres around a keyframe
 SUBMAP_BEFORE_M, SUBMAP_AFTER_M = 20.0, 15.0  # measured: path before and behind a keyframe; 10 and 10 find less
 MERGE_STEP_M = 1.5  # measured: between the scans that are merged; 1 and 2 m are as good

@@ -41,13 +41,13 @@ class RejectReason(Enum):
     UNKNOWN = "rejected by another version"
 
 
-SCAN, IMAGE = "scan", "image"
-_MARKS = {SCAN: "noise_m", IMAGE: "pose_inliers"}  # a number of no other kind
+SCAN, SUBMAP, IMAGE = "scan", "submap", "image"
+_MARKS = {SUBMAP: "terrain_rival", SCAN: "noise_m", IMAGE: "pose_inliers"}  # a number that tells the kind
 
 
 def measured(*kinds: str) -> Any:
-    """A field for hypotheses of these kinds; NaN for others, and where nothing can be said."""
-    return field(default=math.nan, metadata={"kinds": kinds})
+    """A field for hypotheses of these kinds, for submaps as for scans; NaN for others and where it is unknown."""
+    return field(default=math.nan, metadata={"kinds": (*kinds, SUBMAP) if SCAN in kinds else kinds})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +57,8 @@ class Measurement:
     The name of a field is its name in `candidates.csv` and on `~/candidates`.
 
     Attributes:
-        kind: "scan" when two scans or submaps were aligned, "image" when only local features could be.
+        kind: "scan" when two scans were aligned, "submap" when they were merged from scans of narrow sensors, "image"
+            when only local features could be.
         similarity: cosine similarity of the global descriptors.
         inliers_image: pairs of image features that one homography explains.
         inliers_cloud: pairs of the scan's features that one rigid motion explains.
@@ -71,6 +72,7 @@ class Measurement:
         relief_m: standard deviation of the relief on the ground that both scans saw.
         terrain_correlation: of both elevation maps' relief, -1 to 1.
         terrain_score: the same in standard deviations of chance.
+        terrain_rival: correlation at the best of some poses beside this one.
         common: share of a scan's points that the other should see, the smaller of both ways, as all that follow.
         contradiction: share of these that the other's rays passed by, the larger of both.
         counterparts: share of these that have a counterpart, as near as both scans' points let one expect.
@@ -109,6 +111,7 @@ class Measurement:
     relief_m: float = measured(SCAN)
     terrain_correlation: float = measured(SCAN)
     terrain_score: float = measured(SCAN)
+    terrain_rival: float = measured(SUBMAP)
     common: float = measured(SCAN)
     contradiction: float = measured(SCAN)
     counterparts: float = measured(SCAN)

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Keyframe
-from umf_ros.core.geometry import Array, transform
+from umf_ros.core.geometry import Array, make_pose, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.ambiguity import passage_rival, scan_ambiguity
 from umf_ros.verification.elevation_map import evaluate, shared_relief
-from umf_ros.verification.hypothesis import IMAGE, SCAN, Hypothesis, Measurement
+from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, Hypothesis, Measurement
 from umf_ros.verification.pose_search import TemporalMemory, near, prior_sigmas
 from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled
 from umf_ros.verification.rerank import similarities, strongest
@@ -81,7 +81,7 @@ def measure_passage(hypothesis: Hypothesis) -> Measurement:
 def compare_poses(measurement: Measurement, pose: Array, others: Sequence[tuple[Array, Measurement]]) -> Measurement:
     """Return the measurement with its lead over other poses `match_T_query` for the same candidate."""
     distinct = [other.missing for there, other in others if not near(pose, there, const.DISTINCT_M, const.DISTINCT_RAD)]
-    if measurement.kind != SCAN or not distinct:
+    if measurement.kind == IMAGE or not distinct:
         return measurement
     room = const.RUNNER_UP_ROOM
     return replace(measurement, runner_up=math.log((min(distinct) + room) / (measurement.missing + room)))
@@ -138,10 +138,13 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
     level = levelled(match, query, pose)
     fit = evaluate(match.elevation, query.elevation, level)
     ours, theirs = compare_scans(match, query, pose)
+    narrow = match.narrow and query.narrow
+    beside = [evaluate(match.elevation, query.elevation, move @ level).correlation for move in _BESIDE if narrow]
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     return replace(
         known,
-        kind=SCAN,
+        kind=SUBMAP if narrow else SCAN,
+        terrain_rival=max(beside, default=math.nan),
         residual_m=float(np.median(size)),
         residual_p90_m=float(np.percentile(size, 90)),
         noise_m=math.hypot(max(match.noise_m, const.MIN_SURFACE_NOISE_M), common_blur(match, query)),
@@ -156,6 +159,13 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
         upright_counterparts=float(np.fmin(ours.upright_counterparts, theirs.upright_counterparts)),
         unexplained=float(np.fmax(ours.unexplained, theirs.unexplained)),
     )
+
+
+_BESIDE = [
+    make_pose(np.eye(3), [metres * math.cos(angle), metres * math.sin(angle), 0])
+    for metres in const.RIVAL_TERRAIN_M
+    for angle in np.arange(0, 2 * np.pi, np.pi / 4)
+]
 
 
 def _measure_views(known: Measurement, alignment: ViewAlignment) -> Measurement:

@@ -70,6 +70,15 @@ class PreparedScan:
         self.points: Array = points.astype(float)
         self._around: dict[float, Surroundings] = {}
 
+    @cached_property
+    def narrow(self) -> bool:
+        """Whether it was merged from scans that see little around the sensor."""
+        if len(self._lidars_T_body) == 1:
+            return False
+        number = int(np.bincount(self._owner).argmax())
+        own = transform(self._lidars_T_body[number], self.points[self._owner == number])
+        return FieldOfView(own).width_deg < const.NARROW_DEG
+
     def make_ready(self) -> None:
         """Make at once what a query's scan is asked for in every comparison."""
         if self.usable:
