@@ -19,7 +19,7 @@ from umf_ros.verification.acceptance import (
     load_acceptance,
     scores,
 )
-from umf_ros.verification.hypothesis import SCAN
+from umf_ros.verification.hypothesis import SCAN, SUBMAP
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +40,34 @@ def test_shipped_model_accepts_a_good_fit_and_rejects_a_bad_one(shipped: Accepta
 def test_good_features_on_bad_geometry_are_not_enough(shipped: AcceptanceModel) -> None:
     features = {name: GOOD.numbers[name] for name in ("similarity", "inliers_image", "inliers_cloud")}
     assert shipped.probability(replace(BAD, **features, agreement_cloud=6.0)) < 0.5
+
+
+# two submaps of opposite headings: little of what the scans saw is common, the ground between them is
+TURNED = replace(
+    GOOD,
+    kind=SUBMAP,
+    common=0.1,
+    upright_counterparts=0.3,
+    unexplained=0.3,
+    rival_near=0.0,
+    rival_far=0.05,
+    terrain_rival=0.2,
+)
+
+
+def test_submaps_of_narrow_sensors_are_judged_by_their_terrain_too(shipped: AcceptanceModel) -> None:
+    turned = replace(TURNED, terrain_score=30.0, support=2.0, relief_m=0.1)
+    assert shipped.probability(replace(turned, kind=SCAN)) < 0.6 < 0.95 < shipped.probability(turned)
+    for missing in ({"terrain_correlation": 0.25}, {"terrain_score": 4.0, "terrain_rival": 0.85, "overlap": 0.5}):
+        assert shipped.probability(replace(turned, **missing)) < 0.9
+
+
+def test_a_model_without_submaps_judges_them_by_the_shipped_one(shipped: AcceptanceModel, tmp_path: Path) -> None:
+    path = saved(shipped, tmp_path)
+    content = json.loads(path.read_text())
+    del content["models"][SUBMAP]
+    path.write_text(json.dumps(content))
+    assert load_acceptance(str(path)).probability(TURNED) == shipped.probability(TURNED)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -179,7 +179,8 @@ class AcceptanceModel:
 
     def out_of_range(self, measurement: Measurement) -> str:
         """Name and value of a number that no right example of the fit had; empty without one."""
-        for name, (least, greatest) in self.bounds.get(measurement.kind, {}).items():
+        kind = SCAN if measurement.kind == SUBMAP else measurement.kind
+        for name, (least, greatest) in self.bounds.get(kind, {}).items():
             value = getattr(measurement, name)
             if value < least or value > greatest:  # what is unknown is neither
                 return f"{name} {value:.3g}"
@@ -220,7 +221,7 @@ def load_acceptance(path: str = "") -> AcceptanceModel:
             kind: {name: (float(least), float(greatest)) for name, (least, greatest) in numbers.items()}
             for kind, numbers in content.get("bounds", {}).items()
         }
-        return AcceptanceModel(models, covariances, {SUBMAP: bounds.get(SCAN, {})} | bounds)
+        return AcceptanceModel(models, covariances, bounds)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{file}: not an acceptance model of this version ({error!r})") from None
 
