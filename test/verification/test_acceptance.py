@@ -17,6 +17,7 @@ from umf_ros.verification.acceptance import (
     Criterion,
     criteria_of,
     load_acceptance,
+    refuted,
     scores,
 )
 from umf_ros.verification.hypothesis import SCAN, SUBMAP
@@ -58,8 +59,9 @@ TURNED = replace(
 def test_submaps_of_narrow_sensors_are_judged_by_their_terrain_too(shipped: AcceptanceModel) -> None:
     turned = replace(TURNED, terrain_score=30.0, support=2.0, relief_m=0.1)
     assert shipped.probability(replace(turned, kind=SCAN)) < 0.6 < 0.95 < shipped.probability(turned)
-    for missing in ({"terrain_correlation": 0.25}, {"terrain_score": 4.0, "terrain_rival": 0.85, "overlap": 0.5}):
-        assert shipped.probability(replace(turned, **missing)) < 0.9
+    assert shipped.probability(replace(turned, terrain_score=4.0, terrain_rival=0.85, overlap=0.5)) < 0.9
+    assert refuted(turned) is None and refuted(replace(turned, terrain_correlation=0.25)) is not None
+    assert refuted(replace(turned, kind=SCAN, terrain_correlation=0.25)) is None
 
 
 def test_a_model_without_submaps_judges_them_by_the_shipped_one(shipped: AcceptanceModel, tmp_path: Path) -> None:

@@ -125,6 +125,8 @@ def refuted(measurement: Measurement) -> tuple[RejectReason, str] | None:
         return RejectReason.MISFIT, f"{measurement.misfit:.0f} times"
     if measurement.passage_rival < 1.0:
         return RejectReason.PASSAGE, ""
+    if measurement.kind == SUBMAP and not measurement.terrain_correlation >= const.MIN_TERRAIN:
+        return RejectReason.TERRAIN, f"correlation {measurement.terrain_correlation:.2f}"
     return (RejectReason.AMBIGUOUS, "") if measurement.runner_up < const.MIN_RUNNER_UP else None
 
 
@@ -168,10 +170,7 @@ class AcceptanceModel:
         Submaps of narrow sensors are judged as scans and by their terrain, which is what both sides of a place share.
         """
         found = self.models[measurement.kind].probability(scores(measurement))
-        if measurement.kind != SUBMAP:
-            return found
-        as_scan = self.probability(replace(measurement, kind=SCAN))
-        return max(as_scan, found) if measurement.terrain_correlation >= const.MIN_TERRAIN else as_scan
+        return max(found, self.probability(replace(measurement, kind=SCAN))) if measurement.kind == SUBMAP else found
 
     def at_best(self, measurement: Measurement) -> float:
         """The same if no other pose fitted the scans: what it cannot exceed before it is held against its rivals."""

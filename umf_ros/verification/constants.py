@@ -163,7 +163,7 @@ AGREE_M, AGREE_RAD = 0.5, 0.05  # by hand: two findings this near are one
 
 # submaps of narrow sensors, judged by their terrain
 RIVAL_TERRAIN_M = (1.5, 3.0)  # geometry: beyond the error of a right pose, within a wrong one's
-MIN_TERRAIN = 0.3  # by hand: correlation of the terrain without which nothing else speaks for a place
+MIN_TERRAIN = 0.3  # by hand: correlation of the terrain without which submaps of a corridor fit at many places
 NARROW_DEG = 270.0  # geometry: a sensor that sees more recognises a place from any side by its scans
 
 # submaps: what is seen on the metres around a keyframe

@@ -32,6 +32,7 @@ class RejectReason(Enum):
     MISFIT = "surfaces are several times their noise apart"
     PASSAGE = "surfaces fit as well elsewhere along the passage"
     AMBIGUOUS = "another pose fits as well"
+    TERRAIN = "the terrain of the submaps does not fit"
     OUT_OF_RANGE = "a measurement outside the range of the fitted examples"
     TURNED = "turned by more than verification.max_turn_deg"
     LITTLE_SHARED_VIEW = "the views share too little"
