@@ -119,7 +119,7 @@ def test_a_closure_goes_out_as_it_is_documented(talk: Talk) -> None:
 
 
 def test_a_closure_with_another_rover_names_both(talk: Talk) -> None:
-    found, waiting = accepted(), replace(accepted(8), reason="waits")
+    found, waiting = accepted(), replace(accepted(8), reason=RejectReason.UNCONFIRMED)
     closure = found.closure
     assert closure is not None
     keyframe = at(QUERY_NS, 4.0, 2.0)
@@ -134,9 +134,9 @@ def test_a_closure_with_another_rover_names_both(talk: Talk) -> None:
 
 
 def test_what_was_rejected_is_reported_and_never_published_as_a_closure(talk: Talk) -> None:
-    talk.announcer.announce(detection([rejected(7), rejected(8, "turned too far")]), {})
+    talk.announcer.announce(detection([rejected(7), rejected(8, RejectReason.TURNED)]), {})
     (report,) = talk.hear("/front_end/candidates")
-    assert [status.message for status in report.status] == ["few inliers", "turned too far"]
+    assert [status.message for status in report.status] == [RejectReason.NO_POSE.value, RejectReason.TURNED.value]
     talk.announcer.announce(detection([accepted()]), {})
     talk.hear("/loop_closures")
     assert len(talk.heard["/loop_closures"]) == 1
