@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import make_pose
+from umf_ros.pose_graph.closures import VERDICT_COLUMNS as VERDICTS
+from umf_ros.pose_graph.closures import ClosureReason, State
 from umf_ros.runs.tables import (
     CANDIDATES,
     CLOSURES,
@@ -23,6 +25,7 @@ from umf_ros.runs.tables import (
     parse_candidate,
     read_closures,
     read_table,
+    read_verdicts,
     write_table,
 )
 from umf_ros.verification import Hypothesis, Measurement, RejectReason
@@ -146,3 +149,9 @@ def test_the_line_that_is_damaged_is_named(tmp_path: Path, content: str, line: i
 def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(UmfError, match=r"cannot read .*closures\.csv: No such file"):
         read_closures(tmp_path / "closures.csv")
+
+
+def test_a_verdict_of_another_version_keeps_its_state(tmp_path: Path) -> None:
+    path = written(tmp_path / "graph_verdicts.csv", [[MATCH_NS, QUERY_NS, "undecided", "a riddle", 1.5, 0.2]], VERDICTS)
+    (found,) = read_verdicts(path, [closure()]).values()
+    assert (found.state, found.reason, found.residual) == (State.PENDING, ClosureReason.UNKNOWN, 1.5)

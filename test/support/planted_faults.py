@@ -245,7 +245,7 @@ def measured_offset(bag: Bag, sensor: str, seconds: float) -> float | None:
 
 
 def print_findings(path: Path) -> bool:
-    """Print what is said of a recording's sensors; returns whether that is nothing."""
+    """Print the findings about a recording's sensors; return whether there are none."""
     bag = open_bag(path)
     settings = settings_for(bag, None, "auto")
     seen = check_sensors(bag, settings)

@@ -60,6 +60,10 @@ def test_submaps_of_narrow_sensors_are_judged_by_their_terrain_too(shipped: Acce
     turned = replace(TURNED, terrain_score=30.0, support=2.0, relief_m=0.1)
     assert shipped.probability(replace(turned, kind=SCAN)) < 0.6 < 0.95 < shipped.probability(turned)
     assert shipped.probability(replace(turned, terrain_score=4.0, terrain_rival=0.85, overlap=0.5)) < 0.9
+    for one in (turned, replace(turned, terrain_score=4.0, overlap=0.5), replace(turned, common=0.8, rival_far=0.6)):
+        probability = shipped.probability(one)
+        told = sum(shipped.contributions(one).values())
+        assert told == pytest.approx(math.log(probability / (1 - probability)), rel=1e-6)
     assert refuted(turned) is None and refuted(replace(turned, terrain_correlation=0.25)) is not None
     assert refuted(replace(turned, kind=SCAN, terrain_correlation=0.25)) is None
 

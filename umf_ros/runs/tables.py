@@ -43,6 +43,7 @@ COLUMNS = {
 }
 """Columns of each table, which is exported as `<name>.csv`."""
 _REASONS = {reason.value for reason in RejectReason}
+_VERDICT_REASONS = {reason.value for reason in ClosureReason}
 Row = TypeVar("Row")
 
 Endpoints = tuple[int, int]
@@ -138,7 +139,8 @@ def read_verdicts(path: Path, closures: Iterable[LoopClosure]) -> dict[Endpoints
         closure = known.get((int(query), int(match)))
         if closure is None:
             return None
-        found = ClosureVerdict(closure, State(state), ClosureReason(reason), float(residual), float(residual_m))
+        told = ClosureReason(reason) if reason in _VERDICT_REASONS else ClosureReason.UNKNOWN
+        found = ClosureVerdict(closure, State(state), told, float(residual), float(residual_m))
         return (int(query), int(match)), found
 
     return dict(filter(None, read_table(path, parse))) if path.is_file() else {}

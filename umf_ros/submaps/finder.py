@@ -97,12 +97,12 @@ class SubmapFinder:
 
     def _closures(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> bool:
         """Whether there are closures; odometry carries the last of them on to the next keyframes."""
-        closures = [one for one in verdicts if one.closure is not None]
-        for one in closures:
+        closed = False
+        for one in verdicts:
             if one.closure is not None:
-                match = self.history.database[one.candidate.index]
+                match, closed = self.history.database[one.candidate.index], True
                 self._expectation.latest = Found(query, match, one.closure.match_T_query)
-        return bool(closures)
+        return closed
 
     def _candidates(
         self, query: Keyframe, verdicts: Sequence[Hypothesis], expected: Proposal | None

@@ -165,12 +165,15 @@ class AcceptanceModel:
     bounds: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
 
     def probability(self, measurement: Measurement) -> float:
-        """Probability that the closure with this measurement is right.
+        """Probability that the closure with this measurement is right."""
+        decisive = self._decisive(measurement)
+        return self.models[decisive.kind].probability(scores(decisive))
 
-        Submaps of narrow sensors are judged as scans and by their terrain, which is what both sides of a place share.
-        """
-        found = self.models[measurement.kind].probability(scores(measurement))
-        return max(found, self.probability(replace(measurement, kind=SCAN))) if measurement.kind == SUBMAP else found
+    def _decisive(self, measurement: Measurement) -> Measurement:
+        """The measurement as the kind that decides: of a submap its terrain or the scan, whichever is more probable."""
+        kinds = (SUBMAP, SCAN) if measurement.kind == SUBMAP else (measurement.kind,)
+        ways = [replace(measurement, kind=kind) for kind in kinds]
+        return max(ways, key=lambda one: self.models[one.kind].odds(scores(one)))
 
     def at_best(self, measurement: Measurement) -> float:
         """The same if no other pose fitted the scans: what it cannot exceed before it is held against its rivals."""
@@ -187,6 +190,7 @@ class AcceptanceModel:
 
     def lost(self, measurement: Measurement) -> dict[str, float]:
         """Log-odds that each criterion could have added and did not; without those whose value is unknown."""
+        measurement = self._decisive(measurement)
         weights, scored = self.models[measurement.kind].weights, scores(measurement)
         criteria = criteria_of(measurement.kind)
         known = [name for name in weights if math.isfinite(criteria[name].read(measurement))]
@@ -196,6 +200,7 @@ class AcceptanceModel:
 
     def contributions(self, measurement: Measurement) -> dict[str, float]:
         """Log-odds of each criterion by name; "bias" is what has to be overcome."""
+        measurement = self._decisive(measurement)
         model = self.models[measurement.kind]
         return model.contributions(scores(measurement)) | {"bias": model.bias}
 
@@ -212,7 +217,9 @@ def load_acceptance(path: str = "") -> AcceptanceModel:
     file = Path(path) if path else find(SHIPPED)
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-        parts = {SUBMAP: _shipped_submap()} | content["models"]
+        parts = content["models"]
+        if SUBMAP not in parts:
+            parts[SUBMAP] = json.loads(find(SHIPPED).read_text(encoding="utf-8"))["models"][SUBMAP]
         models = {kind: _logistic(parts[kind], kind) for kind in KINDS}
         covariances = {kind: CovarianceModel(**content["covariance"][kind]) for kind in (SCAN, IMAGE)}
         covariances[SUBMAP] = covariances[SCAN]
@@ -223,11 +230,6 @@ def load_acceptance(path: str = "") -> AcceptanceModel:
         return AcceptanceModel(models, covariances, bounds)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{file}: not an acceptance model of this version ({error!r})") from None
-
-
-def _shipped_submap() -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(find(SHIPPED).read_text(encoding="utf-8"))["models"][SUBMAP]
-    return found
 
 
 def _logistic(model: dict[str, Any], kind: str) -> Logistic:

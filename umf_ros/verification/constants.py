@@ -143,11 +143,10 @@ SEARCH_M, SEARCH_RAD = 3.0, 0.35  # what the search itself knows, standard devia
 NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG = 20.0, 0.01, 0.05  # by hand: a yardstick independent of data
 MOMENTS = 6  # parts of a scan whose errors of motion are told apart; by hand: errors change little within a sixth
 MOTION_SHARE = 0.03  # by hand: of the motion during a scan that odometry gets wrong all along, as by its scale
-MIN_RESIDUAL_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanner is better
+MIN_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanner is better
 
 # measurement: every test of a hypothesis
 NO_FIT_M = 0.3  # stands for the residual where nothing overlaps
-MIN_SURFACE_NOISE_M = 0.01  # synthetic scans have less, and no scanner is better
 AGREEMENT_PIXELS = 0.04  # of the image's width, around the place where a feature should reappear; by hand
 AGREEMENT_ROWS = 0.1  # of the image's height: features are compared with their like: sky, horizon, foreground; by hand
 AGREEMENT_M = 1.0  # geometry: a voxel

@@ -58,7 +58,7 @@ class Measurement:
     The name of a field is its name in `candidates.csv` and on `~/candidates`.
 
     Attributes:
-        kind: "scan" when two scans were aligned, "submap" when they were merged from scans of narrow sensors, "image"
+        kind: "scan" when two scans were aligned, "submap" when one was merged from scans of a narrow sensor, "image"
             when only local features could be.
         similarity: cosine similarity of the global descriptors.
         inliers_image: pairs of image features that one homography explains.

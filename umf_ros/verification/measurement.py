@@ -138,7 +138,7 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
     level = levelled(match, query, pose)
     fit = evaluate(match.elevation, query.elevation, level)
     ours, theirs = compare_scans(match, query, pose)
-    narrow = match.narrow and query.narrow
+    narrow = match.narrow or query.narrow
     beside = [evaluate(match.elevation, query.elevation, move @ level).correlation for move in _BESIDE if narrow]
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     return replace(
@@ -147,7 +147,7 @@ def _measure_scans(known: Measurement, alignment: Alignment, match: PreparedScan
         terrain_rival=max(beside, default=math.nan),
         residual_m=float(np.median(size)),
         residual_p90_m=float(np.percentile(size, 90)),
-        noise_m=math.hypot(max(match.noise_m, const.MIN_SURFACE_NOISE_M), common_blur(match, query)),
+        noise_m=math.hypot(max(match.noise_m, const.MIN_NOISE_M), common_blur(match, query)),
         overlap=alignment.overlap,
         points=float(len(alignment.points)),
         relief_m=shared_relief(match.elevation, query.elevation, level),

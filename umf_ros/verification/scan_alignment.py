@@ -83,7 +83,7 @@ class Alignment:
         """Information (N,) of each residual as if they were independent, 1/m^2, with outliers weighed down."""
         if not len(self.residuals):
             return np.empty(0)
-        noise = max(1.4826 * float(np.median(np.abs(self.residuals))), const.MIN_RESIDUAL_NOISE_M)
+        noise = max(1.4826 * float(np.median(np.abs(self.residuals))), const.MIN_NOISE_M)
         found: Array = 1.0 / (1.0 + (self.residuals / (2 * noise)) ** 2) / noise**2
         return found
 

@@ -30,6 +30,8 @@ from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans
 from umf_ros.verification.yaw_search import RotatedElevationMap
 
+NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
+
 
 class Verifier:
     """Decides which candidates of a query are the same place, and where the rover stood.
@@ -52,7 +54,6 @@ class Verifier:
         self._threshold = settings.min_probability
         self._memory = TemporalMemory()
         self._scans = ScanCache()
-        self._guesses: Mapping[int, Array] = {}
         self.latency_ms: dict[str, float] = {}
 
     def retune(self, settings: Verification) -> None:
@@ -72,7 +73,7 @@ class Verifier:
         self,
         query: Keyframe,
         candidates: Sequence[Offered],
-        guesses: Mapping[int, Array] = MappingProxyType({}),
+        guesses: Mapping[int, Array] = NO_GUESSES,
     ) -> list[Hypothesis]:
         """Return one hypothesis per candidate with its reason, accepted ones first, then in the order of the reranking.
 
@@ -81,18 +82,18 @@ class Verifier:
             candidates: of the database, with their keyframes.
             guesses: poses `match_T_query` from odometry, by the stamp of the match.
         """
-        self._guesses = guesses
         self.latency_ms = {"rerank": 0.0, "refine": 0.0}
         with self._timed("refine"):
             turned = self._turned(query) if candidates else None
         # the candidate that odometry predicts from an accepted closure comes first: most often it suffices
         ranked = chosen = self._rank(query, self._memory.expected(query, candidates))
-        judged = self._refine(query, chosen, turned)
+        judged = self._refine(query, chosen, turned, guesses)
         if self._wanting(judged):
             expected = {candidate.stamp_ns for candidate, _ in chosen}
             ranked = self._rank(query, candidates)
             selected = select(ranked, self._settings.refine_best)
-            judged += self._refine(query, [one for one in selected if one[0].stamp_ns not in expected], turned)
+            others = [one for one in selected if one[0].stamp_ns not in expected]
+            judged += self._refine(query, others, turned, guesses)
             chosen = chosen + selected
         self._memory.remember(
             query, [(one.keyframes[1], one.pose, (one.probability or 0.0) >= self._threshold) for one in judged]
@@ -116,10 +117,16 @@ class Verifier:
         with self._timed("rerank"):
             return rerank(query, candidates, self._settings)
 
-    def _refine(self, query: Keyframe, ranked: list[Offered], turned: RotatedElevationMap | None) -> list[Hypothesis]:
+    def _refine(
+        self,
+        query: Keyframe,
+        ranked: list[Offered],
+        turned: RotatedElevationMap | None,
+        guesses: Mapping[int, Array],
+    ) -> list[Hypothesis]:
         """The best hypotheses about some candidates, judged."""
         with self._timed("refine"):
-            hypotheses = self._hypotheses(query, ranked, turned)[: const.MAX_REFINED]
+            hypotheses = self._hypotheses(query, ranked, turned, guesses)[: const.MAX_REFINED]
             return self._judge(hypotheses, min(const.HOPELESS, self._threshold))
 
     def _wanting(self, judged: list[Hypothesis]) -> bool:
@@ -137,12 +144,16 @@ class Verifier:
         return RotatedElevationMap(self._scans[query]) if self._scans[query].usable else None
 
     def _hypotheses(
-        self, query: Keyframe, ranked: list[Offered], turned: RotatedElevationMap | None
+        self,
+        query: Keyframe,
+        ranked: list[Offered],
+        turned: RotatedElevationMap | None,
+        guesses: Mapping[int, Array] = NO_GUESSES,
     ) -> list[Hypothesis]:
         """Hypotheses about the given candidates, the most promising first."""
         found: list[Hypothesis] = []
         for candidate, keyframe in ranked:
-            scan, guess = self._scans[keyframe], self._guesses.get(keyframe.stamp_ns)
+            scan, guess = self._scans[keyframe], guesses.get(keyframe.stamp_ns)
             found += find_hypotheses(query, candidate, keyframe, turned, scan, self._settings, guess)
         return sorted(found, key=lambda one: -one.score)
 
