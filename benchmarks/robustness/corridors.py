@@ -24,8 +24,8 @@ from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Candidate
 from umf_ros.core.geometry import relative
 from umf_ros.embedding import make_embedder
-from umf_ros.lab.simulation.domains.pairs import SAME, ScannedPlace, ScanPair, is_wrong, keyframe_of
-from umf_ros.lab.simulation.domains.passages import PASSAGES, Passage, drive
+from umf_ros.lab.simulation.domains.pairs import SAME, ScanPair, is_wrong, passage_places
+from umf_ros.lab.simulation.domains.passages import PASSAGES, Passage
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.verification import Verifier
 
@@ -68,11 +68,7 @@ def main(
 def run(passage: Passage, seed: int) -> tuple[str, Counter[str], list[float]]:
     """Name, counts of verdicts and milliseconds of refinement of the pairs of one passage."""
     embedder = make_embedder(EmbeddingSettings(threads=1))
-    places = []
-    for number, scan in enumerate(drive(passage, seed)):
-        # of every second passage the motion within a scan is not removed
-        keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, (number + 1) * 10**9, seed % 2 == 0)
-        places.append(ScannedPlace(keyframe, scan, seed))
+    places = passage_places(passage, seed, embedder)
     verifier, counts, refine_ms = Verifier(Verification()), Counter[str](), []
     for pair in (ScanPair(query, match, SAME) for query in places for match in places if query is not match):
         verifier.reset()

@@ -150,7 +150,7 @@ class FleetLink:
             match = self._keyframe(server, key)
             if match is not None:
                 found = by_session.setdefault((key.robot, match.session), [])
-                found.append((Candidate(-1, key.stamp_ns, similarity), match))
+                found.append((Candidate(len(found), key.stamp_ns, similarity), match))
         self._answers.extend(Answer(keyframe, robot, found) for (robot, _), found in by_session.items())
 
     def _keyframe(self, server: FleetServer, key: FleetKey) -> Keyframe | None:

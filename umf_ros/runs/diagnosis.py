@@ -76,15 +76,15 @@ class GateDiagnosis:
 
     def contributions(self, candidate: Hypothesis) -> dict[str, float]:
         """Log-odds of each criterion, where a pose was judged by the fitted decision."""
-        if not candidate.measurement.kind:
+        if not candidate.kind:
             return {}
-        return {name: value for name, value in self._acceptance.contributions(candidate.measurement).items() if value}
+        return {name: value for name, value in self._acceptance.contributions(candidate.measurements).items() if value}
 
     def missing(self, candidate: Hypothesis) -> dict[str, float]:
         """Log-odds that each criterion could have added and did not, the most first."""
-        if not candidate.measurement.kind:
+        if not candidate.kind:
             return {}
-        return dict(sorted(self._acceptance.lost(candidate.measurement).items(), key=lambda one: -one[1]))
+        return dict(sorted(self._acceptance.lost(candidate.measurements).items(), key=lambda one: -one[1]))
 
     def at_threshold(self, threshold: float) -> tuple[int, int]:
         """Closures that would be published from this probability on, and how many of them join no same place."""
@@ -155,7 +155,7 @@ class GateDiagnosis:
             case RejectReason.NO_DEPTH:
                 return "depth", best.outcome, "topics.cloud or topics.right_image"
             case RejectReason.NO_POSE:
-                return "pose", f"{best.outcome} ({best.measurement.inliers_image:.0f} image inliers)", ""
+                return "pose", f"{best.outcome} ({best.measurements.get('inliers_image', 0):.0f} image inliers)", ""
             case RejectReason.IMPROBABLE:
                 return self._probability(best)
         return "objection", best.outcome, _LIMITS.get(best.reason, "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -164,7 +165,7 @@ def _unjudged(about: ExaminedRun) -> Iterator[Advice]:
 
 
 def _disparity(about: ExaminedRun) -> Iterator[Advice]:
-    found = [one.measurement.disparity_bias_px for one in about.run.candidates if one.accepted]
+    found = [one.measurements.get("disparity_bias_px", math.nan) for one in about.run.candidates if one.accepted]
     known = np.array([bias for bias in found if np.isfinite(bias)])
     if len(known) >= FEW_VIEWS and abs(median := float(np.median(known))) > BIAS_PX:
         more, less = ("too little", "far") if median > 0 else ("too much", "near")

@@ -19,7 +19,7 @@ from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.core.io import atomic_write
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureReason, ClosureVerdict, State
-from umf_ros.verification.hypothesis import ACCEPTED, Hypothesis, Measurement, RejectReason
+from umf_ros.verification.hypothesis import ACCEPTED, Hypothesis, RejectReason
 
 POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
 SIGMA = ["sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"]
@@ -119,15 +119,14 @@ def parse_candidate(row: dict[str, str]) -> Hypothesis:
     """The hypothesis in a row of `candidates.csv`; a reason of another version is kept as its detail."""
     numbers = {name: float(value) for name, value in json.loads(row["numbers"]).items()}
     candidate = Candidate(-1, int(row["match_stamp_ns"]), float(row["similarity"]))
-    probability, measurement = numbers.pop("probability", None), Measurement.read(candidate.similarity, numbers)
+    found = Hypothesis(int(row["query_stamp_ns"]), candidate, probability=numbers.pop("probability", None))
+    found.measurements = {"similarity": candidate.similarity} | numbers
     reason, detail = row["reason"], row.get("detail") or ""
-    if reason == ACCEPTED:
-        return Hypothesis(int(row["query_stamp_ns"]), candidate, measurement, probability=probability)
-    if reason not in _REASONS:
-        reason, detail = RejectReason.UNKNOWN.value, reason
-    return Hypothesis(
-        int(row["query_stamp_ns"]), candidate, measurement, RejectReason(reason), detail, probability=probability
-    )
+    if reason in _REASONS:
+        found.reject(RejectReason(reason), detail)
+    elif reason != ACCEPTED:
+        found.reject(RejectReason.UNKNOWN, reason)
+    return found
 
 
 def read_verdicts(path: Path, closures: Iterable[LoopClosure]) -> dict[Endpoints, ClosureVerdict]:

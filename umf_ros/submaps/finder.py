@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from umf_ros.core.config import Loop, Verification
 from umf_ros.core.frames import Candidate, Keyframe
+from umf_ros.core.geometry import Array, relative
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.submaps.submap_history import SubmapHistory
-from umf_ros.submaps.submap_index import Expectation, Found, Lookalikes, Proposal
+from umf_ros.submaps.history import SubmapHistory
+from umf_ros.submaps.lookalikes import Lookalikes
 from umf_ros.verification import Hypothesis, Verifier
 from umf_ros.verification import constants as const
+
+NO_GUESSES: dict[int, Array] = {}
 
 
 class SubmapFinder:
@@ -20,7 +23,7 @@ class SubmapFinder:
 
     Sixteen beams in the open hit little that another scan hits too, and a narrow sensor that comes back the other way
     shares nothing with its earlier scans; merged over some metres by odometry, they do. Submaps are verified as scans
-    are: the candidates are those whose scans came near to a closure, those where odometry puts the rover since the
+    are: the candidates are those whose scans came near to a closure, the place where odometry puts the rover since the
     latest closure, and now and then those whose relief has the same keypoints.
 
     Keyframes must come in order. Without odometry, or with scans that show enough, nothing is done.
@@ -38,17 +41,18 @@ class SubmapFinder:
         self._rules = rules
         self._verifier = Verifier(settings)
         self.history = SubmapHistory(database)
-        self._lookalikes = Lookalikes(self.history, rules)
+        self._lookalikes = Lookalikes()
+        self._next = self._stored = len(self.history.anchors)
         self.reset()
 
     def retune(self, settings: Verification, rules: Loop) -> None:
         """Look for and judge submaps by other settings from now on."""
-        self._rules = self._lookalikes.rules = self._expectation.rules = rules
+        self._rules = rules
         self._verifier.retune(settings)
 
     def reset(self) -> None:
         """Forget what was found lately; the places stay."""
-        self._expectation = Expectation(self.history, self._rules)
+        self._latest: tuple[Keyframe, Keyframe, Array] | None = None
         self._verifier.reset()
         self.history.reset()
         self._asked_m = -np.inf
@@ -60,63 +64,86 @@ class SubmapFinder:
             query: the newest keyframe, not yet remembered.
             verdicts: about its scan.
         """
-        found = self._closures(query, verdicts)
-        if found or not self.history.needed or query.odom_T_body is None:
+        if self._note_closures(query, verdicts) or not self.history.needed or query.odom_T_body is None:
             return list(verdicts)
-        expected = self._expectation.propose(query)
-        compared = self.compare(query, self._candidates(query, verdicts, expected), expected)
-        self._closures(query, compared)
+        expected = self._expected(query)
+        candidates = self._candidates(query, verdicts, expected)
+        guesses = NO_GUESSES if expected is None else {self.history.anchors[expected[0]].stamp_ns: expected[1]}
+        compared = self.compare(query, candidates, guesses)
+        self._note_closures(query, compared)
         known = {one.candidate.stamp_ns for one in compared}
         return compared + [one for one in verdicts if one.candidate.stamp_ns not in known]
 
     def compare(
-        self, query: Keyframe, candidates: Sequence[Candidate], expected: Proposal | None = None
+        self, query: Keyframe, candidates: Sequence[Candidate], guesses: dict[int, Array] = NO_GUESSES
     ) -> list[Hypothesis]:
         """One verdict for each candidate whose submap can be compared with that of a keyframe.
 
         Args:
             query: the newest keyframe.
             candidates: places that it may show.
-            expected: where odometry puts it.
+            guesses: poses `match_T_query` from odometry, by the stamp of the match.
         """
         pairs, first_m = [], -np.inf
         for candidate in candidates:
             match, last_m = self.history.database[candidate.index], np.inf
             if match.session == query.session:  # scans that both submaps hold are alike for no other reason
-                middle_m = (match.path_length_m + query.path_length_m) / 2
-                first_m, last_m = max(first_m, middle_m), middle_m
+                last_m = (match.path_length_m + query.path_length_m) / 2
+                first_m = max(first_m, last_m)
             pairs.append((candidate, self.history.around(match, last_m) or match))
-        whole = self.history.before(query, first_m) if pairs else None
-        guesses = {} if expected is None else {self.history.anchors[expected.row].stamp_ns: expected.pose}
-        return [] if whole is None else self._verifier.verify(whole, pairs, guesses)
+        submap = self.history.before(query, first_m) if pairs else None
+        return [] if submap is None else self._verifier.verify(submap, pairs, guesses)
 
     def remember(self, keyframe: Keyframe) -> None:
         """Take up a keyframe that was added to the database; one without a scan adds nothing to a submap."""
         if self.history.add(keyframe) and self.history.needed:
-            self._lookalikes.describe()
+            self._describe()
 
-    def _closures(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> bool:
+    def _note_closures(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> bool:
         """Whether there are closures; odometry carries the last of them on to the next keyframes."""
-        closed = False
-        for one in verdicts:
-            if one.closure is not None:
-                match, closed = self.history.database[one.candidate.index], True
-                self._expectation.latest = Found(query, match, one.closure.match_T_query)
-        return closed
+        closures = [(one.candidate.index, one.closure) for one in verdicts if one.closure is not None]
+        for index, closure in closures:
+            self._latest = query, self.history.database[index], closure.match_T_query
+        return bool(closures)
+
+    def _expected(self, query: Keyframe) -> tuple[int, Array] | None:
+        """Row of the nearest anchor where odometry puts the rover, and `match_T_query` there; None without one."""
+        for session, odom_T_query, first_m, last_m in self._predictions(query):
+            rows = self.history.rows(session, first_m, last_m)
+            rows = rows[self.history.past(query, rows, self._rules)]
+            poses = [relative(self.history.odometry(row), odom_T_query) for row in rows.tolist()]
+            away = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
+            if away and min(away) < const.SUBMAP_NEAR_M:
+                best = int(np.argmin(away))
+                return int(rows[best]), poses[best]
+        return None
+
+    def _predictions(self, query: Keyframe) -> Iterator[tuple[int, Array, float, float]]:
+        """Session, pose of the query in its odometry, and the part of the path where that is trusted.
+
+        From the latest closure on, and by odometry alone over a short path.
+        """
+        now = query.odom_T_body
+        assert now is not None
+        if self._latest is not None:
+            (found, match, match_T_found), reach_m = self._latest, const.ODOMETRY_REACH_M
+            near = found.session == query.session and query.path_length_m - found.path_length_m < reach_m
+            if near and found.odom_T_body is not None and match.odom_T_body is not None:
+                where = match.odom_T_body @ match_T_found @ relative(found.odom_T_body, now)
+                yield match.session, where, match.path_length_m - reach_m, match.path_length_m + reach_m
+        yield query.session, now, query.path_length_m - const.ODOMETRY_ALONE_M, query.path_length_m
 
     def _candidates(
-        self, query: Keyframe, verdicts: Sequence[Hypothesis], expected: Proposal | None
+        self, query: Keyframe, verdicts: Sequence[Hypothesis], expected: tuple[int, Array] | None
     ) -> list[Candidate]:
         """Candidates worth a comparison, no place twice."""
         found = [one.candidate for one in verdicts if (one.probability or 0.0) >= const.PROMISING]
         if expected is not None:
-            found.append(self._candidate(query, expected.row))
+            found.append(self._candidate(query, expected[0]))
         elif query.path_length_m - self._asked_m >= const.ASKED_EVERY_M:
             self._asked_m = query.path_length_m
-            whole = self.history.before(query)
-            rows = [] if whole is None else self._lookalikes.propose(whole, query.path_length_m)[: const.LOOKALIKES]
             found += [verdicts[0].candidate] if verdicts else []
-            found += [self._candidate(query, row) for row in rows]
+            found += [self._candidate(query, row) for row in self._look_alike(query)]
         return list({candidate.index: candidate for candidate in found}.values())
 
     def _candidate(self, query: Keyframe, row: int) -> Candidate:
@@ -126,3 +153,33 @@ class SubmapFinder:
         match = self.history.database[index]
         similarity = float(query.embedding.descriptor @ match.embedding.descriptor)
         return Candidate(index, anchor.stamp_ns, similarity)
+
+    def _look_alike(self, query: Keyframe) -> list[int]:
+        """Rows of the anchors whose submaps look most like that of a keyframe."""
+        submap, rows = self.history.before(query), np.array(self._lookalikes.rows, np.intp)
+        if submap is None or not len(rows):
+            return []
+        # scans that both submaps hold are alike for no other reason
+        first_m = query.path_length_m - const.SUBMAP_BEFORE_M - const.SUBMAP_AFTER_M
+        anchors = [self.history.anchors[row] for row in rows]
+        apart = np.array([one.session != query.session or one.path_length_m < first_m for one in anchors])
+        return self._lookalikes.search(submap, apart & self.history.past(query, rows, self._rules))[: const.LOOKALIKES]
+
+    def _describe(self) -> None:
+        """Describe the anchors whose submaps are complete now, and one that was stored before, the latest first."""
+        anchors = self.history.anchors
+        while self._next < len(anchors):
+            complete_m = anchors[self._next].path_length_m + const.SUBMAP_AFTER_M
+            if anchors[self._next].session == anchors[-1].session and anchors[-1].path_length_m < complete_m:
+                break
+            self._describe_anchor(self._next)
+            self._next += const.DESCRIBED_ANCHORS
+        if self._stored > 0:
+            self._stored = max(self._stored - const.DESCRIBED_ANCHORS, 0)
+            self._describe_anchor(self._stored)
+
+    def _describe_anchor(self, row: int) -> None:
+        index = self.history.index_of(self.history.anchors[row])
+        submap = None if index is None else self.history.around(self.history.database[index])
+        if submap is not None:
+            self._lookalikes.add(row, submap)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from umf_ros.core.frames import Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, heading, relative, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.prepared_scan import PreparedScan, prepare
+from umf_ros.verification.prepared_scan import PreparedScan, cubes
 from umf_ros.verification.scan_alignment import align_scans
 
 
@@ -37,12 +37,12 @@ def needed_scans(keyframe: Keyframe, others: Sequence[Keyframe]) -> Sequence[Key
     A sensor that is sparse at the distances of the structure, or sees little of what is around, needs many.
     """
     reach_m = _reach_m(keyframe)
-    cell_m = float(np.clip(reach_m / const.REACH_CELLS, *const.AROUND_CELL_M))
+    cell_m = float(np.clip(reach_m / const.REACH_CELLS, *const.MAP_CELL_M))
     seen, counts = np.empty(0, np.int64), []
     for one in (keyframe, *others):
         points = moved_to(keyframe, one)
         near = points[np.einsum("ij,ij->i", points, points) < reach_m**2]
-        seen = np.union1d(seen, _cubes(near, cell_m))
+        seen = np.union1d(seen, cubes(near, cell_m))
         counts.append(len(seen))
     shares = np.array(counts) / max(counts[-1], 1)
     return [] if shares[0] >= const.ENOUGH_SEEN else others[: int(np.argmax(shares >= const.MOST_SEEN))]
@@ -60,10 +60,10 @@ def _merged(keyframe: Keyframe, others: Sequence[Keyframe], drift: DriftMeter) -
     owner = np.repeat(np.arange(len(scans)), [len(one.points) for one in scans])
     inside = (owner == 0) | (np.einsum("ij,ij->i", points, points) < const.MAX_RANGE_M**2)
     points, owner = points[inside], owner[inside]
-    cell_m, chosen = const.THIN_CELL_M, _first_of_cubes(points, const.THIN_CELL_M)
+    cell_m, chosen = const.THIN_CELL_M, _first_ofcubes(points, const.THIN_CELL_M)
     while len(chosen) > const.MERGED_POINTS and len(chosen) > len(keyframe.points):
         cell_m *= max(float(np.sqrt(len(chosen) / const.MERGED_POINTS)), 1.05)
-        chosen = _first_of_cubes(points, cell_m)
+        chosen = _first_ofcubes(points, cell_m)
         chosen = np.concatenate([np.arange(len(keyframe.points)), chosen[owner[chosen] > 0]])
     taken = sorted(set(owner[chosen].tolist()), key=lambda number: scans[number].stamp_ns)
     seconds = np.array([1e-9 * (one.stamp_ns - keyframe.stamp_ns) for one in scans], np.float32)
@@ -78,16 +78,9 @@ def _merged(keyframe: Keyframe, others: Sequence[Keyframe], drift: DriftMeter) -
     return replace(keyframe, points=points[chosen].astype(np.float32), motion=motion)
 
 
-def _first_of_cubes(points: Array, cell_m: float) -> NDArray[np.intp]:
+def _first_ofcubes(points: Array, cell_m: float) -> NDArray[np.intp]:
     """Indices of the first of (N, 3) points in every occupied cube of this side, in order."""
-    return np.sort(np.unique(_cubes(points, cell_m), return_index=True)[1])
-
-
-def _cubes(points: Array, cell_m: float) -> NDArray[np.int64]:
-    """(N,) numbers of the cubes that points (N, 3) lie in."""
-    row, column, layer = (np.floor(points / cell_m).astype(np.int64) + 2**20).T
-    found: NDArray[np.int64] = (row << 42) + (column << 21) + layer
-    return found
+    return np.sort(np.unique(cubes(points, cell_m), return_index=True)[1])
 
 
 def _body_T_other(keyframe: Keyframe, other: Keyframe) -> Array:
@@ -119,9 +112,9 @@ class DriftMeter:
         """Compare a scan with those before it, newest first."""
         points = np.concatenate([moved_to(before[0], one) for one in before[::-1]])
         ways_m = np.concatenate([np.full(len(one.points), _way_m(keyframe, one)) for one in before[::-1]])
-        oldest = _first_of_cubes(points, const.SUBMAP_CELL_M)
+        oldest = _first_ofcubes(points, const.SUBMAP_CELL_M)
         match = PreparedScan(points[oldest].astype(np.float32))
-        query = prepare(keyframe)
+        query = PreparedScan.of(keyframe)
         if not (match.usable and query.usable):
             return
         moved = _body_T_other(before[0], keyframe)

@@ -17,17 +17,16 @@ POINT_THRESHOLD_M = 0.75  # geometry: the cells of the voxel features are about 
 SERIAL_PRODUCTS = 2**18  # multiplications up to which OpenBLAS stays on one thread; its others would spin for nothing
 SUPERFEATURE_RATIO = 0.9  # [UMF eq. 4.1]
 SAME_PLACE_M = 3.0  # by hand: candidates nearer than this to a chosen one show the same place
-
-# ransac
 MAX_TILT_RAD = 0.5  # by hand: a rover does not lie on its side
 
 # hypotheses: which poses are worth a closer look?
 MIN_POINTS = 6  # by hand: that agree on a motion
 MIN_PIXELS = 15  # measured: that agree on a view; of other places never more than 13 did
 DISTINCT_M, DISTINCT_RAD = 0.8, 0.1  # geometry: nearer hypotheses end in the same basin of the alignment
-MIN_MAP_SCORE = 5.0  # by hand, in standard deviations of chance: below, two elevation maps fit no better than noise
+SAME_M, SAME_RAD = 0.05, 0.01  # geometry: of the error of a right pose; aligned hypotheses this near are one
+MIN_MAP_SCORE = 5.0  # by hand, in standard deviations of chance: below, two maps fit no better than noise
 MAX_REFINED = 3  # hypotheses per group of candidates that are aligned: bounds the time
-EXPECTED_M = 4.0  # by hand: a candidate this near to where odometry carries an accepted closure is tested first
+HOPELESS = 0.5  # by definition: an improbable pose, whatever its rivals, is not compared with them
 
 # views: what two images say about a pose
 # standard deviation of a feature's place, of the image's width. XFeat's: a pixel in 688, measured on right pairs under
@@ -45,32 +44,30 @@ UNMEASURED = 1e6  # pixels^2: the variance of a disparity that was not measured
 NEAREST_SEEN_M = 0.3  # nothing nearer than this is in front of a camera
 NOMINAL_BASELINE_M = 0.2  # S3LI's: how well depths of a camera without a right one are taken to be known
 
-# elevation maps: how well does the ground fit at a pose?
-CELL_M = 0.5  # by hand: rocks and ripples are seen, and ten thousand returns leave few holes
-ROWS, COLUMNS = 116, 116  # geometry: to RANGE_M all around
-RANGE_M = 28.0  # geometry: beyond, cells without a return outnumber the others
+# grid maps: how well do relief and structure fit?
+REACH_CELLS = 15.0  # measured: the median range of a scan in cells
+MAP_RADIUS, MAP_SHIFT = 26, 12  # geometry: cells; 26 + 26 + 12 come round to themselves no more
+MAP_CELL_M = (0.25, 1.0)  # by hand: rooms, fields
 PLANE_SIGMA_CELLS = 2.4  # by hand: relief is what rises above a plane about this wide
 PLANE_RIDGE_CELLS2 = 1.2  # keeps the slope of that plane finite where the neighbours lie on a line
 MAX_RELIEF_CELLS = 0.4  # by hand: one boulder must not outvote a field
 MIN_CELLS = 50  # by hand: cells below which a fit means nothing
 MIN_NEIGHBOURHOOD = 0.25  # by hand: weight of the occupied cells around one, of all, below which it has no relief
+LAYER_M = 0.3  # by hand: just more than the thinning
+TALL_LAYERS, MIN_TALL = 3, 20  # by hand: cells of walls, trunks and boxes, and how many make a place
+BARE_RELIEF_CELLS = 0.02  # measured on simulated drives: of bare, even ground .004, of the plainest of other places .06
+BARE_ODDS = 10.0  # by hand: bare ground whose texture comes again elsewhere is that much likelier than a view that does
+# measured: of images that agree about bare ground from .097, of 80 of umf_ros/lab/simulation/scenes.py to .096
+BARE_SPREAD = 0.1
 
 # search over all headings
 SECTORS = 72  # of 5 deg, by hand
 MIN_SECTOR_SHARE = 1e-3  # by hand: of all points; fewer are strays
-AROUND_CELLS, AROUND_RADIUS, AROUND_SHIFT = 64, 26, 12  # geometry: 26 + 26 + 12 cells come round to themselves no more
-REACH_CELLS = 15.0  # measured: the median range of a scan in cells
-AROUND_CELL_M = (0.25, 1.0)  # by hand: rooms, fields
-LAYER_M = 0.3  # by hand: just more than the thinning
-TALL_LAYERS, MIN_TALL = 3, 20  # by hand: cells of walls, trunks and boxes, and how many make a place
 ALL_HEADINGS = np.radians(np.arange(0.0, 360.0, 6.0))  # geometry: half a step is within reach of the alignment
-MIN_SHARED_VIEW = 0.6  # of the narrower view; by hand: a LiDAR of 70 deg may be turned by 28
 SEARCHED_OVERLAP = 0.45  # by hand: a view of 70 deg is looked for within 38
-PEAKS = (3, 4)  # by hand: of relief alone, of relief and structure
-SETTLE_MEDIANS, SETTLE_M = 2.5, 0.05  # by hand: cells that a plane between two maps is fitted to lie so near to it
-MAX_SLOPE = 0.3  # by hand: of one map against the other, rad
-ALTERNATIVES = (2, 2)  # by hand: as PEAKS, at one heading
-SCOUTS, SCOUT_STEPS = 300, 5  # by hand: points and steps that draw a peak to the match
+PEAKS, ALTERNATIVES = 4, 2  # by hand: of relief alone and with structure, at all headings and at one
+SETTLE_MEDIANS, MAX_SLOPE = 2.5, 0.3  # by hand: ground of one map on the other's, rad
+SCOUTS, SCOUT_STEPS = 300, 5  # by hand: points and steps of ICP that refine a peak
 SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells; geometry: a peak is off by less than a cell and half a heading
 TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain in the open
 
@@ -78,65 +75,13 @@ TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain i
 THIN_CELL_M = 0.25  # by hand: a scan keeps some 4,500 of its returns
 MAX_RANGE_M = 40.0  # geometry: beyond, returns of a flat scan are metres apart
 NORMAL_NEIGHBOURS = 10  # small_gicp's own default
-NOISE_NEIGHBOURS = 5  # by hand: the point itself and four around it
+NEIGHBOURS = 5  # by hand: they reach the next ring
 SAMPLE = 1500  # measured: points of the query that are aligned; a third of the scan is as good in half the time
-COARSE_REACH_M, COARSE_STEPS = 1.0, 10  # geometry: two cells of the elevation maps
+COARSE_REACH_M, COARSE_STEPS = 1.0, 10  # geometry: two cells of the maps
 COARSE_EVERY = 3  # of the sample; measured: all of it ends within a millimetre of the same poses
 FINE_REACH_M, FINE_STEPS = 0.4, 8  # by hand: the spacing of far returns is wider than the noise
 MIN_SCAN_POINTS = 100  # by hand: below, there is nothing to align
-BARE_RELIEF_M = 0.01  # measured on simulated drives: of bare, even ground .002, of the plainest of other places .03
-BARE_ODDS = 10.0  # by hand: bare ground whose texture comes again elsewhere is that much likelier than a view that does
-BARE_SPREAD = (
-    0.1  # measured: of images that agree about bare ground from .097, of 80 of umf_ros/lab/simulation/scenes.py to .096
-)
 SCANS_KEPT = 60  # prepared scans in memory: bounds it, changes no result
-
-# free space: what the rays of one scan say of the points of another
-SIGHT_ROWS, SIGHT_COLUMNS = 90, 180  # geometry: cells of two degrees, as far apart as the rings of sixteen beams
-SIGHT_MARGIN_M, SIGHT_MARGIN = 0.3, 0.03  # by hand: noise, motion and error of the pose, which grows with the range
-SIGHT_KNOWN = 0.3  # by hand: of a cell's neighbourhood that must have returns for its rays to be known
-SIGHT_FROM_M = 0.8  # by hand: nearer than this is the robot itself
-SIGHT_FILLED_M = 5.0  # geometry: nearer, a thinned point is wider than a cell and its neighbours' gaps
-
-# discord of the modalities, told in words: agreement in standard deviations of chance, contradiction of free space
-IMAGE_CONTRADICTS, IMAGE_SUPPORTS = 0.0, 4.0  # by hand
-SCANS_SUPPORT, SCANS_CONTRADICT = 0.05, 0.12  # measured: right poses stay below the one, half of the wrong ones above
-
-# meeting of two scans
-MEETING_POINTS = 20  # by hand: of a kind, below which a share of them means nothing
-COUNTERPART_M, COUNTERPART_SPACINGS = 0.05, 0.5  # measured: .3 m and 1 spacing tell places apart less well
-BLUR_M = 0.04  # by hand: a metre per second in a scan of a tenth to a fifth of one, whose motion was not removed
-UNEXPLAINED = 2.0  # measured: in these reaches; of all measures the most alike from one kind of place to another
-SPACING_NEIGHBOURS = 6  # by hand: the point itself and five, so that they reach the next ring
-UPRIGHT = 0.7  # geometry: surfaces steeper than 45 deg
-RIVAL_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: beyond the error of a right pose, within a wrong one's
-RIVAL_FAR_M = np.concatenate([np.arange(-6.0, -0.9, 0.5), np.arange(1.0, 6.1, 0.5)])  # geometry: what repeats: doors
-RIVAL_EVERY = 10  # of the sample: bounds the time
-RIVAL_MISFIT = 3.0  # by hand: how bad a misfit can be, in counterparts' reach
-
-# passages: corridors, tunnels, aisles, canyons, where a scan looks the same all along
-BAND_DEG = 2.0  # geometry: elevations about one ring of sixteen
-PLANE_NEIGHBOURS, PLANE_REACH_M = 8, 0.8  # measured: 12 neighbours leave next to no planes of sixteen rings
-PLANE_WIDTH_M, PLANE_ROUNDNESS = 0.1, 0.45  # by hand: narrower neighbourhoods lie on a single ring
-PLANE_THICKNESS_M = 0.04  # by hand: twice the noise of a range
-PLANE_SIGMA_M, PLANE_MISFIT_FLOOR = 0.1, 0.05  # measured: .05 and .2 m tell right poses from wrong ones less well
-PASSAGE_RATIO = 0.2  # measured: of surfaces along to surfaces across; passages have up to .17
-ROUGH_PASSAGE_RATIO = 0.35  # measured: the same of all normals; passages have up to .30
-PASSAGE_SURFACE = 0.1  # measured: share of points on planes; woods and orchards have less, passages from .2
-PASSAGE_COMMON = 0.25  # by hand: of the compared points that a rival needs
-PASSAGE_FAR_M = np.concatenate([np.arange(-15.0, -0.9, 0.5), np.arange(1.0, 15.1, 0.5)])  # geometry: scans overlap
-PASSAGE_SAMPLE, PASSAGE_SCOUTS, PASSAGE_KEPT = 750, 100, 6  # by hand: points of a half, first of all, of few rivals
-FAN = 0.5  # geometry: length of the mean bearing; .94 of a view of 70 deg, .5 of one of 217 deg
-# measured on benchmarks/corridors.py, seed 10000: 1 in 100 of wrong closures has more, where bays repeat; none with a
-# narrow view; .15 loses half as many right ones and keeps 1 in 20 wrong ones
-PASSAGE_RIVAL, NARROW_PASSAGE_RIVAL = 0.26, 0.12
-
-HOPELESS = 0.5  # by definition: what is wrong more likely than right, whatever its rivals, is held against none
-RUNNER_UP_ROOM = 0.02  # by hand: shares nearer to nothing than this are alike
-MAX_MISFIT = 2.5  # measured: of 2,400 right poses one in 100 has more than 1.5, of wrong ones half have more than this
-MIN_RUNNER_UP = 0.1  # measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 86
-
-SAME_M, SAME_RAD = 0.05, 0.01  # geometry: of the error of a right pose; aligned hypotheses this near are one
 
 # covariance
 SEARCH_M, SEARCH_RAD = 3.0, 0.35  # what the search itself knows, standard deviation: nothing is wider than this
@@ -145,25 +90,39 @@ MOMENTS = 6  # parts of a scan whose errors of motion are told apart; by hand: e
 MOTION_SHARE = 0.03  # by hand: of the motion during a scan that odometry gets wrong all along, as by its scale
 MIN_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanner is better
 
-# measurement: every test of a hypothesis
+# free space: what the rays of one scan say of the points of another
+SIGHT_ROWS, SIGHT_COLUMNS = 90, 180  # geometry: cells of two degrees, as far apart as the rings of sixteen beams
+SIGHT_MARGIN_M, SIGHT_MARGIN = 0.3, 0.03  # by hand: noise, motion and error of the pose, which grows with the range
+SIGHT_KNOWN = 0.3  # by hand: of a cell's neighbourhood that must have returns for its rays to be known
+SIGHT_FROM_M = 0.8  # by hand: nearer than this is the robot itself
+SIGHT_FILLED_M = 5.0  # geometry: nearer, a thinned point is wider than a cell and its neighbours' gaps
+
+# consistency of two scans
+FEWEST_POINTS = 20  # by hand: of a kind, below which a share of them means nothing
+COUNTERPART_M, COUNTERPART_SPACINGS = 0.05, 0.5  # measured: .3 m and 1 spacing tell places apart less well
+BLUR_M = 0.04  # by hand: a metre per second in a scan of a tenth to a fifth of one, whose motion was not removed
+UNEXPLAINED = 2.0  # measured: in these reaches; of all measures the most alike from one kind of place to another
+UPRIGHT = 0.7  # geometry: surfaces steeper than 45 deg
 NO_FIT_M = 0.3  # stands for the residual where nothing overlaps
-AGREEMENT_PIXELS = 0.04  # of the image's width, around the place where a feature should reappear; by hand
-AGREEMENT_ROWS = 0.1  # of the image's height: features are compared with their like: sky, horizon, foreground; by hand
-AGREEMENT_M = 1.0  # geometry: a voxel
-AGREEMENT_RANGE, AGREEMENT_RANGE_M = 0.25, 1.0  # by hand: likewise, share of the range and what is added to it
-AGREEMENT_PEERS = 8  # by hand: features a comparison needs
-AGREEMENT_COMPARED = 400  # strongest features of a side that are compared: bounds time and memory
+MAX_MISFIT = 2.5  # measured: of 2,400 right poses one in 100 has more than 1.5, of wrong ones half have more than this
+
+# ambiguity: would the surfaces fit as well elsewhere?
+BAND_DEG = 2.0  # geometry: elevations about one ring of sixteen
+PLANE_NEIGHBOURS, PLANE_REACH_M = 8, 0.8  # measured: 12 neighbours leave next to no planes of sixteen rings
+PLANE_WIDTH_M, PLANE_ROUNDNESS = 0.1, 0.45  # by hand: narrower neighbourhoods lie on a single ring
+PLANE_THICKNESS_M = 0.04  # by hand: twice the noise of a range
+PLANE_SIGMA_M, MISFIT_FLOOR = 0.1, 0.05  # measured: .05 and .2 m tell right poses from wrong ones less well
+RIVAL_COMMON = 0.25  # by hand: of the points compared at the pose that a rival needs
+RIVAL_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: beyond the error of a right pose, within a wrong one's
+RIVAL_FAR_M = np.concatenate([np.arange(-15.0, -0.9, 0.5), np.arange(1.0, 15.1, 0.5)])  # geometry: scans overlap
+RIVAL_SAMPLE, RIVAL_SCOUTS, RIVALS_KEPT = 500, 100, 4  # by hand: points of a half, of few rivals and first of all
+MIN_RIVAL = 0.1
 
 # temporal memory
 MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of keyframes
 ODOMETRY_REACH_M = 15.0  # by hand: odometry is trusted over this distance
-PRIOR_M = 1.0  # by hand: standard deviation of what odometry predicts before any way is driven
+EXPECTED_M = 4.0  # by hand: a candidate this near to where odometry carries an accepted closure is tested first
 AGREE_M, AGREE_RAD = 0.5, 0.05  # by hand: two findings this near are one
-
-# submaps of narrow sensors, judged by their terrain
-RIVAL_TERRAIN_M = (1.5, 3.0)  # geometry: beyond the error of a right pose, within a wrong one's
-MIN_TERRAIN = 0.3  # by hand: correlation of the terrain without which submaps of a corridor fit at many places
-NARROW_DEG = 270.0  # geometry: a sensor that sees more recognises a place from any side by its scans
 
 # submaps: what is seen on the metres around a keyframe
 SUBMAP_BEFORE_M, SUBMAP_AFTER_M = 20.0, 15.0  # measured: path before and behind a keyframe; 10 and 10 find less
@@ -174,7 +133,7 @@ MAX_BLUR_M = (
     0.3  # by hand: standard deviation by which a merged point may lie beside its place: half a cell of the maps
 )
 NEED_ASKED_EVERY = 4  # anchors; by hand: bounds the time for a sensor that needs none
-SUBMAP_CELL_M = 0.5  # by hand: of what the drift of odometry is measured against
+SUBMAP_CELL_M, SUBMAP_RADIUS = 0.5, 52  # by hand: of the drift of odometry and of keypoints; geometry: 26 m
 SUBMAP_NEAR_M = 5.0  # by hand: from where odometry expects the rover to a keyframe that is compared
 PROMISING = 0.05  # by hand: probability of a scan's hypothesis from which on submaps are compared
 # by hand: scans that the drift of odometry is judged by, at least and at most, and their overlap with those before

@@ -1,4 +1,4 @@
-"""Find poses for a candidate: from elevation maps, from local features and from findings of earlier keyframes."""
+"""Poses for a candidate: from maps, from local features, and from findings of earlier keyframes."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from umf_ros.verification.hypothesis import Hypothesis
 from umf_ros.verification.prepared_scan import PreparedScan, views_decide
 from umf_ros.verification.rerank import fit_rigid
 from umf_ros.verification.view_alignment import PairedViews
-from umf_ros.verification.yaw_search import Fit, RotatedElevationMap, coarse_align, search
+from umf_ros.verification.yaw_search import Fit, RotatedMaps, coarse_align, search
 
 
 def find_hypotheses(
     query: Keyframe,
     candidate: Candidate,
     keyframe: Keyframe,
-    turned: RotatedElevationMap | None,
+    turned: RotatedMaps | None,
     match: PreparedScan,
     settings: Verification,
     guess: Array | None = None,
 ) -> list[Hypothesis]:
-    """Distinct poses for one candidate, best first; where scans tell places apart, those at which elevation maps fit.
+    """Distinct poses for one candidate, best first; where scans tell places apart, those at which their maps fit.
 
     Args:
         query: the query keyframe.
         candidate: the candidate, reranked.
         keyframe: its keyframe.
-        turned: the query's surroundings at every heading; None without a usable scan.
+        turned: the query's map at every heading; None without a usable scan.
         match: the candidate's scan, usable or not.
         settings: RANSAC iterations and seed.
         guess: `match_T_query` (4, 4) as odometry has it.
@@ -44,32 +44,22 @@ def find_hypotheses(
         views = PairedViews.of(query, keyframe, const.VIEW_NOISE[settings.features])
     if turned is None or not match.usable or (views is not None and views_decide(match, turned.scan)):
         seen = views.best_pose() if views else None
-        poses = [(seen[0], float(seen[1]))] if seen else []
-        return [Hypothesis.of(query, candidate, keyframe, pose=pose, score=score, views=views) for pose, score in poses]
-    from_points = pose_from_points(query, candidate, keyframe, settings.ransac_iterations, settings.seed)
-    guesses = (from_points, views.any_pose() if views else None)
+        return [Hypothesis.of(query, candidate, keyframe, pose=seen[0], score=seen[1], views=views)] if seen else []
+    guesses = _pose_from_features(query, candidate, keyframe, settings), views.any_pose() if views else None
     fits = [coarse_align(match, turned.scan, pose) for pose in guesses if pose is not None]
     fits = [fit for fit in fits if fit.telling] + search(match, turned)
     fits.sort(key=lambda fit: -fit.score)
     if guess is not None and (fit := coarse_align(match, turned.scan, guess)).telling:
         fits.insert(0, replace(fit, share=1.0))  # submaps that share little would not rank it first
-    return [
-        Hypothesis.of(query, candidate, keyframe, pose=fit.pose, score=fit.score, views=views)
-        for fit in _distinct(fits)
-    ]
+    distinct: list[Fit] = []
+    for fit in fits:
+        if not any(near(fit.pose, other.pose, const.DISTINCT_M, const.DISTINCT_RAD) for other in distinct):
+            distinct.append(fit)
+    return [Hypothesis.of(query, candidate, keyframe, pose=fit.pose, score=fit.score, views=views) for fit in distinct]
 
 
-def pose_from_points(
-    query: Keyframe, candidate: Candidate, match: Keyframe, iterations: int, seed: int
-) -> Array | None:
+def _pose_from_features(query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification) -> Array | None:
     """`match_T_query` from 3-D/3-D pairs of both modalities at once, or None."""
-    ours, theirs = paired_points(query, candidate, match)
-    consensus = fit_rigid(ours, theirs, const.POINT_THRESHOLD_M, iterations, seed)
-    return consensus.model if consensus is not None and consensus.count >= const.MIN_POINTS else None
-
-
-def paired_points(query: Keyframe, candidate: Candidate, match: Keyframe) -> tuple[Array, Array]:
-    """Points (P, 3) of the query and of the match, each in its body frame, of all pairs with known depths."""
     ours, theirs = [np.empty((0, 3))], [np.empty((0, 3))]
     for mine, other, pairs in (
         (query.embedding.image, match.embedding.image, candidate.image_pairs),
@@ -80,7 +70,9 @@ def paired_points(query: Keyframe, candidate: Candidate, match: Keyframe) -> tup
             known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
             ours.append(a[known])
             theirs.append(b[known])
-    return np.concatenate(ours), np.concatenate(theirs)
+    points = np.concatenate(ours), np.concatenate(theirs)
+    consensus = fit_rigid(*points, const.POINT_THRESHOLD_M, settings.ransac_iterations, settings.seed)
+    return consensus.model if consensus is not None and consensus.count >= const.MIN_POINTS else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +97,15 @@ class TemporalMemory:
         """Add what one keyframe found: matched keyframes, `match_T_query` and whether it was accepted."""
         self._findings.append([_Finding(query, *finding) for finding in found])
 
-    def expected_distance(self, query: Keyframe, match: Keyframe) -> float:
+    def expected(
+        self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]
+    ) -> list[tuple[Candidate, Keyframe]]:
+        """The candidate nearest to where earlier closures and odometry put the rover, if there is one within 4 m."""
+        distances = [self._expected_distance(query, keyframe) for _, keyframe in candidates]
+        nearest = int(np.argmin(distances)) if distances else 0
+        return [candidates[nearest]] if distances and distances[nearest] < const.EXPECTED_M else []
+
+    def _expected_distance(self, query: Keyframe, match: Keyframe) -> float:
         """Metres between a pair, as odometry carries it over from the latest accepted closure near it; or inf."""
         for finding in (one for findings in reversed(self._findings) for one in findings if one.accepted):
             carried = _carried(finding, query, match)
@@ -113,48 +113,20 @@ class TemporalMemory:
                 return float(np.linalg.norm(carried[:3, 3]))
         return float("inf")
 
-    def expected(
-        self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]
-    ) -> list[tuple[Candidate, Keyframe]]:
-        """The candidate nearest to where earlier closures and odometry put the rover, if there is one within 4 m."""
-        distances = [self.expected_distance(query, keyframe) for _, keyframe in candidates]
-        nearest = int(np.argmin(distances)) if distances else 0
-        return [candidates[nearest]] if distances and distances[nearest] < const.EXPECTED_M else []
-
     def support(self, query: Keyframe, match: Keyframe, match_T_query: Array) -> float:
         """How many of the remembered keyframes found a pose that odometry carries over to this one."""
-        return float(sum(any(_agrees(f, query, match, match_T_query) for f in findings) for findings in self._findings))
 
+        def agrees(finding: _Finding) -> bool:
+            carried = _carried(finding, query, match)
+            return carried is not None and near(carried, match_T_query, const.AGREE_M, const.AGREE_RAD)
 
-def prior_sigmas(query: Keyframe, match: Keyframe, match_T_query: Array, drift: float) -> float:
-    """Distance from what odometry alone predicts, in standard deviations of its drift; NaN without odometry.
-
-    The test is soft by construction: after a long way round, odometry predicts next to nothing.
-    """
-    if query.odom_T_body is None or match.odom_T_body is None or query.session != match.session:
-        return float("nan")
-    predicted = relative(match.odom_T_body, query.odom_T_body)
-    driven = abs(query.path_length_m - match.path_length_m)
-    return float(np.linalg.norm(predicted[:3, 3] - match_T_query[:3, 3]) / (const.PRIOR_M + drift * driven))
-
-
-def _distinct(fits: list[Fit]) -> list[Fit]:
-    kept: list[Fit] = []
-    for fit in fits:
-        if not any(near(fit.pose, other.pose, const.DISTINCT_M, const.DISTINCT_RAD) for other in kept):
-            kept.append(fit)
-    return kept
+        return float(sum(any(map(agrees, findings)) for findings in self._findings))
 
 
 def near(a: Array, b: Array, metres: float, radians: float) -> bool:
     """Whether two poses are one within these tolerances."""
     gap = relative(a, b)
     return bool(np.linalg.norm(gap[:3, 3]) < metres and rotation_angle(gap) < radians)
-
-
-def _agrees(found: _Finding, query: Keyframe, match: Keyframe, match_T_query: Array) -> bool:
-    carried = _carried(found, query, match)
-    return carried is not None and near(carried, match_T_query, const.AGREE_M, const.AGREE_RAD)
 
 
 def _carried(found: _Finding, query: Keyframe, match: Keyframe) -> Array | None:

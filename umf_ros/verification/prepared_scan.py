@@ -1,9 +1,9 @@
-"""A scan prepared for comparison: thinned, with normals and index."""
+"""A scan prepared for comparison: thinned, with normals, nearest neighbours and maps."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,47 +14,84 @@ from umf_ros.core.frames import Frame, Keyframe, Points, ScanMotion
 from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.core.levelling import upright
 from umf_ros.verification import constants as const
-from umf_ros.verification.elevation_map import ElevationMap
-from umf_ros.verification.surfaces import Surfaces
-from umf_ros.verification.surroundings import FieldOfView, RangeImage, Surroundings
+from umf_ros.verification.grid_map import GridMap
+from umf_ros.verification.visibility import FieldOfView, RangeImage
+
+Indices = NDArray[np.intp]
 
 
-def thin_scan(points: Points | None, cell_m: float = const.THIN_CELL_M) -> Points:
-    """One mean point per occupied cube of `cell_m`, nearer than 40 m: (M, 3) float32, body frame."""
+def thin_scan(points: Points | None) -> Points:
+    """One mean point per occupied cube of 0.25 m, nearer than 40 m: (M, 3) float32, body frame."""
     points = np.empty((0, 3), np.float32) if points is None else points
-    return cell_means(points, points, cell_m)
+    return _cell_means(points, points)
 
 
 def thin_frame(frame: Frame) -> tuple[Points, ScanMotion | None]:
     """The thinned scan of a frame, and the motion meanwhile with a mean moment for every thinned point."""
     if frame.points is None or frame.motion is None:
         return thin_scan(frame.points), None
-    timed = np.column_stack([frame.points, frame.motion.moments_s])
-    means = cell_means(frame.points, timed, const.THIN_CELL_M)
+    means = _cell_means(frame.points, np.column_stack([frame.points, frame.motion.moments_s]))
     return np.ascontiguousarray(means[:, :3]), replace(frame.motion, moments_s=means[:, 3])
 
 
-def cell_means(points: Points, values: Points, cell_m: float) -> Points:
+def _cell_means(points: Points, values: Points) -> Points:
     """Means (M, C) float32 of values (N, C) over the points (N, 3) nearer than 40 m in every occupied cube."""
     inside = np.einsum("ij,ij->i", points, points) < const.MAX_RANGE_M**2
     near, values = points[inside].astype(float), values[inside].astype(float)
-    cells = np.floor((near + const.MAX_RANGE_M) / cell_m).astype(np.int64)
-    side = int(2 * const.MAX_RANGE_M / cell_m) + 2
-    keys = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
-    _, owner, count = np.unique(keys, return_inverse=True, return_counts=True)
+    _, owner, count = np.unique(cubes(near, const.THIN_CELL_M), return_inverse=True, return_counts=True)
     means = [np.bincount(owner, column) / count for column in values.T]
     return np.column_stack(means).astype(np.float32)
+
+
+def cubes(points: Array, cell_m: float) -> NDArray[np.int64]:
+    """(N,) numbers of the cubes with sides of `cell_m` that points (N, 3) lie in."""
+    row, column, layer = (np.floor(points / cell_m).astype(np.int64) + 2**20).T
+    found: NDArray[np.int64] = (row << 42) + (column << 21) + layer
+    return found
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Points with the planes through their neighbourhoods.
+
+    Attributes:
+        points: (M, 3) m.
+        tree: their nearest neighbours.
+        normals: (M, 3) unit vectors.
+        centres: (M, 3) m, of the neighbourhoods.
+        reach_m: (M,) radius of the neighbourhood.
+        planar: (M,) whether the neighbours determine a plane; those on a single ring do not.
+    """
+
+    points: Array
+    tree: small_gicp.KdTree
+    normals: Array
+    centres: Array
+    reach_m: Array
+    planar: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, points: Array) -> Surfaces:
+        """Fit a plane at each of (M, 3) points."""
+        tree = small_gicp.KdTree(points)
+        index, squared = tree.batch_knn_search(points, const.PLANE_NEIGHBOURS, 1)
+        neighbours = points[np.asarray(index, np.intp)]
+        centres = neighbours.mean(axis=1)
+        offsets = neighbours - centres[:, None]
+        variances, axes = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets / neighbours.shape[1])
+        thickness, width, length = np.sqrt(np.maximum(variances, 0.0)).T
+        reach = np.sqrt(np.asarray(squared)[:, -1])
+        even = (thickness < const.PLANE_THICKNESS_M) & (4 * thickness < width)
+        wide = (width > const.PLANE_WIDTH_M) & (width > const.PLANE_ROUNDNESS * length)
+        planar = even & wide & (reach < const.PLANE_REACH_M)
+        return cls(points, tree, axes[:, :, 0], centres, reach, planar)
 
 
 class PreparedScan:
     """A keyframe's scan made ready for comparison, each part when it is first asked for."""
 
     def __init__(
-        self,
-        points: Points,
-        body_T_lidar: Array | None = None,
-        blur_m: float = 0.0,
-        owner: NDArray[np.intp] | None = None,
+        self, points: Points, body_T_lidar: Array | None = None, blur_m: float = 0.0, owner: Indices | None = None
     ) -> None:
         """Prepare nothing yet.
 
@@ -64,34 +101,26 @@ class PreparedScan:
             blur_m: how far points may be off because the LiDAR moved during the scan, standard deviation.
             owner: (M,) the merged scan of each point, 0 to K - 1.
         """
+        self.points: Array = points.astype(float)
         self.blur_m = blur_m
         self._lidars_T_body = invert(np.eye(4)[None] if body_T_lidar is None else body_T_lidar.reshape(-1, 4, 4))
         self._owner = np.zeros(len(points), np.intp) if owner is None else owner
-        self.points: Array = points.astype(float)
-        self._around: dict[float, Surroundings] = {}
+        self._maps: dict[float, GridMap] = {}
 
-    @cached_property
-    def narrow(self) -> bool:
-        """Whether it was merged from scans that see little around the sensor."""
-        if len(self._lidars_T_body) == 1:
-            return False
-        number = int(np.bincount(self._owner).argmax())
-        own = transform(self._lidars_T_body[number], self.points[self._owner == number])
-        return FieldOfView(own).width_deg < const.NARROW_DEG
+    @classmethod
+    def of(cls, keyframe: Keyframe) -> PreparedScan:
+        """The scan of a keyframe; one whose motion was not removed is blurred."""
+        motion = keyframe.motion
+        blur_m = const.BLUR_M if motion is None or not motion.removed else 0.0
+        if motion is None or not len(motion.body_T_lidars):
+            return cls(keyframe.points, keyframe.body_T_lidar, blur_m)
+        return cls(keyframe.points, motion.body_T_lidars, blur_m, np.unique(motion.moments_s, return_inverse=True)[1])
 
     def make_ready(self) -> None:
         """Make at once what a query's scan is asked for in every comparison."""
         if self.usable:
-            self.around(self.cell_m)
-            for part in (
-                "elevation",
-                "view",
-                "range_images",
-                "spacing",
-                "scouts_cloud",
-                "coarse_cloud",
-                "sample_cloud",
-            ):
+            self.map(self.cell_m)
+            for part in ("view", "range_images", "spacing", "scouts_cloud", "coarse_cloud", "sample_cloud"):
                 getattr(self, part)
 
     @property
@@ -99,15 +128,10 @@ class PreparedScan:
         """Whether there is anything to align."""
         return len(self.points) >= const.MIN_SCAN_POINTS
 
-    @cached_property
+    @property
     def bare(self) -> bool:
         """Whether it shows bare, even ground alone, which could lie anywhere on such ground."""
-        return float(self.elevation.values.std()) < const.BARE_RELIEF_M if len(self.elevation.values) else False
-
-    @cached_property
-    def elevation(self) -> ElevationMap:
-        """Heights and relief, upright."""
-        return ElevationMap(self.upright_points)
+        return self.map(self.cell_m).even
 
     @cached_property
     def up(self) -> Array:
@@ -126,39 +150,17 @@ class PreparedScan:
         return FieldOfView(self.upright_points)
 
     @cached_property
-    def reach_m(self) -> float:
-        """Median distance of the points, m."""
-        return float(np.median(np.linalg.norm(self.points, axis=1)))
-
-    @cached_property
     def cell_m(self) -> float:
-        """Side of a cell of the map of its surroundings, m, as the place asks for it."""
-        steps = np.round(np.log2(self.reach_m / const.REACH_CELLS) * 2) / 2
-        return float(np.clip(2.0**steps, *const.AROUND_CELL_M))
+        """Side of a cell of the map, m, as the place asks for it."""
+        reach_m = float(np.median(np.linalg.norm(self.points, axis=1)))
+        steps = np.round(np.log2(reach_m / const.REACH_CELLS) * 2) / 2
+        return float(np.clip(2.0**steps, *const.MAP_CELL_M))
 
-    def around(self, cell_m: float) -> Surroundings:
-        """Map of what stands around it, in cells of this size, m."""
-        if cell_m not in self._around:
-            self._around[cell_m] = Surroundings(self.upright_points, cell_m)
-        return self._around[cell_m]
-
-    @cached_property
-    def scouts(self) -> Array:
-        """(S, 3) a few points, evenly taken, m."""
-        return self.points[self._picks(const.SCOUTS)]
-
-    @cached_property
-    def scouts_cloud(self) -> small_gicp.PointCloud:
-        """The few with covariances of their own."""
-        return _cloud_of(self.scouts)
-
-    def _picks(self, count: int) -> NDArray[np.intp]:
-        return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(np.intp)
-
-    @cached_property
-    def cloud(self) -> small_gicp.PointCloud:
-        """Points, normals and covariances."""
-        return _cloud_of(self.points, self.tree)
+    def map(self, cell_m: float) -> GridMap:
+        """Map of what lies around it, in cells of this size, m."""
+        if cell_m not in self._maps:
+            self._maps[cell_m] = GridMap(self.upright_points, cell_m)
+        return self._maps[cell_m]
 
     @cached_property
     def range_images(self) -> list[RangeImage]:
@@ -180,20 +182,37 @@ class PreparedScan:
         return found
 
     @cached_property
-    def picks(self) -> NDArray[np.intp]:
+    def tree(self) -> small_gicp.KdTree:
+        """Nearest neighbours among the points."""
+        return small_gicp.KdTree(self.points)
+
+    def nearest(self, points: Array) -> tuple[Indices, Array]:
+        """Index (N,) of the nearest point to each of (N, 3), and its squared distance, m^2."""
+        index, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
+        return np.asarray(index, np.intp), np.asarray(squared)
+
+    @cached_property
+    def cloud(self) -> small_gicp.PointCloud:
+        """Points, normals and covariances."""
+        return _cloud_of(self.points, self.tree)
+
+    @cached_property
+    def normals(self) -> Array:
+        """(M, 3) unit normals, zero where the neighbourhood is too small."""
+        return np.asarray(self.cloud.normals())[:, :3]
+
+    def _pick(self, count: int) -> Indices:
+        return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(np.intp)
+
+    @cached_property
+    def picks(self) -> Indices:
         """(S,) indices of at most 1500 points, evenly taken."""
-        return self._picks(const.SAMPLE)
+        return self._pick(const.SAMPLE)
 
     @cached_property
     def sample(self) -> Array:
-        """(S, 3) at most 1500 points, evenly taken."""
+        """(S, 3) these points, m."""
         return self.points[self.picks]
-
-    @cached_property
-    def spacing(self) -> Array:
-        """(S,) m: how far the points of the sample are from the fifth of their neighbours."""
-        _, squared = self.tree.batch_knn_search(self.sample, const.SPACING_NEIGHBOURS, 1)
-        return np.sqrt(np.asarray(squared)[:, -1])
 
     @cached_property
     def sample_cloud(self) -> small_gicp.PointCloud:
@@ -202,18 +221,33 @@ class PreparedScan:
 
     @cached_property
     def coarse_cloud(self) -> small_gicp.PointCloud:
-        """A third of the sample, likewise: enough for where there is far to go."""
+        """A third of the sample, likewise: enough for the far-sighted steps."""
         return _cloud_of(self.sample[:: const.COARSE_EVERY])
 
     @cached_property
-    def tree(self) -> small_gicp.KdTree:
-        """Nearest neighbours among the points."""
-        return small_gicp.KdTree(self.points)
+    def scouts(self) -> Array:
+        """(S, 3) m: a few hundred points, evenly taken."""
+        return self.points[self._pick(const.SCOUTS)]
 
     @cached_property
-    def normals(self) -> Array:
-        """(M, 3) unit normals, zero where the neighbourhood is too small."""
-        return np.asarray(self.cloud.normals())[:, :3]
+    def scouts_cloud(self) -> small_gicp.PointCloud:
+        """The few with covariances of their own."""
+        return _cloud_of(self.scouts)
+
+    @cached_property
+    def spacing(self) -> Array:
+        """(S,) m: how far the points of the sample are from the fifth of their neighbours."""
+        _, squared = self.tree.batch_knn_search(self.sample, const.NEIGHBOURS + 1, 1)
+        return np.sqrt(np.asarray(squared)[:, -1])
+
+    @cached_property
+    def noise_m(self) -> float:
+        """How far the points scatter about their neighbours' planes, m: sensor noise and roughness together."""
+        index, _ = self.tree.batch_knn_search(self.sample, const.NEIGHBOURS, 1)
+        neighbours = np.asarray(index, np.intp)
+        offsets = self.points[neighbours[:, 1:]] - self.sample[:, None]
+        away = np.abs(np.einsum("nki,ni->nk", offsets, self.normals[neighbours[:, 0]]))
+        return 1.4826 * float(np.median(away))
 
     @cached_property
     def surfaces(self) -> tuple[Surfaces, Surfaces]:
@@ -223,20 +257,6 @@ class PreparedScan:
         elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
         odd = (np.floor(elevation / const.BAND_DEG) % 2).astype(bool)
         return Surfaces.of(self.points[~odd]), Surfaces.of(self.points[odd])
-
-    @cached_property
-    def noise_m(self) -> float:
-        """How far the points scatter about their neighbours' planes, m: sensor noise and roughness together."""
-        index, _ = self.tree.batch_knn_search(self.sample, const.NOISE_NEIGHBOURS, 1)
-        neighbours = np.asarray(index, np.intp)
-        offsets = self.points[neighbours[:, 1:]] - self.sample[:, None]
-        away = np.abs(np.einsum("nki,ni->nk", offsets, self.normals[neighbours[:, 0]]))
-        return 1.4826 * float(np.median(away))
-
-    def nearest(self, points: Array) -> tuple[NDArray[np.intp], Array]:
-        """Index (N,) of the nearest point to each of (N, 3), and its squared distance, m^2."""
-        index, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
-        return np.asarray(index, np.intp), np.asarray(squared)
 
 
 def _cloud_of(points: Array, tree: small_gicp.KdTree | None = None) -> small_gicp.PointCloud:
@@ -248,32 +268,14 @@ def _cloud_of(points: Array, tree: small_gicp.KdTree | None = None) -> small_gic
 
 def levelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
     """The pose `match_T_query` (4, 4) between the upright frames of two scans."""
-    to_match, from_query = make_pose(match.up, np.zeros(3)), make_pose(query.up.T, np.zeros(3))
-    found: Array = to_match @ pose @ from_query
+    found: Array = make_pose(match.up, np.zeros(3)) @ pose @ make_pose(query.up.T, np.zeros(3))
     return found
 
 
 def unlevelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
     """The pose `match_T_query` (4, 4) that is this one between the upright frames of two scans."""
-    from_match, to_query = make_pose(match.up.T, np.zeros(3)), make_pose(query.up, np.zeros(3))
-    found: Array = from_match @ pose @ to_query
+    found: Array = make_pose(match.up.T, np.zeros(3)) @ pose @ make_pose(query.up, np.zeros(3))
     return found
-
-
-def prepare(keyframe: Keyframe) -> PreparedScan:
-    """The scan of a keyframe; one whose motion was not removed is blurred."""
-    motion = keyframe.motion
-    blur_m = const.BLUR_M if motion is None or not motion.removed else 0.0
-    if motion is None or not len(motion.body_T_lidars):
-        return PreparedScan(keyframe.points, keyframe.body_T_lidar, blur_m)
-    owner = np.unique(motion.moments_s, return_inverse=True)[1]
-    return PreparedScan(keyframe.points, motion.body_T_lidars, blur_m, owner)
-
-
-def prepare_frame(frame: Frame) -> PreparedScan:
-    """The same scan, before its frame is a keyframe."""
-    points, motion = thin_frame(frame)
-    return PreparedScan(points, frame.body_T_lidar, const.BLUR_M if motion is None else 0.0)
 
 
 def views_decide(match: PreparedScan, query: PreparedScan) -> bool:
@@ -291,11 +293,11 @@ class ScanCache:
 
     def __init__(self) -> None:
         self._scans: OrderedDict[tuple[int, int], PreparedScan] = OrderedDict()
-        self._prefetched: tuple[int, PreparedScan] | None = None
+        self._prefetched: dict[int, PreparedScan] = {}
 
     def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
         key = (keyframe.session, keyframe.stamp_ns)
-        scan = self._scans.pop(key, None) or self._foreseen_of(keyframe) or prepare(keyframe)
+        scan = self._scans.pop(key, None) or self._prefetched.pop(keyframe.stamp_ns, None) or PreparedScan.of(keyframe)
         self._scans[key] = scan
         if len(self._scans) > const.SCANS_KEPT:
             self._scans.popitem(last=False)
@@ -303,15 +305,12 @@ class ScanCache:
 
     def prefetch(self, frame: Frame) -> None:
         """Make the scan ready of a frame that is about to become a keyframe."""
-        scan = prepare_frame(frame)
+        points, motion = thin_frame(frame)
+        scan = PreparedScan(points, frame.body_T_lidar, const.BLUR_M if motion is None else 0.0)
         scan.make_ready()
-        self._prefetched = frame.stamp_ns, scan
+        self._prefetched = {frame.stamp_ns: scan}
 
     def clear(self) -> None:
         """Forget all scans, as when stamps start over."""
         self._scans.clear()
-        self._prefetched = None
-
-    def _foreseen_of(self, keyframe: Keyframe) -> PreparedScan | None:
-        known, self._prefetched = self._prefetched, None
-        return known[1] if known is not None and known[0] == keyframe.stamp_ns else None
+        self._prefetched.clear()

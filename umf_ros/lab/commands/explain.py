@@ -44,7 +44,7 @@ def command(
     draw(explanation, frames[0].left, frames[1].left, out)
     console.print(explanation.verdict, highlight=False)
     if explanation.best is not None:
-        for name, value in explanation.best.measurement.numbers.items():
+        for name, value in explanation.best.measurements.items():
             console.print(f"  {name:22} {value:.4g}", highlight=False)
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
 

@@ -55,7 +55,7 @@ def explain(query: Keyframe, match: Keyframe, settings: Verification) -> Explana
     if not examined:
         return Explanation(query, match, None, settings.min_probability, {}, np.empty((0, 4), np.float32))
     best = max(examined, key=lambda one: one.probability or 0.0)
-    contributions = load_acceptance(settings.calibration).contributions(best.measurement)
+    contributions = load_acceptance(settings.calibration).contributions(best.measurements)
     pixels = best.views.consistent_pixels(best.pose) if best.views else np.empty((0, 4), np.float32)
     return Explanation(query, match, best, settings.min_probability, contributions, pixels)
 

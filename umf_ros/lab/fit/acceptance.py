@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,13 @@ from scipy.stats import chi2
 
 from umf_ros.core.geometry import Array
 from umf_ros.runs.truth import normalised_errors, share_inside
-from umf_ros.verification.acceptance import KINDS, AcceptanceModel, Logistic, refuted, scores
-from umf_ros.verification.hypothesis import IMAGE, SCAN, Measurement
+from umf_ros.verification.acceptance import CRITERIA, AcceptanceModel, Logistic, Measurements, refuted, scores
+from umf_ros.verification.hypothesis import IMAGE, SCAN, kind_of
+from umf_ros.verification.measurement import MEASUREMENTS
 from umf_ros.verification.scan_alignment import CovarianceModel, covariance_of
 
 EXAMPLES = Path(__file__).with_name("acceptance_examples.npz")
 """Examples that the shipped decision was fitted to."""
-NUMBERS = tuple(one.name for one in fields(Measurement) if one.name != "kind")
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,43 +30,45 @@ class Example:
     """One refined pose and whether it was right.
 
     Attributes:
-        measurement: what verification measured.
+        measurements: what verification measured.
         right: whether the pose was.
         domain: sensor, place and mount, or another name for what resembles each other; empty: nothing in particular.
     """
 
-    measurement: Measurement
+    measurements: Measurements
     right: bool
     domain: str = ""
+
+    @property
+    def kind(self) -> str:
+        """Of the hypothesis."""
+        return kind_of(self.measurements)
 
 
 def save_examples(examples: list[Example], path: Path) -> None:
     """Write examples for `load_examples`, some forty bytes each."""
-    numbers = np.array([[getattr(one.measurement, name) for name in NUMBERS] for one in examples], np.float32)
+    rows = [[one.measurements.get(name, math.nan) for name in MEASUREMENTS] for one in examples]
     np.savez_compressed(
         path,
-        names=np.array(NUMBERS),
-        numbers=numbers,
-        kinds=np.array([one.measurement.kind for one in examples]),
+        names=np.array(list(MEASUREMENTS)),
+        numbers=np.array(rows, np.float32),
         right=np.array([one.right for one in examples]),
         domains=np.array([one.domain for one in examples]),
     )
 
 
 def load_examples(path: Path) -> list[Example]:
-    """Examples from a file; a number that is younger than the file is unknown.
+    """Examples from a file; a number that the file does not have, or is unknown there, is left out.
 
     Raises:
         OSError: the file cannot be read.
     """
     with np.load(path) as content:
-        names = [str(name) for name in content["names"]]
-        rows, kinds = content["numbers"].astype(float), content["kinds"]
-        right, domains = content["right"], content["domains"]
-    kept = [(column, name) for column, name in enumerate(names) if name in NUMBERS]
+        names, rows = content["names"].tolist(), content["numbers"].astype(float).tolist()
+        right, domains = content["right"].tolist(), content["domains"].tolist()
     return [
-        Example(Measurement(kind=str(kind), **{name: row[column] for column, name in kept}), bool(yes), str(domain))
-        for row, kind, yes, domain in zip(rows, kinds, right, domains, strict=True)
+        Example({name: value for name, value in zip(names, row, strict=True) if not math.isnan(value)}, yes, domain)
+        for row, yes, domain in zip(rows, right, domains, strict=True)
     ]
 
 
@@ -95,11 +97,11 @@ def fit_logistic(examples: list[Example], kind: str, ridge: float = RIDGE) -> Lo
     Raises:
         ValueError: only right or only wrong examples.
     """
-    mine = [example for example in examples if example.measurement.kind == kind]
+    mine = [example for example in examples if example.kind == kind]
     right = np.array([example.right for example in mine], bool)
     if right.all() or not right.any():
         raise ValueError(f"need right and wrong examples of kind {kind}, got {int(right.sum())} right of {len(right)}")
-    return fit_weights([scores(example.measurement) for example in mine], right, ridge, _balance(mine))
+    return fit_weights([scores(example.measurements) for example in mine], right, ridge, _balance(mine))
 
 
 def fit_weights(
@@ -133,10 +135,10 @@ def fit_decision(examples: list[Example], kind: str, threshold: float) -> tuple[
     Returns:
         The model, and the log-odds (N,) of the examples of this kind, each without its domain, lowered alike.
     """
-    mine = [example for example in examples if example.measurement.kind == kind]
+    mine = [example for example in examples if example.kind == kind]
     odds = left_out_odds(mine, kind)
     model = fit_logistic(mine, kind)
-    wrong = np.array([not (one.right or refuted(one.measurement)) for one in mine], bool)
+    wrong = np.array([not (one.right or refuted(one.measurements)) for one in mine], bool)
     safe = made_safe(model, odds[wrong], threshold)
     return safe, odds + safe.bias - model.bias
 
@@ -148,9 +150,9 @@ def fit_without(examples: list[Example], kind: str, domain: str) -> Logistic:
 
 def left_out_odds(examples: list[Example], kind: str) -> Array:
     """Log-odds (N,) of the examples of a kind, each by a fit to the other domains."""
-    mine = [example for example in examples if example.measurement.kind == kind]
+    mine = [example for example in examples if example.kind == kind]
     models = {name: fit_without(mine, kind, name) for name in {example.domain for example in mine}}
-    return np.array([models[example.domain].odds(scores(example.measurement)) for example in mine])
+    return np.array([models[example.domain].odds(scores(example.measurements)) for example in mine])
 
 
 def made_safe(model: Logistic, wrong_odds: Array, threshold: float) -> Logistic:
@@ -167,10 +169,10 @@ def made_safe(model: Logistic, wrong_odds: Array, threshold: float) -> Logistic:
 
 def bounds_of(examples: list[Example], kind: str) -> dict[str, tuple[float, float]]:
     """Smallest and largest values of right poses of a kind, with some margin, by the name of the number."""
-    mine = [example.measurement for example in examples if example.measurement.kind == kind and example.right]
+    mine = [example.measurements for example in examples if example.kind == kind and example.right]
     bounds = {}
     for name in (*BOUNDED[kind], *NECESSARY[kind]):
-        values = np.array([getattr(measurement, name) for measurement in mine])
+        values = np.array([measurements.get(name, math.nan) for measurements in mine])
         known = values[np.isfinite(values)]
         share = COMMONLY if name in NECESSARY[kind] else 1.0
         least, greatest = np.quantile(known, [1.0 - share, share])
@@ -199,9 +201,9 @@ def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: dict[str, s
         "fitted_with": before["fitted_with"] | fitted_with,
         "results": before["results"] | results,
     }
-    content["models"] = {kind: asdict(model.models[kind]) for kind in KINDS}
+    content["models"] = {kind: asdict(model.models[kind]) for kind in CRITERIA}
     content["bounds"] = model.bounds
-    content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in (SCAN, IMAGE)}
+    content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in CRITERIA}
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 

@@ -31,23 +31,33 @@ from umf_ros.lab.fit.acceptance import (
     save_examples,
 )
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
-from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, QUICK, ScannedPlace, ScanPair, pairs_of, places_of
+from umf_ros.lab.simulation.domains.pairs import (
+    ELSEWHERE,
+    QUICK,
+    ScannedPlace,
+    ScanPair,
+    pairs_of,
+    passage_places,
+    places_of,
+)
+from umf_ros.lab.simulation.domains.passages import PASSAGES
 from umf_ros.lab.simulation.drives import SurveyedDrive, embedded, kept, worlds
 from umf_ros.lab.simulation.scenes import TRAPS
 from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
-from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance, refuted
-from umf_ros.verification.hypothesis import SCAN, Hypothesis, Measurement
-from umf_ros.verification.measurement import compare_poses, measure
-from umf_ros.verification.pose_search import TemporalMemory
-from umf_ros.verification.prepared_scan import ScanCache
+from umf_ros.verification.acceptance import AcceptanceModel, Measurements, load_acceptance, refuted
+from umf_ros.verification.hypothesis import SCAN, Hypothesis
+from umf_ros.verification.measurement import measure
+from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.rerank import rerank
 from umf_ros.verification.scan_alignment import align_scans
+from umf_ros.verification.scan_consistency import ambiguity
 
 RIGHT_M, RIGHT_DEG = 0.3, 2.5
 WRONG_M, WRONG_DEG = 0.75, 4.0  # what lies between is neither
 SAME_BASIN_M, SAME_BASIN_RAD = 0.1, 0.02
+MIN_COMMON = 0.1
 VIEWS = ("whole", "whole", "untimed", "narrow", "near", "sparse")
 
 
@@ -80,14 +90,18 @@ def is_right(metres: float, degrees: float) -> bool | None:
 
 
 def kept_examples(
-    domain: Domain, seeds: range, pairs: int, scans: Path | None, embedder: Embedder, kept: Path | None
+    domain: Domain | str, seeds: range, pairs: int, scans: Path | None, embedder: Embedder, kept: Path | None
 ) -> list[Example]:
-    """The same as `examples_of`, from a file in the folder `kept` where an earlier call left it."""
-    path = kept / f"examples_{domain.name}_{seeds.start}_{len(seeds)}_{pairs}.pkl" if kept else None
+    """Examples of a domain, or of a kind of passage; from a file in the folder `kept` where an earlier call left it."""
+    name = domain if isinstance(domain, str) else domain.name
+    path = kept / f"examples_{name}_{seeds.start}_{len(seeds)}_{pairs}.pkl" if kept else None
     if path is not None and path.exists():
         found: list[Example] = pickle.loads(path.read_bytes())
         return found
-    found = list(examples_of(domain, seeds, pairs, scans, embedder))
+    if isinstance(domain, str):
+        found = list(passage_examples(domain, seeds, pairs, embedder))
+    else:
+        found = list(examples_of(domain, seeds, pairs, scans, embedder))
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(pickle.dumps(found))
@@ -107,31 +121,51 @@ def examples_of(domain: Domain, seeds: range, pairs: int, scans: Path | None, em
     for number, pair in enumerate(chosen):
         view = VIEWS[number % len(VIEWS)]
         query, match = (_seen(place.keyframe, view, domain.scanner.all_round) for place in (pair.query, pair.match))
-        tried = Tried(query, match, pair)
-        yield from _examples(tried, verifier, domain, rng)
+        yield from _examples(Tried(query, match, pair), verifier, (domain.name, domain.scanner.all_round), rng)
+        if pair.query.before is not None:
+            merged = Tried(pair.query.before, pair.match.around or pair.match.keyframe, pair)
+            yield from _examples(merged, verifier, (domain.name, domain.scanner.all_round), rng)
 
 
-def _examples(tried: Tried, verifier: Verifier, domain: Domain, rng: np.random.Generator) -> Iterator[Example]:
+def passage_examples(kind: str, seeds: range, pairs: int, embedder: Embedder) -> Iterator[Example]:
+    """Examples from pairs of stations in passages of one kind, each with a sensor, mount and relief of its own."""
+    passages = [passage for passage in PASSAGES if passage.kind == kind]
+    rng, verifier = np.random.default_rng([seeds.start, 61]), Verifier(Verification())
+    for seed in seeds:
+        passage = passages[int(rng.integers(len(passages)))]
+        places = passage_places(passage, seed, embedder)
+        for _ in range(pairs // len(seeds)):
+            query, match = (places[index] for index in rng.choice(len(places), 2, replace=False))
+            tried = Tried(query.keyframe, match.keyframe, ScanPair(query, match, "same way"))
+            yield from _examples(tried, verifier, (kind, passage.scanner.all_round), rng)
+
+
+def _examples(
+    tried: Tried, verifier: Verifier, domain: tuple[str, bool], rng: np.random.Generator
+) -> Iterator[Example]:
     """Poses that verification finds, and its measurements at poses that it may find another time."""
     verifier.reset()
     candidates = [(Candidate(0, tried.match.stamp_ns, tried.pair.similarity), tried.match)]
-    found = [
-        (one.pose, one.measurement) for one in verifier.examine(tried.query, candidates) if one.measurement.kind == SCAN
-    ]
-    scans = ScanCache()
-    if all(scans[keyframe].usable for keyframe in (tried.match, tried.query)):
+    name, all_round = domain
+    examined = [one for one in verifier.examine(tried.query, candidates) if one.kind == SCAN]
+    found = [(one.pose, one.measurements) for one in examined]
+    scans = PreparedScan.of(tried.match), PreparedScan.of(tried.query)
+    if all(scan.usable for scan in scans):
         ranked, _ = rerank(tried.query, candidates, Verification())[0]
-        guesses = _guesses(tried, domain.scanner.all_round, rng)
-        guessed = [_aligned(tried, ranked, scans, guess) for guess in guesses]
-        found += [(pose, compare_poses(measurement, pose, found)) for pose, measurement in guessed]
+        others = [one.pose for one in examined]
+        found += [_aligned(tried, ranked, scans, guess, others) for guess in _guesses(tried, all_round, rng)]
     kept: list[Array] = []
-    for pose, measurement in found:
+    for pose, measurements in found:
         right = tried.is_right(pose)
         # scans that share no view cannot show that a pose is right
-        if right is None or (right and measurement.common < 0.1) or any(_same_basin(pose, other) for other in kept):
+        if (
+            right is None
+            or (right and measurements["common"] < MIN_COMMON)
+            or any(_same_basin(pose, other) for other in kept)
+        ):
             continue
         kept.append(pose)
-        yield Example(measurement, right, domain.name)
+        yield Example(measurements, right, name)
 
 
 def _guesses(tried: Tried, all_round: bool, rng: np.random.Generator) -> list[Array]:
@@ -151,12 +185,14 @@ def _guesses(tried: Tried, all_round: bool, rng: np.random.Generator) -> list[Ar
     return [tried.true @ move for move in moves + around]
 
 
-def _aligned(tried: Tried, ranked: Candidate, scans: ScanCache, guess: Array) -> tuple[Array, Measurement]:
-    prepared = scans[tried.match], scans[tried.query]
-    alignment = align_scans(*prepared, guess)
-    found = {"pose": alignment.pose, "scans": prepared, "alignment": alignment}
+def _aligned(
+    tried: Tried, ranked: Candidate, scans: tuple[PreparedScan, PreparedScan], guess: Array, others: list[Array]
+) -> tuple[Array, Measurements]:
+    alignment = align_scans(*scans, guess)
+    found = {"pose": alignment.pose, "scans": scans, "alignment": alignment}
     hypothesis = Hypothesis.of(tried.query, ranked, tried.match, **found)
-    return alignment.pose, measure(hypothesis, TemporalMemory(), Verification().odometry_drift)
+    rivals = ambiguity(*scans, alignment.pose, alignment.information, others)
+    return alignment.pose, hypothesis.measurements | measure(hypothesis) | rivals
 
 
 def _between_worlds(places: list[ScannedPlace], rng: np.random.Generator) -> ScanPair:
@@ -243,13 +279,14 @@ def in_domains(
 ) -> list[Example]:
     """Examples of all domains."""
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        waiting = [pool.submit(_in_domain, domain, settings, pairs, folder, kept) for domain in DOMAINS]
+        kinds = sorted({passage.kind for passage in PASSAGES})
+        waiting = [pool.submit(_in_domain, domain, settings, pairs, folder, kept) for domain in (*DOMAINS, *kinds)]
         found = [one.result() for one in track(waiting, "domains", transient=True)]
     return [example for domain in found for example in domain]
 
 
 def _in_domain(
-    domain: Domain, settings: EmbeddingSettings, pairs: int, folder: Path | None, kept: Path | None
+    domain: Domain | str, settings: EmbeddingSettings, pairs: int, folder: Path | None, kept: Path | None
 ) -> list[Example]:
     return kept_examples(domain, SURVEYS, pairs, folder, make_embedder(settings), kept)
 
@@ -260,7 +297,7 @@ def fit(examples: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
     The shipped model's parts for other kinds than scans stay.
     """
     shipped = load_acceptance()
-    mine = [example for example in examples + _sprung_traps() if example.measurement.kind == SCAN]
+    mine = [example for example in examples + _sprung_traps() if example.kind == SCAN]
     save_examples(mine, EXAMPLES)
     model, odds = fit_decision(mine, SCAN, THRESHOLD)
     bounds = shipped.bounds | {SCAN: bounds_of(mine, SCAN)}
@@ -285,7 +322,7 @@ def examine(drive: SurveyedDrive, keyframes: list[Keyframe]) -> Iterator[Example
                 metres, degrees = drive.error(query, one.candidate.index, one.pose)
                 right = is_right(metres, degrees)
                 if right is not None:
-                    yield Example(one.measurement, right, f"drive {drive.seed}")
+                    yield Example(one.measurements, right, f"drive {drive.seed}")
         database.add(keyframe)
     database.close()
 
@@ -324,13 +361,13 @@ def _sprung_traps() -> list[Example]:
         for seed in range(100, 110):
             query, match = trap(seed)
             examined = Verifier(Verification()).examine(query, [(Candidate(0, match.stamp_ns, 0.9), match)])
-            found += [Example(one.measurement, False, "traps") for one in examined]
+            found += [Example(one.measurements, False, "traps") for one in examined]
     return found
 
 
 def _judge(kind: str, examples: list[Example], odds: Array) -> dict[str, float]:
     """Figures of log-odds that every example got without its domain."""
-    right, refused = np.array([(example.right, bool(refuted(example.measurement))) for example in examples]).T
+    right, refused = np.array([(example.right, bool(refuted(example.measurements))) for example in examples]).T
     accepted = (odds >= ACCEPTED_ODDS) & ~refused
     domains = np.array([example.domain for example in examples])
     recall = [float(accepted[right & (domains == name)].mean()) for name in np.unique(domains[right])]

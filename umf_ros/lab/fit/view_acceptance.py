@@ -110,7 +110,7 @@ class ViewFinding:
     @property
     def example(self) -> Example:
         """Data that the acceptance model is fitted to."""
-        return Example(self.examined.measurement, self.right)
+        return Example(self.examined.measurements, self.right)
 
 
 def main(
@@ -239,8 +239,7 @@ def _held_out(findings: list[ViewFinding]) -> Array:
         others = [finding.example for finding in findings if finding.recording != name]
         model = fit_logistic(others, IMAGE, RIDGE)
         for index in np.flatnonzero(names == name):
-            contributions = model.contributions(scores(findings[index].examined.measurement))
-            odds[index] = model.bias + sum(contributions.values())
+            odds[index] = model.odds(scores(findings[index].examined.measurements))
     return odds
 
 

@@ -17,6 +17,8 @@ from umf_ros.core.io import atomic_write
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
+from umf_ros.lab.simulation.domains.passages import Passage
+from umf_ros.lab.simulation.domains.passages import drive as drive_passage
 from umf_ros.lab.simulation.domains.survey import FIRST, MOUNTS, OTHER_WAY, SAME_WAY
 from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.scan_files import UNCALIBRATED, make_snapshot
@@ -184,6 +186,16 @@ def _between(anchors: list[Keyframe], keyframe: Keyframe, first_m: float, last_m
     ahead = [(one.path_length_m - keyframe.path_length_m, one) for one in anchors if one is not keyframe]
     near = [(metres, one) for metres, one in ahead if first_m <= metres <= last_m]
     return [one for _, one in sorted(near, key=lambda item: abs(item[0]))]
+
+
+def passage_places(passage: Passage, seed: int, embedder: Embedder) -> list[ScannedPlace]:
+    """Keyframes of the stations along a passage; of every second passage the motion within a scan is not removed."""
+    places = []
+    for number, scan in enumerate(drive_passage(passage, seed)):
+        stamp_ns, steady = (number + 1) * 10**9, seed % 2 == 0
+        keyframe = keyframe_of(scan.sweep.points, scan.sweep.intensity, embedder, stamp_ns, steady)
+        places.append(ScannedPlace(keyframe, scan, seed))
+    return places
 
 
 def pairs_of(places: list[ScannedPlace], domain: Domain, rng: np.random.Generator) -> Iterator[ScanPair]:

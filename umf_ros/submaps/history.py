@@ -1,10 +1,10 @@
-"""Past keyframes as anchors of submaps."""
+"""Past keyframes with odometry and a scan: the anchors of submaps."""
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import OrderedDict
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,25 +18,12 @@ from umf_ros.submaps.merging import DriftMeter, needed_scans, submap_of
 from umf_ros.verification import constants as const
 
 
-@dataclass(frozen=True, slots=True)
-class SubmapAnchor:
-    """A remembered keyframe with odometry and a scan.
+class SubmapAnchor(NamedTuple):
+    """A remembered keyframe with odometry and a scan: session, path length since its start in m, and stamp in ns."""
 
-    Attributes:
-        stamp_ns: its key.
-        session: its session.
-        path_length_m: metres driven since the start of the session.
-        odom_T_body: its odometry; None until it is first asked for.
-    """
-
-    stamp_ns: int
     session: int
     path_length_m: float
-    odom_T_body: Array | None = None
-
-
-def _path(anchor: SubmapAnchor) -> tuple[int, float]:
-    return anchor.session, anchor.path_length_m
+    stamp_ns: int
 
 
 class SubmapHistory:
@@ -54,7 +41,8 @@ class SubmapHistory:
     def __init__(self, database: PlaceDatabase) -> None:
         self.database = database
         self.anchors = _stored(database)
-        self._submaps: OrderedDict[tuple[int, int, int], Keyframe] = OrderedDict()
+        self._odometry: dict[SubmapAnchor, Array] = {}
+        self._submaps: OrderedDict[tuple[SubmapAnchor, int], Keyframe] = OrderedDict()
         self.reset()
 
     def reset(self) -> None:
@@ -68,7 +56,7 @@ class SubmapHistory:
 
         One that is not in the database, as while localising, is no anchor.
         """
-        if keyframe.odom_T_body is None or len(keyframe.points) < const.MIN_SCAN_POINTS:
+        if not can_be_merged(keyframe):
             return False
         before = self.scans_before(keyframe)
         if before and keyframe.path_length_m - before[0].path_length_m < const.MERGE_STEP_M:
@@ -79,18 +67,19 @@ class SubmapHistory:
             self.drift.add(keyframe, before)
         self._recent = [keyframe, *before]
         self._added += 1
-        anchor = SubmapAnchor(keyframe.stamp_ns, keyframe.session, keyframe.path_length_m, keyframe.odom_T_body)
-        if self.index_of(anchor) is not None and (not self.anchors or _path(anchor) > _path(self.anchors[-1])):
+        anchor = _anchor_of(keyframe)
+        if self.index_of(anchor) is not None and (not self.anchors or anchor[:2] > self.anchors[-1][:2]):
             self.anchors.append(anchor)
         return True
 
     def odometry(self, row: int) -> Array:
         """Odometry (4, 4) of an anchor."""
-        if self.anchors[row].odom_T_body is None:
-            self.anchors[row] = replace(self.anchors[row], odom_T_body=self._load(row).odom_T_body)
-        found = self.anchors[row].odom_T_body
-        assert found is not None
-        return found
+        anchor = self.anchors[row]
+        if anchor not in self._odometry:
+            found = self._load(row).odom_T_body
+            assert found is not None
+            self._odometry[anchor] = found
+        return self._odometry[anchor]
 
     def index_of(self, anchor: SubmapAnchor) -> int | None:
         """Its index in the database; None when it is not there."""
@@ -105,8 +94,8 @@ class SubmapHistory:
 
     def rows(self, session: int, first_m: float, last_m: float) -> NDArray[np.intp]:
         """Rows of a session's anchors between two places of the path."""
-        first = bisect_left(self.anchors, (session, first_m), key=_path)
-        return np.arange(first, bisect_right(self.anchors, (session, last_m), key=_path))
+        first = bisect_left(self.anchors, (session, first_m), key=lambda anchor: anchor[:2])
+        return np.arange(first, bisect_right(self.anchors, (session, last_m), key=lambda anchor: anchor[:2]))
 
     def scans_before(self, keyframe: Keyframe, first_m: float = -np.inf) -> list[Keyframe]:
         """Keyframes on the last metres before the newest one, newest first, none of them before a place of the path."""
@@ -116,28 +105,27 @@ class SubmapHistory:
 
     def before(self, keyframe: Keyframe, first_m: float = -np.inf) -> Keyframe | None:
         """The newest keyframe as the submap of the last metres; None where there is none."""
-        if keyframe.odom_T_body is None or len(keyframe.points) < const.MIN_SCAN_POINTS:
+        if not can_be_merged(keyframe):
             return None
         return submap_of(keyframe, self.scans_before(keyframe, first_m), self.drift)
 
-    def around(self, keyframe: Keyframe, last_m: float) -> Keyframe | None:
+    def around(self, keyframe: Keyframe, last_m: float = np.inf) -> Keyframe | None:
         """A keyframe of the past as the submap of what was seen before and after it; None where there is none.
 
         Args:
             keyframe: of the database.
             last_m: metres driven up to the last scan that may be used.
         """
+        if not can_be_merged(keyframe):
+            return None
         centre_m = keyframe.path_length_m
         last_m = min(last_m, centre_m + const.SUBMAP_AFTER_M)
-        key = keyframe.session, keyframe.stamp_ns, round(last_m)
+        key = _anchor_of(keyframe), round(last_m)
         if key not in self._submaps:
             rows = self.rows(keyframe.session, centre_m - const.SUBMAP_BEFORE_M, last_m)
-            if keyframe.odom_T_body is None or len(keyframe.points) < const.MIN_SCAN_POINTS:
-                return None
-            rows = rows[[self.anchors[row].stamp_ns != keyframe.stamp_ns for row in rows]]
-            away = np.abs([self.anchors[row].path_length_m - centre_m for row in rows])
-            near = [self._load(rows[i]) for i in np.argsort(away, kind="stable")]
-            submap = submap_of(keyframe, near, self.drift)
+            others = [row for row in rows.tolist() if self.anchors[row].stamp_ns != keyframe.stamp_ns]
+            others.sort(key=lambda row: abs(self.anchors[row].path_length_m - centre_m))
+            submap = submap_of(keyframe, [self._load(row) for row in others], self.drift)
             if submap is None:
                 return None
             self._submaps[key] = submap
@@ -153,10 +141,19 @@ class SubmapHistory:
         return self.database[index]
 
 
+def can_be_merged(keyframe: Keyframe) -> bool:
+    """Whether a keyframe has odometry and a scan."""
+    return keyframe.odom_T_body is not None and len(keyframe.points) >= const.MIN_SCAN_POINTS
+
+
+def _anchor_of(keyframe: Keyframe) -> SubmapAnchor:
+    return SubmapAnchor(keyframe.session, keyframe.path_length_m, keyframe.stamp_ns)
+
+
 def _stored(database: PlaceDatabase) -> list[SubmapAnchor]:
-    """Anchors of what is in the database already: with odometry, and apart along the path."""
+    """Anchors of the places that are in the database already: with odometry, and apart along the path."""
     keys = database.store.keys[np.isfinite(database.store.keys["travelled_m"])]
     keys = keys[np.lexsort((keys["travelled_m"], keys["session"]))]
     steps = np.column_stack([keys["session"], np.floor(keys["travelled_m"] / const.MERGE_STEP_M)])
     first = np.sort(np.unique(steps, axis=0, return_index=True)[1])
-    return [SubmapAnchor(int(key["stamp_ns"]), int(key["session"]), float(key["travelled_m"])) for key in keys[first]]
+    return [SubmapAnchor(int(key["session"]), float(key["travelled_m"]), int(key["stamp_ns"])) for key in keys[first]]
