@@ -18,7 +18,7 @@ from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.tables import KeyframeRow
 from umf_ros.runs.truth import JudgedRun, TruePlaces, judge_closure
-from umf_ros.verification import Hypothesis, Measurement, RejectReason
+from umf_ros.verification import Hypothesis, RejectReason
 
 START_NS = 1_600_000_000 * 10**9
 LAP_S = 40
@@ -45,12 +45,12 @@ BELOW = {
     "residual_p90_m": 0.05,
     "overlap": 0.9,
     "points": 900.0,
-    "relief_m": 0.1,
     "terrain_correlation": 0.5,
     "terrain_score": 5.0,
     "common": 0.7,
     "contradiction": 0.0,
-    "counterparts": 0.7,
+    "upright_counterparts": 0.7,
+    "unexplained": 0.05,
     "rival_near": 0.1,
     "rival_far": 0.2,
     "position_std_m": 0.1,
@@ -85,9 +85,8 @@ def candidate(
     probability = numbers.pop("probability", None)
     if reason is RejectReason.IMPROBABLE and probability is not None:
         detail = f"{probability:.2f} < 0.9"
-    measurement = Measurement.read(looks, numbers)
     place = Candidate(-1, stamp(match_s), looks)
-    return Hypothesis(stamp(query_s), place, measurement, reason, detail, probability=probability)
+    return Hypothesis(stamp(query_s), place, {"similarity": looks} | numbers, reason, detail, probability=probability)
 
 
 def accepted(state: State = State.ACCEPTED, reason: ClosureReason = ClosureReason.AGREES) -> ClosureVerdict:

@@ -8,7 +8,7 @@ too little of the place, by its submaps: the scans of the metres around them, me
 rover's does.
 
 Every domain is verified twice: by what is shipped, and by a decision fitted without any example of the domain
-(`left out`), from the examples that `fit_verification.py` keeps beside it.
+(`left out`), from the examples that `umf_ros/lab/fit/scan_acceptance.py` keeps beside it.
 """
 
 from __future__ import annotations

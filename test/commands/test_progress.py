@@ -16,7 +16,7 @@ from rich.console import Console
 from umf_ros.commands.console import WARNING, FrameProgress, stop_on_interrupt, undisturbed
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.detector import Detection
-from umf_ros.verification import Hypothesis, Measurement
+from umf_ros.verification import Hypothesis
 
 SIGNALS = signal.SIGINT, signal.SIGTERM
 
@@ -96,10 +96,7 @@ def test_an_error_while_writing_gives_ctrl_c_back() -> None:
 def found(stamp_s: float, closures: int) -> Detection:
     stamp = round(stamp_s * 1e9)
     made = [LoopClosure(stamp, i, np.eye(4), np.eye(6)) for i in range(closures)]
-    verdicts = [
-        Hypothesis(i, Candidate(i, i, 0.9), Measurement(similarity=0.9), closure=closure)
-        for i, closure in enumerate(made)
-    ]
+    verdicts = [Hypothesis(i, Candidate(i, i, 0.9), closure=closure) for i, closure in enumerate(made)]
     return Detection(stamp, make_keyframe(stamp_s), verdicts)
 
 

@@ -24,9 +24,9 @@ from umf_ros.runs.tables import read_closures
 from umf_ros.runs.writer import RunRecorder, count_drops, read_summary
 from umf_ros.sensors.buffers import SURPLUS, InputCounter
 from umf_ros.sensors.synchronizer import INPUTS
-from umf_ros.verification import Hypothesis, Measurement, RejectReason
+from umf_ros.verification import Hypothesis, RejectReason
 
-MEASUREMENT = Measurement(similarity=0.4, inliers_image=3.0)
+MEASUREMENTS = {"similarity": 0.4, "inliers_image": 3.0}
 COUNTS = ["frames", "pairs", "keyframes", "queries", "closures_published", "closures_rejected"]
 OTHERS = ["latency_ms", "drops", "realtime_factor", "peak_rss_mb", "seed", "version", "weights"]
 KEYS = [*COUNTS, "ground_truth", *OTHERS]
@@ -38,7 +38,7 @@ def accepted(query_ns: int, match_ns: int) -> Hypothesis:
         query_ns, match_ns, make_pose(turn, [1.5, -0.25, 0.125]), np.diag([4, 1, 1, 0.25, 1, 1]), 0.97
     )
     pixels = np.array([[1, 2, 3, 4], [5, 6, 7, 8]], np.float32)
-    return Hypothesis(query_ns, Candidate(0, match_ns, 0.8), MEASUREMENT, closure=closure, inlier_pixels=pixels)
+    return Hypothesis(query_ns, Candidate(0, match_ns, 0.8), MEASUREMENTS, closure=closure, inlier_pixels=pixels)
 
 
 def detection(stamp_s: float, verdicts: list[Hypothesis]) -> Detection:
@@ -48,7 +48,7 @@ def detection(stamp_s: float, verdicts: list[Hypothesis]) -> Detection:
 
 def record_a_little(folder: Path) -> RunRecorder:
     recorder = RunRecorder(folder, Settings(), "some_weights")
-    rejected = Hypothesis(40, Candidate(1, 5, 0.4), MEASUREMENT, RejectReason.NO_POSE)
+    rejected = Hypothesis(40, Candidate(1, 5, 0.4), MEASUREMENTS, RejectReason.NO_POSE)
     recorder.record(make_frame(1), Detection(10**9))
     recorder.record(make_frame(2), detection(2, []))
     recorder.record(
@@ -82,7 +82,7 @@ def test_tables_are_exported_at_the_end(tmp_path: Path) -> None:
     with (tmp_path / "candidates.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["reason"] for row in rows] == ["accepted", RejectReason.NO_POSE.value]
-    assert json.loads(rows[1]["numbers"]) == MEASUREMENT.numbers
+    assert json.loads(rows[1]["numbers"]) == MEASUREMENTS
     with (tmp_path / "inliers.csv").open() as file:
         assert [float(row["match_v"]) for row in csv.DictReader(file)] == [4, 8]
     with (tmp_path / "keyframes.csv").open() as file:
@@ -135,7 +135,7 @@ def test_the_summary_can_be_written_again_as_the_run_goes_on(tmp_path: Path) -> 
 
 def test_a_keyframe_that_was_asked_and_found_nothing_is_no_query(tmp_path: Path) -> None:
     recorder = RunRecorder(tmp_path, Settings(), "w")
-    rejected = Hypothesis(40, Candidate(1, 5, 0.4), MEASUREMENT, RejectReason.NO_POSE)
+    rejected = Hypothesis(40, Candidate(1, 5, 0.4), MEASUREMENTS, RejectReason.NO_POSE)
     recorder.record(make_frame(1), detection(1, []))
     recorder.record(make_frame(2), detection(2, [rejected, rejected]))
     recorder.record(make_frame(60), detection(60, [accepted(60, 2), accepted(60, 3), rejected]))

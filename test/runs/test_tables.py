@@ -28,7 +28,7 @@ from umf_ros.runs.tables import (
     read_verdicts,
     write_table,
 )
-from umf_ros.verification import Hypothesis, Measurement, RejectReason
+from umf_ros.verification import Hypothesis, RejectReason
 from umf_ros.verification.hypothesis import SCAN
 
 QUERY_NS, MATCH_NS = 1_667_000_100_123_456_789, 1_667_000_000_000_000_001
@@ -83,25 +83,28 @@ def test_a_table_without_rows_holds_no_closure(tmp_path: Path) -> None:
 
 def test_figures_of_a_reason_may_hold_anything(tmp_path: Path) -> None:
     detail = 'turned too far, "31 deg"\n; gave up'
-    measurement = Measurement(similarity=1 / 3, inliers_image=float("inf"))
+    measurements = {"similarity": 1 / 3, "inliers_image": float("inf")}
     put = Hypothesis(
-        QUERY_NS, Candidate(3, MATCH_NS, 0.123456789), measurement, RejectReason.TURNED, detail, probability=2 / 3
+        QUERY_NS, Candidate(3, MATCH_NS, 0.123456789), measurements, RejectReason.TURNED, detail, probability=2 / 3
     )
     path = written(tmp_path / "candidates.csv", [candidate_row(put)], CANDIDATES)
     (row,) = read_table(path, dict)
     assert (row["reason"], row["detail"]) == (RejectReason.TURNED.value, detail) and row["similarity"] == "0.123457"
-    counts = {"inliers_image": float("inf"), "inliers_cloud": 0.0, "superfeatures": 0.0}
-    assert json.loads(row["numbers"]) == {"similarity": 0.333333, **counts, "probability": 0.666667}
+    assert json.loads(row["numbers"]) == {
+        "similarity": 0.333333,
+        "inliers_image": float("inf"),
+        "probability": 0.666667,
+    }
 
 
 @pytest.mark.parametrize("reason", [None, *RejectReason])
 def test_a_candidate_reads_back_as_it_was_written(tmp_path: Path, reason: RejectReason | None) -> None:
-    measurement = Measurement(kind=SCAN, similarity=0.5, noise_m=0.25, rival_far=0.125)
-    put = Hypothesis(QUERY_NS, Candidate(3, MATCH_NS, 0.5), measurement, reason, "0.5 m", probability=0.75)
+    measurements = {"similarity": 0.5, "noise_m": 0.25, "unexplained": float("nan"), "rival_far": 0.125}
+    put = Hypothesis(QUERY_NS, Candidate(3, MATCH_NS, 0.5), measurements, reason, "0.5 m", probability=0.75)
     path = written(tmp_path / "candidates.csv", [candidate_row(put)], CANDIDATES)
     (got,) = read_table(path, parse_candidate)
     assert (got.endpoints, got.reason, got.probability) == (put.endpoints, reason, 0.75)
-    assert got.numbers == pytest.approx(put.numbers, nan_ok=True) and got.measurement.kind == SCAN
+    assert got.numbers == pytest.approx(put.numbers, nan_ok=True) and got.kind == SCAN
     assert reason is None or got.outcome == put.outcome
 
 
@@ -115,7 +118,7 @@ def test_a_reason_of_another_version_is_kept_as_text(tmp_path: Path) -> None:
 def test_inliers_are_pixels_to_a_tenth(tmp_path: Path) -> None:
     pixels = np.array([[1.26, 2, 3, 687.98], [0, 0, 0, 0]], np.float32)
     put = Hypothesis(
-        QUERY_NS, Candidate(0, MATCH_NS, 0.5), Measurement(similarity=0.5), closure=closure(), inlier_pixels=pixels
+        QUERY_NS, Candidate(0, MATCH_NS, 0.5), {"similarity": 0.5}, closure=closure(), inlier_pixels=pixels
     )
     path = written(tmp_path / "inliers.csv", inlier_rows(put), INLIERS)
     rows = read_table(path, lambda row: (int(row["query_stamp_ns"]), *(float(row[name]) for name in INLIERS[2:])))

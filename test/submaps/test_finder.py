@@ -8,11 +8,12 @@ import pytest
 from submaps_drives import Drive, drive, rough_ground
 
 from umf_ros.core.config import Database, Loop, Verification
-from umf_ros.core.frames import Candidate, LoopClosure
-from umf_ros.core.geometry import invert, relative, rotation_angle
+from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
+from umf_ros.core.geometry import invert, make_pose, relative, rotation_angle
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
-from umf_ros.verification import Hypothesis, Measurement, RejectReason
+from umf_ros.verification import Hypothesis, RejectReason
+from umf_ros.verification import constants as const
 
 
 def replay(outing: Drive, database: PlaceDatabase, **settings: float) -> Iterator[tuple[int, list[Hypothesis]]]:
@@ -21,6 +22,20 @@ def replay(outing: Drive, database: PlaceDatabase, **settings: float) -> Iterato
         yield i, finder.find(keyframe, [])
         database.add(keyframe)
         finder.remember(keyframe)
+
+
+def driven(outing: Drive, database: PlaceDatabase, count: int) -> SubmapFinder:
+    """A finder that has seen the first keyframes and found nothing in them."""
+    finder = SubmapFinder(Verification(), Loop(), database)
+    for keyframe in outing.keyframes[:count]:
+        database.add(keyframe)
+        finder.remember(keyframe)
+    return finder
+
+
+def compared_with(finder: SubmapFinder, query: Keyframe) -> list[Keyframe]:
+    """Keyframes whose submaps are compared with a query about whose scan nothing is known."""
+    return [finder.history.database[one.candidate.index] for one in finder.find(query, [])]
 
 
 def test_a_way_driven_back_is_recognised_with_the_right_pose(outing: Drive, database: PlaceDatabase) -> None:
@@ -63,17 +78,37 @@ def test_a_dense_scan_all_around_needs_no_submap(database: PlaceDatabase) -> Non
 
 
 def test_a_place_that_a_scan_has_found_is_not_looked_for(outing: Drive, database: PlaceDatabase) -> None:
-    finder = SubmapFinder(Verification(), Loop(), database)
-    for keyframe in outing.keyframes[:-1]:
-        database.add(keyframe)
-        finder.remember(keyframe)
+    finder = driven(outing, database, len(outing.keyframes) - 1)
     query, match = outing.keyframes[-1], outing.keyframes[0]
     assert finder.find(query, [])
     closure = LoopClosure(query.stamp_ns, match.stamp_ns, np.eye(4), np.eye(6), 0.95)
-    known = [
-        Hypothesis(query.stamp_ns, Candidate(0, match.stamp_ns, 1.0), Measurement(similarity=1.0), closure=closure)
-    ]
+    known = [Hypothesis(query.stamp_ns, Candidate(0, match.stamp_ns, 1.0), closure=closure)]
     assert finder.find(query, known) == known
+
+
+def test_odometry_carries_a_closure_to_the_next_keyframes(outing: Drive, database: PlaceDatabase) -> None:
+    query, later, match = outing.keyframes[80], outing.keyframes[84], outing.keyframes[30]
+    assert query.odom_T_body is not None and match.odom_T_body is not None and later.odom_T_body is not None
+    for metres in (0.0, -6.0):
+        finder = driven(outing, database if metres else PlaceDatabase(Database(), "none", 2), 84)
+        off = make_pose(np.eye(3), [metres, 0.0, 0.0]) @ relative(match.odom_T_body, query.odom_T_body)
+        closure = LoopClosure(query.stamp_ns, match.stamp_ns, off, np.eye(6), 0.95)
+        place = Candidate(30, match.stamp_ns, 1.0)
+        finder.find(query, [Hypothesis(query.stamp_ns, place, closure=closure)])
+        expected_m = later.odom_T_body[0, 3] + metres  # along the way out
+        (found,) = compared_with(finder, later)
+        assert found.odom_T_body is not None
+        assert found.path_length_m < 45 and abs(found.odom_T_body[0, 3] - expected_m) < 2 * const.MERGE_STEP_M / 3
+
+
+def test_without_a_closure_odometry_alone_is_trusted_for_a_while(outing: Drive, database: PlaceDatabase) -> None:
+    query = outing.keyframes[80]
+    (found,) = compared_with(driven(outing, database, 80), query)
+    assert found.odom_T_body is not None and query.odom_T_body is not None
+    assert np.linalg.norm(found.odom_T_body[:2, 3] - query.odom_T_body[:2, 3]) < 3
+    late, finder = outing.keyframes[-1], driven(outing, PlaceDatabase(Database(), "none", 2), len(outing.keyframes) - 1)
+    for one in compared_with(finder, late):  # the anchors at the start would be nearer
+        assert late.path_length_m - one.path_length_m <= const.ODOMETRY_ALONE_M
 
 
 def test_results_do_not_depend_on_what_is_in_memory(outing: Drive, database: PlaceDatabase) -> None:

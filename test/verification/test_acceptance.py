@@ -6,21 +6,27 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from measurements import BAD, GOOD
+from measurements import BAD, BAD_VIEWS, GOOD, GOOD_VIEWS
 
 from umf_ros.core.errors import ConfigError
 from umf_ros.lab.fit.acceptance import save_acceptance
-from umf_ros.verification import Measurement
+from umf_ros.verification import RejectReason
 from umf_ros.verification.acceptance import (
-    KINDS,
+    CRITERIA,
+    WITHOUT_RIVALS,
     AcceptanceModel,
     Criterion,
-    criteria_of,
     load_acceptance,
     refuted,
     scores,
 )
-from umf_ros.verification.hypothesis import SCAN, SUBMAP
+from umf_ros.verification.constants import MAX_MISFIT, MIN_RIVAL
+from umf_ros.verification.hypothesis import IMAGE, SCAN, kind_of
+from umf_ros.verification.measurement import MEASUREMENTS
+
+RIVALS, STANDING = ("rival_near", "rival_far"), ("upright_counterparts", "unexplained")
+PAIRS = {SCAN: (GOOD, BAD), IMAGE: (GOOD_VIEWS, BAD_VIEWS)}
+NAN = math.nan
 
 
 @pytest.fixture(scope="module")
@@ -33,125 +39,124 @@ def saved(model: AcceptanceModel, folder: Path) -> Path:
     return folder / "model.json"
 
 
-def test_shipped_model_accepts_a_good_fit_and_rejects_a_bad_one(shipped: AcceptanceModel) -> None:
-    assert shipped.probability(GOOD) > 0.95
-    assert shipped.probability(BAD) < 0.05
+def without(measurements: dict[str, float], *names: str) -> dict[str, float]:
+    return {name: value for name, value in measurements.items() if name not in names}
+
+
+@pytest.mark.parametrize("kind", CRITERIA)
+def test_shipped_model_accepts_a_good_fit_and_rejects_a_bad_one(shipped: AcceptanceModel, kind: str) -> None:
+    good, bad = PAIRS[kind]
+    assert kind_of(good) == kind_of(bad) == kind
+    assert shipped.probability(good) > 0.95
+    assert shipped.probability(bad) < 0.05
 
 
 def test_good_features_on_bad_geometry_are_not_enough(shipped: AcceptanceModel) -> None:
-    features = {name: GOOD.numbers[name] for name in ("similarity", "inliers_image", "inliers_cloud")}
-    assert shipped.probability(replace(BAD, **features, agreement_cloud=6.0)) < 0.5
+    features = {name: GOOD[name] for name in ("similarity", "inliers_image", "inliers_cloud")}
+    assert shipped.probability(BAD | features) < 0.5
+    assert shipped.probability(BAD_VIEWS | features) < 0.5
 
 
-# two submaps of opposite headings: little of what the scans saw is common, the ground between them is
-TURNED = replace(
-    GOOD,
-    kind=SUBMAP,
-    common=0.1,
-    upright_counterparts=0.3,
-    unexplained=0.3,
-    rival_near=0.0,
-    rival_far=0.05,
-    terrain_rival=0.2,
-)
-
-
-def test_submaps_of_narrow_sensors_are_judged_by_their_terrain_too(shipped: AcceptanceModel) -> None:
-    turned = replace(TURNED, terrain_score=30.0, support=2.0, relief_m=0.1)
-    assert shipped.probability(replace(turned, kind=SCAN)) < 0.6 < 0.95 < shipped.probability(turned)
-    assert shipped.probability(replace(turned, terrain_score=4.0, terrain_rival=0.85, overlap=0.5)) < 0.9
-    for one in (turned, replace(turned, terrain_score=4.0, overlap=0.5), replace(turned, common=0.8, rival_far=0.6)):
-        probability = shipped.probability(one)
-        told = sum(shipped.contributions(one).values())
-        assert told == pytest.approx(math.log(probability / (1 - probability)), rel=1e-6)
-    assert refuted(turned) is None and refuted(replace(turned, terrain_correlation=0.25)) is not None
-    assert refuted(replace(turned, kind=SCAN, terrain_correlation=0.25)) is None
-
-
-def test_a_model_without_submaps_judges_them_by_the_shipped_one(shipped: AcceptanceModel, tmp_path: Path) -> None:
-    path = saved(shipped, tmp_path)
-    content = json.loads(path.read_text())
-    del content["models"][SUBMAP]
-    path.write_text(json.dumps(content))
-    assert load_acceptance(str(path)).probability(TURNED) == shipped.probability(TURNED)
-
-
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", CRITERIA)
 def test_no_criterion_argues_against_itself(shipped: AcceptanceModel, kind: str) -> None:
     assert all(weight >= 0 for weight in shipped.models[kind].weights.values())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", CRITERIA)
 def test_scores_stay_between_nothing_and_all(kind: str) -> None:
-    good, bad = replace(GOOD, kind=kind), replace(BAD, kind=kind)
+    good, bad = PAIRS[kind]
     for values in ((1e9, 1e-9), (1e-9, 1e9)):
-        wild = {name: values[number % 2] for number, name in enumerate(good.numbers)}
-        assert all(0 <= score <= 1 for score in scores(replace(good, **wild)).values())
-    assert all(scores(good)[name] >= scores(bad)[name] for name in criteria_of(kind))
+        wild = {name: values[number % 2] for number, name in enumerate(good)}
+        assert all(0 <= score <= 1 for score in scores(wild).values())
+    best, worst = scores(good), scores(bad)
+    assert all(best[name] >= worst[name] for name in CRITERIA[kind])
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_criteria_read_only_what_is_measured_for_their_kind(kind: str) -> None:
-    good = replace(GOOD, kind=kind)
-    assert scores(Measurement(kind=kind, **good.numbers)) == scores(good)
+@pytest.mark.parametrize("kind", CRITERIA)
+def test_every_criterion_reads_what_is_measured_and_no_more(kind: str) -> None:
+    """A good fit has all that the criteria need, and no other measurement changes a score."""
+    good, _ = PAIRS[kind]
+    others = {name: 0.123 for name in MEASUREMENTS if name not in good}
+    others.pop("noise_m", None)  # would make a scan of a view
+    assert scores(good | others) == scores(good)
+    assert set(scores(good)) == set(CRITERIA[kind])
 
 
 def test_criterion_goes_from_its_worst_to_its_best_whichever_is_larger() -> None:
-    rising = Criterion(lambda measurement: measurement.overlap, worst=0.2, best=0.6)
-    falling = Criterion(lambda measurement: measurement.overlap, worst=0.6, best=0.2)
+    rising = Criterion(lambda known: known["overlap"], worst=0.2, best=0.6)
+    falling = Criterion(lambda known: known["overlap"], worst=0.6, best=0.2)
     for overlap, score in ((0.0, 0.0), (0.2, 0.0), (0.3, 0.25), (0.6, 1.0), (0.9, 1.0)):
-        assert rising(replace(GOOD, overlap=overlap)) == pytest.approx(score)
-        assert falling(replace(GOOD, overlap=overlap)) == pytest.approx(1 - score)
+        assert rising({"overlap": overlap}) == pytest.approx(score)
+        assert falling({"overlap": overlap}) == pytest.approx(1 - score)
 
 
-def test_missing_numbers_count_as_their_neutral_value() -> None:
-    found = scores(replace(GOOD, agreement_cloud=math.nan, prior_sigmas=math.nan))
-    assert found["cloud_agreement"] == 0.5
-    assert 0 < found["odometry_prior"] < 1
+@pytest.mark.parametrize("unknown", [without(GOOD, *STANDING), GOOD | dict.fromkeys(STANDING, NAN)])
+def test_missing_numbers_count_as_their_neutral_value(unknown: dict[str, float]) -> None:
+    found = scores(unknown)
+    assert (found["upright_counterparts"], found["explained"]) == (0.4, 0.5)
+    assert {name: found[name] for name in ("common_view", "no_rival")} == pytest.approx(
+        {name: scores(GOOD)[name] for name in ("common_view", "no_rival")}
+    )
 
 
-def test_contributions_add_up_to_the_log_odds(shipped: AcceptanceModel) -> None:
-    odds = sum(shipped.contributions(GOOD).values())
-    assert shipped.probability(GOOD) == pytest.approx(1 / (1 + math.exp(-odds)))
-    assert shipped.contributions(GOOD)["bias"] == shipped.models["scan"].bias
+def test_rivals_that_were_not_looked_for_speak_for_nothing() -> None:
+    found = scores(without(GOOD, *RIVALS))
+    assert (found["position_along_known"], found["no_rival"]) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("kind", CRITERIA)
+def test_contributions_add_up_to_the_log_odds(shipped: AcceptanceModel, kind: str) -> None:
+    for measurements in PAIRS[kind]:
+        odds = sum(shipped.contributions(measurements).values())
+        assert shipped.probability(measurements) == pytest.approx(1 / (1 + math.exp(-odds)))
+        assert shipped.contributions(measurements)["bias"] == shipped.models[kind].bias
 
 
 def test_saved_model_reads_back(shipped: AcceptanceModel, tmp_path: Path) -> None:
     assert load_acceptance(str(saved(shipped, tmp_path))) == shipped
 
 
-@pytest.mark.parametrize("damage", ["", "{", "{}", '{"models": {}}'])
+@pytest.mark.parametrize("damage", ["", "{", "{}", "[]", '{"models": {}}'])
 def test_damaged_model_is_one_clear_error(tmp_path: Path, damage: str) -> None:
     (tmp_path / "model.json").write_text(damage)
     with pytest.raises(ConfigError, match=r"model\.json: not an acceptance model"):
         load_acceptance(str(tmp_path / "model.json"))
 
 
-def test_model_of_other_criteria_is_refused(shipped: AcceptanceModel, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", CRITERIA)
+def test_a_model_of_other_criteria_is_refused_and_the_criterion_named(
+    shipped: AcceptanceModel, tmp_path: Path, kind: str
+) -> None:
+    """One of another version, with a criterion too many or too few."""
     path = saved(shipped, tmp_path)
     content = json.loads(path.read_text())
-    content["models"]["scan"]["weights"]["luck"] = 1.0
+    weights, last = content["models"][kind]["weights"], list(CRITERIA[kind])[-1]
+    for other in (weights | {"luck": 1.0}, without(weights, last)):
+        content["models"][kind]["weights"] = other
+        path.write_text(json.dumps(content))
+        with pytest.raises(
+            ConfigError, match=r"model\.json: not an acceptance model.*" + ("luck" if "luck" in other else last)
+        ):
+            load_acceptance(str(path))
+
+
+@pytest.mark.parametrize(("part", "kind"), [("models", IMAGE), ("models", SCAN), ("covariance", SCAN)])
+def test_a_model_that_lacks_a_kind_is_refused(shipped: AcceptanceModel, tmp_path: Path, part: str, kind: str) -> None:
+    path = saved(shipped, tmp_path)
+    content = json.loads(path.read_text())
+    del content[part][kind]
     path.write_text(json.dumps(content))
-    with pytest.raises(ConfigError, match="luck"):
+    with pytest.raises(ConfigError, match=kind):
         load_acceptance(str(path))
 
 
-def test_a_criterion_younger_than_the_model_has_no_weight(shipped: AcceptanceModel, tmp_path: Path) -> None:
-    path = saved(shipped, tmp_path)
-    content = json.loads(path.read_text())
-    del content["models"]["scan"]["weights"]["heading_known"]
-    path.write_text(json.dumps(content))
-    old = load_acceptance(str(path))
-    assert old.models["scan"].weights["heading_known"] == 0.0
-    assert old.probability(GOOD) < shipped.probability(GOOD)
-
-
 def test_what_no_right_pose_ever_measured_is_named(shipped: AcceptanceModel, tmp_path: Path) -> None:
-    bounded = replace(shipped, bounds={"scan": {"noise_m": (0.001, 0.1), "common": (0.2, 1.0)}})
+    bounded = replace(shipped, bounds={SCAN: {"noise_m": (0.001, 0.1), "common": (0.2, 1.0)}})
     assert bounded.out_of_range(GOOD) == ""
-    assert bounded.out_of_range(replace(GOOD, noise_m=0.3)) == "noise_m 0.3"
-    assert bounded.out_of_range(replace(GOOD, common=0.05)) == "common 0.05"
-    assert bounded.out_of_range(replace(GOOD, kind="image", noise_m=0.3)) == ""
+    assert bounded.out_of_range(GOOD | {"noise_m": 0.3}) == "noise_m 0.3"
+    assert bounded.out_of_range(GOOD | {"common": 0.05}) == "common 0.05"
+    assert bounded.out_of_range(without(GOOD, "common")) == ""
+    assert bounded.out_of_range(GOOD_VIEWS | {"common": 0.05}) == ""
     assert load_acceptance(str(saved(bounded, tmp_path))) == bounded
 
 
@@ -160,29 +165,56 @@ def test_one_strong_contradiction_sinks_a_closure_however_well_the_rest_fits(
     shipped: AcceptanceModel, name: str, value: float
 ) -> None:
     assert shipped.out_of_range(GOOD) == ""
-    assert shipped.out_of_range(replace(GOOD, **{name: value})).startswith(name)
+    assert shipped.out_of_range(GOOD | {name: value}).startswith(name)
 
 
-@pytest.mark.parametrize("name", ["residual_m", "position_std_m", "prior_sigmas", "unexplained", "contradiction"])
+@pytest.mark.parametrize(
+    "name", ["residual_p90_m", "position_std_m", "heading_std_deg", "unexplained", "contradiction"]
+)
 def test_larger_errors_never_make_a_closure_more_probable(shipped: AcceptanceModel, name: str) -> None:
-    value = GOOD.numbers[name]
-    odds = [shipped.probability(replace(GOOD, **{name: value * factor})) for factor in (0.5, 1, 2, 5, 20)]
-    assert odds == sorted(odds, reverse=True)
+    odds = [shipped.probability(GOOD | {name: GOOD[name] * factor}) for factor in (0.5, 1, 2, 5, 20)]
+    assert odds == sorted(odds, reverse=True) and odds[0] > odds[-1]
 
 
-@pytest.mark.parametrize("measurement", [GOOD, BAD], ids=["good", "bad"])
+@pytest.mark.parametrize("measurements", [GOOD, BAD], ids=["good", "bad"])
 @pytest.mark.parametrize("rival", [-1.0, 0.0, 0.2, 3.0])
 def test_no_rival_makes_a_closure_more_probable_than_none(
-    shipped: AcceptanceModel, measurement: Measurement, rival: float
+    shipped: AcceptanceModel, measurements: dict[str, float], rival: float
 ) -> None:
-    alone = replace(measurement, rival_near=float("nan"), rival_far=float("nan"))
-    beside = replace(measurement, rival_near=rival, rival_far=rival)
+    alone = without(measurements, *RIVALS)
+    beside = measurements | dict.fromkeys(RIVALS, rival)
     assert shipped.at_best(alone) >= shipped.probability(beside) >= shipped.probability(alone)
 
 
+def test_at_best_no_criterion_of_rivals_is_left_short() -> None:
+    assert {scores(BAD | WITHOUT_RIVALS)[name] for name in ("position_along_known", "no_rival")} == {1.0}
+
+
 def test_what_was_never_measured_is_not_what_a_closure_was_lost_by(shipped: AcceptanceModel) -> None:
-    assert shipped.lost(BAD)["no_rival"] == pytest.approx(shipped.models["scan"].weights["no_rival"])
-    hopeless = replace(BAD, rival_near=float("nan"), rival_far=float("nan"))
-    lost = shipped.lost(hopeless)
+    assert shipped.lost(BAD)["no_rival"] == pytest.approx(shipped.models[SCAN].weights["no_rival"])
+    lost = shipped.lost(without(BAD, *RIVALS))
     assert "no_rival" not in lost and "heading_known" in lost
     assert all(odds > 0 for odds in lost.values())
+
+
+@pytest.mark.parametrize(
+    ("measurements", "reason"),
+    [
+        (GOOD, None),
+        (GOOD | {"rival_far": 1.01 * MIN_RIVAL}, None),
+        (GOOD | {"rival_far": 0.99 * MIN_RIVAL}, RejectReason.AMBIGUOUS),
+        (GOOD | {"rival_far": -0.5}, RejectReason.AMBIGUOUS),
+        (without(GOOD, *RIVALS), None),
+        (GOOD | {"rival_far": NAN}, None),
+        (GOOD | {"residual_m": 0.99 * MAX_MISFIT * GOOD["noise_m"]}, None),
+        (GOOD | {"residual_m": 1.01 * MAX_MISFIT * GOOD["noise_m"]}, RejectReason.MISFIT),
+        (GOOD_VIEWS, None),
+        (BAD_VIEWS | {"rival_far": -0.5}, None),
+    ],
+)
+def test_a_rival_and_surfaces_apart_refute_scans_however_probable(
+    measurements: dict[str, float], reason: RejectReason | None
+) -> None:
+    objection = refuted(measurements)
+    assert (objection and objection[0]) == reason
+    assert objection is None or objection[1]  # with its figures

@@ -11,12 +11,12 @@ from umf_ros.core.frames import Candidate, Frame, Keyframe
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 from umf_ros.verification import Verifier, thin_frame
 from umf_ros.verification.constants import SCANS_KEPT
-from umf_ros.verification.prepared_scan import PreparedScan, ScanCache, prepare, prepare_frame
-from umf_ros.verification.surroundings import Sight
+from umf_ros.verification.prepared_scan import PreparedScan, ScanCache
+from umf_ros.verification.visibility import Sight
 
 GROUND = landscape(20)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
-READY = ("elevation", "range_images", "spacing", "coarse_cloud", "sample_cloud", "cloud", "up")
+READY = ("view", "range_images", "spacing", "scouts_cloud", "coarse_cloud", "sample_cloud", "cloud", "up")
 
 
 def frame_and_keyframe(stamp_s: float) -> tuple[Frame, Keyframe]:
@@ -33,10 +33,10 @@ def test_a_scan_that_was_foreseen_is_the_keyframes_own_and_ready() -> None:
     scans.prefetch(frame)
     scan = scans[keyframe]
     assert set(READY) <= set(vars(scan))  # nothing of it is made again
-    other = prepare(keyframe)
+    other = PreparedScan.of(keyframe)
     assert not set(READY) & set(vars(other))
     assert (scan.points == other.points).all() and scan.blur_m == other.blur_m
-    assert (scan.elevation.values == other.elevation.values).all()
+    assert np.array_equal(scan.map(scan.cell_m).relief, other.map(other.cell_m).relief, equal_nan=True)
     assert scans[keyframe] is scan
 
 
@@ -71,15 +71,19 @@ def test_next_to_nothing_is_ready_at_once(points: np.ndarray) -> None:
     scan = PreparedScan(points)
     scan.make_ready()
     assert not scan.usable
-    assert not prepare_frame(replace(make_frame(1.0), points=points)).usable
+    frame, keyframe = frame_and_keyframe(100.0)
+    scans = ScanCache()
+    scans.prefetch(replace(frame, points=points))
+    assert not scans[replace(keyframe, points=points)].usable
 
 
 def test_the_cache_is_bounded() -> None:
     scans = ScanCache()
-    keyframes = [replace(take(GROUND, HERE, 1.0), stamp_ns=i, points=np.ones((5, 3), np.float32)) for i in range(99)]
+    seen = replace(take(GROUND, HERE, 1.0), points=np.ones((5, 3), np.float32))
+    keyframes = [replace(seen, stamp_ns=number) for number in range(SCANS_KEPT + 1)]
     first = scans[keyframes[0]]
     assert scans[keyframes[0]] is first
-    for keyframe in keyframes[1 : SCANS_KEPT + 1]:
+    for keyframe in keyframes[1:]:
         assert scans[keyframe] is not first
     assert scans[keyframes[0]] is not first  # gave way to newer ones
 

@@ -141,7 +141,7 @@ def test_a_few_outliers_do_not_make_a_fit_surer_or_much_less_sure() -> None:
 
 def test_thinning_keeps_one_mean_per_cube() -> None:
     pair = np.array([[5.0, 0.1, 0.1], [5.1, 0.12, 0.12], [9.0, 0, 0], [60.0, 0, 0]], np.float32)
-    thinned = thin_scan(pair, 0.5)
+    thinned = thin_scan(pair)
     assert len(thinned) == 2
     np.testing.assert_allclose(np.sort(thinned[:, 0]), [5.05, 9.0], atol=1e-5)
 

@@ -1,16 +1,15 @@
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from umf_ros.core.frames import Embedding, Keyframe
+from umf_ros.core.frames import Candidate, Embedding, Keyframe
 from umf_ros.core.geometry import make_pose, relative
 from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA, landscape, pose_at
 from umf_ros.verification.constants import MEMORY_KEYFRAMES
-from umf_ros.verification.pose_search import TemporalMemory, prior_sigmas
+from umf_ros.verification.pose_search import TemporalMemory
 
 GROUND = landscape(0, bumps=1)
 
@@ -33,6 +32,10 @@ def pair(step: float) -> tuple[Keyframe, Keyframe, np.ndarray]:
     """Query and match one step further along, with their true relative pose."""
     query, match = (step, 1.0, 5.0), (step - 0.5, 0.0, 0.0)
     return keyframe(*query, 100 + step), keyframe(*match, 10 + step), truth(query, match)
+
+
+def offered(*places: Keyframe) -> list[tuple[Candidate, Keyframe]]:
+    return [(Candidate(index, place.stamp_ns, 0.5), place) for index, place in enumerate(places)]
 
 
 def test_a_place_recognised_again_is_supported() -> None:
@@ -76,23 +79,25 @@ def test_without_odometry_or_across_sessions_there_is_no_support(change: dict[st
     memory.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
     query, match, pose = pair(1.0)
     assert memory.support(replace(query, **change), match, pose) == 0
-    assert memory.expected_distance(replace(query, **change), match) == math.inf
+    assert memory.expected(replace(query, **change), offered(match)) == []
 
 
 def test_expected_place_needs_an_accepted_closure() -> None:
     memory = TemporalMemory()
     query, match, pose = pair(0.0)
     memory.remember(query, [(match, pose, False)])
-    assert memory.expected_distance(*pair(1.0)[:2]) == math.inf
+    later, place, _ = pair(1.0)
+    assert memory.expected(later, offered(place)) == []
     memory.remember(query, [(match, pose, True)])
-    query, match, pose = pair(1.0)
-    assert memory.expected_distance(query, match) == pytest.approx(np.linalg.norm(pose[:3, 3]), abs=1e-6)
+    assert memory.expected(later, offered(place)) == offered(place)
 
 
-def test_prior_is_soft_after_a_long_way_and_unknown_without_odometry() -> None:
-    query, match, pose = pair(0.0)
-    near = prior_sigmas(query, match, pose, drift=0.05)
-    far = prior_sigmas(replace(query, path_length_m=1000.0), match, pose, drift=0.05)
-    assert 0 < far < near / 5
-    assert math.isnan(prior_sigmas(replace(query, odom_T_body=None), match, pose, drift=0.05))
-    assert math.isnan(prior_sigmas(replace(query, session=3), match, pose, drift=0.05))
+def test_of_the_expected_places_the_nearest_is_taken_and_none_that_is_far() -> None:
+    memory = TemporalMemory()
+    memory.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
+    query = pair(1.0)[0]  # expected at (1, 1)
+    places = [keyframe(x, 0.0, 0.0, 10 + x) for x in (-1.0, 2.5, 0.5, 6.0)]
+    candidates = offered(*places)
+    assert memory.expected(query, candidates) == [candidates[2]]
+    assert memory.expected(query, candidates[3:]) == []  # five metres off
+    assert memory.expected(query, []) == []

@@ -13,7 +13,7 @@ from umf_ros.lab.simulation.scenes import TRAPS, spring
 from umf_ros.verification import Verifier
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.rerank import fit_homography, mutual_neighbours, similarities
-from umf_ros.verification.yaw_search import RotatedElevationMap, search
+from umf_ros.verification.yaw_search import RotatedMaps, search
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -27,11 +27,11 @@ def test_trap_is_not_accepted(verifier: Verifier, name: str, seed: int) -> None:
 def test_the_homography_trap_is_a_real_one(verifier: Verifier) -> None:
     """The local features alone would fall for it."""
     verdict = spring(verifier, TRAPS["same_plane_and_texture"], 0)
-    assert verdict.measurement.inliers_image >= 20
+    assert verdict.measurements["inliers_image"] >= 20
 
 
 def test_the_rock_trap_is_a_real_one(verifier: Verifier) -> None:
-    assert spring(verifier, TRAPS["same_rocks_elsewhere"], 0).measurement.inliers_image >= 40
+    assert spring(verifier, TRAPS["same_rocks_elsewhere"], 0).measurements["inliers_image"] >= 40
 
 
 def test_the_mirror_trap_is_a_real_one() -> None:
@@ -60,7 +60,7 @@ def test_the_crowded_trap_is_a_real_one() -> None:
 def test_no_relief_no_pose_from_it(name: str) -> None:
     query, match = TRAPS[name](0)
     scan = PreparedScan(query.points)
-    assert not scan.usable or search(PreparedScan(match.points), RotatedElevationMap(scan)) == []
+    assert not scan.usable or search(PreparedScan(match.points), RotatedMaps(scan)) == []
 
 
 @pytest.mark.parametrize("name", list(TRAPS))

@@ -25,7 +25,7 @@ from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection
 from umf_ros.runs.reader import remember_recording
 from umf_ros.runs.writer import RunRecorder
-from umf_ros.verification import Hypothesis, Measurement, RejectReason
+from umf_ros.verification import Hypothesis, RejectReason
 
 LATENCY = {"embed": 30.0, "query": 1.0, "verify": 9.0, "total": 40.0}
 PIXELS = np.array([[10, 12, 50, 30], [40, 20, 20, 41]], np.float32)
@@ -39,7 +39,7 @@ def verdict(query: Frame, match: Frame, error_m: float, probability: float) -> H
     return Hypothesis(
         query.stamp_ns,
         Candidate(0, match.stamp_ns, 0.8),
-        Measurement(similarity=0.8),
+        {"similarity": 0.8},
         closure=closure,
         inlier_pixels=PIXELS,
     )
@@ -56,7 +56,7 @@ def record_run(folder: Path, bag: Path, settings_folder: Path) -> list[Frame]:
     for i, frame in enumerate(frames):
         keyframe = replace(make_keyframe(0, 0.2 * i), stamp_ns=frame.stamp_ns)
         rejected = Hypothesis(
-            frames[0].stamp_ns, Candidate(1, frames[0].stamp_ns, 0.1), Measurement(similarity=0.1), RejectReason.NO_POSE
+            frames[0].stamp_ns, Candidate(1, frames[0].stamp_ns, 0.1), {"similarity": 0.1}, RejectReason.NO_POSE
         )
         found = [closures[i], rejected] if i in closures else []
         recorder.record(frame, Detection(frame.stamp_ns, keyframe, found, LATENCY))

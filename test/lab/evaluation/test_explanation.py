@@ -34,7 +34,7 @@ def test_same_place_is_explained_by_contributions_that_add_up() -> None:
 def test_other_place_is_rejected_with_its_numbers() -> None:
     found = explained(same=False)
     assert found.verdict.startswith("rejected")
-    assert found.best is None or found.best.measurement.residual_m > 0.01
+    assert found.best is None or found.best.measurements["residual_m"] > 0.01
 
 
 def test_picture_is_written_with_and_without_images_and_pose(tmp_path: Path) -> None:

@@ -124,7 +124,7 @@ def examples_of(domain: Domain, seeds: range, pairs: int, scans: Path | None, em
         yield from _examples(Tried(query, match, pair), verifier, (domain.name, domain.scanner.all_round), rng)
         if pair.query.before is not None:
             merged = Tried(pair.query.before, pair.match.around or pair.match.keyframe, pair)
-            yield from _examples(merged, verifier, (domain.name, domain.scanner.all_round), rng)
+            yield from _examples(merged, verifier, (domain.name, True), rng)
 
 
 def passage_examples(kind: str, seeds: range, pairs: int, embedder: Embedder) -> Iterator[Example]:

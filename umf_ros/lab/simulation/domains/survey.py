@@ -198,7 +198,7 @@ DOMAINS: tuple[Domain, ...] = (
 
 
 def survey(domain: Domain, seed: int, step_m: float, longest_m: float, place: Place | None = None) -> list[DomainScan]:
-    """Drive a stretch of the place's trail, again the same way and, with a LiDAR that sees all around, back.
+    """Drive a stretch of the place's trail, again the same way, and back.
 
     Args:
         domain: what to take along and where.
@@ -215,7 +215,7 @@ def survey(domain: Domain, seed: int, step_m: float, longest_m: float, place: Pl
     carrier = np.random.default_rng([seed, 51])
     body_T_lidar = mount.body_T_lidar(carrier)
     scans: list[DomainScan] = []
-    for visit, label in enumerate((FIRST, SAME_WAY, OTHER_WAY) if scanner.all_round else (FIRST, SAME_WAY)):
+    for visit, label in enumerate((FIRST, SAME_WAY, OTHER_WAY)):
         visited: list[DomainScan] = []
         rng = np.random.default_rng([seed, 52, visit])
         scene = place.scene(visit)

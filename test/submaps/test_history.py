@@ -5,10 +5,8 @@ import pytest
 from submaps_drives import SPEED_M_S, Drive
 
 from umf_ros.core.config import Loop
-from umf_ros.core.geometry import invert
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.submaps.submap_history import SubmapHistory
-from umf_ros.submaps.submap_index import Expectation, Found
+from umf_ros.submaps.history import SubmapHistory
 from umf_ros.verification import constants as const
 
 
@@ -60,24 +58,30 @@ def test_scans_are_joined_by_odometry(trail: SubmapHistory, outing: Drive) -> No
     assert ahead == pytest.approx(moments * SPEED_M_S, abs=0.1)
 
 
-def test_odometry_carries_a_closure_to_the_next_keyframes(trail: SubmapHistory, outing: Drive) -> None:
-    expectation = Expectation(trail, Loop())
-    query, later = outing.keyframes[80], outing.keyframes[84]
-    match, odometry = outing.keyframes[30], invert(outing.keyframes[30].odom_T_body) @ query.odom_T_body
-    off = odometry.copy()
-    off[:3, 3] += 2.0
-    expectation.latest = Found(query, match, off)
-    proposal = expectation.propose(later)
-    assert proposal is not None
-    where = trail.anchors[proposal.row].odom_T_body @ proposal.pose
-    assert where[:3, 3] == pytest.approx(match.odom_T_body[:3, :3] @ [2, 2, 2] + later.odom_T_body[:3, 3], abs=0.1)
+def test_the_part_of_the_path_between_two_places_is_found(trail: SubmapHistory) -> None:
+    rows = trail.rows(0, 10.0, 20.0)
+    path = [trail.anchors[row].path_length_m for row in rows]
+    assert len(rows) > 3 and 10.0 <= min(path) < 12.0 and 18.0 < max(path) <= 20.0
+    assert len(trail.rows(1, 10.0, 20.0)) == 0 and len(trail.rows(0, 12.0, 11.0)) == 0
 
 
-def test_without_a_closure_odometry_alone_is_believed_for_a_while(trail: SubmapHistory, outing: Drive) -> None:
-    middle = Expectation(trail, Loop()).propose(outing.keyframes[80])
-    assert middle is not None and np.linalg.norm(middle.pose[:2, 3]) < 3
-    late = outing.keyframes[-5]
-    last = Expectation(trail, Loop()).propose(late)
-    assert last is not None  # the stops at the start would be nearer
-    way_m = late.path_length_m - trail.anchors[last.row].path_length_m
-    assert const.ODOMETRY_ALONE_M - 2 < way_m <= const.ODOMETRY_ALONE_M
+def test_what_is_past_is_old_and_far_enough_back(trail: SubmapHistory, outing: Drive) -> None:
+    query, rules = outing.keyframes[80], Loop(min_time_gap_s=20.0, min_travel_m=15.0)
+    rows = np.arange(len(trail.anchors))
+    past = trail.past(query, rows, rules)
+    assert past.any() and not past.all()
+    for row in rows:
+        anchor = trail.anchors[row]
+        age_s, way_m = (query.stamp_ns - anchor.stamp_ns) * 1e-9, query.path_length_m - anchor.path_length_m
+        assert past[row] == (age_s >= 20.0 and way_m >= 15.0)
+
+
+def test_anchors_of_a_stored_session_are_found_again(
+    trail: SubmapHistory, outing: Drive, database: PlaceDatabase
+) -> None:
+    again = SubmapHistory(database)
+    assert len(again.anchors) == pytest.approx(len(trail.anchors), abs=3)
+    row = len(again.anchors) // 2
+    stamps = [keyframe.stamp_ns for keyframe in outing.keyframes]
+    seen = outing.keyframes[stamps.index(again.anchors[row].stamp_ns)]
+    assert (again.odometry(row) == seen.odom_T_body).all()
