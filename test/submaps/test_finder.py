@@ -54,7 +54,8 @@ def test_a_way_driven_back_is_recognised_with_the_right_pose(outing: Drive, data
 
 
 def test_a_limit_on_the_turn_is_kept(outing: Drive, database: PlaceDatabase) -> None:
-    verdicts = [verdict for _, found in replay(outing, database, max_turn_deg=90.0) for verdict in found]
+    part = Drive(outing.keyframes[:80], outing.truth)
+    verdicts = [verdict for _, found in replay(part, database, max_turn_deg=90.0) for verdict in found]
     assert not any(verdict.closure for verdict in verdicts)
     assert any(verdict.reason is RejectReason.TURNED for verdict in verdicts)
 
@@ -78,8 +79,8 @@ def test_a_dense_scan_all_around_needs_no_submap(database: PlaceDatabase) -> Non
 
 
 def test_a_place_that_a_scan_has_found_is_not_looked_for(outing: Drive, database: PlaceDatabase) -> None:
-    finder = driven(outing, database, len(outing.keyframes) - 1)
-    query, match = outing.keyframes[-1], outing.keyframes[0]
+    finder = driven(outing, database, 80)
+    query, match = outing.keyframes[80], outing.keyframes[0]
     assert finder.find(query, [])
     closure = LoopClosure(query.stamp_ns, match.stamp_ns, np.eye(4), np.eye(6), 0.95)
     known = [Hypothesis(query.stamp_ns, Candidate(0, match.stamp_ns, 1.0), closure=closure)]
@@ -113,8 +114,11 @@ def test_without_a_closure_odometry_alone_is_trusted_for_a_while(outing: Drive, 
 
 def test_results_do_not_depend_on_what_is_in_memory(outing: Drive, database: PlaceDatabase) -> None:
     small = PlaceDatabase(Database(cached_keyframes=20), "none", 2)
-    for (_, one), (_, other) in zip(replay(outing, database), replay(outing, small), strict=True):
-        assert [v.reason for v in one] == [v.reason for v in other]
+    part, closures = Drive(outing.keyframes[:80], outing.truth), 0
+    for (_, one), (_, other) in zip(replay(part, database), replay(part, small), strict=True):
+        assert [v.outcome for v in one] == [v.outcome for v in other]
+        closures += sum(verdict.accepted for verdict in one)
+    assert closures > 5
 
 
 def test_odometry_that_drifts_far_gives_no_wrong_closure(outing: Drive, database: PlaceDatabase) -> None:

@@ -74,17 +74,17 @@ def test_a_wall_that_one_scan_lacks_speaks_against_the_pose_whichever_scan_it_is
 
 
 def test_the_worse_of_both_ways_counts() -> None:
-    """A narrow view sees all that it has again in the other, which sees much that the narrow one does not."""
+    """All that a narrow view sees the other sees too, which sees much that the narrow one does not."""
     world = hall()
     narrow = seen(world[np.abs(np.arctan2(world[:, 1], world[:, 0])) < 0.5], np.eye(4))
-    one, other = compare_scans(MATCH, narrow, np.eye(4)), compare_scans(narrow, MATCH, np.eye(4))
-    assert one["common"] == pytest.approx(other["common"], abs=0.02) and one["common"] < 0.4
     assert compare_scans(narrow, narrow, np.eye(4))["common"] > 0.8
+    for pair in ((MATCH, narrow), (narrow, MATCH)):
+        assert compare_scans(*pair, np.eye(4))["common"] < 0.4
 
 
 def test_too_few_visible_points_count_against_the_pose_and_say_nothing_of_what_stands() -> None:
-    away = make_pose(np.eye(3), [500.0, 0.0, 0.0])
-    narrow = seen((world := hall())[np.abs(np.arctan2(world[:, 1], world[:, 0])) < 0.5], np.eye(4))
+    world, away = hall(), make_pose(np.eye(3), [500.0, 0.0, 0.0])
+    narrow = seen(world[np.abs(np.arctan2(world[:, 1], world[:, 0])) < 0.5], np.eye(4))
     behind = make_pose(np.diag([-1.0, -1.0, 1.0]), [0.0, 0.0, 0.0])
     for found in (compare_scans(narrow, narrow, behind), compare_scans(narrow, narrow, behind @ away)):
         assert found["common"] < 0.02 and found["contradiction"] == 1

@@ -15,7 +15,7 @@ from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_imag
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification.constants import SAME_M, SAME_RAD
 from umf_ros.verification.hypothesis import SCAN
-from umf_ros.verification.pose_search import near
+from umf_ros.core.geometry import near
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)

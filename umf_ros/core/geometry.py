@@ -69,6 +69,12 @@ def rotation_angle(pose: ArrayLike) -> float:
     return float(Rotation.from_matrix(np.asarray(pose)[:3, :3]).magnitude())
 
 
+def near(a: Array, b: Array, metres: float, radians: float) -> bool:
+    """Whether two poses in one frame are nearer to each other than these tolerances."""
+    gap = relative(a, b)
+    return bool(np.linalg.norm(gap[:3, 3]) < metres and rotation_angle(gap) < radians)
+
+
 def heading(world_T_body: Array) -> Any:
     """Direction of the body's x axis in the world's x-y plane, radians from the x axis; of one pose or (..., 4, 4)."""
     return np.arctan2(world_T_body[..., 1, 0], world_T_body[..., 0, 0])

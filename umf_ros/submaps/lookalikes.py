@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.frames import Keyframe
 from umf_ros.verification import constants as const
-from umf_ros.verification.grid_map import Grid, GridMap
+from umf_ros.verification.grid_map import Grid
 from umf_ros.verification.prepared_scan import PreparedScan
 
 
@@ -29,13 +29,12 @@ class Keypoints:
 
 def keypoints_of(submap: Keyframe) -> Keypoints:
     """Keypoints of the relief of a submap."""
-    points = PreparedScan.of(submap).upright_points
-    return find_keypoints(GridMap(points, const.SUBMAP_CELL_M, const.SUBMAP_RADIUS).relief)
+    return find_keypoints(PreparedScan.of(submap).terrain.relief)
 
 
 def find_keypoints(relief: Grid) -> Keypoints:
-    """Keypoints of a map (R, C) of relief, m, NaN where it is unknown, in cells of `SUBMAP_CELL_M`."""
-    highest = const.MAX_RELIEF_CELLS * const.SUBMAP_CELL_M
+    """Keypoints of a map (R, C) of relief, m, NaN where it is unknown, in cells of `TERRAIN_CELL_M`."""
+    highest = const.MAX_RELIEF_CELLS * const.TERRAIN_CELL_M
     picture = np.clip(128 + 127 / highest * np.nan_to_num(relief), 0, 255).astype(np.uint8)
     # the border of the known ground is an edge that depends on where the rover looked
     inner = cv2.erode(np.isfinite(relief).astype(np.uint8), np.ones((3, 3), np.uint8))
@@ -45,7 +44,7 @@ def find_keypoints(relief: Grid) -> Keypoints:
         return Keypoints(np.empty((0, 2), np.float32), np.empty((0, 128), np.float32))
     order = np.argsort([-one.response for one in found], kind="stable")[: const.KEYPOINTS]
     pixels = np.array([found[i].pt[::-1] for i in order])
-    places = (pixels + 0.5 - np.array(relief.shape) / 2) * const.SUBMAP_CELL_M
+    places = (pixels + 0.5 - np.array(relief.shape) / 2) * const.TERRAIN_CELL_M
     share = descriptors[order] / np.maximum(descriptors[order].sum(axis=1, keepdims=True), 1e-6)
     return Keypoints(places.astype(np.float32), np.sqrt(share).astype(np.float32))
 

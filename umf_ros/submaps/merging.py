@@ -112,7 +112,7 @@ class DriftMeter:
         """Compare a scan with those before it, newest first."""
         points = np.concatenate([moved_to(before[0], one) for one in before[::-1]])
         ways_m = np.concatenate([np.full(len(one.points), _way_m(keyframe, one)) for one in before[::-1]])
-        oldest = _first_of_cubes(points, const.SUBMAP_CELL_M)
+        oldest = _first_of_cubes(points, const.TERRAIN_CELL_M)
         match = PreparedScan(points[oldest].astype(np.float32))
         query = PreparedScan.of(keyframe)
         if not (match.usable and query.usable):

@@ -48,6 +48,7 @@ NOMINAL_BASELINE_M = 0.2  # S3LI's: how well depths of a camera without a right 
 REACH_CELLS = 15.0  # measured: the median range of a scan in cells
 MAP_RADIUS, MAP_SHIFT = 26, 12  # geometry: cells; 26 + 26 + 12 come round to themselves no more
 MAP_CELL_M = (0.25, 1.0)  # by hand: rooms, fields
+TERRAIN_CELL_M, TERRAIN_RADIUS = 0.5, 52  # by hand: rocks and ripples are seen; geometry: beyond, holes prevail
 PLANE_SIGMA_CELLS = 2.4  # by hand: relief is what rises above a plane about this wide
 PLANE_RIDGE_CELLS2 = 1.2  # keeps the slope of that plane finite where the neighbours lie on a line
 MAX_RELIEF_CELLS = 0.4  # by hand: one boulder must not outvote a field
@@ -133,7 +134,6 @@ MAX_BLUR_M = (
     0.3  # by hand: standard deviation by which a merged point may lie beside its place: half a cell of the maps
 )
 NEED_ASKED_EVERY = 4  # anchors; by hand: bounds the time for a sensor that needs none
-SUBMAP_CELL_M, SUBMAP_RADIUS = 0.5, 52  # by hand: of the drift of odometry and of keypoints; geometry: 26 m
 SUBMAP_NEAR_M = 5.0  # by hand: from where odometry expects the rover to a keyframe that is compared
 PROMISING = 0.05  # by hand: probability of a scan's hypothesis from which on submaps are compared
 # by hand: scans that the drift of odometry is judged by, at least and at most, and their overlap with those before

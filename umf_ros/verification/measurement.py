@@ -41,7 +41,8 @@ MEASUREMENTS = {
     "contradiction": "share of these that the other's rays passed by, the larger of both",
     "upright_counterparts": "of walls, trunks and rocks that should be seen, the share with a counterpart",
     "unexplained": "of the same, the share that is far from everything, the larger of both",
-    "rival_near": "logarithm of how much worse the surfaces fit half a metre on; unknown for improbable hypotheses",
+    "surface_misfit": "mean misfit of the surfaces, 0 to 1; unknown for improbable hypotheses, as the next two",
+    "rival_near": "logarithm of how much worse the surfaces fit half a metre on",
     "rival_far": "the same at the best other pose; 0 when another pose fits as well",
     "pose_inliers": "feature pairs that agree with the pose",
     "residual_sigmas": "errors of reprojection in standard deviations of the features' noise",
@@ -77,8 +78,7 @@ def closure_covariance(hypothesis: Hypothesis, model: CovarianceModel) -> Array:
 
 
 def _measure_scans(alignment: Alignment, match: PreparedScan, query: PreparedScan) -> dict[str, float]:
-    maps = match.map(query.cell_m), query.map(query.cell_m)
-    correlation, score = terrain_fit(*maps, levelled(match, query, alignment.pose))
+    correlation, score = terrain_fit(match.terrain, query.terrain, levelled(match, query, alignment.pose))
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     return {
         "residual_m": float(np.median(size)),

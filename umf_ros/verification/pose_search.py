@@ -10,7 +10,7 @@ import numpy as np
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe
-from umf_ros.core.geometry import Array, relative, rotation_angle
+from umf_ros.core.geometry import Array, near, relative
 from umf_ros.verification import constants as const
 from umf_ros.verification.hypothesis import Hypothesis
 from umf_ros.verification.prepared_scan import PreparedScan, views_decide
@@ -121,12 +121,6 @@ class TemporalMemory:
             return carried is not None and near(carried, match_T_query, const.AGREE_M, const.AGREE_RAD)
 
         return float(sum(any(map(agrees, findings)) for findings in self._findings))
-
-
-def near(a: Array, b: Array, metres: float, radians: float) -> bool:
-    """Whether two poses are one within these tolerances."""
-    gap = relative(a, b)
-    return bool(np.linalg.norm(gap[:3, 3]) < metres and rotation_angle(gap) < radians)
 
 
 def _carried(found: _Finding, query: Keyframe, match: Keyframe) -> Array | None:

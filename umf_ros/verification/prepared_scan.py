@@ -73,6 +73,7 @@ class Surfaces:
     @classmethod
     def of(cls, points: Array) -> Surfaces:
         """Fit a plane at each of (M, 3) points."""
+        points = points if len(points) else np.full((1, 3), 10 * const.MAX_RANGE_M)  # a tree needs a point
         tree = small_gicp.KdTree(points)
         index, squared = tree.batch_knn_search(points, const.PLANE_NEIGHBOURS, 1)
         neighbours = points[np.asarray(index, np.intp)]
@@ -120,7 +121,7 @@ class PreparedScan:
         """Make at once what a query's scan is asked for in every comparison."""
         if self.usable:
             self.map(self.cell_m)
-            for part in ("view", "range_images", "spacing", "scouts_cloud", "coarse_cloud", "sample_cloud"):
+            for part in ("view", "terrain", "range_images", "spacing", "scouts_cloud", "coarse_cloud", "sample_cloud"):
                 getattr(self, part)
 
     @property
@@ -131,7 +132,7 @@ class PreparedScan:
     @property
     def bare(self) -> bool:
         """Whether it shows bare, even ground alone, which could lie anywhere on such ground."""
-        return self.map(self.cell_m).even
+        return self.terrain.even
 
     @cached_property
     def up(self) -> Array:
@@ -161,6 +162,11 @@ class PreparedScan:
         if cell_m not in self._maps:
             self._maps[cell_m] = GridMap(self.upright_points, cell_m)
         return self._maps[cell_m]
+
+    @cached_property
+    def terrain(self) -> GridMap:
+        """Map of the relief out to 26 m, in cells in which rocks and ripples are seen at any range."""
+        return GridMap(self.upright_points, const.TERRAIN_CELL_M, const.TERRAIN_RADIUS)
 
     @cached_property
     def range_images(self) -> list[RangeImage]:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.geometry import Array, invert, transform
+from umf_ros.core.geometry import Array, invert, near, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan, common_blur
 from umf_ros.verification.scan_alignment import SEARCHED, run_gicp
@@ -70,14 +70,15 @@ def _share(what: Mask, of: Mask, otherwise: float) -> float:
 def ambiguity(
     match: PreparedScan, query: PreparedScan, pose: Array, information: Array, others: Sequence[Array]
 ) -> dict[str, float]:
-    """Return how much worse the surfaces of two scans fit at the best other pose.
+    """Return how well the surfaces of two scans fit, and how much worse at the best other pose.
 
+    - `surface_misfit`: mean misfit at the pose itself, 0 to 1;
     - `rival_near`: half a metre on, along the direction in which the position is known least;
-    - `rival_far`: at the best of all other poses: further along that direction, as far as scans overlap, at the other
-      peaks of the search, and where other hypotheses ended.
+    - `rival_far`: at the best of all other poses: further along that direction, as far as scans overlap, at other peaks
+      of the search, and where other hypotheses ended.
 
-    Each is the logarithm of the ratio of the mean misfits: 0 when another pose fits as well. A corridor fits anywhere
-    along it; where it repeats, it fits best at the right place.
+    The latter are logarithms of the ratio of the mean misfits: 0 when another pose fits as well. A corridor fits
+    anywhere along it; where it repeats, it fits best at the right place.
 
     Args:
         match: the matched scan.
@@ -87,17 +88,21 @@ def ambiguity(
         others: poses of other hypotheses.
     """
     across = np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1]
-    near, far = (_shifted(pose, across, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
+    beside, far = (_shifted(pose, across, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
     found = [*far, *alternatives(match, query, pose), *others]
-    rivals = np.stack([one for one in found if np.linalg.norm((one - pose)[:3, 3]) > const.DISTINCT_M])
+    rivals = np.stack([one for one in found if not near(one, pose, const.DISTINCT_M, const.DISTINCT_RAD)])
     coarse = _misfit(match, query, np.stack([pose, *rivals]), const.RIVAL_SCOUTS)[1:]
     best = np.argsort(coarse)[: const.RIVALS_KEPT]
     refined = [run_gicp(match, query.scouts_cloud, one, const.FINE_REACH_M, const.SCOUT_STEPS) for one in rivals[best]]
-    refined = [one for one in refined if np.linalg.norm((one - pose)[:3, 3]) > const.DISTINCT_M]
-    poses = np.stack([pose, *near, *rivals[best], *refined])
-    fit = np.log(surface_misfit(match, query, poses, const.RIVAL_SAMPLE) + const.MISFIT_FLOOR)
-    first = 1 + len(near)
-    return {"rival_near": float(fit[1:first].min() - fit[0]), "rival_far": float(fit[first:].min() - fit[0])}
+    refined = [one for one in refined if not near(one, pose, const.DISTINCT_M, const.DISTINCT_RAD)]
+    poses = np.stack([pose, *beside, *rivals[best], *refined])
+    misfit = surface_misfit(match, query, poses, const.RIVAL_SAMPLE)
+    fit, first = np.log(misfit + const.MISFIT_FLOOR), 1 + len(beside)
+    return {
+        "surface_misfit": float(misfit[0]),
+        "rival_near": float(fit[1:first].min() - fit[0]),
+        "rival_far": float(fit[first:].min() - fit[0]),
+    }
 
 
 def _shifted(pose: Array, across: Array, shifts: Array) -> Array:
@@ -137,8 +142,8 @@ def _misfit(scan: PreparedScan, other: PreparedScan, poses: Array, count: int) -
         sigmas = (away / (const.PLANE_SIGMA_M + 2 * common_blur(scan, other))) ** 2
         passed = scan.look_at(points) == Sight.PASSED
         misfit = np.where(passed, 1.0, sigmas / (1.0 + sigmas)).reshape(len(poses), -1)
-        near = planes.planar[index] & (np.asarray(squared) < planes.reach_m[index] ** 2)
-        known = (passed | near).reshape(misfit.shape)
+        close = planes.planar[index] & (np.asarray(squared) < planes.reach_m[index] ** 2)
+        known = (passed | close).reshape(misfit.shape)
         total += (misfit * known).sum(axis=1)
         compared += known.sum(axis=1)
     enough = compared >= max(const.FEWEST_POINTS, const.RIVAL_COMMON * compared[0])

@@ -11,12 +11,12 @@ import numpy as np
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Frame, Keyframe, LoopClosure
-from umf_ros.core.geometry import Array, heading
+from umf_ros.core.geometry import Array, heading, near
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
 from umf_ros.verification.hypothesis import SCAN, Hypothesis, RejectReason
 from umf_ros.verification.measurement import closure_covariance, measure
-from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses, near
+from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses
 from umf_ros.verification.prepared_scan import ScanCache, views_decide
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans

@@ -206,7 +206,7 @@ class PairedViews:
         return 0 if pose is None else int(self._compare(pose).agreeing.sum())
 
     def consistent_pixels(self, pose: Array) -> Points:
-        """Column and row in the query's image and in the match's (K, 4), float32, of the pairs that agree with a pose."""
+        """Pixels (K, 4) float32 in the query's and in the match's image of the pairs that agree with a pose."""
         pixels = np.hstack([self.query.measured[:, :2], self.match.measured[:, :2]])
         return pixels[self._compare(pose).agreeing].astype(np.float32)
 

@@ -86,9 +86,9 @@ def coarse_align(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
     pose = _by_scouts(match, query, guess)
     squared = match.nearest(transform(pose, query.scouts))[1]
     near = squared < (const.SCOUT_NEAR * query.cell_m) ** 2
-    maps = match.map(query.cell_m), query.map(query.cell_m)
-    terrain = terrain_fit(*maps, levelled(match, query, pose))[1]
-    return Fit(pose, float(near.mean()), terrain, all(one.structured for one in maps))
+    terrain = terrain_fit(match.terrain, query.terrain, levelled(match, query, pose))[1]
+    structured = all(scan.map(query.cell_m).structured for scan in (match, query))
+    return Fit(pose, float(near.mean()), terrain, structured)
 
 
 def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:

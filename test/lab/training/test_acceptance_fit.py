@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from measurements import BAD, GOOD
+from measurements import BAD, BAD_VIEWS, GOOD
 
 from umf_ros.lab.fit.acceptance import (
     Example,
@@ -17,9 +17,8 @@ from umf_ros.lab.fit.acceptance import (
     inside_ellipsoid,
     scale_covariance,
 )
-from umf_ros.verification import Measurement
 from umf_ros.verification.acceptance import scores
-from umf_ros.verification.hypothesis import IMAGE, SCAN
+from umf_ros.verification.hypothesis import SCAN
 from umf_ros.verification.scan_alignment import CovarianceModel, covariance_of
 
 
@@ -29,8 +28,8 @@ def examples(count: int, rng: np.random.Generator) -> list[Example]:
     for number in range(count):
         right = number % 2 == 0
         share = np.clip(rng.normal(0.8 if right else 0.2, 0.15), 0, 1)
-        numbers = {name: float(share * good + (1 - share) * BAD.numbers[name]) for name, good in GOOD.numbers.items()}
-        found.append(Example(Measurement(**numbers | {"kind": SCAN, "support": float(3 * rng.random())}), right))
+        measurements = {name: float(share * good + (1 - share) * BAD[name]) for name, good in GOOD.items()}
+        found.append(Example(measurements | {"terrain_score": float(15 * rng.random())}, right))
     return found
 
 
@@ -38,11 +37,12 @@ def test_fit_separates_and_is_calibrated() -> None:
     rng = np.random.default_rng(0)
     model = fit_logistic(examples(400, rng), SCAN)
     fresh = examples(400, rng)
-    odds = np.array([model.probability(scores(example.measurement)) for example in fresh])
+    odds = np.array([model.odds(scores(example.measurements)) for example in fresh])
+    probability = 1 / (1 + np.exp(-odds))
     right = np.array([example.right for example in fresh])
-    assert odds[right].mean() > 0.9 and odds[~right].mean() < 0.1
-    assert abs(odds.mean() - right.mean()) < 0.05
-    assert model.weights["support"] < max(model.weights.values()) / 5  # it was noise
+    assert probability[right].mean() > 0.9 and probability[~right].mean() < 0.1
+    assert abs(probability.mean() - right.mean()) < 0.05
+    assert model.weights["terrain_score"] < max(model.weights.values()) / 5  # it was noise
 
 
 def test_fit_needs_both_classes() -> None:
@@ -50,13 +50,15 @@ def test_fit_needs_both_classes() -> None:
         fit_logistic([Example(GOOD, True)] * 3, SCAN)
 
 
+LOOKALIKE = GOOD | {"residual_p90_m": 0.05, "upright_counterparts": 0.7, "unexplained": 0.1}
+
+
 def in_domains(rng: np.random.Generator) -> list[Example]:
     """Four domains; in the last of them wrong poses look nearly as right as right ones do."""
     found = []
     for domain in ("a", "b", "c", "last"):
         found += [replace(example, domain=domain) for example in examples(100, rng)]
-    lookalike = replace(GOOD, similarity=0.5, residual_m=0.02, upright_counterparts=0.7, unexplained=0.1, runner_up=0.9)
-    return [*found, *[Example(lookalike, False, "last")] * 20]
+    return [*found, *[Example(LOOKALIKE, False, "last")] * 20]
 
 
 def accepted(examples: list[Example], odds: np.ndarray, right: bool) -> float:
@@ -69,17 +71,15 @@ def test_decision_lets_no_wrong_pose_of_a_domain_pass_that_it_does_not_know() ->
     decision, odds = fit_decision(known, SCAN, 0.9)
     assert accepted(known, odds, right=False) == 0
     assert decision.bias < fit_logistic(known, SCAN).bias
-    without_trap = [example for example in known if example.measurement.runner_up != 0.9]
+    without_trap = [example for example in known if example.measurements is not LOOKALIKE]
     assert accepted(without_trap, fit_decision(without_trap, SCAN, 0.9)[1], right=True) > accepted(known, odds, True)
 
 
 def test_a_wrong_pose_with_a_rival_does_not_lower_the_decision() -> None:
     """It is refused anyway."""
     known = in_domains(np.random.default_rng(3))
-    rivalled = [
-        replace(one, measurement=replace(one.measurement, runner_up=0.0)) if one.measurement.runner_up == 0.9 else one
-        for one in known
-    ]
+    beside = LOOKALIKE | {"rival_far": 0.0}
+    rivalled = [replace(one, measurements=beside) if one.measurements is LOOKALIKE else one for one in known]
     assert fit_decision(rivalled, SCAN, 0.9)[0].bias > fit_decision(known, SCAN, 0.9)[0].bias
 
 
@@ -91,8 +91,8 @@ def test_every_domain_counts_as_much_as_any_other() -> None:
 
 
 def test_bounds_hold_what_right_poses_measured_with_some_room() -> None:
-    known = [Example(replace(GOOD, noise_m=noise), True) for noise in (0.01, 0.04)]
-    least, greatest = bounds_of([*known, Example(replace(GOOD, noise_m=5.0), False)], SCAN)["noise_m"]
+    known = [Example(GOOD | {"noise_m": noise}, True) for noise in (0.01, 0.04)]
+    least, greatest = bounds_of([*known, Example(GOOD | {"noise_m": 5.0}, False)], SCAN)["noise_m"]
     assert 0.005 < least < 0.01 and 0.04 < greatest < 0.1
 
 
@@ -130,12 +130,12 @@ def test_covariances_of_the_wrong_size_are_scaled_until_95_percent_lie_inside(fa
 def test_a_measure_that_argues_against_itself_is_given_no_weight() -> None:
     rng = np.random.default_rng(3)
     found = examples(200, rng)
-    perverse = [Example(replace(one.measurement, common=0.2 if one.right else 0.8), one.right) for one in found]
+    perverse = [Example(one.measurements | {"common": 0.2 if one.right else 0.8}, one.right) for one in found]
     assert fit_logistic(perverse, SCAN).weights["common_view"] == 0
 
 
 def test_examples_of_another_kind_are_left_aside() -> None:
     rng = np.random.default_rng(4)
     found = examples(100, rng)
-    others = [Example(replace(BAD, kind=IMAGE), True)] * 50
+    others = [Example(BAD_VIEWS, True)] * 50
     assert fit_logistic(found + others, SCAN) == fit_logistic(found, SCAN)
