@@ -9,11 +9,10 @@ import pytest
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe
-from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle
+from umf_ros.core.geometry import Array, make_pose, near, relative, rotation_angle
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan
 from umf_ros.verification import Hypothesis
 from umf_ros.verification.constants import DISTINCT_M, DISTINCT_RAD
-from umf_ros.core.geometry import near
 from umf_ros.verification.pose_search import _pose_from_features, find_hypotheses
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.rerank import rerank

@@ -10,12 +10,11 @@ import pytest
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, ScanMotion
-from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle
+from umf_ros.core.geometry import Array, make_pose, near, relative, rotation_angle
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification.constants import SAME_M, SAME_RAD
 from umf_ros.verification.hypothesis import SCAN
-from umf_ros.core.geometry import near
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)

@@ -17,7 +17,7 @@ from typing import Any
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.resources import find
 from umf_ros.verification import constants as const
-from umf_ros.verification.hypothesis import IMAGE, SCAN, RejectReason, kind_of
+from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, RejectReason, kind_of
 from umf_ros.verification.scan_alignment import CovarianceModel
 
 SHIPPED = "config/verification/calibration.json"
@@ -59,23 +59,35 @@ def _log_of(name: str, worst: float, best: float, missing: float = 0.0, floor: f
     return Criterion(read, math.log(worst), math.log(best), missing)
 
 
-def _tail(known: Measurements) -> float:
-    return math.log(max(known["noise_m"], 1e-6) / max(known["residual_p90_m"], 1e-6))
+def _log_ratio(above: str, below: str, worst: float, best: float) -> Criterion:
+    """The same of the logarithm of a ratio of two sizes."""
+    read = lambda known: math.log(max(known[above], 1e-6) / max(known[below], 1e-6))  # noqa: E731
+    return Criterion(read, math.log(worst), math.log(best))
 
 
 # every range is by hand: wide enough for right poses, beyond the reach of most wrong ones
 CRITERIA: dict[str, dict[str, Criterion]] = {
     SCAN: {
-        "tail_like_noise": Criterion(_tail, math.log(0.15), math.log(0.6)),
+        "tail_like_noise": _log_ratio("noise_m", "residual_p90_m", 0.15, 0.6),
         "terrain_score": _of("terrain_score", 3.0, 15.0),
         "common_view": _log_of("common", 0.1, 0.8),
         "uncontradicted": _log_of("contradiction", 0.3, 0.01, floor=3e-3),
-        "upright_counterparts": _of("upright_counterparts", 0.3, 0.9, missing=0.4),
+        "upright_counterparts": _of("upright_counterparts", 0.4, 0.65, missing=0.5),
         "explained": _log_of("unexplained", 0.2, 0.01, missing=0.5, floor=4e-3),
-        "position_along_known": _of("rival_near", 0.0, 0.3),
-        "no_rival": _of("rival_far", 0.0, 0.5),
+        "position_along_known": _of("rival_near", 0.0, 0.1),
+        "no_rival": _of("rival_far", 0.0, 0.3),
         "position_known": _log_of("position_std_m", 1.0, 0.05),
         "heading_known": _log_of("heading_std_deg", 5.0, 0.2),
+    },
+    SUBMAP: {
+        "submap_correlation": _of("terrain_correlation", 0.2, 0.8),
+        "submap_terrain": _of("terrain_score", 5.0, 30.0),
+        "submap_unique": Criterion(lambda known: known["terrain_correlation"] - known["terrain_rival"], 0.0, 0.6),
+        "submap_overlap": _of("overlap", 0.6, 0.95),
+        "submap_position_known": _log_of("position_std_m", 1.0, 0.1),
+        "submap_relief": _log_ratio("relief_m", "residual_m", 1.5, 6.0),
+        "submap_odometry": _of("prior_sigmas", 4.0, 1.0, missing=0.7),
+        "submap_support": _of("support", 0.0, 2.0),
     },
     IMAGE: {
         "inliers": Criterion(
@@ -93,20 +105,26 @@ CRITERIA: dict[str, dict[str, Criterion]] = {
 }
 
 
-def scores(measurements: Measurements) -> dict[str, float]:
-    """How far the measurements meet every criterion of their kind, 0 to 1, by name."""
-    return {name: criterion(measurements) for name, criterion in CRITERIA[kind_of(measurements)].items()}
+def scores(measurements: Measurements, kind: str = "") -> dict[str, float]:
+    """How far the measurements meet every criterion of their kind, or of another, 0 to 1, by name."""
+    criteria = CRITERIA[kind or kind_of(measurements)]
+    return {name: criterion(measurements) for name, criterion in criteria.items()}
 
 
 def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
     """Why a hypothesis is no closure however probable, with figures; None when nothing refutes it."""
-    if kind_of(measurements) != SCAN:
+    kind = kind_of(measurements)
+    if kind == IMAGE:
         return None
     misfit = measurements["residual_m"] / measurements["noise_m"]
     if misfit > const.MAX_MISFIT:
         return RejectReason.MISFIT, f"{misfit:.0f} times"
-    rival = measurements.get("rival_far", math.nan)
-    return (RejectReason.AMBIGUOUS, f"{rival:.2f}") if rival < const.MIN_RIVAL else None
+    if measurements.get("passage_rival", math.nan) < 1.0:
+        return RejectReason.PASSAGE, ""
+    correlation = measurements["terrain_correlation"]
+    if kind == SUBMAP and not correlation >= const.MIN_TERRAIN:
+        return RejectReason.TERRAIN, f"correlation {correlation:.2f}"
+    return (RejectReason.AMBIGUOUS, "") if measurements.get("runner_up", math.nan) < const.MIN_RUNNER_UP else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +144,7 @@ class AcceptanceModel:
     """Everything that was fitted.
 
     Attributes:
-        models: one logistic model per kind of hypothesis: `SCAN` and `IMAGE`.
+        models: one logistic model per kind of hypothesis: `SCAN`, `SUBMAP` and `IMAGE`.
         covariances: likewise, what turns residuals into a covariance.
         bounds: likewise, least and greatest of what right poses measured, by the name of the number.
     """
@@ -137,8 +155,14 @@ class AcceptanceModel:
 
     def probability(self, measurements: Measurements) -> float:
         """Probability that the closure with these measurements is right."""
-        odds = self.models[kind_of(measurements)].odds(scores(measurements))
+        kind = self._decisive(measurements)
+        odds = self.models[kind].odds(scores(measurements, kind))
         return 1.0 / (1.0 + math.exp(-min(max(odds, -60.0), 60.0)))
+
+    def _decisive(self, measurements: Measurements) -> str:
+        """The kind that decides: of a submap its terrain or its scan, whichever is more probable."""
+        kinds = (SUBMAP, SCAN) if kind_of(measurements) == SUBMAP else (kind_of(measurements),)
+        return max(kinds, key=lambda kind: self.models[kind].odds(scores(measurements, kind)))
 
     def at_best(self, measurements: Measurements) -> float:
         """The same if no other pose fitted the scans: what it cannot exceed before the ambiguity is known."""
@@ -146,7 +170,8 @@ class AcceptanceModel:
 
     def out_of_range(self, measurements: Measurements) -> str:
         """Name and value of a number that no right example of the fit had; empty without one."""
-        for name, (least, greatest) in self.bounds.get(kind_of(measurements), {}).items():
+        kind = SCAN if kind_of(measurements) == SUBMAP else kind_of(measurements)
+        for name, (least, greatest) in self.bounds.get(kind, {}).items():
             value = measurements.get(name, math.nan)
             if value < least or value > greatest:  # an unknown value is neither
                 return f"{name} {value:.3g}"
@@ -154,12 +179,14 @@ class AcceptanceModel:
 
     def contributions(self, measurements: Measurements) -> dict[str, float]:
         """Log-odds of each criterion by name; "bias" is what has to be overcome."""
-        model, scored = self.models[kind_of(measurements)], scores(measurements)
+        kind = self._decisive(measurements)
+        model, scored = self.models[kind], scores(measurements, kind)
         return {name: weight * scored[name] for name, weight in model.weights.items()} | {"bias": model.bias}
 
     def lost(self, measurements: Measurements) -> dict[str, float]:
         """Log-odds that each criterion could have added and did not; without those whose value is unknown."""
-        kind, scored = kind_of(measurements), scores(measurements)
+        kind = self._decisive(measurements)
+        scored = scores(measurements, kind)
         known = [name for name, one in CRITERIA[kind].items() if math.isfinite(one.read(measurements))]
         weights = self.models[kind].weights
         lost = {name: weights[name] * (1.0 - scored[name]) for name in known}
@@ -176,7 +203,8 @@ def load_acceptance(path: str = "") -> AcceptanceModel:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         models = {kind: _logistic(content["models"][kind], kind) for kind in CRITERIA}
-        covariances = {kind: CovarianceModel(**content["covariance"][kind]) for kind in CRITERIA}
+        covariances = {kind: CovarianceModel(**content["covariance"][kind]) for kind in (SCAN, IMAGE)}
+        covariances[SUBMAP] = covariances[SCAN]
         bounds = {
             kind: {name: (float(least), float(greatest)) for name, (least, greatest) in numbers.items()}
             for kind, numbers in content.get("bounds", {}).items()

@@ -101,23 +101,26 @@ class GridMap:
         return found
 
 
-def terrain_fit(match: GridMap, query: GridMap, pose: Array) -> tuple[float, float]:
-    """Correlation of the relief of two maps at a pose, -1 to 1, and the same in standard deviations of chance.
+def terrain_fit(match: GridMap, query: GridMap, pose: Array) -> tuple[float, float, float]:
+    """How well the relief of two maps fits at a pose.
 
     Args:
         match: map of the matched scan.
         query: map of the query's scan.
         pose: (4, 4) `match_T_query` between the upright frames.
+
+    Returns:
+        Correlation, -1 to 1; the same in standard deviations of chance; standard deviation of the match's relief, m.
     """
     ours = query.known_relief
     theirs = match.look_up(match.relief, transform(pose, query.cells))
     shared = np.isfinite(theirs) & np.isfinite(ours)
     ours, theirs = ours[shared].astype(float), theirs[shared]
     if len(ours) < const.MIN_CELLS / 2:
-        return 0.0, 0.0
+        return 0.0, 0.0, float(theirs.std()) if len(theirs) else 0.0
     norm = float(np.sqrt((ours**2).sum() * (theirs**2).sum()))
     correlation = float((ours * theirs).sum()) / max(norm, 1e-9)
-    return correlation, correlation * math.sqrt(len(ours))
+    return correlation, correlation * math.sqrt(len(ours)), float(theirs.std())
 
 
 def relief_of(height: Array, known: NDArray[np.bool_], cell_m: float) -> Grid:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from umf_ros.verification.view_alignment import PairedViews, ViewAlignment
 
 ACCEPTED = "accepted"
-SCAN, IMAGE = "scan", "image"
+SCAN, SUBMAP, IMAGE = "scan", "submap", "image"
 
 
 class RejectReason(Enum):
@@ -29,7 +29,9 @@ class RejectReason(Enum):
     NO_POSE = "no pose fits"
     IMPROBABLE = "probability below verification.min_probability"
     MISFIT = "surfaces are several times their noise apart"
+    PASSAGE = "surfaces fit as well elsewhere along the passage"
     AMBIGUOUS = "another pose fits as well"
+    TERRAIN = "the terrain of the submaps does not fit"
     OUT_OF_RANGE = "a measurement outside the range of the fitted examples"
     TURNED = "turned by more than verification.max_turn_deg"
     TOO_FAR = "farther apart than verification.max_shift_m"
@@ -85,7 +87,7 @@ class Hypothesis:
 
     @property
     def kind(self) -> str:
-        """How the pose was measured: `SCAN`, `IMAGE`, or empty without a pose."""
+        """How the pose was measured: `SCAN`, `SUBMAP`, `IMAGE`, or empty without a pose."""
         return kind_of(self.measurements)
 
     @property
@@ -121,7 +123,10 @@ class Hypothesis:
 
 
 def kind_of(measurements: dict[str, float]) -> str:
-    """`SCAN` where two scans were aligned, `IMAGE` where only views were, empty without a pose."""
+    """Return `SCAN` where two scans were aligned and `IMAGE` where only views were; empty without a pose.
+
+    `SUBMAP` where one of the scans was merged from those of a narrow sensor.
+    """
     if "noise_m" in measurements:
-        return SCAN
+        return SUBMAP if "terrain_rival" in measurements else SCAN
     return IMAGE if "pose_inliers" in measurements else ""

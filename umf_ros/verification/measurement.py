@@ -7,13 +7,14 @@ A new test is three steps: a number in one of the functions below with its meani
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
-from umf_ros.core.geometry import Array
+from umf_ros.core.geometry import Array, make_pose, near
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import terrain_fit
-from umf_ros.verification.hypothesis import Hypothesis
+from umf_ros.verification.hypothesis import IMAGE, Hypothesis
 from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled
 from umf_ros.verification.scan_alignment import (
     Alignment,
@@ -37,13 +38,17 @@ MEASUREMENTS = {
     "points": "points that have a counterpart",
     "terrain_correlation": "correlation of the relief of both scans, -1 to 1",
     "terrain_score": "the same in standard deviations of chance",
+    "terrain_rival": "the correlation at the best of some poses beside this one, of submaps of narrow sensors",
+    "relief_m": "standard deviation of the relief on the ground that both scans saw",
     "common": "share of a scan's points that the other should see, the smaller of both ways, as all that follow",
     "contradiction": "share of these that the other's rays passed by, the larger of both",
+    "counterparts": "share of these that have a counterpart",
     "upright_counterparts": "of walls, trunks and rocks that should be seen, the share with a counterpart",
     "unexplained": "of the same, the share that is far from everything, the larger of both",
-    "surface_misfit": "mean misfit of the surfaces, 0 to 1; unknown for improbable hypotheses, as the next two",
-    "rival_near": "logarithm of how much worse the surfaces fit half a metre on",
-    "rival_far": "the same at the best other pose; 0 when another pose fits as well",
+    "rival_near": "logarithm of how much worse the points fit half a metre on; unknown for improbable hypotheses",
+    "rival_far": "the same of the best fit 1 to 6 m on; 0 when another pose fits as well",
+    "passage_rival": "how much worse the surfaces fit elsewhere along a passage; a closure needs 1",
+    "runner_up": "logarithm of how much more is missing at the next best hypothesis about the pair",
     "pose_inliers": "feature pairs that agree with the pose",
     "residual_sigmas": "errors of reprojection in standard deviations of the features' noise",
     "spread": "of the pairs across the image: smaller deviation of column and row, as a share of width and height",
@@ -51,6 +56,7 @@ MEASUREMENTS = {
     "two_way_m": "distance of the poses that the query's depths and the match's give by themselves",
     "position_std_m": "standard deviation of the position along its least known direction, from the residuals",
     "heading_std_deg": "of the heading",
+    "prior_sigmas": "distance from what odometry predicts, in standard deviations of its drift",
     "support": "earlier keyframes, of the last few, that found a pose which odometry carries over to this one",
 }
 """Name and meaning of every measurement, as in `candidates.csv` and on `~/candidates`."""
@@ -68,6 +74,22 @@ def measure(hypothesis: Hypothesis) -> dict[str, float]:
     return found | {"position_std_m": position_std_m, "heading_std_deg": heading_std_deg}
 
 
+def runner_up(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> dict[str, float]:
+    """Return the lead of a hypothesis over others about the same candidate that end elsewhere, in what is missing."""
+    pose = hypothesis.pose
+    distinct = [_missing(one) for one in others if not near(pose, one.pose, const.DISTINCT_M, const.DISTINCT_RAD)]
+    if hypothesis.kind == IMAGE or not distinct:
+        return {}
+    room = const.RUNNER_UP_ROOM
+    return {"runner_up": math.log((min(distinct) + room) / (_missing(hypothesis) + room))}
+
+
+def _missing(hypothesis: Hypothesis) -> float:
+    """Share of all that stands, or where nothing does of all points, that should have a counterpart and has none."""
+    known = hypothesis.measurements["upright_counterparts"]
+    return 1.0 - (known if math.isfinite(known) else hypothesis.measurements["counterparts"])
+
+
 def closure_covariance(hypothesis: Hypothesis, model: CovarianceModel) -> Array:
     """Covariance (6, 6) of the pose in ROS order, match axes, m^2 and rad^2."""
     query, match = hypothesis.keyframes
@@ -78,7 +100,12 @@ def closure_covariance(hypothesis: Hypothesis, model: CovarianceModel) -> Array:
 
 
 def _measure_scans(alignment: Alignment, match: PreparedScan, query: PreparedScan) -> dict[str, float]:
-    correlation, score = terrain_fit(match.terrain, query.terrain, levelled(match, query, alignment.pose))
+    level = levelled(match, query, alignment.pose)
+    correlation, score, relief_m = terrain_fit(match.terrain, query.terrain, level)
+    rival = {}
+    if match.narrow or query.narrow:
+        beside = [terrain_fit(match.terrain, query.terrain, move @ level)[0] for move in _BESIDE]
+        rival = {"terrain_rival": max(beside)}
     size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
     return {
         "residual_m": float(np.median(size)),
@@ -88,8 +115,17 @@ def _measure_scans(alignment: Alignment, match: PreparedScan, query: PreparedSca
         "points": float(len(alignment.points)),
         "terrain_correlation": correlation,
         "terrain_score": score,
+        "relief_m": relief_m,
+        **rival,
         **compare_scans(match, query, alignment.pose),
     }
+
+
+_BESIDE = [
+    make_pose(np.eye(3), [metres * math.cos(angle), metres * math.sin(angle), 0])
+    for metres in const.RIVAL_TERRAIN_M
+    for angle in np.arange(0, 2 * np.pi, np.pi / 4)
+]
 
 
 def _measure_views(alignment: ViewAlignment) -> dict[str, float]:

@@ -117,6 +117,15 @@ class PreparedScan:
             return cls(keyframe.points, keyframe.body_T_lidar, blur_m)
         return cls(keyframe.points, motion.body_T_lidars, blur_m, np.unique(motion.moments_s, return_inverse=True)[1])
 
+    @cached_property
+    def narrow(self) -> bool:
+        """Whether it was merged from scans that see little around the sensor."""
+        if len(self._lidars_T_body) == 1:
+            return False
+        number = int(np.bincount(self._owner).argmax())
+        own = transform(self._lidars_T_body[number], self.points[self._owner == number])
+        return FieldOfView(own).width_deg < const.NARROW_DEG
+
     def make_ready(self) -> None:
         """Make at once what a query's scan is asked for in every comparison."""
         if self.usable:

@@ -14,13 +14,13 @@ from umf_ros.core.frames import Frame, Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading, near
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
-from umf_ros.verification.hypothesis import SCAN, Hypothesis, RejectReason
-from umf_ros.verification.measurement import closure_covariance, measure
-from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses
+from umf_ros.verification.ambiguity import ambiguity, passage_rival
+from umf_ros.verification.hypothesis import Hypothesis, RejectReason
+from umf_ros.verification.measurement import closure_covariance, measure, runner_up
+from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses, prior_sigmas
 from umf_ros.verification.prepared_scan import ScanCache, views_decide
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans
-from umf_ros.verification.scan_consistency import ambiguity
 from umf_ros.verification.yaw_search import RotatedMaps
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
@@ -141,17 +141,21 @@ class Verifier:
     def _judge(self, hypotheses: list[Hypothesis], hopeless: float) -> list[Hypothesis]:
         """Align and measure hypotheses, and judge each beside the others about its candidate.
 
-        The ambiguity, which is slow, is left out below the probability `hopeless` at its best.
+        The slow tests are left out where they cannot change the decision.
         """
         aligned = self._aligned(hypotheses)
         for one in aligned:
+            prior = prior_sigmas(*one.keyframes, one.pose, self._settings.odometry_drift)
             support = self._memory.support(*one.keyframes, one.pose)
-            one.measurements = one.measurements | measure(one) | {"support": support}
-            if one.kind == SCAN and self._acceptance.at_best(one.measurements) >= hopeless:
-                others = [other.pose for other in aligned if other.candidate is one.candidate]
+            one.measurements |= measure(one) | {"prior_sigmas": prior, "support": support}
+        for one in aligned:
+            one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
+            if one.scans and self._acceptance.at_best(one.measurements) >= hopeless:
                 assert one.alignment is not None
-                one.measurements |= ambiguity(*one.scans, one.pose, one.alignment.information, others)
+                one.measurements |= ambiguity(*one.scans, one.pose, one.alignment.information)
             one.probability = self._probability(one)
+            if one.scans and self._probable(one):
+                one.measurements["passage_rival"] = passage_rival(*one.scans, one.pose)
         return aligned
 
     def _probability(self, hypothesis: Hypothesis) -> float:

@@ -203,7 +203,7 @@ def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: dict[str, s
     }
     content["models"] = {kind: asdict(model.models[kind]) for kind in CRITERIA}
     content["bounds"] = model.bounds
-    content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in CRITERIA}
+    content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in (SCAN, IMAGE)}
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 

@@ -47,12 +47,12 @@ from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, Measurements, load_acceptance, refuted
+from umf_ros.verification.ambiguity import ambiguity
 from umf_ros.verification.hypothesis import SCAN, Hypothesis
-from umf_ros.verification.measurement import measure
+from umf_ros.verification.measurement import measure, runner_up
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.rerank import rerank
 from umf_ros.verification.scan_alignment import align_scans
-from umf_ros.verification.scan_consistency import ambiguity
 
 RIGHT_M, RIGHT_DEG = 0.3, 2.5
 WRONG_M, WRONG_DEG = 0.75, 4.0  # what lies between is neither
@@ -152,8 +152,7 @@ def _examples(
     scans = PreparedScan.of(tried.match), PreparedScan.of(tried.query)
     if all(scan.usable for scan in scans):
         ranked, _ = rerank(tried.query, candidates, Verification())[0]
-        others = [one.pose for one in examined]
-        found += [_aligned(tried, ranked, scans, guess, others) for guess in _guesses(tried, all_round, rng)]
+        found += [_aligned(tried, ranked, scans, guess, examined) for guess in _guesses(tried, all_round, rng)]
     kept: list[Array] = []
     for pose, measurements in found:
         right = tried.is_right(pose)
@@ -186,13 +185,13 @@ def _guesses(tried: Tried, all_round: bool, rng: np.random.Generator) -> list[Ar
 
 
 def _aligned(
-    tried: Tried, ranked: Candidate, scans: tuple[PreparedScan, PreparedScan], guess: Array, others: list[Array]
+    tried: Tried, ranked: Candidate, scans: tuple[PreparedScan, PreparedScan], guess: Array, others: list[Hypothesis]
 ) -> tuple[Array, Measurements]:
     alignment = align_scans(*scans, guess)
     found = {"pose": alignment.pose, "scans": scans, "alignment": alignment}
     hypothesis = Hypothesis.of(tried.query, ranked, tried.match, **found)
-    rivals = ambiguity(*scans, alignment.pose, alignment.information, others)
-    return alignment.pose, hypothesis.measurements | measure(hypothesis) | rivals
+    hypothesis.measurements |= measure(hypothesis) | ambiguity(*scans, alignment.pose, alignment.information)
+    return alignment.pose, hypothesis.measurements | runner_up(hypothesis, others)
 
 
 def _between_worlds(places: list[ScannedPlace], rng: np.random.Generator) -> ScanPair:

@@ -1,0 +1,153 @@
+"""Ambiguity of a pose: whether two scans fit as well elsewhere.
+
+The pattern of one sensor lies on floor, walls and ceiling of a passage in the same way wherever it stands. Points of
+two scans therefore coincide at the identity pose although the places differ, and a test that measures from point to
+point finds every other pose worse. In a passage a point's distance is therefore that to a plane, and the points of
+one half of a scan, every second band of elevations, are compared with planes of the other half alone: no ring meets
+itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from umf_ros.core.geometry import Array, invert, near
+from umf_ros.verification import constants as const
+from umf_ros.verification.prepared_scan import PreparedScan, common_blur
+from umf_ros.verification.scan_alignment import SEARCHED
+from umf_ros.verification.scan_consistency import counterpart_reach
+from umf_ros.verification.visibility import Sight, visible
+from umf_ros.verification.yaw_search import alternatives
+
+
+def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> dict[str, float]:
+    """Return how much worse the points of two scans fit at other poses, as logarithms of the ratio of the mean misfits.
+
+    - `rival_near`: half a metre on, along the direction in which the position is known least;
+    - `rival_far`: at the best pose 1 to 6 m on, and at the other peaks of the search at the same heading.
+
+    0 when another pose fits as well. A corridor fits anywhere along it; where it repeats, it fits best at the right
+    place.
+
+    Args:
+        match: the matched scan.
+        query: the query's scan.
+        pose: (4, 4) `match_T_query`.
+        information: (6, 6) of the alignment.
+    """
+    across = np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1]
+    way = np.append(across, 0.0)
+    beside, along = (_shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
+    poses = np.stack([pose, *beside, *along, *_other_peaks(match, query, pose)])
+    misfits = _point_misfit(match, query, poses), _point_misfit(query, match, invert(poses))
+    fit, far = np.log(np.maximum(sum(misfits) / 2, const.MISFIT_FLOOR)), 1 + len(beside)
+    return {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
+
+
+def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array:
+    """(K,) mean misfit with a scan of the other's visible points at poses (K, 4, 4); the worst where few are."""
+    sample = other.sample[:: const.RIVAL_EVERY]
+    points = (sample @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
+    reach = np.tile(counterpart_reach(other.spacing[:: const.RIVAL_EVERY], common_blur(scan, other)), len(poses))
+    misfit = np.minimum(np.sqrt(scan.nearest(points)[1]) / reach, const.RIVAL_MISFIT)
+    seen = visible(scan.look_at(points)).reshape(len(poses), -1)
+    count = seen.sum(axis=1)
+    mean = (misfit.reshape(seen.shape) * seen).sum(axis=1) / np.maximum(count, 1)
+    return np.where(count >= const.FEWEST_POINTS, mean, const.RIVAL_MISFIT)
+
+
+def _other_peaks(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
+    """Poses at the other peaks of the search at the heading of a pose."""
+    return [one for one in alternatives(match, query, pose) if not near(one, pose, const.DISTINCT_M, np.inf)]
+
+
+def _shifted(pose: Array, way: Array, shifts: Array) -> Array:
+    """(K, 4, 4) the pose, shifted by each of (K,) metres along a direction (3,) of the match."""
+    shifted = np.repeat(pose[None], len(shifts), axis=0)
+    shifted[:, :3, 3] += shifts[:, None] * way
+    return shifted
+
+
+def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> float:
+    """How much worse the surfaces of two scans fit at the best other pose along a passage.
+
+    A place is a passage where surfaces across it outweigh those along it. Poses are shifted along the passage as far
+    as the scans overlap; the other peaks of the search at the same heading are rivals, too.
+
+    Args:
+        match: the matched scan.
+        query: the query's scan.
+        pose: (4, 4) `match_T_query`.
+
+    Returns:
+        Logarithm of the ratio of the mean misfits, as a share of that which a closure needs: 0 when another pose fits
+        as well, 1 when all others fit so much worse that the pose is known. NaN where there is no passage.
+    """
+    way = passage_direction(match, query, pose)
+    if way is None:
+        return float("nan")
+    needed = const.NARROW_PASSAGE_RIVAL if match.view.is_fan or query.view.is_fan else const.PASSAGE_RIVAL
+    beside = _surface_rival(match, query, [pose, *_shifted(pose, way, const.RIVAL_NEAR_M)], const.PASSAGE_SAMPLE)
+    if beside.min() < needed:
+        return float(beside.min()) / needed
+    poses = [pose, *_shifted(pose, way, const.PASSAGE_FAR_M), *_other_peaks(match, query, pose)]
+    best = np.argsort(_surface_rival(match, query, poses, const.PASSAGE_SCOUTS))[: const.PASSAGE_KEPT] + 1
+    far = _surface_rival(match, query, [poses[index] for index in (0, *best)], const.PASSAGE_SAMPLE)
+    return float(min(beside.min(), far.min())) / needed
+
+
+def passage_direction(match: PreparedScan, query: PreparedScan, pose: Array) -> Array | None:
+    """(3,) the horizontal direction of the passage about the match that both scans show; None where there is none."""
+    turn = pose[:3, :3].T
+    rough = np.concatenate([match.normals[match.picks], query.normals[query.picks] @ turn])
+    weights, _ = _across(match, rough)
+    if weights[0] > const.ROUGH_PASSAGE_RATIO * weights[1]:  # most places are none: their planes are never asked for
+        return None
+    normals = [planes.normals[planes.planar] for planes in match.surfaces]
+    normals += [planes.normals[planes.planar] @ turn for planes in query.surfaces]
+    flat = np.concatenate(normals)
+    weights, ways = _across(match, flat)
+    few = len(flat) < const.PASSAGE_SURFACE * (len(match.points) + len(query.points))
+    if few or weights[0] > const.PASSAGE_RATIO * weights[1]:
+        return None
+    way: Array = match.up.T @ np.append(ways[:, 0], 0.0)
+    return way
+
+
+def _across(match: PreparedScan, normals: Array) -> tuple[Array, Array]:
+    """Weights (2,) and horizontal directions (2, 2) of normals (N, 3) about the match, the least first."""
+    level = (normals @ match.up.T)[:, :2]
+    weights, ways = np.linalg.eigh(level.T @ level)
+    return weights, ways
+
+
+def _surface_rival(match: PreparedScan, query: PreparedScan, poses: list[Array], sample: int) -> Array:
+    """(K,) logarithm of the misfit at all but the first of 1 + K poses, against that at the first."""
+    stacked = np.stack(poses)
+    misfits = _surface_misfit(match, query, stacked, sample), _surface_misfit(query, match, invert(stacked), sample)
+    logarithm = np.log(sum(misfits) / 2 + const.MISFIT_FLOOR)
+    found: Array = logarithm[1:] - logarithm[0]
+    return found
+
+
+def _surface_misfit(scan: PreparedScan, other: PreparedScan, poses: Array, sample: int) -> Array:
+    """(K,) mean misfit, 0 to 1, of the other scan's points with the scan's planes; 1 where few can be compared.
+
+    Points of every second band of elevations are compared with planes of the bands between: a ring never meets itself.
+    """
+    total, count = np.zeros(len(poses)), np.zeros(len(poses), int)
+    for planes, others in zip(scan.surfaces, reversed(other.surfaces), strict=True):
+        picks = np.linspace(0, len(others.points) - 1, min(sample, len(others.points))).astype(np.intp)
+        points = (others.points[picks] @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
+        found, squared = planes.tree.batch_nearest_neighbor_search(points, num_threads=1)
+        index = np.asarray(found, np.intp)
+        away = np.einsum("ij,ij->i", points - planes.centres[index], planes.normals[index])
+        sigmas = (away / (const.PLANE_SIGMA_M + 2 * common_blur(scan, other))) ** 2
+        passed = scan.look_at(points) == Sight.PASSED
+        misfit = np.where(passed, 1.0, sigmas / (1.0 + sigmas)).reshape(len(poses), -1)
+        close = planes.planar[index] & (np.asarray(squared) < planes.reach_m[index] ** 2)
+        known = (passed | close).reshape(misfit.shape)
+        total += (misfit * known).sum(axis=1)
+        count += known.sum(axis=1)
+    enough = count >= max(const.FEWEST_POINTS, const.PASSAGE_COMMON * count[0])
+    return np.where(enough, total / np.maximum(count, 1), 1.0)
