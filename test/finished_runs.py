@@ -13,11 +13,9 @@ from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State
-from umf_ros.runs.diagnosis import GateDiagnosis
-from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.tables import KeyframeRow
-from umf_ros.runs.truth import JudgedRun, TruePlaces, judge_closure
+from umf_ros.runs.run_file import KEYFRAME
+from umf_ros.runs.truth import JudgedRun, judge_closure
 from umf_ros.verification import Hypothesis, Measurement, RejectReason
 
 START_NS = 1_600_000_000 * 10**9
@@ -103,38 +101,37 @@ def examined(
     settings: Settings | None = None,
     sensors: SensorReport | None = None,
     missed: list[float] | None = None,
-    keyframe_rows: list[KeyframeRow] | None = None,
+    keyframe_rows: list[tuple[int, int, float]] | None = None,
     ate: tuple[float, float] | None = None,
     **summary: Any,
-) -> ExaminedRun:
+) -> JudgedRun:
     """A run with a keyframe every two seconds, closures that all have one verdict of the graph, and a truth or none."""
     closures = closures or []
     rows = keyframe_rows
     if rows is None:
-        rows = [KeyframeRow(stamp(second), 0, float(second)) for second in range(0, 80, 2)]
+        rows = [(stamp(second), 0, float(second)) for second in range(0, 80, 2)]
     run = FinishedRun(
         folder=folder,
         summary={**SUMMARY, **summary},
         settings=settings or load_settings(None),
         closures=closures,
-        keyframes=rows,
+        keyframes=np.array(rows, KEYFRAME),
         candidates=candidates or [],
         verdicts={(one.query_stamp_ns, one.match_stamp_ns): verdict for one in closures} if verdict else {},
         odometry=trajectory(),
         optimized=trajectory(),
         truth=truth,
     )
-    judged = JudgedRun()
-    if truth is not None:
-        poses = {stamp(second): at(second) for second in range(80)}
-        covered = int(truth.at(run.stamps)[1].sum()) if rows else 0
-        judged = JudgedRun(
-            closures=[judge_closure(one, poses[one.query_stamp_ns], poses[one.match_stamp_ns]) for one in closures],
-            revisits=len(closures) + len(missed or []),
-            covered=(covered, len(rows)),
-            missed=[stamp(second) for second in missed or []],
-            ate_odometry_m=ate and ate[0],
-            ate_optimized_m=ate and ate[1],
-        )
-    places = TruePlaces(run)
-    return ExaminedRun(run, judged, places, GateDiagnosis(run, places), None, sensors or SensorReport())
+    if truth is None:
+        return JudgedRun(run, sensors=sensors or SensorReport())
+    poses = {stamp(second): at(second) for second in range(80)}
+    return JudgedRun(
+        run,
+        closures=[judge_closure(one, poses[one.query_stamp_ns], poses[one.match_stamp_ns]) for one in closures],
+        revisits=len(closures) + len(missed or []),
+        covered=(int(truth.at(run.stamps)[1].sum()), len(rows)),
+        missed=[stamp(second) for second in missed or []],
+        ate_odometry_m=ate and ate[0],
+        ate_optimized_m=ate and ate[1],
+        sensors=sensors or SensorReport(),
+    )

@@ -15,11 +15,11 @@ from rich.console import Console
 
 from umf_ros.bags.inputs import Advice
 from umf_ros.pose_graph.closures import ClosureReason, State
-from umf_ros.runs.findings import ExaminedRun, conclude, look_first
+from umf_ros.runs.findings import conclude, look_first
 from umf_ros.runs.gallery import Gallery
 from umf_ros.runs.report import closure_rows, describe, final_verdicts, print_summary, write_page
 from umf_ros.runs.scene import build_scene, pairs_of
-from umf_ros.runs.truth import JudgedClosure
+from umf_ros.runs.truth import JudgedClosure, JudgedRun
 from umf_ros.verification import RejectReason
 
 NASTY = "</script><script>alert('x')</script> & \"quotes\" [red]"
@@ -49,7 +49,7 @@ class Read(HTMLParser):
             self.text.append(data.strip())
 
 
-def written(about: ExaminedRun, findings: list[Advice] | None = None) -> str:
+def written(about: JudgedRun, findings: list[Advice] | None = None) -> str:
     findings = look_first(about) if findings is None else findings
     scene = build_scene(about, pairs_of(about), Gallery([], [], None), {})
     write_page(about, conclude(about, findings), findings, scene)
@@ -85,8 +85,8 @@ def test_every_closure_is_a_row_and_a_pair_with_its_number(tmp_path: Path) -> No
         tmp_path, closures, verdict=accepted(State.REJECTED, ClosureReason.CONTRADICTS), truth=trajectory(0, 53)
     )
     rows = closure_rows(about)
-    assert rows[0].cells[:7] == ["1", "50.0", "40.0", "0.00", "0.0", "0.9700", "rejected"]
-    assert [row.word for row in rows[:2]] == ["yes", "NO"] and rows[1].mark == "bad"
+    assert rows[0][:7] == ["1", "50.0", "40.0", "0.00", "0.0", "0.9700", "rejected"]
+    assert [row[-1] for row in rows[:2]] == ["yes", "NO"]
     told = scene_in(written(about))["pairs"]
     assert [(pair["kind"], pair["number"]) for pair in told] == [("rejected", 1), ("false", 2), ("rejected", 3)]
     assert told[0]["graph"] == "rejected: contradicts the map (2.0 sigma, 0.10 m)"

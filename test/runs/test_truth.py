@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.config import Loop
+from umf_ros.core.config import Loop, load_settings
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative, transform
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.runs.tables import KeyframeRow
+from umf_ros.runs.reader import FinishedRun
+from umf_ros.runs.run_file import KEYFRAME
 from umf_ros.runs.truth import (
     JudgedRun,
     absolute_trajectory_error,
-    endpoints,
     find_revisits,
     judge_closure,
     judge_run,
@@ -43,7 +45,7 @@ def truth(first: int = 0, last: int = 80, has_orientation: bool = True) -> Traje
     return Trajectory(stamps, np.stack([at(second) for second in seconds]), has_orientation)
 
 
-ROWS = [KeyframeRow(stamp(second), 0, float(second)) for second in range(0, 80, 2)]
+ROWS = [(stamp(second), 0, float(second)) for second in range(0, 80, 2)]
 """A run with a keyframe every two seconds."""
 
 
@@ -52,8 +54,16 @@ def closure(query_s: float, match_s: float, error_m: float = 0.0) -> LoopClosure
     return LoopClosure(stamp(query_s), stamp(match_s), pose, np.eye(6))
 
 
-def judged(known: Trajectory, closures: list[LoopClosure]) -> JudgedRun:
-    return judge_run(ROWS, known, closures, RULES, None, None)
+def judged(
+    known: Trajectory,
+    closures: list[LoopClosure],
+    rules: Loop = RULES,
+    rows: list[tuple[int, int, float]] = ROWS,
+    odometry: Trajectory | None = None,
+    optimized: Trajectory | None = None,
+) -> JudgedRun:
+    settings, keyframes = load_settings().model_copy(update={"loop": rules}), np.array(rows, KEYFRAME)
+    return judge_run(FinishedRun(Path(), {}, settings, closures, keyframes, [], {}, odometry, optimized, known))
 
 
 def test_true_and_false_closures_are_counted() -> None:
@@ -85,7 +95,7 @@ def test_revisits_are_those_that_the_truth_covers() -> None:
 def test_the_gaps_of_the_settings_decide_what_can_be_a_revisit() -> None:
     patient = Loop(min_time_gap_s=60, min_travel_m=15)
     # only what was passed at least a minute before: within 12 m of a place 40 s and more ago
-    found = judge_run(ROWS, truth(), [], patient, None, None).revisits
+    found = judged(truth(), [], patient).revisits
     assert found == sum(
         any(second - past >= 60 and abs(second % 40 - past) <= 12 for past in range(0, 40, 2))
         for second in range(40, 80, 2)
@@ -98,7 +108,7 @@ def test_errors_of_trajectories_are_after_alignment() -> None:
     moved = Trajectory(known.stamps_ns, turned @ known.poses)
     bent = known.poses.copy()
     bent[40:, 1, 3] += 2.0
-    found = judge_run(ROWS, known, [], RULES, Trajectory(known.stamps_ns, bent), moved)
+    found = judged(known, [], odometry=Trajectory(known.stamps_ns, bent), optimized=moved)
     assert found.ate_optimized_m == pytest.approx(0, abs=1e-6)
     # two lines 2 m apart against one: a metre each, after the best alignment at most
     assert found.ate_odometry_m is not None and 0.9 < found.ate_odometry_m <= 1.0 + 1e-9
@@ -130,7 +140,9 @@ def test_the_summary_compares_stated_errors_with_true_ones() -> None:
 
 
 def test_the_summary_has_its_keys_and_plain_numbers() -> None:
-    assert JudgedRun([], 7, 1.23456789, None).summary() == {
+    assert replace(
+        judged(truth(), []), revisits=7, any_heading=(0, 0), covered=(0, 0), ate_odometry_m=1.23456789
+    ).summary() == {
         "closures_true": 0,
         "closures_false": 0,
         "revisits": 7,
@@ -145,7 +157,7 @@ def test_the_summary_has_its_keys_and_plain_numbers() -> None:
 
 
 def test_a_run_without_keyframes() -> None:
-    assert judge_run([], truth(), [], RULES, None, None).revisits == 0
+    assert judged(truth(), [], rows=[]).revisits == 0
 
 
 def random_pose(rng: np.random.Generator) -> np.ndarray:
@@ -167,8 +179,8 @@ def test_scale_is_not_aligned_away() -> None:
 
 def test_closures_are_found_by_their_endpoints() -> None:
     closures = [closure(42, 2), closure(42, 3, 0.6)]
-    found = judged(truth(), closures).by_endpoints()
-    assert [found[endpoints(one)].closure for one in closures] == closures
+    found = judged(truth(), closures).by_endpoints
+    assert [found[one.endpoints].closure for one in closures] == closures
     assert (stamp(2), stamp(42)) not in found  # query first
 
 

@@ -81,7 +81,7 @@ def command(
     from umf_ros.replay import Replay
     from umf_ros.runs.report import finish_run
     from umf_ros.runs.rerun_log import RerunLog
-    from umf_ros.runs.writer import ReplayFolder, count_drops
+    from umf_ros.runs.writer import count_drops, create_folder, finish_folder, unfinished_folder, with_places
 
     console = Console()
     recording, settings = open_recording(
@@ -104,10 +104,11 @@ def command(
     viewer = RerunLog(rerun) if rerun else None
     # a store or a map that cannot be used is reported before there is a folder
     detector = LoopDetector(settings, network) if settings.database.path or settings.localizing else None
-    run = (ReplayFolder.resume if resume and not settings.localizing else ReplayFolder.create)(out, bag, settings)
-    detector = detector or LoopDetector(run.working_settings, network)
+    begun = unfinished_folder(out, bag, settings) if resume and not settings.localizing else None
+    folder = begun or create_folder(out, bag)
+    detector = detector or LoopDetector(with_places(settings, folder), network)
     inputs.tell_absent(settings, odometry is not None)
-    replay = Replay(run.path, settings, detector, run.resumed)
+    replay = Replay(folder, settings, detector, begun is not None)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
         stream = reader.stream()
         for detection in replay.run(viewer.watch(stream) if viewer else stream):
@@ -122,14 +123,14 @@ def command(
     with undisturbed():
         replay.finish(count_drops(reader.counters))
         if not interrupted() or settings.localizing:
-            run.finish()
+            finish_folder(folder)
         if viewer:
-            viewer.finish(run.path)
-        inputs.remember(run.path, reader.counters, interrupted(), odometry, odometry_frame)
+            viewer.finish(folder)
+        inputs.remember(folder, reader.counters, interrupted(), odometry, odometry_frame)
         if settings.localizing:
-            status = _report_localization(console, run.path, replay.counts, newest)
+            status = _report_localization(console, folder, replay.counts, newest)
         else:
-            status = finish_run(run.path, recording, console, ground_truth, inputs.told).exit_code
+            status = finish_run(folder, recording, console, ground_truth, inputs.told).exit_code
     replay.raise_if_frames_failed()
     raise typer.Exit(status)
 

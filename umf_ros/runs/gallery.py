@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -68,12 +68,8 @@ SCAN_POINTS, SCAN_UNIT_M = 600, 0.02  # by hand: enough to see the ground, and w
 MAP_POINTS = 4000  # by hand: of a scan
 
 
-class Photograph(NamedTuple):
-    """A small picture: a `data:` address, and the size in pixels of the image that it was made from."""
-
-    address: str
-    width: int
-    height: int
+Photograph = tuple[str, int, int]
+"""A small picture: a `data:` address, and width and height in pixels of the image that it was made from."""
 
 
 class Gallery:
@@ -133,7 +129,7 @@ def photograph(image: Image) -> Photograph:
     size = PHOTO_WIDTH, max(1, round(height * PHOTO_WIDTH / width))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if width > PHOTO_WIDTH else image
     _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, PHOTO_QUALITY])
-    return Photograph(data_address("image/jpeg", data.tobytes()), width, height)
+    return data_address("image/jpeg", data.tobytes()), width, height
 
 
 def encode_scan(points: Points) -> str:
