@@ -18,8 +18,8 @@ from umf_ros.bags.sensor_check import SensorReport
 from umf_ros.core.config import Loop
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, align, heading, invert, relative, rotation_angle, transform, wrap_angle
-from umf_ros.core.keyframes import is_past
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.places.database import is_past
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import Endpoints
 from umf_ros.verification.hypothesis import Hypothesis

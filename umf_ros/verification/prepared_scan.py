@@ -270,12 +270,6 @@ def prepare(keyframe: Keyframe) -> PreparedScan:
     return PreparedScan(keyframe.points, motion.body_T_lidars, blur_m, owner)
 
 
-def prepare_frame(frame: Frame) -> PreparedScan:
-    """The same scan, before its frame is a keyframe."""
-    points, motion = thin_frame(frame)
-    return PreparedScan(points, frame.body_T_lidar, const.BLUR_M if motion is None else 0.0)
-
-
 def views_decide(match: PreparedScan, query: PreparedScan) -> bool:
     """Whether images have to tell the pose, where there are any: a scan is wanting, or both show bare ground alone."""
     return not (match.usable and query.usable) or (match.bare and query.bare)
@@ -291,27 +285,15 @@ class ScanCache:
 
     def __init__(self) -> None:
         self._scans: OrderedDict[tuple[int, int], PreparedScan] = OrderedDict()
-        self._prefetched: tuple[int, PreparedScan] | None = None
 
     def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
         key = (keyframe.session, keyframe.stamp_ns)
-        scan = self._scans.pop(key, None) or self._foreseen_of(keyframe) or prepare(keyframe)
+        scan = self._scans.pop(key, None) or prepare(keyframe)
         self._scans[key] = scan
         if len(self._scans) > const.SCANS_KEPT:
             self._scans.popitem(last=False)
         return scan
 
-    def prefetch(self, frame: Frame) -> None:
-        """Make the scan ready of a frame that is about to become a keyframe."""
-        scan = prepare_frame(frame)
-        scan.make_ready()
-        self._prefetched = frame.stamp_ns, scan
-
     def clear(self) -> None:
         """Forget all scans, as when stamps start over."""
         self._scans.clear()
-        self._prefetched = None
-
-    def _foreseen_of(self, keyframe: Keyframe) -> PreparedScan | None:
-        known, self._prefetched = self._prefetched, None
-        return known[1] if known is not None and known[0] == keyframe.stamp_ns else None

@@ -11,7 +11,7 @@ from types import MappingProxyType
 import numpy as np
 
 from umf_ros.core.config import Verification
-from umf_ros.core.frames import Frame, Keyframe, LoopClosure
+from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
@@ -65,9 +65,9 @@ class Verifier:
         self._memory.reset()
         self._scans.clear()
 
-    def prefetch(self, frame: Frame) -> None:
-        """Make ready what is asked of a scan whose keyframe is verified next."""
-        self._scans.prefetch(frame)
+    def prefetch(self, keyframe: Keyframe) -> None:
+        """Prepare the scan of a keyframe that is verified next; it need not be embedded yet."""
+        self._scans[keyframe].make_ready()
 
     def verify(
         self,
