@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from umf_ros.localizer import Localization
-    from umf_ros.replay import LocalizationCounts
 
 MinProbability = Annotated[
     float | None, typer.Option("--min-probability", min=0, max=1, help="Publish closures from here on.")
@@ -135,16 +134,15 @@ def command(
     raise typer.Exit(status)
 
 
-def _report_localization(
-    console: Console, folder: Path, counts: LocalizationCounts, newest: Localization | None
-) -> int:
+def _report_localization(console: Console, folder: Path, counts: dict[str, Any], newest: Localization | None) -> int:
     """Print the result of a localising run; 3 where the rover was not found in the map."""
     text = "not found in the map"
-    if counts.located:
-        text = f"found after {counts.keyframes_until_found} keyframes, known at {counts.located} of {counts.keyframes}"
+    if counts["located"]:
+        located = f"{counts['located']} of {counts['keyframes']}"
+        text = f"found after {counts['keyframes_until_found']} keyframes, known at {located}"
     if newest is not None:
         x, y, z = newest.map_T_body[:3, 3]
         sigma_m = float(newest.covariance[:2, :2].trace() ** 0.5)
         text += f"; at last at ({x:.1f}, {y:.1f}, {z:.1f}) m, +- {sigma_m:.2f} m, p = {newest.probability:.4f}"
     console.print(f"{text}\n{folder}", markup=False, highlight=False, soft_wrap=True)
-    return 0 if counts.located else 3
+    return 0 if counts["located"] else 3
