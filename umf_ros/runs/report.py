@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -328,14 +329,17 @@ def _draw_matches(
     """Write matches/*.png for closures spread over the run."""
     target = about.run.folder / "matches"
     target.mkdir(exist_ok=True)
-    for closure in chosen:
+
+    def draw(closure: LoopClosure) -> None:
         key = closure.endpoints
         query, match = (gallery.images.get(stamp) for stamp in key)
-        if query is None or match is None:
-            continue
-        lines = inliers.get(key, np.empty((0, 4)))
-        picture = draw_match(query, match, lines, describe(closure, len(lines), about.by_endpoints.get(key)))
-        cv2.imwrite(str(target / f"{key[0]}_{key[1]}.png"), picture)
+        if query is not None and match is not None:
+            lines = inliers.get(key, np.empty((0, 4)))
+            picture = draw_match(query, match, lines, describe(closure, len(lines), about.by_endpoints.get(key)))
+            cv2.imwrite(str(target / f"{key[0]}_{key[1]}.png"), picture)
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(draw, chosen))
 
 
 def _odometry_file(run: FinishedRun) -> Trajectory | None:
