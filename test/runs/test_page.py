@@ -108,7 +108,9 @@ def test_the_sweep_counts_what_a_threshold_would_publish(tmp_path: Path) -> None
         candidate(54, 14, RejectReason.TURNED, probability=0.99),
     ]
     about = examined(tmp_path, [closure(50, 10)], tested, truth=trajectory())
-    sweep = scene_in(written(about))["sweep"]
+    scene = scene_in(written(about))
+    sweep = scene["sweep"]
+    assert [pair["truth"] for pair in scene["pairs"] if pair["kind"] == "tested"] == ["0.0 m apart", "18.0 m apart"]
     assert [row for row in sweep if row[0]] == [[0.97, 1, 1], [0.8, 0, 1]]
     assert sum(revisit for *_, revisit in sweep) == 20  # every keyframe of the second lap, whatever became of it
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from umf_ros.core.frames import Points
-from umf_ros.core.geometry import Array, align, relative, rotation_angle
+from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, contributions, explain, missing, most_probable
@@ -17,7 +17,7 @@ from umf_ros.runs.findings import explain_missed
 from umf_ros.runs.gallery import SCAN_UNIT_M, Gallery, Photograph
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import Endpoints
-from umf_ros.runs.truth import JudgedRun, positions_in_truth
+from umf_ros.runs.truth import JudgedRun, pose_in_truth, positions_in_truth
 from umf_ros.verification.hypothesis import Hypothesis
 
 ORDER = ("false", "missed", "rejected", "pending", "tested", "accepted")
@@ -163,11 +163,7 @@ def drawn_trajectory(about: JudgedRun) -> Trajectory | None:
     best = run.optimized or run.odometry
     if best is None:
         return run.truth
-    if len(best) < 3:
-        return best
-    # the positions are the trajectory's own, moved rigidly
-    moved = align(best.poses[:, :3, 3], positions_in_truth(best, run.truth))[0]
-    return Trajectory(best.stamps_ns, np.asarray(moved @ best.poses), best.has_orientation)
+    return Trajectory(best.stamps_ns, pose_in_truth(best, run.truth) @ best.poses, best.has_orientation)
 
 
 def build_scene(about: JudgedRun, pairs: Pairs, gallery: Gallery, inliers: Mapping[Endpoints, Array]) -> dict[str, Any]:

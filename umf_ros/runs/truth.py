@@ -293,22 +293,26 @@ def absolute_trajectory_error(estimate: Array, truth: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((aligned - truth) ** 2, axis=1))))
 
 
-def positions_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Array:
-    """Positions (N, 3) in metres, to be drawn in the frame of the truth.
+def pose_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Array:
+    """Pose (4, 4) of a trajectory's frame in that of the truth, to be drawn there.
 
-    They are joined to the truth at the first pose that it covers, or laid best over a truth without headings.
-    Without a truth, or one that covers fewer than three poses, they stay in the frame of the trajectory.
+    They are joined at the first pose that the truth covers, or laid best over a truth without headings. It is the
+    identity without a truth, or where it covers fewer than three poses.
     """
-    positions: Array = trajectory.poses[:, :3, 3]
     if truth is None or trajectory is truth:
-        return positions
+        return np.eye(4)
     poses, known = truth.at(trajectory.stamps_ns)
     if np.count_nonzero(known) < 3:
-        return positions
+        return np.eye(4)
     if not truth.has_orientation:
-        return transform(align(positions[known], poses[known, :3, 3])[0], positions)
+        return align(trajectory.poses[known, :3, 3], poses[known, :3, 3])[0]
     first = int(np.flatnonzero(known)[0])
-    return transform(poses[first] @ invert(trajectory.poses[first]), positions)
+    return np.asarray(poses[first] @ invert(trajectory.poses[first]))
+
+
+def positions_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Array:
+    """Positions (N, 3) in metres, to be drawn in the frame of the truth."""
+    return transform(pose_in_truth(trajectory, truth), trajectory.poses[:, :3, 3])
 
 
 def _rounded(value: float | None) -> float | None:
