@@ -15,7 +15,7 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import KEYFRAME
-from umf_ros.runs.truth import JudgedRun, judge_closure
+from umf_ros.runs.truth import JudgedRun, judge_closures
 from umf_ros.verification import Hypothesis, Measurement, RejectReason
 
 START_NS = 1_600_000_000 * 10**9
@@ -124,10 +124,11 @@ def examined(
     )
     if truth is None:
         return JudgedRun(run, sensors=sensors or SensorReport())
-    poses = {stamp(second): at(second) for second in range(80)}
+    by_stamp = {stamp(second): at(second) for second in range(80)}
+    poses = [np.array([by_stamp[one.endpoints[end]] for one in closures]) for end in (0, 1)]
     return JudgedRun(
         run,
-        closures=[judge_closure(one, poses[one.query_stamp_ns], poses[one.match_stamp_ns]) for one in closures],
+        closures=judge_closures(closures, *poses),
         revisits=len(closures) + len(missed or []),
         covered=(int(truth.at(run.stamps)[1].sum()), len(rows)),
         missed=[stamp(second) for second in missed or []],

@@ -71,7 +71,7 @@ def test_true_and_false_closures_are_counted() -> None:
     found = judged(truth(), closures)
     # half a metre is the limit; (30, 2) has the right pose and is 28 m away
     assert [one.is_true for one in found.closures] == [True, True, False, False]
-    assert [one.closure for one in found.closures] == closures
+    assert [(one.query_stamp_ns, one.match_stamp_ns) for one in found.closures] == [one.endpoints for one in closures]
     assert [one.distance_m for one in found.closures] == pytest.approx([0, 1, 0, 28])
     assert (found.summary()["closures_true"], found.summary()["closures_false"]) == (2, 2)
 
@@ -83,7 +83,7 @@ def test_poses_between_those_of_the_truth_are_interpolated() -> None:
 
 @pytest.mark.parametrize("ends", [(78, 30), (60, 5)])
 def test_a_closure_with_an_end_outside_of_the_truth_is_not_judged(ends: tuple[int, int]) -> None:
-    assert judged(truth(10, 70), [closure(*ends)]).closures == []
+    assert judged(truth(10, 70), [closure(*ends)]).closures.size == 0
 
 
 def test_revisits_are_those_that_the_truth_covers() -> None:
@@ -180,7 +180,7 @@ def test_scale_is_not_aligned_away() -> None:
 def test_closures_are_found_by_their_endpoints() -> None:
     closures = [closure(42, 2), closure(42, 3, 0.6)]
     found = judged(truth(), closures).by_endpoints
-    assert [found[one.endpoints].closure for one in closures] == closures
+    assert [bool(found[one.endpoints].is_true) for one in closures] == [True, False]
     assert (stamp(2), stamp(42)) not in found  # query first
 
 
@@ -237,7 +237,7 @@ def test_an_exact_closure_is_true() -> None:
 def test_the_pose_must_be_right(shift_m: float, turn_deg: float, expected: bool) -> None:
     error = make_pose(Rotation.from_euler("y", turn_deg, degrees=True).as_matrix(), [0, shift_m, 0])
     found = judge_closure(claim(relative(MATCH, QUERY) @ error), QUERY, MATCH)
-    assert found.is_true is expected
+    assert found.is_true == expected
     assert found.translation_error_m == pytest.approx(shift_m, abs=1e-6)
     assert found.rotation_error_deg == pytest.approx(turn_deg, abs=1e-4)
 

@@ -133,10 +133,9 @@ def _graph(about: JudgedRun) -> Iterator[Advice]:
 
 def _closures(about: JudgedRun) -> Iterator[Advice]:
     judged = about.closures
-    if wrong := [one for one in judged if not one.is_true]:
-        highest = max(one.closure.probability for one in wrong)
-        kept = sum(one.is_true and one.closure.probability > highest for one in judged)
-        worst_m = max(one.translation_error_m for one in wrong)
+    if len(wrong := judged[~judged.is_true]):
+        highest, worst_m = wrong.probability.max(), wrong.translation_error_m.max()
+        kept = (judged.is_true & (judged.probability > highest)).sum()
         what = f"{len(wrong)} of {len(judged)} closures are false, the worst {worst_m:.1f} m off"
         remedy = f"verification.min_probability above {highest:.3f} would have kept {kept} true ones and no false one"
         yield Advice("fault", what, remedy)
@@ -250,7 +249,7 @@ def _found(about: JudgedRun) -> str:
     if about.run.truth is None or (about.covered[1] and not about.covered[0]):
         reason = "there is no ground truth" if about.run.truth is None else "no ground truth of this time"
         return f"{len(about.run.closures)} loop closures; {reason} to judge them by"
-    true = sum(one.is_true for one in about.closures)
+    true = int(about.closures.is_true.sum())
     return f"{true} true and {len(about.closures) - true} false loop closures at {about.revisits} revisits"
 
 

@@ -36,7 +36,7 @@ from umf_ros.runs.gallery import Gallery, walk
 from umf_ros.runs.reader import FinishedRun, read_run
 from umf_ros.runs.run_file import Endpoints, read_inliers
 from umf_ros.runs.scene import build_scene, by_need, drawn_trajectory, named_curves, pairs_of, size_of
-from umf_ros.runs.truth import MEDIAN_EXPECTED, JudgedClosure, JudgedRun, in_words, judge_run
+from umf_ros.runs.truth import MEDIAN_EXPECTED, Judged, JudgedRun, in_words, judge_run
 from umf_ros.runs.writer import write_summary
 
 
@@ -185,7 +185,7 @@ def final_verdicts(about: JudgedRun) -> list[str]:
     return lines if more <= 0 else [*lines[:MOST_LINES], f"... and {more} more in graph_verdicts.csv"]
 
 
-def describe(closure: LoopClosure, inliers: int, judged: JudgedClosure | None) -> str:
+def describe(closure: LoopClosure, inliers: int, judged: Judged | None) -> str:
     """One line for the picture of a closure."""
     shift_m, turn_deg = size_of(closure.match_T_query)
     text = f"{shift_m:.2f} m, {turn_deg:.1f} deg apart   p {closure.probability:.3f}   {inliers} image inliers"
@@ -319,7 +319,7 @@ def draw_trajectory(about: JudgedRun) -> None:
         both = known.reshape(-1, 2).all(axis=1)
         ends = poses[:, :3, 3].reshape(-1, 2, 3)[both]
         judged = [about.by_endpoints.get(run.closures[row].endpoints) for row in np.flatnonzero(both)]
-        verdicts = [one and one.is_true for one in judged]
+        verdicts = [None if one is None else bool(one.is_true) for one in judged]
     plot_trajectories(run.folder / "trajectory.png", curves, ends, verdicts)
 
 

@@ -283,7 +283,7 @@ def read_verdicts(path: Path, closures: Iterable[LoopClosure]) -> dict[Endpoints
         match, query, state, reason, residual, residual_m = (row[name] for name in VERDICT_COLUMNS)
         closure = known.get((int(query), int(match)))
         decision = State(state), ClosureReason(reason), float(residual), float(residual_m)
-        return closure and ClosureVerdict(closure, *decision)
+        return None if closure is None else ClosureVerdict(closure, *decision)
 
     found = read_table(path, parse) if path.is_file() else []
     return {one.closure.endpoints: one for one in found if one is not None}

@@ -252,7 +252,7 @@ def _similarity(descriptors: Points | None) -> dict[str, Any] | None:
 def _sweep(about: JudgedRun) -> list[list[float | int]]:
     """Per keyframe with candidates: best probability, 1 or 0 for the same place or not and -1 for unknown, revisit."""
     rows: list[list[float | int]] = []
-    right = {one.closure.query_stamp_ns: one.is_true for one in about.closures}
+    right = dict(zip(about.closures.query_stamp_ns.tolist(), about.closures.is_true.tolist(), strict=True))
     for row, stamp in enumerate(map(int, about.run.stamps)):
         best, revisit = most_probable(about, stamp), int(len(about.same_places(row)) > 0)
         if best is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf, isfinite, nan, radians
@@ -17,7 +18,7 @@ from umf_ros.bags.reader import Bag
 from umf_ros.bags.sensor_check import SensorReport
 from umf_ros.core.config import Loop
 from umf_ros.core.frames import LoopClosure
-from umf_ros.core.geometry import Array, align, heading, invert, relative, rotation_angle, transform, wrap_angle
+from umf_ros.core.geometry import Array, align, heading, invert, relative, transform, wrap_angle
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.places.database import is_past
 from umf_ros.runs.reader import FinishedRun
@@ -71,25 +72,23 @@ POSE_TOLERANCE_DEG = 5.0
 Stamps = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
-class JudgedClosure:
-    """A published closure held against the truth.
-
-    Attributes:
-        closure: the closure.
-        distance_m: distance of the two keyframes in truth.
-        translation_error_m: error of the relative translation; of its length where the truth has no orientation.
-        rotation_error_deg: error of the relative rotation, NaN where the truth has no orientation.
-        is_true: whether the closure is right.
-        nees: normalised error squared under the stated covariance, NaN where the truth has no orientation.
-    """
-
-    closure: LoopClosure
-    distance_m: float
-    translation_error_m: float
-    rotation_error_deg: float
-    is_true: bool
-    nees: float = nan
+Judged = Any
+"""(K,) closures held against the truth, or one of them: a `numpy.recarray` or `numpy.record` of `JUDGED`."""
+JUDGED = np.dtype(
+    [
+        ("query_stamp_ns", np.int64),
+        ("match_stamp_ns", np.int64),
+        ("probability", float),
+        ("distance_m", float),
+        ("translation_error_m", float),
+        ("rotation_error_deg", float),
+        ("nees", float),
+        ("is_true", bool),
+    ]
+)
+"""Stamps and probability of a closure, distance of its keyframes in truth, errors of its relative pose, its normalised
+error squared under the stated covariance, and whether it is right. Where the truth has no orientation, the error of the
+translation is that of its length, and those of rotation and normalised error are NaN."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,7 @@ class JudgedRun:
 
     Attributes:
         run: files of the run.
-        closures: one per closure whose endpoints the truth covers.
+        closures: those whose endpoints the truth covers.
         revisits: keyframes that saw an earlier place again, in about the same direction.
         ate_odometry_m: error of the odometry, or None without odometry.
         ate_optimized_m: error of the optimised trajectory, or None.
@@ -110,7 +109,7 @@ class JudgedRun:
     """
 
     run: FinishedRun
-    closures: list[JudgedClosure] = field(default_factory=list)
+    closures: Judged = field(default_factory=lambda: judge_closures([], np.eye(4)[None], np.eye(4)[None]))
     revisits: int = 0
     ate_odometry_m: float | None = None
     ate_optimized_m: float | None = None
@@ -122,8 +121,8 @@ class JudgedRun:
 
     def summary(self) -> dict[str, Any]:
         """The `ground_truth` entry of `summary.json`."""
-        true = sum(judged.is_true for judged in self.closures)
-        squared = np.array([judged.nees for judged in self.closures if isfinite(judged.nees)])
+        true = int(self.closures.is_true.sum())
+        squared = self.closures.nees[np.isfinite(self.closures.nees)]
         return {
             "closures_true": true,
             "closures_false": len(self.closures) - true,
@@ -139,9 +138,9 @@ class JudgedRun:
         }
 
     @cached_property
-    def by_endpoints(self) -> dict[Endpoints, JudgedClosure]:
+    def by_endpoints(self) -> dict[Endpoints, Judged]:
         """The judged closures, to be found by the stamps of query and match."""
-        return {judged.closure.endpoints: judged for judged in self.closures}
+        return {(int(one.query_stamp_ns), int(one.match_stamp_ns)): one for one in self.closures}
 
     @cached_property
     def tested(self) -> dict[int, list[Hypothesis]]:
@@ -202,16 +201,18 @@ def judge_run(run: FinishedRun, bag: Bag | None = None) -> JudgedRun:
         return JudgedRun(run, bag=bag)
     poses, known = truth.at(run.stamps)
     stamps, poses, path_length = run.stamps[known], poses[known], run.keyframes["path_length_m"][known]
-    judged = _judge_closures(run.closures, truth)
+    ends, covered = truth.at(np.array([closure.endpoints for closure in run.closures], np.int64).ravel())
+    both = np.flatnonzero(covered.reshape(-1, 2).all(axis=1))
+    query, match = ends.reshape(-1, 2, 4, 4)[both].swapaxes(0, 1)
+    judged = judge_closures([run.closures[row] for row in both], query, match, truth.has_orientation)
     again = find_revisits(stamps, poses, path_length, rules, same_view=False)
     same_view = find_revisits(stamps, poses, path_length, rules, truth.has_orientation)
     published = {closure.query_stamp_ns for closure in run.closures}
-    true_queries = {one.closure.query_stamp_ns for one in judged if one.is_true}
     return JudgedRun(
         run,
         closures=judged,
         revisits=int(same_view.sum()),
-        any_heading=(int(again.sum()), int(np.isin(stamps[again], list(true_queries)).sum())),
+        any_heading=(int(again.sum()), int(np.isin(stamps[again], judged.query_stamp_ns[judged.is_true]).sum())),
         covered=(len(stamps), len(known)),
         missed=[stamp for stamp in stamps[same_view].tolist() if stamp not in published],
         ate_odometry_m=trajectory_error(run.odometry, truth),
@@ -220,33 +221,39 @@ def judge_run(run: FinishedRun, bag: Bag | None = None) -> JudgedRun:
     )
 
 
-def _judge_closures(closures: list[LoopClosure], truth: Trajectory) -> list[JudgedClosure]:
-    poses, known = truth.at(np.array([closure.endpoints for closure in closures], np.int64).ravel())
-    ends = zip(closures, poses.reshape(-1, 2, 4, 4), known.reshape(-1, 2), strict=True)
-    return [judge_closure(one, pair[0], pair[1], truth.has_orientation) for one, pair, covered in ends if covered.all()]
-
-
-def judge_closure(
-    closure: LoopClosure, world_T_query: Array, world_T_match: Array, has_orientation: bool = True
-) -> JudgedClosure:
-    """Hold one closure against the truth.
+def judge_closures(
+    closures: Sequence[LoopClosure], world_T_query: Array, world_T_match: Array, has_orientation: bool = True
+) -> Judged:
+    """Hold closures (K,) against true poses (K, 4, 4) of their keyframes.
 
     True means: both keyframes within 12 m of each other [UMF 5.1.2], whatever their headings, and the published
     relative pose within 0.5 m and 5 deg. A truth of positions alone (RTKLIB) checks distances only.
     """
-    truth = relative(world_T_match, world_T_query)
-    distance_m = float(np.linalg.norm(truth[:3, 3]))
+    found = np.zeros(len(closures), JUDGED).view(np.recarray)
+    if not closures:
+        return found
+    poses, truth = np.stack([one.match_T_query for one in closures]), relative(world_T_match, world_T_query)
+    found.query_stamp_ns, found.match_stamp_ns = np.array([one.endpoints for one in closures], np.int64).T
+    found.probability = [one.probability for one in closures]
+    found.distance_m = np.linalg.norm(truth[:, :3, 3], axis=1)
     if has_orientation:
-        error = invert(truth) @ closure.match_T_query
-        translation_m = float(np.linalg.norm(error[:3, 3]))
-        rotation_deg = float(np.degrees(rotation_angle(error)))
-        nees = float(normalised_errors(pose_error(closure.match_T_query, truth), closure.covariance))
+        error = invert(truth) @ poses
+        found.translation_error_m = np.linalg.norm(error[:, :3, 3], axis=1)
+        found.rotation_error_deg = np.degrees(Rotation.from_matrix(error[:, :3, :3]).magnitude())
+        found.nees = normalised_errors(pose_error(poses, truth), np.stack([one.covariance for one in closures]))
     else:
-        translation_m = abs(float(np.linalg.norm(closure.match_T_query[:3, 3])) - distance_m)
-        rotation_deg, nees = nan, nan
-    pose_ok = translation_m <= POSE_TOLERANCE_M and not rotation_deg > POSE_TOLERANCE_DEG
-    is_true = distance_m <= PLACE_RADIUS_M and pose_ok
-    return JudgedClosure(closure, distance_m, translation_m, rotation_deg, is_true, nees)
+        found.translation_error_m = np.abs(np.linalg.norm(poses[:, :3, 3], axis=1) - found.distance_m)
+        found.rotation_error_deg = found.nees = nan
+    pose_ok = (found.translation_error_m <= POSE_TOLERANCE_M) & ~(found.rotation_error_deg > POSE_TOLERANCE_DEG)
+    found.is_true = (found.distance_m <= PLACE_RADIUS_M) & pose_ok
+    return found
+
+
+def judge_closure(
+    closure: LoopClosure, world_T_query: Array, world_T_match: Array, has_orientation: bool = True
+) -> Judged:
+    """The same of one closure and the true poses (4, 4) of its keyframes."""
+    return judge_closures([closure], world_T_query[None], world_T_match[None], has_orientation)[0]
 
 
 def find_revisits(

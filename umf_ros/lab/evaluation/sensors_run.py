@@ -124,8 +124,7 @@ def score(about: JudgedRun, stretches: Sequence[Stretch]) -> dict[str, StretchSc
         raise UmfError("the recording holds no ground truth to judge by")
     stamps = about.run.stamps
     again = np.array([len(about.same_places(row)) > 0 for row in range(len(stamps))], bool)
-    queries = np.array([one.closure.query_stamp_ns for one in about.closures], np.int64)
-    right = np.array([one.is_true for one in about.closures], bool)
+    queries, right = about.closures.query_stamp_ns, about.closures.is_true
     closed = again & np.isin(stamps, queries[right])
     found = {}
     for one in stretches:
