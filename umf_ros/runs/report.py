@@ -313,7 +313,7 @@ def draw_trajectory(about: JudgedRun) -> None:
     run, verdicts = about.run, list[bool | None]()
     colours = {"ground truth": TRUTH, "odometry": ODOMETRY, "optimised": OPTIMISED}
     curves = [(name, colours[name], positions) for name, positions in named_curves(run).items()]
-    ends = np.empty((0, 2, 3))
+    ends: Array = np.empty((0, 2, 3))
     if reference := run.truth or run.optimized or run.odometry:
         poses, known = reference.at(np.array([one.endpoints for one in run.closures], np.int64).ravel())
         both = known.reshape(-1, 2).all(axis=1)

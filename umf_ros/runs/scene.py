@@ -25,7 +25,7 @@ ORDER = ("false", "missed", "rejected", "pending", "tested", "accepted")
 MOST = {"missed": 60, "tested": 20, "accepted": 400}
 """Pairs of a kind that are explained in full."""
 Pairs = dict[Endpoints, dict[str, Any]]
-"""What the page says of pairs of keyframes."""
+"""Entries of the page about pairs of keyframes, by their stamps."""
 
 
 def pairs_of(about: JudgedRun) -> Pairs:
@@ -82,7 +82,7 @@ def _candidate(about: JudgedRun, key: Endpoints) -> Hypothesis | None:
 def _describe(
     about: JudgedRun, key: Endpoints, kind: str, number: int = 0, why: ClosureDiagnosis | None = None
 ) -> dict[str, Any]:
-    """What is known of a pair; `number` is that of its closure, 0 without one."""
+    """The entry of a pair; `number` is that of its closure, 0 without one."""
     candidate, verdict = _candidate(about, key), about.run.verdicts.get(key)
     known = about.run.closures[number - 1] if number else candidate
     told = {

@@ -229,7 +229,7 @@ def judge_closures(
     True means: both keyframes within 12 m of each other [UMF 5.1.2], whatever their headings, and the published
     relative pose within 0.5 m and 5 deg. A truth of positions alone (RTKLIB) checks distances only.
     """
-    found = np.zeros(len(closures), JUDGED).view(np.recarray)
+    found: Judged = np.zeros(len(closures), JUDGED).view(np.recarray)
     if not closures:
         return found
     poses, truth = np.stack([one.match_T_query for one in closures]), relative(world_T_match, world_T_query)
