@@ -142,7 +142,7 @@ class LoopDetector:
 
     Attributes:
         database: the rover's places.
-        encounters: with other rovers of a fleet; None of a rover on its own.
+        inter_robot: closures with other rovers of a fleet; None of a rover on its own.
         embed_ms: milliseconds that the last embedding took, prefetched or not.
 
     Raises:
