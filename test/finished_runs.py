@@ -13,11 +13,9 @@ from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State
-from umf_ros.runs.diagnosis import GateDiagnosis
-from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.tables import KeyframeRow
-from umf_ros.runs.truth import JudgedRun, TruePlaces, judge_closure
+from umf_ros.runs.run_file import KEYFRAME
+from umf_ros.runs.truth import JudgedRun, judge_closures
 from umf_ros.verification import Hypothesis, RejectReason
 
 START_NS = 1_600_000_000 * 10**9
@@ -45,12 +43,12 @@ BELOW = {
     "residual_p90_m": 0.05,
     "overlap": 0.9,
     "points": 900.0,
+    "relief_m": 0.1,
     "terrain_correlation": 0.5,
     "terrain_score": 5.0,
     "common": 0.7,
     "contradiction": 0.0,
-    "upright_counterparts": 0.7,
-    "unexplained": 0.05,
+    "counterparts": 0.7,
     "rival_near": 0.1,
     "rival_far": 0.2,
     "position_std_m": 0.1,
@@ -85,8 +83,9 @@ def candidate(
     probability = numbers.pop("probability", None)
     if reason is RejectReason.IMPROBABLE and probability is not None:
         detail = f"{probability:.2f} < 0.9"
+    measurements = {"similarity": looks} | numbers
     place = Candidate(-1, stamp(match_s), looks)
-    return Hypothesis(stamp(query_s), place, {"similarity": looks} | numbers, reason, detail, probability=probability)
+    return Hypothesis(stamp(query_s), place, measurements, reason, detail, probability=probability)
 
 
 def accepted(state: State = State.ACCEPTED, reason: ClosureReason = ClosureReason.AGREES) -> ClosureVerdict:
@@ -102,38 +101,38 @@ def examined(
     settings: Settings | None = None,
     sensors: SensorReport | None = None,
     missed: list[float] | None = None,
-    keyframe_rows: list[KeyframeRow] | None = None,
+    keyframe_rows: list[tuple[int, int, float]] | None = None,
     ate: tuple[float, float] | None = None,
     **summary: Any,
-) -> ExaminedRun:
+) -> JudgedRun:
     """A run with a keyframe every two seconds, closures that all have one verdict of the graph, and a truth or none."""
     closures = closures or []
     rows = keyframe_rows
     if rows is None:
-        rows = [KeyframeRow(stamp(second), 0, float(second)) for second in range(0, 80, 2)]
+        rows = [(stamp(second), 0, float(second)) for second in range(0, 80, 2)]
     run = FinishedRun(
         folder=folder,
         summary={**SUMMARY, **summary},
         settings=settings or load_settings(None),
         closures=closures,
-        keyframes=rows,
+        keyframes=np.array(rows, KEYFRAME),
         candidates=candidates or [],
         verdicts={(one.query_stamp_ns, one.match_stamp_ns): verdict for one in closures} if verdict else {},
         odometry=trajectory(),
         optimized=trajectory(),
         truth=truth,
     )
-    judged = JudgedRun()
-    if truth is not None:
-        poses = {stamp(second): at(second) for second in range(80)}
-        covered = int(truth.at(run.stamps)[1].sum()) if rows else 0
-        judged = JudgedRun(
-            closures=[judge_closure(one, poses[one.query_stamp_ns], poses[one.match_stamp_ns]) for one in closures],
-            revisits=len(closures) + len(missed or []),
-            covered=(covered, len(rows)),
-            missed=[stamp(second) for second in missed or []],
-            ate_odometry_m=ate and ate[0],
-            ate_optimized_m=ate and ate[1],
-        )
-    places = TruePlaces(run)
-    return ExaminedRun(run, judged, places, GateDiagnosis(run, places), None, sensors or SensorReport())
+    if truth is None:
+        return JudgedRun(run, sensors=sensors or SensorReport())
+    by_stamp = {stamp(second): at(second) for second in range(80)}
+    poses = [np.array([by_stamp[one.endpoints[end]] for one in closures]) for end in (0, 1)]
+    return JudgedRun(
+        run,
+        closures=judge_closures(closures, *poses),
+        revisits=len(closures) + len(missed or []),
+        covered=(int(truth.at(run.stamps)[1].sum()), len(rows)),
+        missed=[stamp(second) for second in missed or []],
+        ate_odometry_m=ate and ate[0],
+        ate_optimized_m=ate and ate[1],
+        sensors=sensors or SensorReport(),
+    )

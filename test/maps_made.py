@@ -14,8 +14,7 @@ from umf_ros.core.config import Settings
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, expmap, make_pose, relative
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
-from umf_ros.runs.run_file import RunFile, StoredOdometry
-from umf_ros.runs.tables import CLOSURES, KEYFRAMES, closure_row, write_table
+from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, StoredOdometry, closure_row, write_table
 
 PERIOD_NS = 10**9
 START_NS = 1_700_000_000 * 10**9
@@ -77,7 +76,7 @@ def made_map(path: Path, sessions: list[MadeSession], settings: Settings | None 
                 file.append_odometry(row, one)
         metres = range(made.first_m, made.last_m + 1)
         keyframes = [[made.stamp(metre), number, metre - made.first_m] for metre in metres]
-        write_table(run / "keyframes.csv", KEYFRAMES, keyframes)
+        write_table(run / "keyframes.csv", COLUMNS["keyframes"], keyframes)
         write_table(run / "closures.csv", CLOSURES, [])
         first, last = made.stamp(made.first_m), made.stamp(made.last_m)
         recording = {"path": f"{made.name}.mcap", "start_ns": first, "end_ns": last, "messages": {"a": number}}

@@ -17,7 +17,7 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.runs.reader import FinishedRun, read_run
 from umf_ros.runs.report import ODOMETRY, OPTIMISED, RIGHT, TRUTH
 from umf_ros.runs.scene import error_curves
-from umf_ros.runs.truth import endpoints, positions_in_truth
+from umf_ros.runs.truth import positions_in_truth
 
 
 def draw(run: FinishedRun, out: Path) -> None:
@@ -33,7 +33,7 @@ def draw(run: FinishedRun, out: Path) -> None:
             above.plot(way[:, 0], way[:, 1], color=colour, linewidth=1.8, label=name)
     reference = run.truth or run.optimized
     if reference is not None and run.closures:
-        poses, _ = reference.at(np.array([endpoints(one) for one in run.closures], np.int64).ravel())
+        poses, _ = reference.at(np.array([one.endpoints for one in run.closures], np.int64).ravel())
         lines = poses[:, :2, 3].reshape(-1, 2, 2)
         above.add_collection(LineCollection(lines.tolist(), colors=RIGHT, linewidths=0.8, alpha=0.7))
         above.plot([], [], color=RIGHT, label=f"{len(run.closures)} closures")

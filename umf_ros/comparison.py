@@ -5,12 +5,11 @@ from __future__ import annotations
 import csv
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from umf_ros.bags.frames import FrameReader, Moment, nearest_frames, parse_moment, split_reference
 from umf_ros.bags.presets import settings_for
@@ -18,9 +17,9 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import Verification
 from umf_ros.core.errors import ConfigError, SensorFileError, UmfError
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
-from umf_ros.core.geometry import to_quaternion
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
+from umf_ros.runs.run_file import pose_numbers
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.scan_files import OUT_OF_REACH, UNCALIBRATED, fit_image, make_snapshot, read_image, read_scan
 from umf_ros.verification import Hypothesis, Verifier
@@ -57,11 +56,6 @@ class PlaceView:
     right: str = ""
 
     @property
-    def parts(self) -> tuple[tuple[str, str], ...]:
-        """Names of the files by kind."""
-        return ("scan", self.scan), ("left", self.left), ("right", self.right)
-
-    @property
     def moment(self) -> Moment:
         """The moment of a view that is a frame of a recording.
 
@@ -76,82 +70,40 @@ class PlaceView:
             raise SensorFileError(f"{self.scan}: {error}") from None
 
 
-@dataclass(frozen=True, slots=True)
-class ReadingRules:
-    """How views are read.
+class Comparer:
+    """Reads views, caches their keyframes, and compares them, each pair on its own.
 
-    Attributes:
+    Args:
+        embedder: the network.
+        settings: the verification group of the settings.
         calibration: file, or name of a data set; None: files have none, recordings that of their data set.
         bin_columns: numbers per point of a .bin; 0: found from the data.
         config: parameter file for recordings, or None.
         dataset: of the recordings, or auto.
-    """
-
-    calibration: Path | None = None
-    bin_columns: int = 0
-    config: Path | None = None
-    dataset: str = "auto"
-
-
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """Result for two views.
-
-    Attributes:
-        reason: why they are not the same place, or "accepted".
-        similarity: cosine similarity of the descriptors.
-        probability: that the best pose is right; None without one.
-        closure: `match_T_query` with its covariance, where they are the same place.
-        milliseconds: verification time, without reading and embedding.
-    """
-
-    reason: str
-    similarity: float
-    probability: float | None = None
-    closure: LoopClosure | None = None
-    milliseconds: float = 0.0
-
-    @property
-    def row(self) -> Row:
-        """The values of `RESULT_COLUMNS`, None where there is none."""
-        row: Row = dict.fromkeys(RESULT_COLUMNS)
-        row |= {"accepted": int(self.closure is not None), "reason": self.reason}
-        row |= {"milliseconds": round(self.milliseconds, 1), "similarity": round(self.similarity, 6)}
-        if self.probability is not None:
-            row["probability"] = round(self.probability, 6)
-        if self.closure is not None:
-            pose, sigma = self.closure.match_T_query, np.sqrt(np.diag(self.closure.covariance))
-            numbers = [*pose[:3, 3], *to_quaternion(pose), *sigma]
-            row |= dict(zip((*POSE, *SIGMA), (float(f"{number:.9g}") for number in numbers), strict=True))
-        return row
-
-
-class KeyframeSource:
-    """Reads views and caches their keyframes.
-
-    Args:
-        embedder: the network.
-        rules: how views are read.
         warn: called once per distinct warning.
 
     Raises:
         CalibrationError: the calibration cannot be read.
+        ConfigError: the acceptance model cannot be read.
     """
 
     def __init__(
-        self, embedder: Embedder, rules: ReadingRules = ReadingRules(), warn: Callable[[str], None] = lambda _: None
+        self,
+        embedder: Embedder,
+        settings: Verification,
+        calibration: Path | None = None,
+        bin_columns: int = 0,
+        config: Path | None = None,
+        dataset: str = "auto",
+        warn: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self._embedder = embedder
-        self._rules = rules
+        self._embedder, self._verifier = embedder, Verifier(settings)
+        self._bin_columns, self._config, self._dataset = bin_columns, config, dataset
         self._warn = cache(warn)
-        self._calibration = UNCALIBRATED if rules.calibration is None else load_calibration(str(rules.calibration))
+        self._named = None if calibration is None else str(calibration)
+        self._calibration = UNCALIBRATED if calibration is None else load_calibration(str(calibration))
         self._cache: OrderedDict[PlaceView, Keyframe | UmfError] = OrderedDict()
         self._expected: dict[Path, list[PlaceView]] = {}
-
-    @property
-    def calibrated(self) -> bool:
-        """Whether the files have a calibration."""
-        return self._calibration is not UNCALIBRATED
 
     def expect(self, views: Iterable[PlaceView]) -> None:
         """Announce the views in the order of their use: a recording is read once for many of them."""
@@ -160,6 +112,21 @@ class KeyframeSource:
             if reference is not None:
                 self._expected.setdefault(reference[0], []).append(view)
 
+    def compare(self, match: PlaceView, query: PlaceView) -> Row:
+        """Compare two views and return the values of `RESULT_COLUMNS`.
+
+        Raises:
+            UmfError: one of them cannot be read; says which.
+        """
+        keyframes = self._read("match", match), self._read("query", query)
+        similarity = similarity_of(*keyframes)
+        if self._named is None and not (match.scan and query.scan):
+            return result_row(NO_CALIBRATION, similarity, 0.0)
+        verdict = judge(self._verifier, *keyframes)
+        blind = verdict.closure is None and not any(keyframe.has_depth for keyframe in keyframes)
+        reason, elapsed_ms = NO_DEPTH if blind else verdict.outcome, sum(self._verifier.latency_ms.values())
+        return result_row(reason, similarity, elapsed_ms, verdict.probability, verdict.closure)
+
     def keyframe(self, view: PlaceView) -> Keyframe:
         """Return the keyframe of a view.
 
@@ -167,26 +134,33 @@ class KeyframeSource:
             UmfError: it cannot be read.
         """
         if view not in self._cache:
-            reference = split_reference(view.scan)
             try:
-                if reference is None:
-                    self._keep(view, self._from_files(view))
-                else:
+                if reference := split_reference(view.scan):
                     self._read_recording(reference[0], view)
+                else:
+                    self._cache[view] = self._from_files(view)
             except UmfError as error:
-                self._keep(view, error)
+                self._cache[view] = error
         self._cache.move_to_end(view)
+        while len(self._cache) > CACHED_KEYFRAMES:
+            self._cache.popitem(last=False)
         found = self._cache[view]
         if isinstance(found, UmfError):
             raise found
         return found
 
+    def _read(self, role: str, view: PlaceView) -> Keyframe:
+        try:
+            return self.keyframe(view)
+        except UmfError as error:
+            raise SensorFileError(f"{role}: {error}") from None
+
     def _from_files(self, view: PlaceView) -> Keyframe:
         if not view.scan and not view.left:
             raise SensorFileError("neither a scan nor a left image")
-        cloud = read_scan(Path(view.scan), self._rules.bin_columns) if view.scan else None
+        cloud = read_scan(Path(view.scan), self._bin_columns) if view.scan else None
         names = [view.left, view.right]
-        if cloud is not None and any(names) and not self.calibrated:
+        if cloud is not None and any(names) and self._named is None:
             self._warn("images beside a scan are not used without a calibration")
             names = ["", ""]
         left, right = (fit_image(read_image(Path(name)), self._calibration) if name else None for name in names)
@@ -198,72 +172,19 @@ class KeyframeSource:
 
     def _read_recording(self, path: Path, view: PlaceView) -> None:
         """Keep the keyframe of a frame, and of the frames of its recording that are expected next."""
-        expected = self._expected.get(path, [view])
+        expected, wanted = self._expected.get(path, []), {view: view.moment}
         start = expected.index(view) if view in expected else 0
-        moments: dict[PlaceView, Moment] = {}
-        for one in {view: None} | dict.fromkeys(expected[start : start + FRAMES_AT_ONCE]):
-            try:
-                moments[one] = one.moment
-            except UmfError as error:
-                self._keep(one, error)
-        if view not in moments:
-            return
+        for one in expected[start : start + FRAMES_AT_ONCE]:
+            with suppress(SensorFileError):  # it is reported when it is asked for
+                wanted[one] = one.moment
         bag = open_bag(path)
-        calibration = str(self._rules.calibration) if self._rules.calibration else None
-        settings = settings_for(bag, self._rules.config, self._rules.dataset, calibration=calibration)
-        found = nearest_frames(FrameReader(bag, settings, warn=self._warn), list(moments.values()))
-        for one, frame in zip(moments, found, strict=True):
+        settings = settings_for(bag, self._config, self._dataset, calibration=self._named)
+        found = nearest_frames(FrameReader(bag, settings, warn=self._warn), list(wanted.values()))
+        for one, frame in zip(wanted, found, strict=True):
             try:
-                self._keep(one, make_keyframe(frame.checked(), self._embedder))
+                self._cache[one] = make_keyframe(frame.checked(), self._embedder)
             except UmfError as error:
-                self._keep(one, error)
-
-    def _keep(self, view: PlaceView, found: Keyframe | UmfError) -> None:
-        self._cache[view] = found
-        while len(self._cache) > CACHED_KEYFRAMES:
-            self._cache.popitem(last=False)
-
-
-class Comparer:
-    """Compares views, each pair on its own.
-
-    Args:
-        source: reads the views.
-        settings: the verification group of the settings.
-
-    Raises:
-        ConfigError: the acceptance model cannot be read.
-    """
-
-    def __init__(self, source: KeyframeSource, settings: Verification) -> None:
-        self._source = source
-        self._verifier = Verifier(settings)
-
-    def compare(self, match: PlaceView, query: PlaceView) -> Comparison:
-        """Compare two views.
-
-        Raises:
-            UmfError: one of them cannot be read; says which.
-        """
-        keyframes = self._read("match", match), self._read("query", query)
-        similarity = similarity_of(*keyframes)
-        if not self._source.calibrated and not (match.scan and query.scan):
-            return Comparison(NO_CALIBRATION, similarity)
-        verdict = judge(self._verifier, *keyframes)
-        blind = verdict.closure is None and not any(keyframe.has_depth for keyframe in keyframes)
-        return Comparison(
-            reason=NO_DEPTH if blind else verdict.outcome,
-            similarity=similarity,
-            probability=verdict.probability,
-            closure=verdict.closure,
-            milliseconds=sum(self._verifier.latency_ms.values()),
-        )
-
-    def _read(self, role: str, view: PlaceView) -> Keyframe:
-        try:
-            return self._source.keyframe(view)
-        except UmfError as error:
-            raise SensorFileError(f"{role}: {error}") from None
+                self._cache[one] = error
 
 
 def judge(verifier: Verifier, match: Keyframe, query: Keyframe) -> Hypothesis:
@@ -305,17 +226,38 @@ def read_pairs(path: Path) -> list[Pair]:
 
 def view_row(match: PlaceView, query: PlaceView, base: Path) -> dict[str, str]:
     """Return the values of `VIEW_COLUMNS`; paths relative to the list where they lie beside or below it."""
-    names = {f"{role}_{part}": name for role, view in (("match", match), ("query", query)) for part, name in view.parts}
-    return {column: _relative(names[column], base) for column in VIEW_COLUMNS}
+    views = {"match": asdict(match), "query": asdict(query)}
+    names = {column: views[column[:5]][column[6:]] for column in VIEW_COLUMNS}
+    return {column: _relative(name, base) for column, name in names.items()}
 
 
-def failed_row(reason: str) -> Row:
-    """Return the values of `RESULT_COLUMNS` of a pair that could not be compared."""
-    return dict.fromkeys(RESULT_COLUMNS) | {"accepted": 0, "reason": reason}
+def result_row(
+    reason: str,
+    similarity: float | None = None,
+    milliseconds: float | None = None,
+    probability: float | None = None,
+    closure: LoopClosure | None = None,
+) -> Row:
+    """Return the values of `RESULT_COLUMNS`, None where there is none.
+
+    Args:
+        reason: why the views are not the same place, or "accepted".
+        similarity: cosine similarity of the descriptors.
+        milliseconds: verification time, without reading and embedding.
+        probability: that the best pose is right.
+        closure: `match_T_query` with its covariance, where they are the same place.
+    """
+    row: Row = dict.fromkeys(RESULT_COLUMNS) | {"accepted": int(closure is not None), "reason": reason}
+    numbers = {"milliseconds": (milliseconds, 1), "similarity": (similarity, 6), "probability": (probability, 6)}
+    row |= {name: round(value, digits) for name, (value, digits) in numbers.items() if value is not None}
+    if closure is not None:
+        values = pose_numbers(closure.match_T_query, closure.covariance)
+        row |= dict(zip((*POSE, *SIGMA), (float(f"{value:.9g}") for value in values), strict=True))
+    return row
 
 
 def _listed(role: str, row: dict[str, str | None], base: Path) -> PlaceView:
-    names = ((row.get(f"{role}_{part}") or "").strip() for part, _ in PlaceView().parts)
+    names = ((row.get(f"{role}_{part}") or "").strip() for part in ("scan", "left", "right"))
     return PlaceView(*(str(base / name) if name else "" for name in names))
 
 

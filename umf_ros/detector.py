@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import small_gicp
 
-from umf_ros.core.config import Settings
+from umf_ros.core.config import KeyframePolicy, Settings
 from umf_ros.core.errors import ConfigError, OutputError, UmfError
-from umf_ros.core.frames import Candidate, Frame, Keyframe, LoopClosure
-from umf_ros.core.keyframes import KeyframeSelector
+from umf_ros.core.frames import Candidate, Embedding, Frame, Keyframe, LoopClosure
+from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.depth import lift
 from umf_ros.embedding.embedder import Embedder
@@ -34,6 +34,9 @@ logger = logging.getLogger(__name__)
 Other = TypeVar("Other")
 """Items of a stream beside frames, such as odometry."""
 NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
+COUNTED_STEP_M = 0.05
+"""Motion counts from this distance on: odometry noise of a parked rover must not add up to metres (*by hand*)."""
+_NOT_EMBEDDED = Embedding(np.empty(0, np.float32))
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,63 @@ class Detection:
         return [verdict.closure for verdict in self.verdicts if verdict.closure is not None]
 
 
+class KeyframeSelector:
+    """Chooses frames by distance, angle and time, and counts the metres driven, of each session by itself.
+
+    With odometry a frame is kept after enough motion; one that is merely late (`max_period_s`) is
+    kept only if the rover moved at all, so that a parked rover does not fill the database. Without
+    odometry frames are kept every `untracked_period_s`.
+    """
+
+    def __init__(self, policy: KeyframePolicy) -> None:
+        self._policy = policy
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past, as at the start of a session."""
+        self._last: Frame | None = None
+        self._counted: Array | None = None
+        self._path_length_m = 0.0
+
+    def path_length_m(self, frame: Frame) -> float:
+        """Metres driven from the start of the session to `frame`; NaN without odometry."""
+        return self._path_length_m if frame.odom_T_body is not None else math.nan
+
+    def select(self, frame: Frame) -> bool:
+        """Whether `frame` becomes a keyframe; call once per frame, in order of stamps within a session."""
+        if self._last is not None and frame.session != self._last.session:
+            self.reset()
+        self._count_metres(frame)
+        if self._last is not None and not self._is_due(self._last, frame):
+            return False
+        self._last = frame
+        return True
+
+    def _count_metres(self, frame: Frame) -> None:
+        if frame.odom_T_body is None:
+            return
+        if self._counted is None:
+            self._counted = frame.odom_T_body
+        step = float(np.linalg.norm(frame.odom_T_body[:3, 3] - self._counted[:3, 3]))
+        if step >= COUNTED_STEP_M:
+            self._path_length_m += step
+            self._counted = frame.odom_T_body
+
+    def _is_due(self, last: Frame, frame: Frame) -> bool:
+        policy = self._policy
+        waited_s = (frame.stamp_ns - last.stamp_ns) * 1e-9
+        if waited_s < policy.min_period_s:
+            return False
+        if frame.odom_T_body is None or last.odom_T_body is None:
+            return waited_s >= policy.untracked_period_s
+        moved = relative(last.odom_T_body, frame.odom_T_body)
+        distance_m = float(np.linalg.norm(moved[:3, 3]))
+        angle_deg = math.degrees(rotation_angle(moved))
+        if distance_m >= policy.min_translation_m or angle_deg >= policy.min_rotation_deg:
+            return True
+        return waited_s >= policy.max_period_s and distance_m >= COUNTED_STEP_M
+
+
 @dataclass(slots=True)
 class _Upcoming:
     """A frame that is known before it is processed, and the embedding that was begun for it."""
@@ -67,7 +127,7 @@ class _Upcoming:
     frame: Frame
     is_keyframe: bool
     path_length_m: float
-    embedding: Future[tuple[Keyframe, float]] | None = None
+    embedding: Future[tuple[Embedding, float]] | None = None
 
 
 class LoopDetector:
@@ -82,7 +142,7 @@ class LoopDetector:
 
     Attributes:
         database: the rover's places.
-        encounters: with other rovers of a fleet; None of a rover on its own.
+        inter_robot: closures with other rovers of a fleet; None of a rover on its own.
         embed_ms: milliseconds that the last embedding took, prefetched or not.
 
     Raises:
@@ -123,18 +183,17 @@ class LoopDetector:
         """Take one frame, in order of stamps within a session."""
         if not self.select(frame):
             return Detection(frame.stamp_ns)
-        latency = Stopwatch()
         keyframe = self.embed(frame)
-        latency.add("embed", self.embed_ms)
+        latency = {"embed": self.embed_ms}
         known = self.database.find_duplicate(keyframe) if self._map is None else None
         if known is not None:
             keyframe = self._go_on_from(known)
-        with latency.measure("query"):
+        with _timed(latency, "query"):
             candidates = self.query(keyframe)
-        with latency.measure("verify"):
+        with _timed(latency, "verify"):
             verdicts = self.verify(keyframe, candidates)
         fault = None
-        with latency.measure("submaps"):
+        with _timed(latency, "submaps"):
             verdicts = self.match_submaps(keyframe, verdicts)
         if self._map is None:
             try:
@@ -143,7 +202,7 @@ class LoopDetector:
                 fault = error
         else:
             self._submaps.remember(keyframe)
-        return Detection(frame.stamp_ns, keyframe, verdicts, latency.milliseconds, fault)
+        return Detection(frame.stamp_ns, keyframe, verdicts, latency | {"total": sum(latency.values())}, fault)
 
     def prefetch(
         self, stream: Iterable[Frame | Other], wanted: Callable[[], bool] = lambda: True
@@ -180,25 +239,26 @@ class LoopDetector:
         if self._current is None or self._current.frame is not frame:
             raise ValueError("select has to be called with this frame first")
         coming = self._begin(self._current)
-        if not coming.done() and len(self.database):
-            self._verifier.prefetch(frame)  # beside the network
-        keyframe, self.embed_ms = coming.result()
         path_length_m = self._current.path_length_m + self._ahead_m
-        return replace(keyframe, path_length_m=path_length_m, session=self._stored_session)
+        keyframe = _assemble(frame, _NOT_EMBEDDED, path_length_m, self._stored_session)
+        if not coming.done() and len(self.database):
+            self._verifier.prefetch(keyframe)  # beside the network
+        embedding, self.embed_ms = coming.result()
+        return replace(keyframe, embedding=embedding)
 
     def _decide(self, frame: Frame) -> _Upcoming:
         is_keyframe = self._selector.select(frame)
         return _Upcoming(frame, is_keyframe, self._selector.path_length_m(frame))
 
-    def _begin(self, upcoming: _Upcoming) -> Future[tuple[Keyframe, float]]:
+    def _begin(self, upcoming: _Upcoming) -> Future[tuple[Embedding, float]]:
         if upcoming.embedding is None:
             upcoming.embedding = self._network.submit(self._embed_timed, upcoming.frame)
         return upcoming.embedding
 
-    def _embed_timed(self, frame: Frame) -> tuple[Keyframe, float]:
+    def _embed_timed(self, frame: Frame) -> tuple[Embedding, float]:
         start = time.perf_counter()
-        keyframe = make_keyframe(frame, self._embedder)
-        return keyframe, 1e3 * (time.perf_counter() - start)
+        embedding = lift(frame, self._embedder.embed(frame))
+        return embedding, 1e3 * (time.perf_counter() - start)
 
     def query(self, keyframe: Keyframe) -> list[Candidate]:
         """Remembered places that look like a keyframe, best first."""
@@ -295,10 +355,15 @@ def make_keyframe(frame: Frame, embedder: Embedder, path_length_m: float = float
         path_length_m: metres driven since the start of the session, NaN when unknown.
         session: number of the session among all that are stored.
     """
+    return _assemble(frame, lift(frame, embedder.embed(frame)), path_length_m, session)
+
+
+def _assemble(frame: Frame, embedding: Embedding, path_length_m: float, session: int) -> Keyframe:
+    """The keyframe of a frame whose embedding is known, its scan thinned."""
     points, motion = thin_frame(frame)
     return Keyframe(
         stamp_ns=frame.stamp_ns,
-        embedding=lift(frame, embedder.embed(frame)),
+        embedding=embedding,
         camera=frame.camera,
         body_T_camera=frame.body_T_camera,
         points=points,
@@ -339,20 +404,9 @@ def make_detector_embedder(settings: Settings) -> Embedder:
     return make_embedder(settings.embedding, chosen.rerank == "superfeatures", chosen.features)
 
 
-class Stopwatch:
-    """Wall-clock milliseconds by name, with their total."""
-
-    def __init__(self) -> None:
-        self.milliseconds: dict[str, float] = {"total": 0.0}
-
-    @contextmanager
-    def measure(self, name: str) -> Iterator[None]:
-        """Time the block."""
-        start = time.perf_counter()
-        yield
-        self.add(name, 1e3 * (time.perf_counter() - start))
-
-    def add(self, name: str, elapsed_ms: float) -> None:
-        """Add a time that was measured elsewhere."""
-        self.milliseconds[name] = elapsed_ms
-        self.milliseconds["total"] += elapsed_ms
+@contextmanager
+def _timed(latency_ms: dict[str, float], name: str) -> Iterator[None]:
+    """Add the milliseconds that the block takes, by name."""
+    start = time.perf_counter()
+    yield
+    latency_ms[name] = 1e3 * (time.perf_counter() - start)

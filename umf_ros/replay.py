@@ -6,7 +6,6 @@ import traceback
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ import numpy as np
 from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
-from umf_ros.core.geometry import to_quaternion
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector
 from umf_ros.localizer import Localization, Localizer, read_poses
@@ -32,26 +30,6 @@ FLEET_PATIENCE_S = 30.0
 """Time that a replay waits at its end for a fleet's server; the next run sends the places that are still waiting."""
 
 
-@dataclass
-class LocalizationCounts:
-    """Counts of a localising run, as in its summary.
-
-    Attributes:
-        keyframes: of the run.
-        keyframes_until_found: up to the first known pose; None while there is none.
-        located: keyframes with a known pose.
-        relocalised: number of times that a pose was found, or another one than before.
-        agreed, contradicted: closures that agreed with the pose, or did not.
-    """
-
-    keyframes: int = 0
-    keyframes_until_found: int | None = None
-    located: int = 0
-    relocalised: int = 0
-    agreed: int = 0
-    contradicted: int = 0
-
-
 class Replay:
     """Feed frames to the detector, odometry and closures to the pose graph, and fill a run folder.
 
@@ -66,7 +44,9 @@ class Replay:
 
     Attributes:
         faults: frames that were skipped after internal errors; `faults.log` in the folder has the tracebacks.
-        counts: of a localising run.
+        counts: of a localising run, as in its summary: `keyframes`, those up to the first known pose (None while there
+            is none), those with a known pose, how often a pose was found or another one than before, and closures that
+            agreed with the pose or did not.
 
     Raises:
         UmfError: the map has not been solved, or is damaged.
@@ -82,7 +62,8 @@ class Replay:
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometrySessionSplitter(self._localizer or self._graph)
         self.faults = 0
-        self.counts = LocalizationCounts()
+        self.counts: dict[str, Any] = {"keyframes": 0, "keyframes_until_found": None, "located": 0}
+        self.counts |= {"relocalised": 0, "agreed": 0, "contradicted": 0}
         self._found: list[Localization] = []
         self._has_odometry = False
         self._done = len(self._recorder.recorded) if resume else 0
@@ -168,19 +149,16 @@ class Replay:
     def _record_pose(self, localizer: Localizer) -> None:
         """Write the pose of the newest keyframe."""
         counts, found = self.counts, localizer.estimate()
-        counts.keyframes += 1
-        counts.relocalised = localizer.relocalised
-        counts.agreed, counts.contradicted = localizer.counts["agreed"], localizer.counts["contradicted"]
+        counts["keyframes"] += 1
+        counts["relocalised"] = localizer.relocalised
+        counts |= {name: localizer.counts[name] for name in ("agreed", "contradicted")}
         if found is None:
             return
-        counts.located += 1
-        if counts.keyframes_until_found is None:
-            counts.keyframes_until_found = counts.keyframes
-        if self._found and found.stamp_ns <= self._found[-1].stamp_ns:
-            return  # its clock was set back
-        self._found.append(found)
-        numbers = [*found.map_T_body[:3, 3], *to_quaternion(found.map_T_body), *np.sqrt(np.diag(found.covariance))]
-        self._recorder.record_pose([found.stamp_ns, *(f"{number:.6g}" for number in (*numbers, found.probability))])
+        counts["located"] += 1
+        counts["keyframes_until_found"] = counts["keyframes_until_found"] or counts["keyframes"]
+        if not self._found or found.stamp_ns > self._found[-1].stamp_ns:  # else its clock was set back
+            self._found.append(found)
+            self._recorder.record_pose(*found)
 
     def finish(self, drops: Mapping[str, int]) -> bool:
         """Export the files of the run.
@@ -198,7 +176,7 @@ class Replay:
             has_trajectory = self._write_localization()
         elif has_trajectory := self._has_odometry:
             self._graph.write_results(self._folder)
-        known: dict[str, Any] = {} if self._localizer is None else {"localization": asdict(self.counts)}
+        known = {} if self._localizer is None else {"localization": self.counts}
         write_summary(self._folder, self._recorder.summary(drops) | known)
         self._recorder.close()
         self._detector.close()

@@ -33,7 +33,7 @@ from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.runs.tables import read_closures, read_keyframes
+from umf_ros.runs.run_file import read_closures
 from umf_ros.runs.truth import trajectory_error
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
@@ -83,10 +83,8 @@ def run_ours(name: str, drive: Drive, folder: Path) -> SystemRun:
     if os.waitstatus_to_exitcode(status) not in (0, 3):
         raise typer.Exit(1)
     run = (out / "latest").resolve()
-    rows = read_keyframes(run / "keyframes.csv")
-    centre = {row.stamp_ns: row.stamp_ns for row in rows}
     found = [
-        FoundClosure(one.query_stamp_ns, one.match_stamp_ns, (centre[one.query_stamp_ns],) * 2, one.match_T_query)
+        FoundClosure(one.query_stamp_ns, one.match_stamp_ns, (one.query_stamp_ns,) * 2, one.match_T_query)
         for one in read_closures(run / "closures.csv")
     ]
     _keep_pairs(run, drive)

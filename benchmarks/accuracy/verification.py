@@ -28,13 +28,12 @@ from rich.table import Table
 from umf_ros.core.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading, wrap_angle
-from umf_ros.core.keyframes import is_past
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.fit.acceptance import inside_ellipsoid
 from umf_ros.lab.simulation.drives import SurveyedDrive, embedded, kept, worlds
 from umf_ros.lab.simulation.scenes import TRAPS, spring
 from umf_ros.lab.simulation.world import TEST
-from umf_ros.places.database import PlaceDatabase
+from umf_ros.places.database import PlaceDatabase, is_past
 from umf_ros.verification import Verifier
 
 WRONG_M, WRONG_DEG = 1.0, 5.0

@@ -23,8 +23,7 @@ from umf_ros.bags.trajectories import read_ground_truth, read_tum
 from umf_ros.core.errors import UmfError, either
 from umf_ros.core.geometry import invert, relative, rotation_angle
 from umf_ros.core.resources import dataset_names
-from umf_ros.runs.run_file import RunFile
-from umf_ros.runs.tables import read_closures
+from umf_ros.runs.run_file import RunFile, read_closures
 
 FILES = (
     "summary.json closures.csv candidates.csv trajectory_odometry.tum trajectory_optimized.tum graph.g2o "

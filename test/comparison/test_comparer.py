@@ -15,9 +15,7 @@ from umf_ros.comparison import (
     NO_CALIBRATION,
     NO_DEPTH,
     Comparer,
-    KeyframeSource,
     PlaceView,
-    ReadingRules,
     judge,
     similarity_of,
 )
@@ -32,7 +30,7 @@ MATCH, QUERY = (without_image(take(GROUND, pose_at(GROUND, x, 0.0, 0.0), 10.0)) 
 
 
 def comparer(calibration: Path | None = None) -> Comparer:
-    return Comparer(KeyframeSource(ThumbnailEmbedder(), ReadingRules(calibration)), Verification())
+    return Comparer(ThumbnailEmbedder(), Verification(), calibration=calibration)
 
 
 @pytest.fixture
@@ -60,22 +58,22 @@ def test_a_pair_does_not_depend_on_where_and_when_it_was_taken() -> None:
 
 def test_scans_are_verified_and_timed(here: Path) -> None:
     found = comparer().compare(PlaceView(str(here / "match.npy")), PlaceView(str(here / "query.npy")))
-    assert found.reason not in ("", NO_DEPTH, NO_CALIBRATION)
-    assert (found.closure is not None) == (found.reason == "accepted")
-    assert found.milliseconds > 0
+    assert found["reason"] not in ("", NO_DEPTH, NO_CALIBRATION)
+    assert found["accepted"] == (found["reason"] == "accepted") == (found["x"] is not None)
+    assert found["milliseconds"] > 0
 
 
 def test_images_without_a_calibration_say_why_they_have_no_pose(here: Path) -> None:
     image, scan = PlaceView("", str(here / "left.png")), PlaceView(str(here / "match.npy"))
     for pair in ((image, image), (scan, image), (image, scan)):
         found = comparer().compare(*pair)
-        assert (found.reason, found.closure, found.probability) == (NO_CALIBRATION, None, None)
-    assert comparer().compare(image, image).similarity == pytest.approx(1)
+        assert (found["reason"], found["accepted"], found["probability"]) == (NO_CALIBRATION, 0, None)
+    assert comparer().compare(image, image)["similarity"] == pytest.approx(1)
 
 
 def test_one_image_says_that_its_depth_is_missing(here: Path) -> None:
     image = PlaceView("", str(here / "left.png"))
-    assert comparer(here / "calibration.yaml").compare(image, image).reason == NO_DEPTH
+    assert comparer(here / "calibration.yaml").compare(image, image)["reason"] == NO_DEPTH
 
 
 def test_it_says_which_of_the_two_cannot_be_read(here: Path) -> None:

@@ -12,10 +12,9 @@ from umf_ros.comparison import (
     POSE,
     RESULT_COLUMNS,
     SIGMA,
-    Comparison,
     PlaceView,
-    failed_row,
     read_pairs,
+    result_row,
     view_row,
 )
 from umf_ros.core.errors import ConfigError
@@ -77,7 +76,7 @@ def test_an_accepted_pair_has_its_pose_and_sigmas() -> None:
     pose = make_pose(Rotation.from_euler("z", 20, degrees=True).as_matrix(), [1.0, -2.0, 0.5])
     covariance = np.diag(np.square([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]))
     closure = LoopClosure(2, 1, pose, covariance, 0.97)
-    row = Comparison("accepted", 0.8, 0.97, closure, 41.23).row
+    row = result_row("accepted", 0.8, 41.23, 0.97, closure)
     assert tuple(row) == RESULT_COLUMNS
     assert (row["accepted"], row["reason"], row["probability"], row["milliseconds"]) == (1, "accepted", 0.97, 41.2)
     np.testing.assert_allclose(from_quaternion([row[n] for n in POSE[:3]], [row[n] for n in POSE[3:]]), pose, atol=1e-8)
@@ -85,8 +84,8 @@ def test_an_accepted_pair_has_its_pose_and_sigmas() -> None:
 
 
 def test_others_say_why_and_have_none() -> None:
-    rejected = Comparison("probability 0.20 is below 0.9", 0.5, 0.2).row
-    failed = failed_row("query: cannot read b.npy")
+    rejected = result_row("probability 0.20 is below 0.9", 0.5, 9.0, 0.2)
+    failed = result_row("query: cannot read b.npy")
     for row in (rejected, failed):
         assert row["accepted"] == 0 and row["reason"] and tuple(row) == RESULT_COLUMNS
         assert all(row[name] is None for name in (*POSE, *SIGMA))

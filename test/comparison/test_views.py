@@ -12,7 +12,8 @@ from recordings import CALIBRATION, traverse, write_mcap
 
 from umf_ros import comparison as views
 from umf_ros.baselines.handcrafted import ThumbnailEmbedder
-from umf_ros.comparison import KeyframeSource, PlaceView, ReadingRules
+from umf_ros.comparison import Comparer, PlaceView
+from umf_ros.core.config import Verification
 from umf_ros.core.errors import CalibrationError, SensorFileError, UmfError
 from umf_ros.core.frames import Embedding, Frame
 
@@ -39,13 +40,9 @@ def here(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def calibrated(here: Path) -> ReadingRules:
-    return ReadingRules(here / "calibration.yaml")
-
-
 def test_a_scan_alone_is_in_the_body_frame(here: Path) -> None:
     embedder = CountingEmbedder()
-    keyframe = KeyframeSource(embedder).keyframe(PlaceView(str(here / "scan.npy")))
+    keyframe = Comparer(embedder, Verification()).keyframe(PlaceView(str(here / "scan.npy")))
     (frame,) = embedder.frames
     np.testing.assert_array_equal(frame.points, np.load(here / "scan.npy")[:, :3])
     np.testing.assert_array_equal(keyframe.body_T_lidar, np.eye(4))
@@ -53,18 +50,18 @@ def test_a_scan_alone_is_in_the_body_frame(here: Path) -> None:
 
 def test_with_a_calibration_images_belong_to_it(here: Path) -> None:
     embedder = CountingEmbedder()
-    source = KeyframeSource(embedder, calibrated(here))
+    source = Comparer(embedder, Verification(), calibration=here / "calibration.yaml")
     image = str(here / "left.png")
     source.keyframe(PlaceView(str(here / "scan.npy"), image, image))
     (frame,) = embedder.frames
     assert frame.left is not None and frame.right is not None and frame.points is not None
-    assert frame.camera.fx == 60 and source.calibrated
+    assert frame.camera.fx == 60
 
 
 def test_without_one_they_are_left_aside_and_it_says_so_once(here: Path) -> None:
     told: list[str] = []
     embedder = CountingEmbedder()
-    source = KeyframeSource(embedder, warn=told.append)
+    source = Comparer(embedder, Verification(), warn=told.append)
     for right in ("", "other.png"):
         source.keyframe(PlaceView(str(here / "scan.npy"), str(here / "left.png"), right))
     assert [frame.left for frame in embedder.frames] == [None, None]
@@ -74,7 +71,7 @@ def test_without_one_they_are_left_aside_and_it_says_so_once(here: Path) -> None
 def test_a_view_in_many_pairs_is_embedded_once(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(views, "CACHED_KEYFRAMES", 2)
     embedder = CountingEmbedder()
-    source = KeyframeSource(embedder, calibrated(here))
+    source = Comparer(embedder, Verification(), calibration=here / "calibration.yaml")
     one, two = PlaceView(str(here / "scan.npy")), PlaceView("", str(here / "left.png"))
     three = PlaceView(str(here / "drive.mcap@1"))
     for view in (one, two, one, one, two):
@@ -96,7 +93,7 @@ def test_a_recording_is_read_once_for_all_that_is_expected_of_it(here: Path, mon
         return really_open(path)
 
     monkeypatch.setattr(views, "open_bag", count)
-    source = KeyframeSource(ThumbnailEmbedder(), calibrated(here))
+    source = Comparer(ThumbnailEmbedder(), Verification(), calibration=here / "calibration.yaml")
     asked = [PlaceView(f"{here}/drive.mcap@{second}") for second in (2, 0.5, 1, 0.5, 99)]
     source.expect(asked)
     stamps = [source.keyframe(view).stamp_ns for view in asked[:4]]
@@ -123,7 +120,7 @@ def test_a_recording_is_read_once_for_all_that_is_expected_of_it(here: Path, mon
     ],
 )
 def test_what_cannot_be_read_is_said_every_time(here: Path, view: PlaceView, text: str) -> None:
-    source = KeyframeSource(ThumbnailEmbedder(), calibrated(here))
+    source = Comparer(ThumbnailEmbedder(), Verification(), calibration=here / "calibration.yaml")
     there = PlaceView(*(str(here / name) if name else "" for name in (view.scan, view.left, view.right)))
     for _ in range(2):
         with pytest.raises(UmfError, match=text):
@@ -134,13 +131,16 @@ def test_what_cannot_be_read_is_said_every_time(here: Path, view: PlaceView, tex
 def test_a_scan_in_another_unit_or_frame_is_none(here: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     np.save(here / "scan.npy", change(np.load(here / "scan.npy")))
     with pytest.raises(SensorFileError, match=r"scan\.npy has no return within reach: expected metres"):
-        KeyframeSource(ThumbnailEmbedder()).keyframe(PlaceView(str(here / "scan.npy")))
+        Comparer(ThumbnailEmbedder(), Verification()).keyframe(PlaceView(str(here / "scan.npy")))
 
 
 def test_a_calibration_that_cannot_be_read_is_said_at_once(here: Path) -> None:
     with pytest.raises(CalibrationError, match="cannot read"):
-        KeyframeSource(ThumbnailEmbedder(), ReadingRules(here / "nowhere.yaml"))
+        Comparer(ThumbnailEmbedder(), Verification(), calibration=here / "nowhere.yaml")
 
 
-def test_a_data_set_names_its_calibration() -> None:
-    assert KeyframeSource(ThumbnailEmbedder(), ReadingRules(Path("simulated"))).calibrated
+def test_a_data_set_names_its_calibration(here: Path) -> None:
+    embedder = CountingEmbedder()
+    cv2.imwrite(str(here / "left.png"), np.zeros((512, 688), np.uint8))
+    Comparer(embedder, Verification(), calibration=Path("simulated")).keyframe(PlaceView("", str(here / "left.png")))
+    assert embedder.frames[0].camera.fx > 300

@@ -14,7 +14,7 @@ from umf_ros.core.io import Schema, SqliteFile, atomic_write
 
 FIRST = Schema("log", (("CREATE TABLE line (text TEXT)",),), unversioned=lambda tables: int("line" in tables))
 SECOND = Schema("log", (*FIRST.migrations, ("ALTER TABLE line ADD COLUMN level INTEGER DEFAULT 7",)))
-BESIDE = Schema("queue", (lambda connection: connection.execute("CREATE TABLE queued (id INTEGER)"),))
+BESIDE = Schema("queue", (("CREATE TABLE queued (id INTEGER)",),))
 
 
 def lines(file: SqliteFile) -> list[tuple[object, ...]]:

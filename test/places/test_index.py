@@ -13,9 +13,7 @@ from conftest import make_keyframe, unit
 
 from umf_ros.core.config import Database, Loop
 from umf_ros.places import database as database_module
-from umf_ros.places import index as index_module
-from umf_ros.places.database import PlaceDatabase
-from umf_ros.places.index import PlaceIndex
+from umf_ros.places.database import PlaceDatabase, PlaceIndex
 from umf_ros.places.store import KeyframeStore, delete_sessions, index_path
 
 DIMENSION = 16
@@ -82,8 +80,8 @@ def test_candidates_have_the_similarities_of_full_precision(rng: np.random.Gener
 
 @pytest.fixture
 def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(index_module, "EXACT_UP_TO", 2000)
-    monkeypatch.setattr(index_module, "SHORTLIST", 300)
+    monkeypatch.setattr(database_module, "EXACT_UP_TO", 2000)
+    monkeypatch.setattr(database_module, "SHORTLIST", 300)
     monkeypatch.setattr(database_module, "BATCH", 500)
 
 
@@ -203,7 +201,7 @@ def test_a_small_database_is_one_file(tmp_path: Path, rng: np.random.Generator) 
 def test_a_search_leaves_the_threads_of_the_network_alone() -> None:
     code = (
         "import numpy as np, torch\n"
-        "from umf_ros.places.index import PlaceIndex\n"
+        "from umf_ros.places.database import PlaceIndex\n"
         "torch.set_num_threads(2)\n"
         "index = PlaceIndex(8)\n"
         "index.add(np.eye(8, dtype=np.float32))\n"

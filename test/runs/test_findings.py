@@ -17,11 +17,12 @@ from umf_ros.bags.sensor_check import Disagreement, SensorReport
 from umf_ros.core.config import load_settings
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import ClosureReason, State
-from umf_ros.runs.findings import USELESS, ExaminedRun, conclude, look_first
+from umf_ros.runs.findings import USELESS, conclude, look_first
+from umf_ros.runs.truth import JudgedRun
 from umf_ros.verification import RejectReason
 
 
-def verdict(about: ExaminedRun) -> tuple[str, int, str]:
+def verdict(about: JudgedRun) -> tuple[str, int, str]:
     found = conclude(about, look_first(about))
     return found.mark, found.exit_code, found.sentence
 

@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from finished_runs import accepted, candidate, closure, examined, trajectory
+from finished_runs import accepted, at, candidate, closure, examined, trajectory
 from rich.console import Console
 
 from umf_ros.bags.inputs import Advice
 from umf_ros.pose_graph.closures import ClosureReason, State
-from umf_ros.runs.findings import ExaminedRun, conclude, look_first
+from umf_ros.runs.findings import conclude, look_first
 from umf_ros.runs.gallery import Gallery
 from umf_ros.runs.report import closure_rows, describe, final_verdicts, print_summary, write_page
 from umf_ros.runs.scene import build_scene, pairs_of
-from umf_ros.runs.truth import JudgedClosure
+from umf_ros.runs.truth import JudgedRun, judge_closure
 from umf_ros.verification import RejectReason
 
 NASTY = "</script><script>alert('x')</script> & \"quotes\" [red]"
@@ -49,7 +49,7 @@ class Read(HTMLParser):
             self.text.append(data.strip())
 
 
-def written(about: ExaminedRun, findings: list[Advice] | None = None) -> str:
+def written(about: JudgedRun, findings: list[Advice] | None = None) -> str:
     findings = look_first(about) if findings is None else findings
     scene = build_scene(about, pairs_of(about), Gallery([], [], None), {})
     write_page(about, conclude(about, findings), findings, scene)
@@ -85,8 +85,8 @@ def test_every_closure_is_a_row_and_a_pair_with_its_number(tmp_path: Path) -> No
         tmp_path, closures, verdict=accepted(State.REJECTED, ClosureReason.CONTRADICTS), truth=trajectory(0, 53)
     )
     rows = closure_rows(about)
-    assert rows[0].cells[:7] == ["1", "50.0", "40.0", "0.00", "0.0", "0.9700", "rejected"]
-    assert [row.word for row in rows[:2]] == ["yes", "NO"] and rows[1].mark == "bad"
+    assert rows[0][:7] == ["1", "50.0", "40.0", "0.00", "0.0", "0.9700", "rejected"]
+    assert [row[-1] for row in rows[:2]] == ["yes", "NO"]
     told = scene_in(written(about))["pairs"]
     assert [(pair["kind"], pair["number"]) for pair in told] == [("rejected", 1), ("false", 2), ("rejected", 3)]
     assert told[0]["graph"] == "rejected: contradicts the map (2.0 sigma, 0.10 m)"
@@ -108,7 +108,9 @@ def test_the_sweep_counts_what_a_threshold_would_publish(tmp_path: Path) -> None
         candidate(54, 14, RejectReason.TURNED, probability=0.99),
     ]
     about = examined(tmp_path, [closure(50, 10)], tested, truth=trajectory())
-    sweep = scene_in(written(about))["sweep"]
+    scene = scene_in(written(about))
+    sweep = scene["sweep"]
+    assert [pair["truth"] for pair in scene["pairs"] if pair["kind"] == "tested"] == ["0.0 m apart", "18.0 m apart"]
     assert [row for row in sweep if row[0]] == [[0.97, 1, 1], [0.8, 0, 1]]
     assert sum(revisit for *_, revisit in sweep) == 20  # every keyframe of the second lap, whatever became of it
 
@@ -148,4 +150,5 @@ def test_without_a_keyframe_there_is_no_latency_and_a_page_all_the_same(tmp_path
 def test_a_match_is_described_in_a_line() -> None:
     one = closure(50, 10, error_m=0.5)
     assert describe(one, 31, None) == "0.50 m, 0.0 deg apart   p 0.970   31 image inliers"
-    assert describe(one, 0, JudgedClosure(one, 5, 0.66, 1, False)).endswith("0 image inliers   FALSE, 0.66 m off")
+    wrong = judge_closure(closure(50, 10, error_m=0.66), at(50), at(10))
+    assert describe(one, 0, wrong).endswith("0 image inliers   FALSE, 0.66 m off")

@@ -17,10 +17,8 @@ from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.detector import Detection
-from umf_ros.runs import tables
 from umf_ros.runs import writer as recorder_module
-from umf_ros.runs.run_file import ALWAYS, all_descriptors, read_descriptors
-from umf_ros.runs.tables import read_closures
+from umf_ros.runs.run_file import ALWAYS, read_closures, read_descriptors
 from umf_ros.runs.writer import RunRecorder, count_drops, read_summary
 from umf_ros.sensors.buffers import SURPLUS, InputCounter
 from umf_ros.sensors.synchronizer import INPUTS
@@ -195,7 +193,7 @@ def test_a_folder_with_results_is_continued(tmp_path: Path) -> None:
 
 def test_a_keyframe_is_written_completely_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorder = record_a_little(tmp_path)
-    monkeypatch.setattr(tables, "inlier_rows", lambda *_: 1 / 0)
+    monkeypatch.setattr(recorder_module, "inlier_rows", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         recorder.record(make_frame(90), detection(90, [accepted(90, 2)]))
     recorder.close()
@@ -219,22 +217,17 @@ def test_tables_of_an_older_release_are_set_aside(tmp_path: Path) -> None:
 
 def test_descriptors_come_back_by_stamp(tmp_path: Path) -> None:
     record_a_little(tmp_path).close()
-    found = read_descriptors(tmp_path, [40 * 10**9, 2 * 10**9])
-    expected = make_keyframe(40, 40).embedding.descriptor
-    assert found is not None and found.dtype == np.float32
-    np.testing.assert_allclose(found[0], expected, atol=2e-3)
-    assert read_descriptors(tmp_path, [40 * 10**9, 5]) is None
-    assert all_descriptors(tmp_path).shape == (2, len(expected))
+    found = read_descriptors(tmp_path)
+    assert list(found) == [2 * 10**9, 40 * 10**9] and found[40 * 10**9].dtype == np.float32
+    np.testing.assert_allclose(found[40 * 10**9], make_keyframe(40, 40).embedding.descriptor, atol=2e-3)
 
 
 def test_a_run_of_an_older_release_has_no_descriptors(tmp_path: Path) -> None:
-    assert read_descriptors(tmp_path, [1]) is None
-    with pytest.raises(UmfError, match="holds no descriptors of keyframes"):
-        all_descriptors(tmp_path)
+    assert read_descriptors(tmp_path) == {}
 
 
 def test_nothing_but_the_file_of_the_run_and_its_exports_is_left(tmp_path: Path) -> None:
     record_a_little(tmp_path).close()
-    read_descriptors(tmp_path, [1])
+    read_descriptors(tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {f"{name}.csv" for name in ALWAYS} | {"run.sqlite", "config.yaml"}

@@ -15,15 +15,15 @@ from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS as VERDICTS
 from umf_ros.pose_graph.closures import ClosureReason, State
-from umf_ros.runs.tables import (
-    CANDIDATES,
+from umf_ros.runs.run_file import (
     CLOSURES,
-    INLIERS,
+    COLUMNS,
     candidate_row,
     closure_row,
     inlier_rows,
     parse_candidate,
     read_closures,
+    read_inliers,
     read_table,
     read_verdicts,
     write_table,
@@ -87,21 +87,18 @@ def test_figures_of_a_reason_may_hold_anything(tmp_path: Path) -> None:
     put = Hypothesis(
         QUERY_NS, Candidate(3, MATCH_NS, 0.123456789), measurements, RejectReason.TURNED, detail, probability=2 / 3
     )
-    path = written(tmp_path / "candidates.csv", [candidate_row(put)], CANDIDATES)
+    path = written(tmp_path / "candidates.csv", [candidate_row(put)], COLUMNS["candidates"])
     (row,) = read_table(path, dict)
     assert (row["reason"], row["detail"]) == (RejectReason.TURNED.value, detail) and row["similarity"] == "0.123457"
-    assert json.loads(row["numbers"]) == {
-        "similarity": 0.333333,
-        "inliers_image": float("inf"),
-        "probability": 0.666667,
-    }
+    known = {"similarity": 0.333333, "inliers_image": float("inf"), "probability": 0.666667}
+    assert json.loads(row["numbers"]) == known
 
 
 @pytest.mark.parametrize("reason", [None, *RejectReason])
 def test_a_candidate_reads_back_as_it_was_written(tmp_path: Path, reason: RejectReason | None) -> None:
     measurements = {"similarity": 0.5, "noise_m": 0.25, "unexplained": float("nan"), "rival_far": 0.125}
     put = Hypothesis(QUERY_NS, Candidate(3, MATCH_NS, 0.5), measurements, reason, "0.5 m", probability=0.75)
-    path = written(tmp_path / "candidates.csv", [candidate_row(put)], CANDIDATES)
+    path = written(tmp_path / "candidates.csv", [candidate_row(put)], COLUMNS["candidates"])
     (got,) = read_table(path, parse_candidate)
     assert (got.endpoints, got.reason, got.probability) == (put.endpoints, reason, 0.75)
     assert got.numbers == pytest.approx(put.numbers, nan_ok=True) and got.kind == SCAN
@@ -120,9 +117,8 @@ def test_inliers_are_pixels_to_a_tenth(tmp_path: Path) -> None:
     put = Hypothesis(
         QUERY_NS, Candidate(0, MATCH_NS, 0.5), {"similarity": 0.5}, closure=closure(), inlier_pixels=pixels
     )
-    path = written(tmp_path / "inliers.csv", inlier_rows(put), INLIERS)
-    rows = read_table(path, lambda row: (int(row["query_stamp_ns"]), *(float(row[name]) for name in INLIERS[2:])))
-    assert rows == [(QUERY_NS, 1.3, 2, 3, 688.0), (QUERY_NS, 0, 0, 0, 0)]
+    (found,) = read_inliers(written(tmp_path / "inliers.csv", inlier_rows(put), COLUMNS["inliers"])).items()
+    assert found[0] == (QUERY_NS, MATCH_NS) and found[1].tolist() == [[1.3, 2, 3, 688.0], [0, 0, 0, 0]]
 
 
 def test_a_folder_that_is_gone_is_one_clear_line(tmp_path: Path) -> None:
@@ -157,4 +153,4 @@ def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_a_verdict_of_another_version_keeps_its_state(tmp_path: Path) -> None:
     path = written(tmp_path / "graph_verdicts.csv", [[MATCH_NS, QUERY_NS, "undecided", "a riddle", 1.5, 0.2]], VERDICTS)
     (found,) = read_verdicts(path, [closure()]).values()
-    assert (found.state, found.reason, found.residual) == (State.PENDING, ClosureReason.UNKNOWN, 1.5)
+    assert (found.state, found.reason, found.residual) == (State.PENDING, ClosureReason.EARLIER_VERSION, 1.5)

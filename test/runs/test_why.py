@@ -9,9 +9,9 @@ import numpy as np
 from finished_runs import BELOW, candidate, closure, examined, stamp, trajectory
 
 from umf_ros.core.config import load_settings
-from umf_ros.runs.diagnosis import ClosureDiagnosis
-from umf_ros.runs.findings import ExaminedRun
+from umf_ros.runs.diagnosis import ClosureDiagnosis, explain, missing
 from umf_ros.runs.run_file import RunFile
+from umf_ros.runs.truth import JudgedRun
 from umf_ros.verification import RejectReason
 
 
@@ -21,10 +21,10 @@ def write_descriptors(folder: Path, descriptors: np.ndarray) -> None:
             file.append_descriptor(stamp(2 * number), descriptor)
 
 
-def why(about: ExaminedRun, second: float) -> ClosureDiagnosis:
-    row = about.places.row(stamp(second))
+def why(about: JudgedRun, second: float) -> ClosureDiagnosis:
+    row = about.row(stamp(second))
     assert row is not None
-    return about.gates.explain(row)
+    return explain(about, row)
 
 
 def test_a_keyframe_with_nothing_old_enough_is_stopped_by_the_gap_rules(tmp_path: Path) -> None:
@@ -59,8 +59,8 @@ def test_a_probability_that_is_too_low_says_by_how_much_and_what_the_parameter_c
     assert found.what.startswith(f"{RejectReason.IMPROBABLE.value}: 0.60 < 0.9, 1.8 short in log-odds; lost by ")
     assert found.parameter == "verification.min_probability: 0.600 adds 2 closures, 1 of all 3 between different places"
     assert found.contributions["bias"] < 0
-    missing = about.gates.missing(tested[0])
-    assert list(missing.values()) == sorted(missing.values(), reverse=True) and min(missing.values()) > 0
+    lost = list(missing(about, tested[0]).values())
+    assert lost == sorted(lost, reverse=True) and min(lost) > 0
 
 
 def test_the_right_place_is_explained_not_the_most_probable_wrong_one(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ class Outcome:
         if closure is None:
             return
         self.by_submaps += by_submaps
-        if pair.kind == ELSEWHERE or is_wrong(closure.match_T_query, pair.match_T_query):
+        if is_wrong(closure.match_T_query, pair.match_T_query):  # distant places may well share a view
             self.wrong[pair.kind] += 1
             return
         self.right[pair.kind] += 1

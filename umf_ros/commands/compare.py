@@ -15,7 +15,7 @@ from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, wr
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.comparison import Comparer, Comparison, Pair, PlaceView, Row
+    from umf_ros.comparison import Comparer, Pair, PlaceView, Row
 
 Image = Annotated[Path | None, typer.Option(help="Image file; needs --calibration.", show_default=False)]
 ViewName = Annotated[
@@ -57,7 +57,7 @@ def command(
     from rich.console import Console
 
     from umf_ros.commands.console import WARNING
-    from umf_ros.comparison import Comparer, KeyframeSource, ReadingRules, read_pairs
+    from umf_ros.comparison import Comparer, read_pairs
     from umf_ros.core.config import load_settings
     from umf_ros.detector import make_detector_embedder
 
@@ -68,10 +68,16 @@ def command(
     method = {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}
     settings = load_settings(config, **method)
     errors = Console(stderr=True)
-    rules = ReadingRules(calibration, bin_columns, config, dataset)
-    source = KeyframeSource(make_detector_embedder(settings), rules, warn=lambda text: errors.print(text, **WARNING))
-    source.expect(view for pair in asked for view in pair)
-    comparer = Comparer(source, settings.verification)
+    comparer = Comparer(
+        make_detector_embedder(settings),
+        settings.verification,
+        calibration,
+        bin_columns,
+        config,
+        dataset,
+        warn=lambda text: errors.print(text, **WARNING),
+    )
+    comparer.expect(view for pair in asked for view in pair)
     if pairs is not None and out is not None:
         _compare_list(comparer, asked, pairs.parent, out, errors)
     else:
@@ -125,30 +131,29 @@ def _compare_list(comparer: Comparer, asked: list[Pair], base: Path, out: Path, 
 
 def _result(comparer: Comparer, pair: Pair) -> tuple[Row, str]:
     """Return the row of a pair, and the reason where it could not be compared."""
-    from umf_ros.comparison import failed_row
+    from umf_ros.comparison import result_row
 
     try:
-        return comparer.compare(*pair).row, ""
+        return comparer.compare(*pair), ""
     except UmfError as error:
         failure = str(error)
     except Exception as error:  # foreign data: one pair must not cost the others their results
         failure = f"{type(error).__name__}: {one_line(error)}"
-    return failed_row(failure), failure
+    return result_row(failure), failure
 
 
-def _show(comparison: Comparison, as_json: bool) -> None:
+def _show(row: Row, as_json: bool) -> None:
     from umf_ros.comparison import POSE, SIGMA
 
-    row = comparison.row
     if as_json:
         typer.echo(json.dumps(row, indent=2))
         return
-    sure = "" if comparison.probability is None else f", probability {comparison.probability:.3f}"
-    if comparison.closure is None:
-        typer.echo(f"not accepted as the same place: {comparison.reason}{sure}")
+    sure = "" if row["probability"] is None else f", probability {row['probability']:.3f}"
+    if not row["accepted"]:
+        typer.echo(f"not accepted as the same place: {row['reason']}{sure}")
     else:
         typer.echo(f"the same place{sure}")
         for title, names in (("match_T_query", POSE), ("sigma (m, rad)", SIGMA)):
             numbers = "  ".join(f"{name.removeprefix('sigma_')} {row[name]:.4f}" for name in names)
             typer.echo(f"  {title:15} {numbers}")
-    typer.echo(f"  similarity {comparison.similarity:.3f}, {comparison.milliseconds:.0f} ms")
+    typer.echo(f"  similarity {row['similarity']:.3f}, {row['milliseconds']:.0f} ms")

@@ -56,12 +56,14 @@ def _connected(server: str) -> Iterator[Connection]:
     """A connection whose faults are one line."""
     import psycopg
 
-    from umf_ros.core.config import SecretError, without_password
+    from umf_ros.core.config import without_password
 
     try:
-        with psycopg.connect(without_password(server), autocommit=True, connect_timeout=10) as connection:
-            yield connection
-    except SecretError as error:
+        without_password(server)
+    except ValueError as error:
         raise UmfError(str(error)) from None
+    try:
+        with psycopg.connect(server, autocommit=True, connect_timeout=10) as connection:
+            yield connection
     except psycopg.Error as error:
         raise UmfError(f"the server cannot do that: {' '.join(str(error).split())[:300]}") from None

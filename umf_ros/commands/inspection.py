@@ -16,7 +16,7 @@ from umf_ros.bags.reader import Bag, decode
 from umf_ros.core.config import Settings, Topics
 from umf_ros.core.errors import MessageError, UmfError
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
-from umf_ros.core.keyframes import gap_remedy
+from umf_ros.runs.findings import gap_remedy
 from umf_ros.sensors.calibration import TO_BE_MEASURED
 from umf_ros.sensors.decode import (
     CLOUD,

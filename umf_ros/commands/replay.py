@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from umf_ros.localizer import Localization
-    from umf_ros.replay import LocalizationCounts
 
 MinProbability = Annotated[
     float | None, typer.Option("--min-probability", min=0, max=1, help="Publish closures from here on.")
@@ -81,7 +80,7 @@ def command(
     from umf_ros.replay import Replay
     from umf_ros.runs.report import finish_run
     from umf_ros.runs.rerun_log import RerunLog
-    from umf_ros.runs.writer import ReplayFolder, count_drops
+    from umf_ros.runs.writer import count_drops, create_folder, finish_folder, unfinished_folder, with_places
 
     console = Console()
     recording, settings = open_recording(
@@ -104,10 +103,11 @@ def command(
     viewer = RerunLog(rerun) if rerun else None
     # a store or a map that cannot be used is reported before there is a folder
     detector = LoopDetector(settings, network) if settings.database.path or settings.localizing else None
-    run = (ReplayFolder.resume if resume and not settings.localizing else ReplayFolder.create)(out, bag, settings)
-    detector = detector or LoopDetector(run.working_settings, network)
+    begun = unfinished_folder(out, bag, settings) if resume and not settings.localizing else None
+    folder = begun or create_folder(out, bag)
+    detector = detector or LoopDetector(with_places(settings, folder), network)
     inputs.tell_absent(settings, odometry is not None)
-    replay = Replay(run.path, settings, detector, run.resumed)
+    replay = Replay(folder, settings, detector, begun is not None)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
         stream = reader.stream()
         for detection in replay.run(viewer.watch(stream) if viewer else stream):
@@ -122,28 +122,27 @@ def command(
     with undisturbed():
         replay.finish(count_drops(reader.counters))
         if not interrupted() or settings.localizing:
-            run.finish()
+            finish_folder(folder)
         if viewer:
-            viewer.finish(run.path)
-        inputs.remember(run.path, reader.counters, interrupted(), odometry, odometry_frame)
+            viewer.finish(folder)
+        inputs.remember(folder, reader.counters, interrupted(), odometry, odometry_frame)
         if settings.localizing:
-            status = _report_localization(console, run.path, replay.counts, newest)
+            status = _report_localization(console, folder, replay.counts, newest)
         else:
-            status = finish_run(run.path, recording, console, ground_truth, inputs.told).exit_code
+            status = finish_run(folder, recording, console, ground_truth, inputs.told).exit_code
     replay.raise_if_frames_failed()
     raise typer.Exit(status)
 
 
-def _report_localization(
-    console: Console, folder: Path, counts: LocalizationCounts, newest: Localization | None
-) -> int:
+def _report_localization(console: Console, folder: Path, counts: dict[str, Any], newest: Localization | None) -> int:
     """Print the result of a localising run; 3 where the rover was not found in the map."""
     text = "not found in the map"
-    if counts.located:
-        text = f"found after {counts.keyframes_until_found} keyframes, known at {counts.located} of {counts.keyframes}"
+    if counts["located"]:
+        located = f"{counts['located']} of {counts['keyframes']}"
+        text = f"found after {counts['keyframes_until_found']} keyframes, known at {located}"
     if newest is not None:
         x, y, z = newest.map_T_body[:3, 3]
         sigma_m = float(newest.covariance[:2, :2].trace() ** 0.5)
         text += f"; at last at ({x:.1f}, {y:.1f}, {z:.1f}) m, +- {sigma_m:.2f} m, p = {newest.probability:.4f}"
     console.print(f"{text}\n{folder}", markup=False, highlight=False, soft_wrap=True)
-    return 0 if counts.located else 3
+    return 0 if counts["located"] else 3

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from umf_ros.bags.reader import Bag
     from umf_ros.runs.diagnosis import ClosureDiagnosis
-    from umf_ros.runs.findings import ExaminedRun
+    from umf_ros.runs.truth import JudgedRun
 
 SHOWN = 8
 """Candidates and criteria in the terminal."""
@@ -37,6 +37,7 @@ def command(
 
     from umf_ros.bags.reader import open_bag
     from umf_ros.replay import recover_run
+    from umf_ros.runs.diagnosis import explain
     from umf_ros.runs.reader import read_run
     from umf_ros.runs.report import judge
     from umf_ros.runs.writer import read_summary
@@ -47,10 +48,11 @@ def command(
     known = bag or Path(summary.get("recording", {}).get("path", ""))
     recording: Bag | None = open_bag(known) if bag or known.is_file() or (known.is_dir() and known.name) else None
     about = judge(read_run(folder, recording, ground_truth), recording, keep=False)
-    if not about.run.keyframes:
+    if not len(about.run.keyframes):
         raise UmfError(f"{folder} holds no keyframe")
-    row = about.places.nearest_row(_stamp(moment, int(about.run.stamps[0])))
-    _tell(Console(), about, row, about.gates.explain(row))
+    asked_ns = _stamp(moment, int(about.run.stamps[0]))
+    row = min(range(len(about.run.stamps)), key=lambda row: abs(int(about.run.stamps[row]) - asked_ns))
+    _tell(Console(), about, row, explain(about, row))
 
 
 def _stamp(text: str, start_ns: int) -> int:
@@ -63,7 +65,7 @@ def _stamp(text: str, start_ns: int) -> int:
     return moment if isinstance(moment, int) else start_ns + round(moment * 1e9)
 
 
-def _tell(console: Console, about: ExaminedRun, row: int, why: ClosureDiagnosis) -> None:
+def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -83,12 +85,10 @@ def _tell(console: Console, about: ExaminedRun, row: int, why: ClosureDiagnosis)
     if why.gate != "found":
         through = why.parameter or "no parameter: the measurements do not speak for it"
         say(f"would let it through: {escape(through)}")
-    tested = about.gates.tested(why.stamp_ns)
-    if tested:
+    if tested := about.tested[why.stamp_ns]:
         table = Table("returned", "similarity", "probability", "m by the truth", "reason", box=None, pad_edge=False)
         for one in tested[:SHOWN]:
-            match = about.places.row(one.match_stamp_ns)
-            apart_m = float("inf") if match is None else float(about.places.distances(row)[match])
+            apart_m = about.distance(*one.endpoints)
             probability = "" if one.probability is None else f"{one.probability:.3f}"
             known = f"{apart_m:.1f}" if apart_m < float("inf") else ""
             table.add_row(

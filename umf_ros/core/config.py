@@ -27,18 +27,14 @@ def _known(name: str) -> str:
     names = dataset_names()
     if name not in names:
         find("config/datasets")  # a broken installation lacks them all
-        raise ValueError(f"Input should be {either([repr(one) for one in names])}")
+        raise ValueError(f"Input should be {either([repr(one) for one in names])} (got {name!r})")
     return name
-
-
-class SecretError(ValueError):
-    """A value that must not be repeated."""
 
 
 def without_password(address: str) -> str:
     """The address of a server, unless it holds a password, which would be written beside the results."""
     if "password" in address.lower() or (":" in address.partition("://")[2].partition("@")[0] and "@" in address):
-        raise SecretError("the password belongs into ~/.pgpass or PGPASSWORD, not into the address")
+        raise ValueError("the password belongs into ~/.pgpass or PGPASSWORD, not into the address")
     return address
 
 
@@ -365,6 +361,5 @@ def _explain(problem: Any) -> str:
         return f"unknown parameter {name}"
     if problem["type"] == "missing":
         return f"{name} is missing"
-    if isinstance(problem.get("ctx", {}).get("error"), SecretError):
-        return f"{name}: {text}"
-    return f"{name}: {text[0].lower()}{text[1:]} (got {problem['input']!r})"
+    got = "" if problem["type"] == "value_error" else f" (got {problem['input']!r})"  # our own may hold a password
+    return f"{name}: {text[0].lower()}{text[1:]}{got}"

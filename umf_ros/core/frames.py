@@ -222,3 +222,8 @@ class LoopClosure:
     match_T_query: Array
     covariance: Array
     probability: float = float("nan")
+
+    @property
+    def endpoints(self) -> tuple[int, int]:
+        """Stamps in ns of query and match, which identify a closure of a run."""
+        return self.query_stamp_ns, self.match_stamp_ns

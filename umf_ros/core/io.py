@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ import yaml
 
 from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, shortened, writing
 
-Migration = tuple[str, ...] | Callable[[sqlite3.Connection], None]
 Check = Callable[[sqlite3.Connection], None]
 _DAMAGE = (sqlite3.Error, ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
 """Exceptions that the values of a damaged file raise where rows are read and parsed."""
@@ -85,8 +84,8 @@ def _is_new(folder: Path) -> bool:
     return True
 
 
-class FileLock:
-    """Exclusive lock of a file against other processes, until `release` or the end of the process.
+def lock_file(path: Path) -> int:
+    """Lock a file against other processes, until the descriptor is closed or the process ends.
 
     The lock lies on `<path>.lock`, which stays: SQLite uses locks of its own on `path`, and drops them when any thread
     of the process closes that file. Readers need no lock.
@@ -95,24 +94,18 @@ class FileLock:
         UmfError: another process, which is named, holds the lock.
         OutputError: the lock file cannot be made.
     """
-
-    def __init__(self, path: Path) -> None:
-        lock = path.with_name(path.name + ".lock")
-        with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.pread(self._descriptor, 20, 0).decode("ascii", "replace").strip()
-            self.release()
-            raise UmfError(f"{path} is in use by another process ({holder or 'unknown'}); only one may write") from None
-        os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
-
-    def release(self) -> None:
-        """Let other processes write."""
-        os.close(self._descriptor)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path.with_name(path.name + ".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        holder = os.pread(descriptor, 20, 0).decode("ascii", "replace").strip()
+        os.close(descriptor)
+        raise UmfError(f"{path} is in use by another process ({holder or 'unknown'}); only one may write") from None
+    os.ftruncate(descriptor, 0)
+    os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+    return descriptor
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,14 +114,14 @@ class Schema:
 
     Attributes:
         name: kind of the file, such as "place database"; for errors and the table `schema_version`.
-        migrations: the n-th leads from version n to n + 1; released ones are never changed.
+        migrations: statements; the n-th ones lead from version n to n + 1; released ones are never changed.
         unversioned: version of a file without `schema_version`, as earlier releases wrote it, by the names of its
             tables; 0 where it is another kind of file.
         readable: oldest version that can be read without migration.
     """
 
     name: str
-    migrations: tuple[Migration, ...]
+    migrations: tuple[tuple[str, ...], ...]
     unversioned: Callable[[set[str]], int] = lambda tables: 0
     readable: int = 1
 
@@ -155,7 +148,7 @@ class SqliteFile:
     ) -> None:
         self.name = str(path or f"temporary {schema.name}")
         self._path, self._read_only = path, read_only
-        self._lock: FileLock | None = None
+        self._lock: int | None = None
         self.connection = self._connect(schema)
         try:
             self._check_plain()
@@ -178,12 +171,8 @@ class SqliteFile:
             connection.execute("BEGIN IMMEDIATE")
             connection.execute(_VERSIONS)
             found = self._version(schema)
-            for migration in schema.migrations[found:]:
-                if callable(migration):
-                    migration(connection)
-                    continue
-                for statement in migration:
-                    connection.execute(statement)
+            for statement in chain.from_iterable(schema.migrations[found:]):
+                connection.execute(statement)
             values = schema.name, len(schema.migrations)
             connection.execute("INSERT OR REPLACE INTO schema_version VALUES (?, ?)", values)
 
@@ -228,7 +217,7 @@ class SqliteFile:
         """Close the file and let other processes write it; a temporary file is deleted."""
         self.connection.close()
         if self._lock is not None:
-            self._lock.release()
+            os.close(self._lock)
             self._lock = None
 
     def _connect(self, schema: Schema) -> sqlite3.Connection:
@@ -258,7 +247,7 @@ class SqliteFile:
             check(self.connection)
         if not self._read_only:
             if self._path is not None:
-                self._lock = FileLock(self._path)
+                self._lock = lock_file(self._path)
             self.connection.execute("PRAGMA journal_mode = WAL")
             self.connection.execute("PRAGMA synchronous = NORMAL")
             self.migrate(schema)

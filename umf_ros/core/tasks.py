@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 import socket
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from multiprocessing import get_context
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from umf_ros.core.errors import UmfError, one_line
 
@@ -17,7 +18,7 @@ Done = Callable[[int], None]
 """Told how many tasks are done."""
 
 ATTEMPTS = 3
-"""A task may end its worker so often before it is given up."""
+"""Tasks that end their workers are begun again so often without any of them being done."""
 LOCAL = "local"
 
 
@@ -52,36 +53,23 @@ def spread(
 
 
 def _by_processes(work: Callable[[Task], None], tasks: Sequence[Task], workers: int, done: Done) -> None:
-    left = dict(enumerate(tasks))
-    for _ in range(ATTEMPTS):
-        while left:
-            before = len(left)
-            with ProcessPoolExecutor(min(workers, len(left)), get_context("spawn")) as pool:
-                running = {pool.submit(work, task): number for number, task in left.items()}
-                try:
-                    _collect(running, left, lambda: done(len(tasks) - len(left)))
-                except BaseException:
-                    pool.shutdown(wait=False, cancel_futures=True)
-                    raise
-            if len(left) == before:
-                break
-        if not left:
-            return
-    raise UmfError(f"{len(left)} tasks end the process that works at them: too little memory?")
-
-
-def _collect(running: dict[Future[None], int], left: dict[int, Any], told: Callable[[], None]) -> None:
-    """Strike out what gets done until all is, or a worker died: then all that run with it have to be begun again."""
-    pending = set(running)
-    while pending:
-        finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-        for future in finished:
+    left, attempts = dict(enumerate(tasks)), ATTEMPTS
+    while left and attempts:
+        before = len(left)
+        with ProcessPoolExecutor(min(workers, before), get_context("spawn")) as pool:
+            running = {pool.submit(work, task): number for number, task in left.items()}
             try:
-                future.result()
-            except BrokenProcessPool:
-                continue
-            del left[running[future]]
-            told()
+                for future in as_completed(running):
+                    with suppress(BrokenProcessPool):  # all that run with it have to be begun again
+                        future.result()
+                        del left[running[future]]
+                        done(len(tasks) - len(left))
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        attempts -= len(left) == before
+    if left:
+        raise UmfError(f"{len(left)} tasks end the process that works at them: too little memory?")
 
 
 def _by_ray(work: Callable[[Task], None], tasks: Sequence[Task], address: str, workers: int, done: Done) -> None:

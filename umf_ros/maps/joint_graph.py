@@ -14,8 +14,7 @@ from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.replay import feed
-from umf_ros.runs.run_file import StoredOdometry
-from umf_ros.runs.tables import read_closures, read_keyframes
+from umf_ros.runs.run_file import StoredOdometry, read_closures, read_keyframes
 
 Stamps = NDArray[np.int64]
 
@@ -92,8 +91,7 @@ def solve(folder: MapFolder) -> JointMap:
 
 def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, own: Trajectory) -> JointSession:
     """A recording with the poses of its keyframes in the solved map."""
-    rows = read_keyframes(folder.folder_of(session.name) / "keyframes.csv")
-    stamps = np.array([row.stamp_ns for row in rows], np.int64)
+    stamps = read_keyframes(folder.folder_of(session.name) / "keyframes.csv")["stamp_ns"]
     poses, known = graph.poses_at(stamps + session.shift_ns)
     odometry, _ = own.at(stamps[known])
     return JointSession(session, bool(known.any()), stamps[known], poses[known], odometry)

@@ -34,8 +34,7 @@ from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
-from umf_ros.runs.run_file import RunFile, StoredOdometry
-from umf_ros.runs.tables import CLOSURES, closure_row, write_table
+from umf_ros.runs.run_file import CLOSURES, RunFile, StoredOdometry, closure_row, write_table
 from umf_ros.runs.writer import PLACES, count_drops
 from umf_ros.verification import Hypothesis, Verifier
 

@@ -45,7 +45,6 @@ class ClosureReason(StrEnum):
     TOO_FAR = "moves the pose by more than max_correction_m"
     OUTVOTED = "revoked: more places contradict it"
     BY_HAND = "revoked by hand"
-    UNKNOWN = "decided by another version"
     AGREES_WITH_POSE = "agrees with the pose"
     CONTRADICTS_POSE = "contradicts the pose"
     POSE_UNKNOWN = "the pose is not known yet"

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from math import inf, nan
 from typing import Literal
 
 import numpy as np
 
 from umf_ros.bags.inputs import SEVERITIES, Advice, Severity, absent_inputs, useless_inputs
-from umf_ros.bags.reader import Bag
-from umf_ros.bags.sensor_check import SensorReport, about_sensors
-from umf_ros.core.keyframes import gap_remedy
+from umf_ros.bags.sensor_check import about_sensors
+from umf_ros.core.config import Settings
 from umf_ros.pose_graph.closures import State
-from umf_ros.runs.diagnosis import ClosureDiagnosis, GateDiagnosis
-from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.truth import JudgedRun, TruePlaces, in_words
+from umf_ros.runs.diagnosis import ClosureDiagnosis, explain
+from umf_ros.runs.truth import JudgedRun, in_words
 
 REFUSED = ("size", "encoding", "step", "truncated", "compressed", "fields", "datatype", "unusable", "stamp")
 """Reasons why a message is of no use by itself, whatever the others are."""
@@ -27,55 +25,35 @@ FEW_VIEWS, BIAS_PX = 5, 0.35
 """Closures by images whose bias of the disparities is worth a word, and least bias, by hand."""
 SLOW = 1.0
 """Recorded time by the time it took, below which a rover runs ahead of the detector."""
+SHARES = 4
+"""A match may be a quarter of the run back, and without odometry a quarter has as many keyframes: by hand."""
 MOST_EXPLAINED = 200
 """Missed revisits that are looked into; more change no advice."""
 
 
-@dataclass(frozen=True)
-class ExaminedRun:
-    """A run with all that is known about it.
-
-    Attributes:
-        run: what it left.
-        judged: what the truth says.
-        bag: the recording, or None.
-        sensors: what the recording's measurements say of each other.
-        odometry_from_file: whether the odometry was not the recording's.
-    """
-
-    run: FinishedRun
-    judged: JudgedRun
-    places: TruePlaces
-    gates: GateDiagnosis
-    bag: Bag | None = None
-    sensors: SensorReport = field(default_factory=SensorReport)
-
-    @property
-    def odometry_from_file(self) -> bool:
-        """Whether the odometry came from a file."""
-        return bool(self.run.summary.get("odometry_file")) or self.run.odometry is not None
-
-    def states(self) -> Counter[str]:
-        """How many closures the graph left in which state."""
-        return Counter(verdict.state for verdict in self.run.verdicts.values())
-
-    def missed(self) -> list[ClosureDiagnosis]:
-        """Why each missed revisit was missed."""
-        chosen = self.judged.missed[:: max(1, len(self.judged.missed) // MOST_EXPLAINED)]
-        rows = [self.places.row(stamp) for stamp in chosen]
-        return [self.gates.explain(row) for row in rows if row is not None]
+def explain_missed(about: JudgedRun) -> list[ClosureDiagnosis]:
+    """Why each missed revisit was missed, of `MOST_EXPLAINED` at most."""
+    chosen = about.missed[:: max(1, len(about.missed) // MOST_EXPLAINED)]
+    rows = [about.row(stamp) for stamp in chosen]
+    return [explain(about, row) for row in rows if row is not None]
 
 
-def _inputs(about: ExaminedRun) -> Iterator[Advice]:
+def _states(about: JudgedRun) -> Counter[str]:
+    """How many closures the graph left in which state."""
+    return Counter(verdict.state for verdict in about.run.verdicts.values())
+
+
+def _inputs(about: JudgedRun) -> Iterator[Advice]:
+    odometry_from_file = bool(about.run.summary.get("odometry_file")) or about.run.odometry is not None
     if about.bag is not None:
-        yield from absent_inputs(about.bag, about.run.settings, about.odometry_from_file)
+        yield from absent_inputs(about.bag, about.run.settings, odometry_from_file)
     yield from useless_inputs(about.run.summary.get("inputs", {}))
     for text in about.run.summary.get("warnings", []):
         yield Advice("warning", text)
 
 
-def _truth(about: ExaminedRun) -> Iterator[Advice]:
-    run, (known, total) = about.run, about.judged.covered
+def _truth(about: JudgedRun) -> Iterator[Advice]:
+    run, (known, total) = about.run, about.covered
     if run.truth is None or not total:
         return
     spans = [f"{stamps[0] * 1e-9:.1f} to {stamps[-1] * 1e-9:.1f} s" for stamps in (run.truth.stamps_ns, run.stamps)]
@@ -89,7 +67,7 @@ def _truth(about: ExaminedRun) -> Iterator[Advice]:
         yield Advice("warning", what, "closures outside of it are not judged")
 
 
-def _pairs(about: ExaminedRun) -> Iterator[Advice]:
+def _pairs(about: JudgedRun) -> Iterator[Advice]:
     summary, settings = about.run.summary, about.run.settings
     usable = {
         name: one["received"] - sum(count for reason, count in one["dropped"].items() if reason in REFUSED)
@@ -103,21 +81,42 @@ def _pairs(about: ExaminedRun) -> Iterator[Advice]:
         yield Advice("fault", what, "umf inspect says what the recording holds")
 
 
-def _gaps(about: ExaminedRun) -> Iterator[Advice]:
-    count, rules = len(about.places.stamps), about.run.settings.loop
+def _gaps(about: JudgedRun) -> Iterator[Advice]:
+    count, rules = len(about.run.stamps), about.run.settings.loop
     if not count or about.run.summary.get("interrupted"):
         return
-    if any(about.places.admissible(row).any() for row in range(count - 1, 0, -1)):
+    if any(about.admissible(row).any() for row in range(count - 1, 0, -1)):
         return
-    seconds = (int(about.places.stamps[-1]) - int(about.places.stamps[0])) * 1e-9
-    metres = np.nanmax([row.path_length_m for row in about.run.keyframes] + [0.0])
+    seconds = (int(about.run.stamps[-1]) - int(about.run.stamps[0])) * 1e-9
+    metres = np.nanmax(about.run.keyframes["path_length_m"], initial=0.0)
     asked = f"a match must be {rules.min_time_gap_s:g} s older and {rules.min_travel_m:g} m back"
     what = f"the gap rules exclude every pair: {asked}, and the run lasts {seconds:.0f} s and {metres:.0f} m"
     yield Advice("fault", what, gap_remedy(seconds, float(metres), about.run.settings))
 
 
-def _graph(about: ExaminedRun) -> Iterator[Advice]:
-    verdicts, states = about.run.verdicts.values(), about.states()
+def gap_remedy(seconds: float, metres: float | None, settings: Settings) -> str:
+    """Settings with which a run of this duration has matches that the gap rules allow.
+
+    Args:
+        seconds: duration.
+        metres: path length, 0 without odometry, None where it is unknown.
+        settings: of the run.
+    """
+    changes = {"loop.min_time_gap_s": (settings.loop.min_time_gap_s, seconds / SHARES)}
+    if metres == 0:
+        # time alone selects keyframes, too
+        for name in ("untracked_period_s", "min_period_s"):
+            changes[f"keyframe.{name}"] = getattr(settings.keyframe, name), seconds / (SHARES * SHARES)
+    else:
+        changes["loop.min_travel_m"] = settings.loop.min_travel_m, metres / SHARES if metres else inf
+    text = ", ".join(f"{name}: {new:.2g}" for name, (old, new) in changes.items() if new < old)
+    if metres is None:
+        text += ", loop.min_travel_m: a quarter of the path length"
+    return text + (" (or give odometry: --odometry FILE.tum)" if metres == 0 else "")
+
+
+def _graph(about: JudgedRun) -> Iterator[Advice]:
+    verdicts, states = about.run.verdicts.values(), _states(about)
     total, pending = states.total(), states[State.PENDING]
     rejected = states[State.REJECTED] + states[State.REFUSED]
     reasons = Counter(one.reason for one in verdicts if one.state != State.ACCEPTED).most_common(1)
@@ -132,28 +131,27 @@ def _graph(about: ExaminedRun) -> Iterator[Advice]:
         yield Advice("warning", what, f"odometry worse than {settings} say, or wrong closures: click some")
 
 
-def _closures(about: ExaminedRun) -> Iterator[Advice]:
-    judged = about.judged.closures
-    if wrong := [one for one in judged if not one.is_true]:
-        highest = max(one.closure.probability for one in wrong)
-        kept = sum(one.is_true and one.closure.probability > highest for one in judged)
-        worst_m = max(one.translation_error_m for one in wrong)
+def _closures(about: JudgedRun) -> Iterator[Advice]:
+    judged = about.closures
+    if len(wrong := judged[~judged.is_true]):
+        highest, worst_m = wrong.probability.max(), wrong.translation_error_m.max()
+        kept = (judged.is_true & (judged.probability > highest)).sum()
         what = f"{len(wrong)} of {len(judged)} closures are false, the worst {worst_m:.1f} m off"
         remedy = f"verification.min_probability above {highest:.3f} would have kept {kept} true ones and no false one"
         yield Advice("fault", what, remedy)
-    count, revisits = len(about.judged.missed), about.judged.revisits
+    count, revisits = len(about.missed), about.revisits
     if count > MUCH_MISSED * revisits:
-        whys = about.missed()
+        whys = explain_missed(about)
         gate, number = Counter(why.gate for why in whys).most_common(1)[0]
         first = next(why for why in whys if why.gate == gate)
-        at_s = (first.stamp_ns - int(about.places.stamps[0])) * 1e-9
+        at_s = (first.stamp_ns - int(about.run.stamps[0])) * 1e-9
         share = f"{number / len(whys):.0%} of them at the gate '{gate}'"
         what = f"{count} of {revisits} revisits are missed, {share} (at {at_s:.1f} s: {first.what})"
         severity: Severity = "fault" if count == revisits and not about.run.closures else "warning"
         yield Advice(severity, what, first.parameter or "umf why RUN STAMP says it of each")
 
 
-def _unjudged(about: ExaminedRun) -> Iterator[Advice]:
+def _unjudged(about: JudgedRun) -> Iterator[Advice]:
     """Nothing was found, and no truth tells whether there was anything to find."""
     run = about.run
     if run.closures or run.truth is not None or not run.candidates:
@@ -164,8 +162,8 @@ def _unjudged(about: ExaminedRun) -> Iterator[Advice]:
     yield Advice("warning", what, f"umf why {run.folder.name} {best.query_stamp_ns}")
 
 
-def _disparity(about: ExaminedRun) -> Iterator[Advice]:
-    found = [one.measurements.get("disparity_bias_px", math.nan) for one in about.run.candidates if one.accepted]
+def _disparity(about: JudgedRun) -> Iterator[Advice]:
+    found = [one.measurements.get("disparity_bias_px", nan) for one in about.run.candidates if one.accepted]
     known = np.array([bias for bias in found if np.isfinite(bias)])
     if len(known) >= FEW_VIEWS and abs(median := float(np.median(known))) > BIAS_PX:
         more, less = ("too little", "far") if median > 0 else ("too much", "near")
@@ -173,7 +171,7 @@ def _disparity(about: ExaminedRun) -> Iterator[Advice]:
         yield Advice("warning", what, "rectification of the calibration, or R and P of both camera_info")
 
 
-def _stated_errors(about: ExaminedRun) -> Iterator[Advice]:
+def _stated_errors(about: JudgedRun) -> Iterator[Advice]:
     truth = about.run.summary["ground_truth"] or {}
     median, inside = truth.get("nees_median"), truth.get("inside_95")
     words = "" if median is None or inside is None else in_words(median, inside)
@@ -182,15 +180,15 @@ def _stated_errors(about: ExaminedRun) -> Iterator[Advice]:
         yield Advice("warning", f"stated errors of the closures are {words}", remedy)
 
 
-def _map(about: ExaminedRun) -> Iterator[Advice]:
-    before, after = about.judged.ate_odometry_m, about.judged.ate_optimized_m
+def _map(about: JudgedRun) -> Iterator[Advice]:
+    before, after = about.ate_odometry_m, about.ate_optimized_m
     if before is not None and after is not None and after > 1.1 * before:
         what = f"the optimised trajectory is worse than the odometry: {after:.2f} m against {before:.2f} m"
         remedy = "colour the closures by the graph's verdict; wrong ones pull, pose_graph.odometry_sigma_* weigh"
         yield Advice("warning", what, remedy)
 
 
-def _speed(about: ExaminedRun) -> Iterator[Advice]:
+def _speed(about: JudgedRun) -> Iterator[Advice]:
     summary, costs = about.run.summary, "verification.refine_best and loop.top_k cost the most"
     if summary["drops"].get("worker"):
         what = f"{summary['drops']['worker']} frames were dropped because the machine was late"
@@ -201,7 +199,7 @@ def _speed(about: ExaminedRun) -> Iterator[Advice]:
         yield Advice("note", what, f"{costs}, keyframe.min_translation_m how often")
 
 
-def _end(about: ExaminedRun) -> Iterator[Advice]:
+def _end(about: JudgedRun) -> Iterator[Advice]:
     if about.run.summary.get("interrupted"):
         yield Advice("note", "the run was interrupted: it covers what was done until then")
 
@@ -210,7 +208,7 @@ _CAUSES = (_truth, _gaps, lambda about: about_sensors(about.sensors), _disparity
 _EFFECTS = (_graph, _closures, _unjudged, _map, _stated_errors, _speed, _end)
 
 
-def look_first(about: ExaminedRun) -> list[Advice]:
+def look_first(about: JudgedRun) -> list[Advice]:
     """Every finding: causes before what they bring about, of either kind the worst first, and notes at the end."""
     kinds = [[finding for rule in rules for finding in rule(about)] for rules in (_CAUSES, _EFFECTS)]
     worst_first = [one for found in kinds for one in sorted(found, key=lambda one: SEVERITIES.index(one.severity))]
@@ -231,7 +229,7 @@ class RunVerdict:
     exit_code: int = 0
 
 
-def conclude(about: ExaminedRun, findings: list[Advice]) -> RunVerdict:
+def conclude(about: JudgedRun, findings: list[Advice]) -> RunVerdict:
     """Green only when something was found, or when there was nothing to find."""
     sentence = ", ".join(filter(None, (_found(about), _used(about)))) + _errors(about) + "."
     warnings = [finding for finding in findings if finding.severity != "note"]
@@ -239,7 +237,7 @@ def conclude(about: ExaminedRun, findings: list[Advice]) -> RunVerdict:
         return RunVerdict(f"{_capital(warnings[0].what)}. {sentence}", "bad", 0 if about.run.closures else USELESS)
     if about.run.closures and not warnings:
         return RunVerdict(sentence, "good")
-    nothing_to_find = about.judged.covered[0] and not about.judged.revisits
+    nothing_to_find = about.covered[0] and not about.revisits
     if not about.run.closures and nothing_to_find:
         return RunVerdict(f"No place was seen twice. {sentence}", "good" if not warnings else "warn")
     if warnings:
@@ -247,18 +245,17 @@ def conclude(about: ExaminedRun, findings: list[Advice]) -> RunVerdict:
     return RunVerdict(sentence, "warn")
 
 
-def _found(about: ExaminedRun) -> str:
-    judged, count = about.judged, len(about.run.closures)
-    if about.run.truth is None or (judged.covered[1] and not judged.covered[0]):
+def _found(about: JudgedRun) -> str:
+    if about.run.truth is None or (about.covered[1] and not about.covered[0]):
         reason = "there is no ground truth" if about.run.truth is None else "no ground truth of this time"
-        return f"{count} loop closures; {reason} to judge them by"
-    true = sum(one.is_true for one in judged.closures)
-    return f"{true} true and {len(judged.closures) - true} false loop closures at {judged.revisits} revisits"
+        return f"{len(about.run.closures)} loop closures; {reason} to judge them by"
+    true = int(about.closures.is_true.sum())
+    return f"{true} true and {len(about.closures) - true} false loop closures at {about.revisits} revisits"
 
 
-def _used(about: ExaminedRun) -> str:
+def _used(about: JudgedRun) -> str:
     """How many closures the graph used, and the states of the others."""
-    states = about.states()
+    states = _states(about)
     total, accepted, pending = states.total(), states[State.ACCEPTED], states[State.PENDING]
     if not total:
         return ""
@@ -269,8 +266,8 @@ def _used(about: ExaminedRun) -> str:
     return f"the graph used {used}" + (f" ({', '.join(rest)})" if rest else "")
 
 
-def _errors(about: ExaminedRun) -> str:
-    before, after = about.judged.ate_odometry_m, about.judged.ate_optimized_m
+def _errors(about: JudgedRun) -> str:
+    before, after = about.ate_odometry_m, about.ate_optimized_m
     if before is None or after is None:
         return ""
     return f"; trajectory error {before:.2f} m by odometry, {after:.2f} m optimised"

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import math
+from collections import deque
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 import cv2
 import numpy as np
@@ -66,14 +68,11 @@ class HeightMap:
 PHOTO_WIDTH, PHOTO_QUALITY = 360, 60  # by hand: rocks are still rocks, at some 15 kB
 SCAN_POINTS, SCAN_UNIT_M = 600, 0.02  # by hand: enough to see the ground, and what int16 counts in
 MAP_POINTS = 4000  # by hand: of a scan
+FRAMES_AHEAD = 20  # by hand: bounds the memory
 
 
-class Photograph(NamedTuple):
-    """A small picture: a `data:` address, and the size in pixels of the image that it was made from."""
-
-    address: str
-    width: int
-    height: int
+Photograph = tuple[str, int, int]
+"""A small picture: a `data:` address, and width and height in pixels of the image that it was made from."""
 
 
 class Gallery:
@@ -133,7 +132,7 @@ def photograph(image: Image) -> Photograph:
     size = PHOTO_WIDTH, max(1, round(height * PHOTO_WIDTH / width))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if width > PHOTO_WIDTH else image
     _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, PHOTO_QUALITY])
-    return Photograph(data_address("image/jpeg", data.tobytes()), width, height)
+    return data_address("image/jpeg", data.tobytes()), width, height
 
 
 def encode_scan(points: Points) -> str:
@@ -164,12 +163,18 @@ def walk(
         known_odometry: at any rate, where the recording has none.
     """
     check, stamps, poses = SensorCheck(), [-1], list[Array]([np.eye(4)])
-    for item in FrameReader(bag, settings, odometry, warn=lambda _: None).stream():
-        if isinstance(item, Frame):
-            check.take(item)
-            gallery.take(item)
-        elif item.stamp_ns > stamps[-1]:  # as far as its stamps grow
-            stamps.append(item.stamp_ns)
-            poses.append(item.odom_T_body)
+    waiting: deque[Future[None]] = deque()
+    with ThreadPoolExecutor(1, "sensor-check") as pool:  # OpenCV and the reader of the recording share no lock
+        for item in FrameReader(bag, settings, odometry, warn=lambda _: None).stream():
+            if isinstance(item, Frame):
+                waiting.append(pool.submit(check.take, item))
+                gallery.take(item)
+                if len(waiting) > FRAMES_AHEAD:
+                    waiting.popleft().result()
+            elif item.stamp_ns > stamps[-1]:  # as far as its stamps grow
+                stamps.append(item.stamp_ns)
+                poses.append(item.odom_T_body)
+        for one in waiting:
+            one.result()
     heard = Trajectory(np.array(stamps[1:], np.int64), np.stack(poses)[1:]) if len(stamps) > 1 else known_odometry
     return check.report(heard)

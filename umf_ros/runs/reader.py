@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
@@ -17,8 +17,7 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure, Points
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import ClosureVerdict
-from umf_ros.runs import tables
-from umf_ros.runs.run_file import read_descriptors
+from umf_ros.runs import run_file
 from umf_ros.runs.writer import read_summary, write_summary
 from umf_ros.verification.hypothesis import Hypothesis
 
@@ -35,7 +34,7 @@ class FinishedRun:
         summary: what `summary.json` holds.
         settings: those that the run was made with.
         closures: that were published; a closure's number is its place in this list, from 1.
-        keyframes: in the order of their stamps.
+        keyframes: (N,) `stamp_ns`, `session` and `path_length_m`, NaN without odometry, in the order of their stamps.
         candidates: everything that was tested.
         verdicts: what the graph did with the closures in the end, by stamps of query and match; none without a graph.
         odometry, optimized: trajectories, or None where they were not written.
@@ -46,28 +45,32 @@ class FinishedRun:
     summary: dict[str, Any]
     settings: Settings
     closures: list[LoopClosure]
-    keyframes: list[tables.KeyframeRow]
+    keyframes: NDArray[np.void]
     candidates: list[Hypothesis]
-    verdicts: dict[tables.Endpoints, ClosureVerdict]
+    verdicts: dict[run_file.Endpoints, ClosureVerdict]
     odometry: Trajectory | None
     optimized: Trajectory | None
     truth: Trajectory | None
 
-    @cached_property
+    @property
     def stamps(self) -> Any:
         """(N,) int64 ns of the keyframes."""
-        return np.array([row.stamp_ns for row in self.keyframes], np.int64)
+        return self.keyframes["stamp_ns"]
 
     @cached_property
     def descriptors(self) -> Points | None:
         """(N, D) of the keyframes; None where an older version wrote none."""
-        return read_descriptors(self.folder, [row.stamp_ns for row in self.keyframes])
+        found = run_file.read_descriptors(self.folder)
+        stamps = self.stamps.tolist()
+        return np.stack([found[stamp] for stamp in stamps]) if stamps and found.keys() >= set(stamps) else None
 
     @cached_property
     def latencies_ms(self) -> dict[int, float]:
         """Milliseconds that a keyframe took, by its stamp."""
-        rows = _optional(self.folder / "latencies.csv", lambda row: (int(row["stamp_ns"]), float(row["total"])))
-        return dict(rows)
+        path = self.folder / "latencies.csv"
+        if not path.is_file():
+            return {}
+        return dict(run_file.read_table(path, lambda row: (int(row["stamp_ns"]), float(row["total"]))))
 
 
 def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = None) -> FinishedRun:
@@ -76,15 +79,15 @@ def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = N
     Raises:
         UmfError: the folder holds no run, a file is damaged, or the recording is not the one of the run.
     """
-    closures = tables.read_closures(folder / "closures.csv")
+    closures = run_file.read_closures(folder / "closures.csv")
     run = FinishedRun(
         folder=folder,
         summary=read_summary(folder),
         settings=load_settings(folder / "config.yaml"),
         closures=closures,
-        keyframes=tables.read_keyframes(folder / "keyframes.csv"),
-        candidates=tables.read_table(folder / "candidates.csv", tables.parse_candidate),
-        verdicts=tables.read_verdicts(folder / "graph_verdicts.csv", closures),
+        keyframes=run_file.read_keyframes(folder / "keyframes.csv"),
+        candidates=run_file.read_table(folder / "candidates.csv", run_file.parse_candidate),
+        verdicts=run_file.read_verdicts(folder / "graph_verdicts.csv", closures),
         odometry=_trajectory(folder / "trajectory_odometry.tum"),
         optimized=_trajectory(folder / "trajectory_optimized.tum"),
         truth=read_ground_truth(bag, ground_truth),
@@ -115,8 +118,8 @@ def _check_recording(run: FinishedRun, bag: Bag) -> None:
     if known and (known["start_ns"], known["messages"]) != (bag.start_ns, describe_recording(bag)["messages"]):
         raise UmfError(f"{run.folder} was made on another recording, {known['path']}: nothing was written")
     first, last = bag.start_ns - CLOCK_SLACK_NS, bag.end_ns + CLOCK_SLACK_NS
-    outside = [row.stamp_ns for row in run.keyframes if not first <= row.stamp_ns <= last]
-    if outside:
+    outside = run.stamps[(run.stamps < first) | (run.stamps > last)]
+    if len(outside):
         raise UmfError(
             f"{run.folder} was made on another recording than {bag.path}: {len(outside)} of {len(run.keyframes)} "
             f"keyframes are not of its time, the first at {outside[0]} ns; nothing was written"
@@ -125,8 +128,3 @@ def _check_recording(run: FinishedRun, bag: Bag) -> None:
 
 def _trajectory(path: Path) -> Trajectory | None:
     return read_tum(path) if path.is_file() and path.stat().st_size else None
-
-
-def _optional(path: Path, parse: Callable[[dict[str, str]], tables.Row]) -> list[tables.Row]:
-    """Rows of a table that a run may lack."""
-    return tables.read_table(path, parse) if path.is_file() else []

@@ -6,11 +6,11 @@ A file that cannot be written raises an `OutputError`.
 from __future__ import annotations
 
 import json
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,21 +31,12 @@ from umf_ros.core.geometry import Array
 from umf_ros.core.io import write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
-from umf_ros.runs.diagnosis import GateDiagnosis
-from umf_ros.runs.findings import ExaminedRun, RunVerdict, conclude, look_first
+from umf_ros.runs.findings import RunVerdict, conclude, look_first
 from umf_ros.runs.gallery import Gallery, walk
 from umf_ros.runs.reader import FinishedRun, read_run
+from umf_ros.runs.run_file import Endpoints, read_inliers
 from umf_ros.runs.scene import build_scene, by_need, drawn_trajectory, named_curves, pairs_of, size_of
-from umf_ros.runs.tables import INLIERS, Endpoints, read_table
-from umf_ros.runs.truth import (
-    MEDIAN_EXPECTED,
-    JudgedClosure,
-    JudgedRun,
-    TruePlaces,
-    endpoints,
-    in_words,
-    judge_run,
-)
+from umf_ros.runs.truth import MEDIAN_EXPECTED, Judged, JudgedRun, in_words, judge_run
 from umf_ros.runs.writer import write_summary
 
 
@@ -142,15 +133,7 @@ Summary = Mapping[str, Any]
 """Contents of `summary.json`."""
 
 
-class ClosureRow(NamedTuple):
-    """A row of the page's table: its cells, and the last one, which says whether the closure is true."""
-
-    cells: list[str]
-    word: str
-    mark: str
-
-
-def write_page(about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advice], scene: Mapping[str, Any]) -> None:
+def write_page(about: JudgedRun, verdict: RunVerdict, findings: Sequence[Advice], scene: Mapping[str, Any]) -> None:
     """Write report.html."""
     from plotly.offline import get_plotlyjs
 
@@ -172,7 +155,7 @@ def write_page(about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advic
 
 
 def print_summary(
-    console: Console, about: ExaminedRun, verdict: RunVerdict, findings: Sequence[Advice], told: frozenset[str]
+    console: Console, about: JudgedRun, verdict: RunVerdict, findings: Sequence[Advice], told: frozenset[str]
 ) -> None:
     """Print figures, closures that were not accepted, findings that were not `told` before, and the verdict."""
     plain: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
@@ -189,11 +172,11 @@ def print_summary(
     console.print(f"Report: {about.run.folder / 'report.html'}", **plain)
 
 
-def final_verdicts(about: ExaminedRun) -> list[str]:
+def final_verdicts(about: JudgedRun) -> list[str]:
     """A line for each closure, by its number, that the graph did not accept in the end."""
     lines = []
     for number, closure in enumerate(about.run.closures, 1):
-        verdict = about.run.verdicts.get(endpoints(closure))
+        verdict = about.run.verdicts.get(closure.endpoints)
         if verdict is None or verdict.state == State.ACCEPTED:
             continue
         seconds = (closure.query_stamp_ns - closure.match_stamp_ns) * 1e-9
@@ -202,7 +185,7 @@ def final_verdicts(about: ExaminedRun) -> list[str]:
     return lines if more <= 0 else [*lines[:MOST_LINES], f"... and {more} more in graph_verdicts.csv"]
 
 
-def describe(closure: LoopClosure, inliers: int, judged: JudgedClosure | None) -> str:
+def describe(closure: LoopClosure, inliers: int, judged: Judged | None) -> str:
     """One line for the picture of a closure."""
     shift_m, turn_deg = size_of(closure.match_T_query)
     text = f"{shift_m:.2f} m, {turn_deg:.1f} deg apart   p {closure.probability:.3f}   {inliers} image inliers"
@@ -211,21 +194,19 @@ def describe(closure: LoopClosure, inliers: int, judged: JudgedClosure | None) -
     return f"{text}   {'true' if judged.is_true else 'FALSE'}, {judged.translation_error_m:.2f} m off"
 
 
-def closure_rows(about: ExaminedRun) -> list[ClosureRow]:
+def closure_rows(about: JudgedRun) -> list[list[str]]:
     """The page's table: seconds since the first keyframe, figures, the graph's verdict and the truth's."""
-    known = about.judged.by_endpoints()
-    start = int(about.run.stamps[0]) if len(about.run.stamps) else 0
-    rows = []
+    rows, start = [], int(about.run.stamps[0]) if len(about.run.stamps) else 0
     for number, closure in enumerate(about.run.closures, 1):
         at_s, back_s = ((closure.query_stamp_ns - other) * 1e-9 for other in (start, closure.match_stamp_ns))
         shift_m, turn_deg = size_of(closure.match_T_query)
-        verdict, judged = about.run.verdicts.get(endpoints(closure)), known.get(endpoints(closure))
+        verdict, judged = about.run.verdicts.get(closure.endpoints), about.by_endpoints.get(closure.endpoints)
         figures = [f"{at_s:.1f}", f"{back_s:.1f}", f"{shift_m:.2f}", f"{turn_deg:.1f}", f"{closure.probability:.4f}"]
-        errors, word, mark = ["", "", ""], "", ""
+        errors = ["", "", "", ""]
         if judged is not None:
             errors = [f"{value:.3g}" for value in (judged.translation_error_m, judged.rotation_error_deg, judged.nees)]
-            word, mark = ("yes", "good") if judged.is_true else ("NO", "bad")
-        rows.append(ClosureRow([str(number), *figures, verdict.state if verdict else "", *errors], word, mark))
+            errors.append("yes" if judged.is_true else "NO")
+        rows.append([str(number), *figures, verdict.state if verdict else "", *errors])
     return rows
 
 
@@ -292,13 +273,13 @@ def finish_run(
     run = read_run(folder, bag, ground_truth)
     with console.status("Judging, drawing and writing the report"):
         about = judge(run, bag)
-        draw_trajectory(run, about.judged)
-        inliers = _read_inliers(folder / "inliers.csv")
+        draw_trajectory(about)
+        inliers = read_inliers(folder / "inliers.csv")
         pairs = pairs_of(about)
-        shown = [stamp for pair in by_need(pairs)[:MAX_SHOWN] for stamp in pair.endpoints]
+        shown = [stamp for key in by_need(pairs)[:MAX_SHOWN] for stamp in key]
         rows = np.linspace(0, len(run.closures) - 1, min(len(run.closures), MAX_PICTURES)).astype(int)
         chosen = [run.closures[row] for row in rows]
-        gallery = Gallery(shown, (s for one in chosen for s in endpoints(one)), drawn_trajectory(about))
+        gallery = Gallery(shown, (stamp for one in chosen for stamp in one.endpoints), drawn_trajectory(about))
         about = replace(about, sensors=walk(bag, run.settings, gallery, _odometry_file(run), run.odometry))
         _draw_matches(about, chosen, gallery, inliers)
         findings = look_first(about)
@@ -308,14 +289,13 @@ def finish_run(
     return verdict
 
 
-def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> ExaminedRun:
+def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> JudgedRun:
     """Hold the run against the truth, if there is one, and fill in the `ground_truth` of its summary, to keep or not.
 
     A truth that covers nothing of a run that was judged before raises an `UmfError`.
     """
-    judged = JudgedRun()
+    judged = judge_run(run, bag)
     if run.truth is not None:
-        judged = judge_run(run.keyframes, run.truth, run.closures, run.settings.loop, run.odometry, run.optimized)
         covered, total = judged.covered
         if not covered and total and run.summary["ground_truth"]:
             raise UmfError(
@@ -325,32 +305,41 @@ def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> Examin
         run.summary["ground_truth"] = judged.summary() if covered or not total else None
     if keep:
         write_summary(run.folder, run.summary)
-    places = TruePlaces(run)
-    return ExaminedRun(run, judged, places, GateDiagnosis(run, places), bag)
+    return judged
 
 
-def draw_trajectory(run: FinishedRun, judged: JudgedRun) -> None:
+def draw_trajectory(about: JudgedRun) -> None:
     """Write trajectory.png: everything in the frame of the truth, or of the odometry without one."""
+    run, verdicts = about.run, list[bool | None]()
     colours = {"ground truth": TRUTH, "odometry": ODOMETRY, "optimised": OPTIMISED}
     curves = [(name, colours[name], positions) for name, positions in named_curves(run).items()]
-    plot_trajectories(run.folder / "trajectory.png", curves, *_closure_lines(run, judged))
+    ends: Array = np.empty((0, 2, 3))
+    if reference := run.truth or run.optimized or run.odometry:
+        poses, known = reference.at(np.array([one.endpoints for one in run.closures], np.int64).ravel())
+        both = known.reshape(-1, 2).all(axis=1)
+        ends = poses[:, :3, 3].reshape(-1, 2, 3)[both]
+        judged = [about.by_endpoints.get(run.closures[row].endpoints) for row in np.flatnonzero(both)]
+        verdicts = [None if one is None else bool(one.is_true) for one in judged]
+    plot_trajectories(run.folder / "trajectory.png", curves, ends, verdicts)
 
 
 def _draw_matches(
-    about: ExaminedRun, chosen: list[LoopClosure], gallery: Gallery, inliers: dict[Endpoints, Array]
+    about: JudgedRun, chosen: list[LoopClosure], gallery: Gallery, inliers: dict[Endpoints, Array]
 ) -> None:
     """Write matches/*.png for closures spread over the run."""
     target = about.run.folder / "matches"
     target.mkdir(exist_ok=True)
-    known = about.judged.by_endpoints()
-    for closure in chosen:
-        key = endpoints(closure)
+
+    def draw(closure: LoopClosure) -> None:
+        key = closure.endpoints
         query, match = (gallery.images.get(stamp) for stamp in key)
-        if query is None or match is None:
-            continue
-        lines = inliers.get(key, np.empty((0, 4)))
-        picture = draw_match(query, match, lines, describe(closure, len(lines), known.get(key)))
-        cv2.imwrite(str(target / f"{key[0]}_{key[1]}.png"), picture)
+        if query is not None and match is not None:
+            lines = inliers.get(key, np.empty((0, 4)))
+            picture = draw_match(query, match, lines, describe(closure, len(lines), about.by_endpoints.get(key)))
+            cv2.imwrite(str(target / f"{key[0]}_{key[1]}.png"), picture)
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(draw, chosen))
 
 
 def _odometry_file(run: FinishedRun) -> Trajectory | None:
@@ -359,28 +348,3 @@ def _odometry_file(run: FinishedRun) -> Trajectory | None:
     if not named or not Path(named["path"]).is_file():
         return None
     return read_odometry(named["path"], named["frame"], run.settings)
-
-
-def _closure_lines(run: FinishedRun, judged: JudgedRun) -> tuple[Array, list[bool | None]]:
-    """Positions (K, 2, 3) of both endpoints of every closure, and whether each is true."""
-    reference = run.truth or run.optimized or run.odometry
-    if reference is None or not run.closures:
-        return np.empty((0, 2, 3)), []
-    poses, known = reference.at(np.array([endpoints(closure) for closure in run.closures], np.int64).ravel())
-    both = known.reshape(-1, 2).all(axis=1)
-    verdicts = {key: found.is_true for key, found in judged.by_endpoints().items()}
-    kept = [verdicts.get(endpoints(run.closures[i])) for i in np.flatnonzero(both)]
-    return poses[:, :3, 3].reshape(-1, 2, 3)[both], kept
-
-
-def _read_inliers(path: Path) -> dict[Endpoints, Array]:
-    """Pixels (K, 4) of the inliers of every closure, in its query and its match."""
-
-    def parse(row: dict[str, str]) -> tuple[Endpoints, list[float]]:
-        query, match, *pixels = (row[name] for name in INLIERS)
-        return (int(query), int(match)), [float(pixel) for pixel in pixels]
-
-    lines: dict[Endpoints, list[list[float]]] = defaultdict(list)
-    for key, pixels in read_table(path, parse):
-        lines[key].append(pixels)
-    return {key: np.array(rows) for key, rows in lines.items()}

@@ -1,43 +1,67 @@
-"""One SQLite file per run, written as it goes; the CSV tables are exported from it.
+"""One SQLite file per run, written as it goes, and the CSV tables that are exported from it.
 
-A damaged file raises an `UmfError`, a file that cannot be written an `OutputError`.
+A damaged file or table raises an `UmfError`, one that cannot be written an `OutputError`.
 """
 
 from __future__ import annotations
 
+import csv
+import json
 import sqlite3
-from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from umf_ros.core.errors import UmfError, writing
-from umf_ros.core.frames import LoopClosure, Points
-from umf_ros.core.geometry import Array
-from umf_ros.core.io import Schema, SqliteFile
-from umf_ros.runs import tables
+from umf_ros.core.frames import Candidate, LoopClosure, Points
+from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
+from umf_ros.core.io import Schema, SqliteFile, atomic_write
+from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureReason, ClosureVerdict, State
+from umf_ros.verification.hypothesis import ACCEPTED, Hypothesis, RejectReason
 
 NAME = "run.sqlite"
+POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
+SIGMA = ["sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"]
+CLOSURES = ["query_stamp_ns", "match_stamp_ns", *POSE, *SIGMA, "probability", "similarity", "covariance"]
+STAGES = ("embed", "query", "verify", "submaps", "total")
+COLUMNS = {
+    "keyframes": ["stamp_ns", "session", "travelled_m"],
+    "latencies": ["stamp_ns", *STAGES],
+    "candidates": ["query_stamp_ns", "match_stamp_ns", "similarity", "reason", "detail", "numbers"],
+    "closures": CLOSURES,
+    "inliers": ["query_stamp_ns", "match_stamp_ns", "query_u", "query_v", "match_u", "match_v"],
+    "closures_between": ["match_robot", *CLOSURES],
+    "localization": ["stamp_ns", *POSE, *SIGMA, "probability"],
+}
+"""Columns of each table, which is exported as `<name>.csv`."""
 ALWAYS = ("keyframes", "latencies", "candidates", "closures", "inliers")
 """Tables that are exported without rows too."""
+KEYFRAME = np.dtype([("stamp_ns", np.int64), ("session", np.int64), ("path_length_m", float)])
+SCHEMA = Schema(
+    "run",
+    migrations=(
+        (
+            # the text of the CSV file is kept in its columns
+            *(f"CREATE TABLE {name} ({', '.join(columns)})" for name, columns in COLUMNS.items()),
+            # odometry messages that came before the closure
+            "ALTER TABLE closures ADD COLUMN odometry_before INTEGER",
+            "CREATE TABLE descriptor (stamp_ns INTEGER, data BLOB NOT NULL)",
+            "CREATE TABLE odometry (number INTEGER PRIMARY KEY, stamp_ns INTEGER, odom_T_body BLOB)",
+            "CREATE TABLE about (name TEXT PRIMARY KEY, value)",
+        ),
+        ("ALTER TABLE odometry ADD COLUMN covariance BLOB",),
+    ),
+)
+Row = TypeVar("Row")
 
-
-def _create(connection: sqlite3.Connection) -> None:
-    """Create a table for every CSV file, in whose columns the text of the CSV file is kept, and the others."""
-    for name, columns in tables.COLUMNS.items():
-        connection.execute(f"CREATE TABLE {name} ({', '.join(columns)})")
-    # odometry messages that came before the closure
-    connection.execute("ALTER TABLE closures ADD COLUMN odometry_before INTEGER")
-    connection.execute("CREATE TABLE descriptor (stamp_ns INTEGER, data BLOB NOT NULL)")
-    connection.execute("CREATE TABLE odometry (number INTEGER PRIMARY KEY, stamp_ns INTEGER, odom_T_body BLOB)")
-    connection.execute("CREATE TABLE about (name TEXT PRIMARY KEY, value)")
-
-
-SCHEMA = Schema("run", migrations=(_create, ("ALTER TABLE odometry ADD COLUMN covariance BLOB",)))
+Endpoints = tuple[int, int]
+"""Stamps in ns of a closure's query and match."""
 
 
 class StoredOdometry(NamedTuple):
@@ -85,7 +109,7 @@ class RunFile:
 
     def append(self, table: str, rows: Iterable[Sequence[Any]], **more: Any) -> None:
         """Add rows to a table, within a transaction; `more` are values of columns that are not exported."""
-        columns = [*tables.COLUMNS[table], *more]
+        columns = [*COLUMNS[table], *more]
         statement = f"INSERT INTO {table} ({', '.join(columns)}) VALUES ({', '.join('?' * len(columns))})"
         self._file.connection.executemany(statement, ([*row, *more.values()] for row in rows))
 
@@ -111,27 +135,30 @@ class RunFile:
 
     def rows(self, table: str) -> list[tuple[Any, ...]]:
         """Rows of a table in the columns of its CSV file, in the order in which they came."""
-        return self._select(f"SELECT {', '.join(tables.COLUMNS[table])} FROM {table} ORDER BY rowid")
+        with self._file.reading() as connection:
+            return connection.execute(f"SELECT {', '.join(COLUMNS[table])} FROM {table} ORDER BY rowid").fetchall()
 
     def closures(self) -> list[LoopClosure]:
         """The closures of the run."""
         with self._file.reading():
-            rows = self.rows("closures")
-            return [tables.parse_closure(dict(zip(tables.CLOSURES, map(str, row), strict=True))) for row in rows]
+            return [parse_closure(dict(zip(CLOSURES, row, strict=True))) for row in self.rows("closures")]
 
-    def odometry(self) -> Iterator[StoredOdometry]:
+    def odometry(self) -> list[StoredOdometry]:
         """The odometry of the run in the order in which it came."""
-        for _, stamp_ns, data, *spread in self._select("SELECT * FROM odometry ORDER BY number"):
-            with self._file.reading():
+        found = []
+        with self._file.reading() as connection:
+            # files of an earlier release have no column of covariances
+            for _, stamp_ns, data, *spread in connection.execute("SELECT * FROM odometry ORDER BY number"):
                 pose = np.vstack([np.frombuffer(data, np.float64).reshape(3, 4), (0, 0, 0, 1)])
-                # files of an earlier release have no column of covariances
                 tracked = bool(spread) and spread[0] is not None
                 covariance = np.frombuffer(spread[0], np.float64).reshape(6, 6) if tracked else None
-            yield StoredOdometry(int(stamp_ns), pose, covariance)
+                found.append(StoredOdometry(int(stamp_ns), pose, covariance))
+        return found
 
     def graph_inputs(self) -> Iterator[LoopClosure | StoredOdometry]:
         """Odometry and closures in the order in which the graph got them."""
-        before = self._select("SELECT odometry_before FROM closures ORDER BY rowid")
+        with self._file.reading() as connection:
+            before = connection.execute("SELECT odometry_before FROM closures ORDER BY rowid").fetchall()
         waiting = deque(zip((number for (number,) in before), self.closures(), strict=True))
         for number, odometry in enumerate(self.odometry()):
             while waiting and waiting[0][0] <= number:
@@ -147,10 +174,10 @@ class RunFile:
 
     def export(self, localizing: bool = False) -> None:
         """Write the CSV tables; that of the poses in a map also without rows where the run is localising."""
-        for name, columns in tables.COLUMNS.items():
+        for name, columns in COLUMNS.items():
             rows = self.rows(name)
             if rows or name in ALWAYS or (localizing and name == "localization"):
-                tables.write_table(self._folder / f"{name}.csv", columns, rows)
+                write_table(self._folder / f"{name}.csv", columns, rows)
 
     def close(self) -> None:
         """Write the odometry in hand, and close the file."""
@@ -165,36 +192,137 @@ class RunFile:
             with suppress(OSError):
                 self._path.with_name(f"{NAME}.lock").unlink()
 
-    def _select(self, statement: str) -> list[tuple[Any, ...]]:
-        with self._file.reading() as connection:
-            return connection.execute(statement).fetchall()
-
 
 def _set_aside(folder: Path) -> None:
     """Rename the tables that an earlier release left, before the tables of a new run take their names."""
-    for path in [found for name in tables.COLUMNS if (found := folder / f"{name}.csv").exists()]:
+    for path in [found for name in COLUMNS if (found := folder / f"{name}.csv").exists()]:
         with writing(path):
             path.rename(next(name for i in count(1) if not (name := path.with_suffix(f".{i}.csv")).exists()))
 
 
-def all_descriptors(folder: Path) -> Points:
-    """Descriptors (N, D) float32 of all keyframes of a run, in order; an error where it has none."""
-    found = _descriptors(folder)
-    if not found:
-        raise UmfError(f"{folder} holds no descriptors of keyframes")
-    return np.stack(list(found.values()))
-
-
-def read_descriptors(folder: Path, stamps_ns: Sequence[int]) -> Points | None:
-    """Descriptors (N, D) float32 of keyframes by their stamps; None where one has none, as of an older release."""
-    found = _descriptors(folder)
-    if not stamps_ns or any(stamp not in found for stamp in stamps_ns):
-        return None
-    return np.stack([found[stamp] for stamp in stamps_ns])
-
-
-def _descriptors(folder: Path) -> dict[int, Points]:
+def read_descriptors(folder: Path) -> dict[int, Points]:
+    """Descriptors (D,) float32 of the keyframes of a run by their stamps, in order; none of an older release's."""
     if not (folder / NAME).is_file():
         return {}
     with closing(RunFile(folder, read_only=True)) as file:
         return file.descriptors()
+
+
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV file in one step.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with atomic_write(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:
+    """Row of `closures.csv`: `match_T_query`, one sigma per axis of the match body, probability, covariance.
+
+    Of the covariance the upper triangle is written, row by row, 21 numbers in one cell.
+    """
+    numbers = [*pose_numbers(closure.match_T_query, closure.covariance), closure.probability, similarity]
+    triangle = " ".join(f"{value:.9g}" for value in closure.covariance[np.triu_indices(6)])
+    return [*closure.endpoints, *(f"{number:.9g}" for number in numbers), triangle]
+
+
+def pose_numbers(pose: Array, covariance: Array) -> list[float]:
+    """The values of `POSE` and `SIGMA`: of a pose (4, 4), and the roots of the diagonal of its covariance (6, 6)."""
+    return [*pose[:3, 3], *to_quaternion(pose), *np.sqrt(np.diag(covariance))]
+
+
+def candidate_row(hypothesis: Hypothesis) -> list[Any]:
+    """Row of `candidates.csv`: the reason with its figures, and all measurements as JSON."""
+    numbers = json.dumps({name: float(f"{value:.6g}") for name, value in hypothesis.numbers.items()})
+    reason = hypothesis.reason.value if hypothesis.reason else ACCEPTED
+    similarity = f"{hypothesis.candidate.similarity:.6f}"
+    return [*hypothesis.endpoints, similarity, reason, hypothesis.detail, numbers]
+
+
+def inlier_rows(hypothesis: Hypothesis) -> list[list[Any]]:
+    """Rows of `inliers.csv`: pixels of both left images that see the same point."""
+    pixels = hypothesis.inlier_pixels.tolist()
+    return [[*hypothesis.endpoints, *(f"{value:.1f}" for value in one)] for one in pixels]
+
+
+def read_table(path: Path, parse: Callable[[dict[str, str]], Row]) -> list[Row]:
+    """Return the result of `parse` for every row, which is given by column."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            return [parse(row) for row in reader]
+    except OSError as error:
+        raise UmfError(f"cannot read {path}: {error.strerror}") from None
+    except (KeyError, TypeError, ValueError, csv.Error):
+        raise UmfError(f"{path}, line {reader.line_num}: not a row of this table") from None
+
+
+def parse_candidate(row: dict[str, str]) -> Hypothesis:
+    """The hypothesis in a row of `candidates.csv`; a reason of another version is kept as its detail."""
+    numbers = {name: float(value) for name, value in json.loads(row["numbers"]).items()}
+    candidate = Candidate(-1, int(row["match_stamp_ns"]), float(row["similarity"]))
+    probability, measurements = numbers.pop("probability", None), {"similarity": candidate.similarity} | numbers
+    found = Hypothesis(int(row["query_stamp_ns"]), candidate, measurements, probability=probability)
+    if row["reason"] != ACCEPTED:
+        try:
+            found.reject(RejectReason(row["reason"]), row.get("detail") or "")
+        except ValueError:
+            found.reject(RejectReason.UNKNOWN, row["reason"])
+    return found
+
+
+def read_verdicts(path: Path, closures: Iterable[LoopClosure]) -> dict[Endpoints, ClosureVerdict]:
+    """The graph's verdicts on closures of a run by their endpoints; none without a graph."""
+    known = {one.endpoints: one for one in closures}
+
+    def parse(row: dict[str, str]) -> ClosureVerdict | None:
+        match, query, state, reason, residual, residual_m = (row[name] for name in VERDICT_COLUMNS)
+        closure = known.get((int(query), int(match)))
+        decision = State(state), ClosureReason(reason), float(residual), float(residual_m)
+        return None if closure is None else ClosureVerdict(closure, *decision)
+
+    found = read_table(path, parse) if path.is_file() else []
+    return {one.closure.endpoints: one for one in found if one is not None}
+
+
+def read_keyframes(path: Path) -> NDArray[np.void]:
+    """The keyframes in the order of their stamps: (N,) `stamp_ns`, `session`, and `path_length_m`, NaN if unknown."""
+    rows = read_table(path, lambda row: (int(row["stamp_ns"]), int(row["session"]), float(row["travelled_m"])))
+    return np.array(rows, KEYFRAME)
+
+
+def read_inliers(path: Path) -> dict[Endpoints, Array]:
+    """Pixels (K, 4) of the inliers of every closure, in its query and its match."""
+    query, match, *pixels = COLUMNS["inliers"]
+    lines: dict[Endpoints, list[list[float]]] = defaultdict(list)
+
+    def parse(row: dict[str, str]) -> None:
+        lines[int(row[query]), int(row[match])].append([float(row[name]) for name in pixels])
+
+    read_table(path, parse)
+    return {key: np.array(rows) for key, rows in lines.items()}
+
+
+def read_closures(path: Path) -> list[LoopClosure]:
+    """The closures of a `closures.csv`; with a diagonal covariance where an older version wrote no other."""
+    return read_table(path, parse_closure)
+
+
+def parse_closure(row: Mapping[str, Any]) -> LoopClosure:
+    """The closure in a row of `closures.csv`."""
+    numbers = [float(row[name]) for name in CLOSURES[2:16]]
+    covariance = np.diag(np.square(numbers[7:13]))
+    if triangle := (row.get("covariance") or "").split():
+        covariance[np.triu_indices(6)] = [float(number) for number in triangle]
+        covariance = np.triu(covariance) + np.triu(covariance, 1).T
+    return LoopClosure(
+        query_stamp_ns=int(row["query_stamp_ns"]),
+        match_stamp_ns=int(row["match_stamp_ns"]),
+        match_T_query=from_quaternion(numbers[:3], numbers[3:7]),
+        covariance=covariance,
+        probability=numbers[13],
+    )

@@ -3,76 +3,58 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
-from umf_ros.core.frames import LoopClosure, Points
-from umf_ros.core.geometry import Array, align, relative, rotation_angle
+from umf_ros.core.frames import Points
+from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
-from umf_ros.runs.diagnosis import ClosureDiagnosis
-from umf_ros.runs.findings import ExaminedRun
+from umf_ros.runs.diagnosis import ClosureDiagnosis, contributions, explain, missing, most_probable
+from umf_ros.runs.findings import explain_missed
 from umf_ros.runs.gallery import SCAN_UNIT_M, Gallery, Photograph
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.tables import Endpoints
-from umf_ros.runs.truth import JudgedClosure, endpoints, positions_in_truth
+from umf_ros.runs.run_file import Endpoints
+from umf_ros.runs.truth import JudgedRun, pose_in_truth, positions_in_truth
 from umf_ros.verification.hypothesis import Hypothesis
 
-Kind = Literal["accepted", "pending", "rejected", "false", "missed", "tested"]
-ORDER: tuple[Kind, ...] = ("false", "missed", "rejected", "pending", "tested", "accepted")
-"""Of whose pictures come first where not all find room."""
+ORDER = ("false", "missed", "rejected", "pending", "tested", "accepted")
+"""Kinds of pairs: the pictures of the first ones come first where not all find room."""
 MOST = {"missed": 60, "tested": 20, "accepted": 400}
 """Pairs of a kind that are explained in full."""
+Pairs = dict[Endpoints, dict[str, Any]]
+"""Entries of the page about pairs of keyframes, by their stamps."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
-    """Two keyframes, and what became of them.
-
-    Attributes:
-        kind: how it is drawn.
-        number: of the closure, from 1; 0 for what is none.
-        pose: (4, 4) `match_T_query`, or None where no source knows it.
-        pose_source: of the pose.
-        closure, judged, candidate, why: what is known.
-    """
-
-    kind: Kind
-    endpoints: Endpoints
-    number: int
-    pose: Array | None
-    pose_source: str
-    closure: LoopClosure | None = None
-    judged: JudgedClosure | None = None
-    candidate: Hypothesis | None = None
-    why: ClosureDiagnosis | None = None
-
-
-def pairs_of(about: ExaminedRun) -> list[Pair]:
+def pairs_of(about: JudgedRun) -> Pairs:
     """Every closure, the missed revisits, and the most promising of what was rejected before it became one."""
-    run, judged = about.run, about.judged.by_endpoints()
-    tested = {one.endpoints: one for one in run.candidates}
-    pairs = []
-    for number, closure in enumerate(run.closures, 1):
-        key = endpoints(closure)
-        known = closure, judged.get(key), tested.get(key)
-        pairs.append(
-            Pair(_kind(about, key, judged.get(key)), key, number, closure.match_T_query, "the closure", *known)
+    closures = enumerate((one.endpoints for one in about.run.closures), 1)
+    pairs = {key: _describe(about, key, _kind(about, key), number) for number, key in closures}
+    for why in explain_missed(about):
+        if why.match_stamp_ns is not None:
+            key = why.stamp_ns, why.match_stamp_ns
+            pairs[key] = _describe(about, key, "missed", why=why)
+    found = {one.query_stamp_ns for one in about.run.closures}
+    best: dict[int, Hypothesis] = {}  # the most probable candidates of keyframes without a closure
+    for one in sorted(about.run.candidates, key=lambda one: -(one.probability or 0)):
+        if one.query_stamp_ns not in found and one.endpoints not in pairs and one.probability is not None:
+            best.setdefault(one.query_stamp_ns, one)
+    for one in list(best.values())[: MOST["tested"]]:
+        row = about.row(one.query_stamp_ns)
+        pairs[one.endpoints] = _describe(
+            about, one.endpoints, "tested", why=None if row is None else explain(about, row)
         )
-    pairs += _missed(about, tested)
-    return pairs + _nearly(about, {pair.endpoints for pair in pairs}, {one.query_stamp_ns for one in run.closures})
+    return pairs
 
 
-def by_need(pairs: Sequence[Pair]) -> list[Pair]:
+def by_need(pairs: Pairs) -> list[Endpoints]:
     """The pairs whose details are worth their room, the most telling first, spread over the run."""
-    chosen: list[Pair] = []
+    chosen: list[Endpoints] = []
     for kind in ORDER:
-        mine = [pair for pair in pairs if pair.kind == kind]
-        most = MOST.get(kind, len(mine))
-        chosen += [mine[i] for i in _spread(len(mine), most)]
+        mine = [key for key, pair in pairs.items() if pair["kind"] == kind]
+        chosen += [mine[i] for i in _spread(len(mine), MOST.get(kind, len(mine)))]
     return chosen
 
 
@@ -83,35 +65,57 @@ def _spread(count: int, most: int) -> Iterable[int]:
     return list(dict.fromkeys(kept[i] for stride in strides for i in range(0, len(kept), stride)))
 
 
-def _kind(about: ExaminedRun, key: Endpoints, judged: JudgedClosure | None) -> Kind:
+def _kind(about: JudgedRun, key: Endpoints) -> str:
+    """The kind of a closure."""
+    judged, verdict = about.by_endpoints.get(key), about.run.verdicts.get(key)
     if judged is not None and not judged.is_true:
         return "false"
-    verdict = about.run.verdicts.get(key)
     if verdict is None or verdict.state == State.ACCEPTED:
         return "accepted"
     return "pending" if verdict.state == State.PENDING else "rejected"
 
 
-def _missed(about: ExaminedRun, tested: dict[Endpoints, Hypothesis]) -> list[Pair]:
-    found = [(why, (why.stamp_ns, why.match_stamp_ns)) for why in about.missed() if why.match_stamp_ns is not None]
-    return [Pair("missed", key, 0, *_pose(about, key), candidate=tested.get(key), why=why) for why, key in found]
+def _candidate(about: JudgedRun, key: Endpoints) -> Hypothesis | None:
+    return next((one for one in about.tested[key[0]] if one.endpoints == key), None)
 
 
-def _nearly(about: ExaminedRun, shown: set[Endpoints], found: set[int]) -> list[Pair]:
-    """The most probable candidates of keyframes without a closure."""
-    best: dict[int, Hypothesis] = {}
-    for one in sorted(about.run.candidates, key=lambda one: -(one.probability or 0)):
-        if one.query_stamp_ns not in found and one.endpoints not in shown and one.probability is not None:
-            best.setdefault(one.query_stamp_ns, one)
-    pairs = []
-    for one in list(best.values())[: MOST["tested"]]:
-        row = about.places.row(one.query_stamp_ns)
-        why = about.gates.explain(row) if row is not None else None
-        pairs.append(Pair("tested", one.endpoints, 0, *_pose(about, one.endpoints), candidate=one, why=why))
-    return pairs
+def _describe(
+    about: JudgedRun, key: Endpoints, kind: str, number: int = 0, why: ClosureDiagnosis | None = None
+) -> dict[str, Any]:
+    """The entry of a pair; `number` is that of its closure, 0 without one."""
+    candidate, verdict = _candidate(about, key), about.run.verdicts.get(key)
+    known = about.run.closures[number - 1] if number else candidate
+    told = {
+        "kind": kind,
+        "number": number,
+        "q": about.row(key[0]),
+        "m": about.row(key[1]),
+        "stamps": [str(stamp) for stamp in key],  # no number of a browser holds nanoseconds
+        "p": _number(known.probability if known else None),
+        "s": _number(candidate.candidate.similarity if candidate else None),
+        "graph": f"{verdict.state}: {verdict.reason}{verdict.figures}" if verdict else "",
+        "truth": _truth_words(about, key),
+    }
+    return told if why is None else told | {"why": why.what, "parameter": why.parameter}
 
 
-def _pose(about: ExaminedRun, key: Endpoints) -> tuple[Array | None, str]:
+def _details(about: JudgedRun, key: Endpoints, number: int) -> dict[str, Any]:
+    """The bars of a pair's log-odds, and its pose."""
+    told: dict[str, Any] = {}
+    if (candidate := _candidate(about, key)) is not None:
+        given, lost = contributions(about, candidate), missing(about, candidate)
+        names = sorted({*given, *lost} - {"bias"}, key=lambda name: -(given.get(name, 0) + lost.get(name, 0)))
+        told["bars"] = [[name, round(given.get(name, 0), 2), round(lost.get(name, 0), 2)] for name in names]
+        told["bias"] = round(given.get("bias", 0), 2)
+    pose, source = (about.run.closures[number - 1].match_T_query, "the closure") if number else _pose(about, key)
+    if pose is not None:
+        told["pose"] = [round(float(value), 4) for value in pose[:3].ravel()]
+        shift_m, turn_deg = size_of(pose)
+        told |= {"pose_source": source, "shift_m": round(shift_m, 2), "turn_deg": round(turn_deg, 1)}
+    return told
+
+
+def _pose(about: JudgedRun, key: Endpoints) -> tuple[Array | None, str]:
     """Where the two stood by the truth, else by the optimised trajectory: the run keeps no pose of what it rejected."""
     run = about.run
     with_turns = run.truth if run.truth is not None and run.truth.has_orientation else None
@@ -124,47 +128,17 @@ def _pose(about: ExaminedRun, key: Endpoints) -> tuple[Array | None, str]:
     return None, ""
 
 
-def describe(about: ExaminedRun, pair: Pair, full: bool) -> dict[str, Any]:
-    """Describe a pair for the page; the bars and the pose only in full."""
-    query, match = (about.places.row(stamp) for stamp in pair.endpoints)
-    known, verdict = pair.closure or pair.candidate, about.run.verdicts.get(pair.endpoints)
-    told: dict[str, Any] = {
-        "kind": pair.kind,
-        "number": pair.number,
-        "q": query,
-        "m": match,
-        "stamps": [str(stamp) for stamp in pair.endpoints],  # no number of a browser holds nanoseconds
-        "p": _number(known.probability if known else None),
-        "s": _number(pair.candidate.candidate.similarity if pair.candidate else None),
-        "graph": f"{verdict.state}: {verdict.reason}{verdict.figures}" if verdict else "",
-        "truth": _truth_words(pair),
-    }
-    if pair.why is not None:
-        told["why"], told["parameter"] = pair.why.what, pair.why.parameter
-    if not full:
-        return told
-    if pair.candidate is not None:
-        given, missing = about.gates.contributions(pair.candidate), about.gates.missing(pair.candidate)
-        names = sorted({*given, *missing} - {"bias"}, key=lambda name: -(given.get(name, 0) + missing.get(name, 0)))
-        told["bars"] = [[name, round(given.get(name, 0), 2), round(missing.get(name, 0), 2)] for name in names]
-        told["bias"] = round(given.get("bias", 0), 2)
-    if pair.pose is not None:
-        told["pose"] = [round(float(value), 4) for value in pair.pose[:3].ravel()]
-        told["pose_source"] = pair.pose_source
-        shift_m, turn_deg = size_of(pair.pose)
-        told |= {"shift_m": round(shift_m, 2), "turn_deg": round(turn_deg, 1)}
-    return told
-
-
 def size_of(pose: Array) -> tuple[float, float]:
     """Metres and degrees of a pose (4, 4)."""
     return float(np.linalg.norm(pose[:3, 3])), float(np.degrees(rotation_angle(pose)))
 
 
-def _truth_words(pair: Pair) -> str:
-    judged = pair.judged
+def _truth_words(about: JudgedRun, key: Endpoints) -> str:
+    """Error of a closure, or distance of two keyframes in truth; empty where it is unknown."""
+    judged = about.by_endpoints.get(key)
     if judged is None:
-        return "" if pair.why is None or not np.isfinite(pair.why.distance_m) else f"{pair.why.distance_m:.1f} m apart"
+        distance_m = about.distance(*key)
+        return f"{distance_m:.1f} m apart" if np.isfinite(distance_m) else ""
     turned = f", {judged.rotation_error_deg:.2f} deg" if np.isfinite(judged.rotation_error_deg) else ""
     return f"{'true' if judged.is_true else 'FALSE'}: {judged.translation_error_m:.2f} m{turned} off"
 
@@ -183,36 +157,29 @@ MEDIA_BYTES = 3_600_000
 MAX_INLIERS = 60
 
 
-def drawn_trajectory(about: ExaminedRun) -> Trajectory | None:
+def drawn_trajectory(about: JudgedRun) -> Trajectory | None:
     """The best trajectory that a run has, in the frame that everything is drawn in."""
     run = about.run
     best = run.optimized or run.odometry
     if best is None:
         return run.truth
-    if len(best) < 3:
-        return best
-    # the positions are the trajectory's own, moved rigidly
-    moved = align(best.poses[:, :3, 3], positions_in_truth(best, run.truth))[0]
-    return Trajectory(best.stamps_ns, np.asarray(moved @ best.poses), best.has_orientation)
+    return Trajectory(best.stamps_ns, pose_in_truth(best, run.truth) @ best.poses, best.has_orientation)
 
 
-def build_scene(
-    about: ExaminedRun, pairs: list[Pair], gallery: Gallery, inliers: dict[Endpoints, Array]
-) -> dict[str, Any]:
+def build_scene(about: JudgedRun, pairs: Pairs, gallery: Gallery, inliers: Mapping[Endpoints, Array]) -> dict[str, Any]:
     """The scene: curves, keyframes, pairs with their pictures, matrix, threshold, errors and map."""
-    photographs, scans = _media(pairs, gallery)
-    full = {pair.endpoints for pair in by_need(pairs)}
-    told = [describe(about, pair, pair.endpoints in full) for pair in pairs]
-    for one, pair in zip(told, pairs, strict=True):
-        lines = inliers.get(pair.endpoints)
-        if lines is not None and str(pair.endpoints[0]) in photographs:
-            chosen = np.linspace(0, len(lines) - 1, min(len(lines), MAX_INLIERS)).astype(int)
-            one["inliers"] = np.rint(lines[chosen]).astype(int).tolist() if len(lines) else []
-            one["inlier_count"] = len(lines)
+    chosen = by_need(pairs)
+    photographs, scans = _media(chosen, gallery)
+    for key in chosen:
+        pairs[key] |= _details(about, key, pairs[key]["number"])
+    for key, lines in inliers.items():
+        if key in pairs and str(key[0]) in photographs:
+            few = lines[np.linspace(0, len(lines) - 1, min(len(lines), MAX_INLIERS)).astype(int)]
+            pairs[key] |= {"inliers": np.rint(few).astype(int).tolist(), "inlier_count": len(lines)}
     return {
-        "curves": _curves(about.run),
+        "curves": [{"name": name, "xyz": _thin(xyz).T.tolist()} for name, xyz in named_curves(about.run).items()],
         "keyframes": _keyframes(about),
-        "pairs": told,
+        "pairs": list(pairs.values()),
         "photographs": photographs,
         "scans": scans,
         "scan_unit_m": SCAN_UNIT_M,
@@ -224,14 +191,14 @@ def build_scene(
     }
 
 
-def _media(pairs: list[Pair], gallery: Gallery) -> tuple[dict[str, Photograph], dict[str, str]]:
+def _media(pairs: Iterable[Endpoints], gallery: Gallery) -> tuple[dict[str, Photograph], dict[str, str]]:
     """Photographs and scans by stamp, of the most telling pairs first, as many as find room."""
     room = MEDIA_BYTES
     photographs: dict[str, Photograph] = {}
     scans: dict[str, str] = {}
-    for stamp in dict.fromkeys(stamp for pair in by_need(pairs) for stamp in pair.endpoints):
+    for stamp in dict.fromkeys(stamp for key in pairs for stamp in key):
         photograph, scan = gallery.photographs.get(stamp), gallery.scans.get(stamp, "")
-        size = (len(photograph.address) if photograph else 0) + len(scan)
+        size = (len(photograph[0]) if photograph else 0) + len(scan)
         if size <= room:
             room -= size
             scans[str(stamp)] = scan
@@ -246,28 +213,22 @@ def named_curves(run: FinishedRun) -> dict[str, Array]:
     return {name: positions_in_truth(one, run.truth) for name, one in known.items() if one is not None}
 
 
-def _curves(run: FinishedRun) -> list[dict[str, Any]]:
-    return [{"name": name, "xyz": _thin(positions).T.tolist()} for name, positions in named_curves(run).items()]
-
-
-def _keyframes(about: ExaminedRun) -> dict[str, Any]:
-    run, places = about.run, about.places
-    start = int(places.stamps[0]) if len(places.stamps) else 0
+def _keyframes(about: JudgedRun) -> dict[str, Any]:
+    run, stamps = about.run, about.run.stamps.tolist()
     best: dict[int, float] = {}
     for one in run.candidates:
         best[one.query_stamp_ns] = max(best.get(one.query_stamp_ns, -1.0), one.candidate.similarity)
     return {
-        "t": [round((int(stamp) - start) * 1e-9, 3) for stamp in places.stamps],
+        "t": [round((stamp - stamps[0]) * 1e-9, 3) for stamp in stamps],
         "xy": np.round(_positions(about), 3).tolist(),
-        "way": [_number(row.path_length_m) for row in run.keyframes],
-        "similarity": [_number(best.get(int(stamp))) for stamp in places.stamps],
-        "latency": [_number(run.latencies_ms.get(int(stamp))) for stamp in places.stamps],
+        "similarity": [_number(best.get(stamp)) for stamp in stamps],
+        "latency": [_number(run.latencies_ms.get(stamp)) for stamp in stamps],
     }
 
 
-def _positions(about: ExaminedRun) -> Array:
+def _positions(about: JudgedRun) -> Array:
     """(N, 2) of the keyframes where they are drawn; on a circle where their poses are unknown."""
-    stamps, drawn = about.places.stamps, drawn_trajectory(about)
+    stamps, drawn = about.run.stamps, drawn_trajectory(about)
     if drawn is not None:
         poses, known = drawn.at(stamps)
         if known.any():
@@ -288,17 +249,17 @@ def _similarity(descriptors: Points | None) -> dict[str, Any] | None:
     return {"rows": rows.tolist(), "data": base64.b64encode(matrix.tobytes()).decode("ascii")}
 
 
-def _sweep(about: ExaminedRun) -> list[list[float | int]]:
+def _sweep(about: JudgedRun) -> list[list[float | int]]:
     """Per keyframe with candidates: best probability, 1 or 0 for the same place or not and -1 for unknown, revisit."""
     rows: list[list[float | int]] = []
-    right = {one.closure.query_stamp_ns: one.is_true for one in about.judged.closures}
-    for row, stamp in enumerate(map(int, about.places.stamps)):
-        best, revisit = about.gates.most_probable(stamp), int(len(about.places.same_places(row)) > 0)
+    right = dict(zip(about.closures.query_stamp_ns.tolist(), about.closures.is_true.tolist(), strict=True))
+    for row, stamp in enumerate(map(int, about.run.stamps)):
+        best, revisit = most_probable(about, stamp), int(len(about.same_places(row)) > 0)
         if best is None:
             if revisit:
                 rows.append([0, 0, 1])
             continue
-        same = about.places.is_same_place(stamp, best.match_stamp_ns)
+        same = about.is_same_place(stamp, best.match_stamp_ns)
         if best.accepted and stamp in right:
             same = right[stamp]
         rows.append([round(best.probability or 0, 4), -1 if same is None else int(same), revisit])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import isfinite, nan, radians
+from functools import cached_property
+from math import inf, isfinite, nan, radians
 from typing import Any
 
 import numpy as np
@@ -12,13 +14,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
+from umf_ros.bags.reader import Bag
+from umf_ros.bags.sensor_check import SensorReport
 from umf_ros.core.config import Loop
 from umf_ros.core.frames import LoopClosure
-from umf_ros.core.geometry import Array, align, heading, invert, relative, rotation_angle, transform, wrap_angle
-from umf_ros.core.keyframes import is_past
+from umf_ros.core.geometry import Array, align, heading, invert, relative, transform, wrap_angle
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.places.database import is_past
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.tables import Endpoints, KeyframeRow
+from umf_ros.runs.run_file import Endpoints
+from umf_ros.verification.hypothesis import Hypothesis
 
 CONFIDENCE = 0.95
 MEDIAN_EXPECTED = float(chdtri(6, 0.5))
@@ -67,53 +72,57 @@ POSE_TOLERANCE_DEG = 5.0
 Stamps = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
-class JudgedClosure:
-    """A published closure held against the truth.
-
-    Attributes:
-        closure: the closure.
-        distance_m: distance of the two keyframes in truth.
-        translation_error_m: error of the relative translation; of its length where the truth has no orientation.
-        rotation_error_deg: error of the relative rotation, NaN where the truth has no orientation.
-        is_true: whether the closure is right.
-        nees: normalised error squared under the stated covariance, NaN where the truth has no orientation.
-    """
-
-    closure: LoopClosure
-    distance_m: float
-    translation_error_m: float
-    rotation_error_deg: float
-    is_true: bool
-    nees: float = nan
+Judged = Any
+"""(K,) closures held against the truth, or one of them: a `numpy.recarray` or `numpy.record` of `JUDGED`."""
+JUDGED = np.dtype(
+    [
+        ("query_stamp_ns", np.int64),
+        ("match_stamp_ns", np.int64),
+        ("probability", float),
+        ("distance_m", float),
+        ("translation_error_m", float),
+        ("rotation_error_deg", float),
+        ("nees", float),
+        ("is_true", bool),
+    ]
+)
+"""Stamps and probability of a closure, distance of its keyframes in truth, errors of its relative pose, its normalised
+error squared under the stated covariance, and whether it is right. Where the truth has no orientation, the error of the
+translation is that of its length, and those of rotation and normalised error are NaN."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class JudgedRun:
-    """A run held against the truth.
+    """A run held against the truth, as far as there is one, with all else that is known about it.
 
     Attributes:
-        closures: one per closure whose endpoints the truth covers.
+        run: files of the run.
+        closures: those whose endpoints the truth covers.
         revisits: keyframes that saw an earlier place again, in about the same direction.
         ate_odometry_m: error of the odometry, or None without odometry.
         ate_optimized_m: error of the optimised trajectory, or None.
         any_heading: keyframes that were near an earlier place again, and those of them with a true closure.
         covered: keyframes whose pose the truth knows, and keyframes in all.
         missed: stamps of keyframes that saw a place again and have no closure.
+        bag: the recording, or None.
+        sensors: what the recording's measurements say of each other.
     """
 
-    closures: list[JudgedClosure] = field(default_factory=list)
+    run: FinishedRun
+    closures: Judged = field(default_factory=lambda: judge_closures([], np.eye(4)[None], np.eye(4)[None]))
     revisits: int = 0
     ate_odometry_m: float | None = None
     ate_optimized_m: float | None = None
     any_heading: tuple[int, int] = (0, 0)
     covered: tuple[int, int] = (0, 0)
     missed: list[int] = field(default_factory=list)
+    bag: Bag | None = None
+    sensors: SensorReport = field(default_factory=SensorReport)
 
     def summary(self) -> dict[str, Any]:
         """The `ground_truth` entry of `summary.json`."""
-        true = sum(judged.is_true for judged in self.closures)
-        squared = np.array([judged.nees for judged in self.closures if isfinite(judged.nees)])
+        true = int(self.closures.is_true.sum())
+        squared = self.closures.nees[np.isfinite(self.closures.nees)]
         return {
             "closures_true": true,
             "closures_false": len(self.closures) - true,
@@ -128,73 +137,123 @@ class JudgedRun:
             "inside_95": _rounded(share_inside(squared) if len(squared) else None),
         }
 
-    def by_endpoints(self) -> dict[Endpoints, JudgedClosure]:
+    @cached_property
+    def by_endpoints(self) -> dict[Endpoints, Judged]:
         """The judged closures, to be found by the stamps of query and match."""
-        return {endpoints(judged.closure): judged for judged in self.closures}
+        return {(int(one.query_stamp_ns), int(one.match_stamp_ns)): one for one in self.closures}
+
+    @cached_property
+    def tested(self) -> dict[int, list[Hypothesis]]:
+        """The candidates of each keyframe by its stamp, in the order of the reranking."""
+        tested: dict[int, list[Hypothesis]] = defaultdict(list)
+        for candidate in self.run.candidates:
+            tested[candidate.query_stamp_ns].append(candidate)
+        return tested
+
+    @cached_property
+    def _true_poses(self) -> tuple[Array, NDArray[np.bool_]]:
+        """True poses (N, 4, 4) of the keyframes, and (N,) whether each is known."""
+        nowhere = Trajectory(np.empty(0, np.int64), np.empty((0, 4, 4)), has_orientation=False)
+        return (self.run.truth or nowhere).at(self.run.stamps)
+
+    @cached_property
+    def _rows(self) -> dict[int, int]:
+        return {stamp: row for row, stamp in enumerate(self.run.stamps.tolist())}
+
+    def row(self, stamp_ns: int) -> int | None:
+        """Place of a keyframe among all; None where there is none of this stamp."""
+        return self._rows.get(stamp_ns)
+
+    def admissible(self, row: int) -> NDArray[np.bool_]:
+        """(row,) which earlier keyframes the gap rules allow."""
+        now, past = self.run.keyframes[row], self.run.keyframes[:row]
+        ages, path_m = now["stamp_ns"] - past["stamp_ns"], now["path_length_m"] - past["path_length_m"]
+        return is_past(ages, path_m, self.run.settings.loop, past["session"] == now["session"])
+
+    def distances(self, row: int) -> NDArray[np.float64]:
+        """(N,) metres in truth to every keyframe, infinite where it is unknown."""
+        poses, known = self._true_poses
+        apart = np.linalg.norm(poses[:, :3, 3] - poses[row, :3, 3], axis=1)
+        return np.where(known & known[row], apart, np.inf)
+
+    def distance(self, query_ns: int, match_ns: int) -> float:
+        """Metres in truth between two keyframes, infinite where it is unknown."""
+        query, match = self.row(query_ns), self.row(match_ns)
+        return inf if query is None or match is None else float(self.distances(query)[match])
+
+    def same_places(self, row: int) -> NDArray[np.int64]:
+        """Earlier keyframes that are the same place and may be matched, the nearest first."""
+        distances, same_view = self.distances(row)[:row], bool(self.run.truth and self.run.truth.has_orientation)
+        near = np.isfinite(distances) & _near(self._true_poses[0], row, same_view)
+        rows = np.flatnonzero(self.admissible(row) & near)
+        return rows[np.argsort(distances[rows])]
+
+    def is_same_place(self, query_ns: int, match_ns: int) -> bool | None:
+        """Whether the two are within 12 m in truth, whatever their headings; None where that is unknown."""
+        distance_m = self.distance(query_ns, match_ns)
+        return distance_m <= PLACE_RADIUS_M if isfinite(distance_m) else None
 
 
-def endpoints(closure: LoopClosure) -> Endpoints:
-    """Stamps in ns of the closure's query and match: what tells it from every other of a run."""
-    return closure.query_stamp_ns, closure.match_stamp_ns
-
-
-def judge_run(
-    rows: Sequence[KeyframeRow],
-    truth: Trajectory,
-    closures: list[LoopClosure],
-    rules: Loop,
-    odometry: Trajectory | None,
-    optimized: Trajectory | None,
-) -> JudgedRun:
-    """Hold closures, odometry and optimised trajectory of a run with these keyframes against the truth."""
-    stamps = np.array([row.stamp_ns for row in rows], np.int64)
-    poses, known = truth.at(stamps)
-    stamps, poses = stamps[known], poses[known]
-    path_length = np.array([row.path_length_m for row in rows], float)[known]
-    judged = _judge_closures(closures, truth)
+def judge_run(run: FinishedRun, bag: Bag | None = None) -> JudgedRun:
+    """Hold closures, odometry and optimised trajectory of a run against the truth, as far as there is one."""
+    truth, rules = run.truth, run.settings.loop
+    if truth is None:
+        return JudgedRun(run, bag=bag)
+    poses, known = truth.at(run.stamps)
+    stamps, poses, path_length = run.stamps[known], poses[known], run.keyframes["path_length_m"][known]
+    ends, covered = truth.at(np.array([closure.endpoints for closure in run.closures], np.int64).ravel())
+    both = np.flatnonzero(covered.reshape(-1, 2).all(axis=1))
+    query, match = ends.reshape(-1, 2, 4, 4)[both].swapaxes(0, 1)
+    judged = judge_closures([run.closures[row] for row in both], query, match, truth.has_orientation)
     again = find_revisits(stamps, poses, path_length, rules, same_view=False)
     same_view = find_revisits(stamps, poses, path_length, rules, truth.has_orientation)
-    published = {closure.query_stamp_ns for closure in closures}
-    true_queries = {one.closure.query_stamp_ns for one in judged if one.is_true}
+    published = {closure.query_stamp_ns for closure in run.closures}
     return JudgedRun(
+        run,
         closures=judged,
         revisits=int(same_view.sum()),
-        any_heading=(int(again.sum()), int(np.isin(stamps[again], list(true_queries)).sum())),
-        covered=(len(stamps), len(rows)),
-        missed=[int(stamp) for stamp in stamps[same_view] if stamp not in published],
-        ate_odometry_m=trajectory_error(odometry, truth),
-        ate_optimized_m=trajectory_error(optimized, truth),
+        any_heading=(int(again.sum()), int(np.isin(stamps[again], judged.query_stamp_ns[judged.is_true]).sum())),
+        covered=(len(stamps), len(known)),
+        missed=[stamp for stamp in stamps[same_view].tolist() if stamp not in published],
+        ate_odometry_m=trajectory_error(run.odometry, truth),
+        ate_optimized_m=trajectory_error(run.optimized, truth),
+        bag=bag,
     )
 
 
-def _judge_closures(closures: list[LoopClosure], truth: Trajectory) -> list[JudgedClosure]:
-    stamps = np.array([endpoints(closure) for closure in closures], np.int64)
-    poses, known = truth.at(stamps.reshape(-1))
-    ends = zip(closures, poses.reshape(-1, 2, 4, 4), known.reshape(-1, 2), strict=True)
-    return [judge_closure(one, pair[0], pair[1], truth.has_orientation) for one, pair, covered in ends if covered.all()]
-
-
-def judge_closure(
-    closure: LoopClosure, world_T_query: Array, world_T_match: Array, has_orientation: bool = True
-) -> JudgedClosure:
-    """Hold one closure against the truth.
+def judge_closures(
+    closures: Sequence[LoopClosure], world_T_query: Array, world_T_match: Array, has_orientation: bool = True
+) -> Judged:
+    """Hold closures (K,) against true poses (K, 4, 4) of their keyframes.
 
     True means: both keyframes within 12 m of each other [UMF 5.1.2], whatever their headings, and the published
     relative pose within 0.5 m and 5 deg. A truth of positions alone (RTKLIB) checks distances only.
     """
-    truth = relative(world_T_match, world_T_query)
-    distance_m = float(np.linalg.norm(truth[:3, 3]))
+    found: Judged = np.zeros(len(closures), JUDGED).view(np.recarray)
+    if not closures:
+        return found
+    poses, truth = np.stack([one.match_T_query for one in closures]), relative(world_T_match, world_T_query)
+    found.query_stamp_ns, found.match_stamp_ns = np.array([one.endpoints for one in closures], np.int64).T
+    found.probability = [one.probability for one in closures]
+    found.distance_m = np.linalg.norm(truth[:, :3, 3], axis=1)
     if has_orientation:
-        error = invert(truth) @ closure.match_T_query
-        translation_m = float(np.linalg.norm(error[:3, 3]))
-        rotation_deg = float(np.degrees(rotation_angle(error)))
-        nees = float(normalised_errors(pose_error(closure.match_T_query, truth), closure.covariance))
+        error = invert(truth) @ poses
+        found.translation_error_m = np.linalg.norm(error[:, :3, 3], axis=1)
+        found.rotation_error_deg = np.degrees(Rotation.from_matrix(error[:, :3, :3]).magnitude())
+        found.nees = normalised_errors(pose_error(poses, truth), np.stack([one.covariance for one in closures]))
     else:
-        translation_m = abs(float(np.linalg.norm(closure.match_T_query[:3, 3])) - distance_m)
-        rotation_deg, nees = nan, nan
-    pose_ok = translation_m <= POSE_TOLERANCE_M and not rotation_deg > POSE_TOLERANCE_DEG
-    is_true = distance_m <= PLACE_RADIUS_M and pose_ok
-    return JudgedClosure(closure, distance_m, translation_m, rotation_deg, is_true, nees)
+        found.translation_error_m = np.abs(np.linalg.norm(poses[:, :3, 3], axis=1) - found.distance_m)
+        found.rotation_error_deg = found.nees = nan
+    pose_ok = (found.translation_error_m <= POSE_TOLERANCE_M) & ~(found.rotation_error_deg > POSE_TOLERANCE_DEG)
+    found.is_true = (found.distance_m <= PLACE_RADIUS_M) & pose_ok
+    return found
+
+
+def judge_closure(
+    closure: LoopClosure, world_T_query: Array, world_T_match: Array, has_orientation: bool = True
+) -> Judged:
+    """The same of one closure and the true poses (4, 4) of its keyframes."""
+    return judge_closures([closure], world_T_query[None], world_T_match[None], has_orientation)[0]
 
 
 def find_revisits(
@@ -241,72 +300,27 @@ def absolute_trajectory_error(estimate: Array, truth: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((aligned - truth) ** 2, axis=1))))
 
 
-def positions_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Array:
-    """Positions (N, 3) in metres, to be drawn in the frame of the truth.
+def pose_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Array:
+    """Pose (4, 4) of a trajectory's frame in that of the truth, to be drawn there.
 
-    They are joined to the truth at the first pose that it covers, or laid best over a truth without headings.
-    Without a truth, or one that covers fewer than three poses, they stay in the frame of the trajectory.
+    They are joined at the first pose that the truth covers, or laid best over a truth without headings. It is the
+    identity without a truth, or where it covers fewer than three poses.
     """
-    positions: Array = trajectory.poses[:, :3, 3]
     if truth is None or trajectory is truth:
-        return positions
+        return np.eye(4)
     poses, known = truth.at(trajectory.stamps_ns)
     if np.count_nonzero(known) < 3:
-        return positions
+        return np.eye(4)
     if not truth.has_orientation:
-        return transform(align(positions[known], poses[known, :3, 3])[0], positions)
+        return align(trajectory.poses[known, :3, 3], poses[known, :3, 3])[0]
     first = int(np.flatnonzero(known)[0])
-    return transform(poses[first] @ invert(trajectory.poses[first]), positions)
+    return np.asarray(poses[first] @ invert(trajectory.poses[first]))
+
+
+def positions_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Array:
+    """Positions (N, 3) in metres, to be drawn in the frame of the truth."""
+    return transform(pose_in_truth(trajectory, truth), trajectory.poses[:, :3, 3])
 
 
 def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 4)
-
-
-class TruePlaces:
-    """True poses of the keyframes of a run, and the pairs of them that the gap rules admit, with or without a truth."""
-
-    def __init__(self, run: FinishedRun) -> None:
-        self._rules = run.settings.loop
-        self.stamps = run.stamps
-        self._path_length: Array = np.array([row.path_length_m for row in run.keyframes], float)
-        self._sessions = np.array([row.session for row in run.keyframes], int)
-        truth = run.truth or Trajectory(np.empty(0, np.int64), np.empty((0, 4, 4)), has_orientation=False)
-        self._has_orientation = truth.has_orientation
-        self.poses, self.known = truth.at(self.stamps)
-        self._row = {int(stamp): row for row, stamp in enumerate(self.stamps)}
-
-    def row(self, stamp_ns: int) -> int | None:
-        """Place of a keyframe among all; None where there is none of this stamp."""
-        return self._row.get(int(stamp_ns))
-
-    def nearest_row(self, stamp_ns: int) -> int:
-        """Place of the keyframe nearest to a stamp."""
-        return int(np.abs(self.stamps - stamp_ns).argmin())
-
-    def admissible(self, row: int) -> NDArray[np.bool_]:
-        """(row,) which earlier keyframes the gap rules allow."""
-        return is_past(
-            self.stamps[row] - self.stamps[:row],
-            self._path_length[row] - self._path_length[:row],
-            self._rules,
-            self._sessions[:row] == self._sessions[row],
-        )
-
-    def distances(self, row: int) -> NDArray[np.float64]:
-        """(N,) metres in truth to every keyframe, infinite where it is unknown."""
-        apart = np.linalg.norm(self.poses[:, :3, 3] - self.poses[row, :3, 3], axis=1)
-        return np.where(self.known & self.known[row], apart, np.inf)
-
-    def same_places(self, row: int) -> NDArray[np.int64]:
-        """Earlier keyframes that are the same place and may be matched, the nearest first."""
-        known = self.known[:row] & self.known[row]
-        rows = np.flatnonzero(self.admissible(row) & known & _near(self.poses, row, self._has_orientation))
-        return rows[np.argsort(self.distances(row)[rows])]
-
-    def is_same_place(self, query_ns: int, match_ns: int) -> bool | None:
-        """Whether the two are within 12 m in truth, whatever their headings; None where that is unknown."""
-        query, match = self.row(query_ns), self.row(match_ns)
-        if query is None or match is None or not (self.known[query] and self.known[match]):
-            return None
-        return bool(np.linalg.norm(self.poses[query, :3, 3] - self.poses[match, :3, 3]) <= PLACE_RADIUS_M)

@@ -23,8 +23,16 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import create_run_folder, write_atomically
-from umf_ros.runs import tables
-from umf_ros.runs.run_file import NAME, RunFile, StoredOdometry
+from umf_ros.runs.run_file import (
+    NAME,
+    STAGES,
+    RunFile,
+    StoredOdometry,
+    candidate_row,
+    closure_row,
+    inlier_rows,
+    pose_numbers,
+)
 from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
 
@@ -37,59 +45,44 @@ PLACES = "places.sqlite"
 """Store of places of a replay whose settings name none, until it is finished."""
 
 
-class ReplayFolder:
-    """The folder of a replay: a new one, or that of a replay that was interrupted.
+def create_folder(out: Path, bag: Path) -> Path:
+    """Make a new folder inside `out` for a replay of `bag`."""
+    folder = create_run_folder(out)
+    _note(folder, bag=str(bag.resolve()), finished=False)
+    return folder
 
-    Args:
-        path: the folder.
-        settings: of the run.
-        resumed: whether an earlier process has begun it.
+
+def unfinished_folder(out: Path, bag: Path, settings: Settings) -> Path | None:
+    """Find the newest folder inside `out` of an unfinished replay of `bag`; None where there is none.
+
+    A replay that was begun with other settings raises an `UmfError`.
     """
+    begun = [path.parent for path in sorted(out.glob(f"*/{NAME}"), reverse=True) if not path.parent.is_symlink()]
+    for path in begun:
+        facts: dict[str, Any] = {}
+        with suppress(UmfError), closing(RunFile(path, read_only=True)) as file:
+            facts = file.facts()
+        if facts.get("bag") != str(bag.resolve()) or facts.get("finished"):
+            continue
+        # without settings, the process was killed before its first row
+        if (path / "config.yaml").exists() and load_settings(path / "config.yaml") != settings:
+            raise UmfError(f"{path} was begun with other settings; leave out --resume, or give the same options")
+        (path / "summary.json").unlink(missing_ok=True)  # of a run that was interrupted by Ctrl-C
+        return path
+    return None
 
-    def __init__(self, path: Path, settings: Settings, resumed: bool = False) -> None:
-        self.path, self._settings, self.resumed = path, settings, resumed
 
-    @classmethod
-    def create(cls, out: Path, bag: Path, settings: Settings) -> ReplayFolder:
-        """Make a new folder inside `out` for a replay of `bag`."""
-        folder = cls(create_run_folder(out), settings)
-        _note(folder.path, bag=str(bag.resolve()), finished=False)
-        return folder
+def with_places(settings: Settings, folder: Path) -> Settings:
+    """The settings, with a store of places in the folder of a replay where they name none."""
+    places = settings.database.path or str(folder / PLACES)
+    return settings.model_copy(update={"database": settings.database.model_copy(update={"path": places})})
 
-    @classmethod
-    def resume(cls, out: Path, bag: Path, settings: Settings) -> ReplayFolder:
-        """Find the newest folder inside `out` of an unfinished replay of `bag`; make one where there is none.
 
-        A replay that was begun with other settings raises an `UmfError`.
-        """
-        begun = [path.parent for path in sorted(out.glob(f"*/{NAME}"), reverse=True) if not path.parent.is_symlink()]
-        for path in begun:
-            facts: dict[str, Any] = {}
-            with suppress(UmfError), closing(RunFile(path, read_only=True)) as file:
-                facts = file.facts()
-            if facts.get("bag") != str(bag.resolve()) or facts.get("finished"):
-                continue
-            # without settings, the process was killed before its first row
-            if (path / "config.yaml").exists() and load_settings(path / "config.yaml") != settings:
-                raise UmfError(f"{path} was begun with other settings; leave out --resume, or give the same options")
-            (path / "summary.json").unlink(missing_ok=True)  # of a run that was interrupted by Ctrl-C
-            return cls(path, settings, resumed=True)
-        return cls.create(out, bag, settings)
-
-    @property
-    def working_settings(self) -> Settings:
-        """The settings, with a store of places in the folder where they name none."""
-        database = self._settings.database
-        if database.path:
-            return self._settings
-        update = {"database": database.model_copy(update={"path": str(self.path / PLACES)})}
-        return self._settings.model_copy(update=update)
-
-    def finish(self) -> None:
-        """Mark the run as finished, and delete its store of places."""
-        for path in self.path.glob(f"{PLACES}*"):
-            path.unlink(missing_ok=True)
-        _note(self.path, finished=True)
+def finish_folder(folder: Path) -> None:
+    """Mark a replay as finished, and delete its store of places."""
+    for path in folder.glob(f"{PLACES}*"):
+        path.unlink(missing_ok=True)
+    _note(folder, finished=True)
 
 
 def _note(folder: Path, **values: Any) -> None:
@@ -123,11 +116,11 @@ class RunRecorder:
         self._file = RunFile(folder)
         self.recorded = {(int(row[0]), int(row[1])) for row in self._file.rows("keyframes")}
         self.earlier_closures = self._file.closures()
-        self._pairs = {(closure.query_stamp_ns, closure.match_stamp_ns) for closure in self.earlier_closures}
+        self._pairs = {closure.endpoints for closure in self.earlier_closures}
         latencies = self._file.rows("latencies")
         self._latency = {
             stage: array("f", (value for row in latencies if not isnan(value := float(row[place]))))
-            for place, stage in enumerate(tables.STAGES, 1)
+            for place, stage in enumerate(STAGES, 1)
         }
         self._counts = self._earlier_counts(resume)
         self._odometry = 0
@@ -146,22 +139,22 @@ class RunRecorder:
             return
         stamp_ns = keyframe.stamp_ns
         accepted = [one for one in detection.verdicts if one.closure]
-        new = [one for one in accepted if (stamp_ns, one.candidate.stamp_ns) not in self._pairs]
-        times = [f"{detection.latency_ms.get(stage, nan):.1f}" for stage in tables.STAGES]
-        closures = [tables.closure_row(one.closure, one.candidate.similarity) for one in new if one.closure]
+        new = [one for one in accepted if one.endpoints not in self._pairs]
+        times = [f"{detection.latency_ms.get(stage, nan):.1f}" for stage in STAGES]
+        closures = [closure_row(one.closure, one.candidate.similarity) for one in new if one.closure]
         with self._file.writing():
             self._file.append("keyframes", [[stamp_ns, keyframe.session, f"{keyframe.path_length_m:.4f}"]])
             self._file.append("latencies", [[stamp_ns, *times]])
             self._file.append_descriptor(stamp_ns, keyframe.embedding.descriptor)
-            self._file.append("candidates", [tables.candidate_row(one) for one in detection.verdicts])
+            self._file.append("candidates", [candidate_row(one) for one in detection.verdicts])
             self._file.append("closures", closures, odometry_before=self._odometry)
-            self._file.append("inliers", [row for one in new for row in tables.inlier_rows(one)])
+            self._file.append("inliers", [row for one in new for row in inlier_rows(one)])
             self._file.note(**self._facts())
         self._counts["keyframes"] += 1
         self._counts["queries"] += bool(detection.verdicts)
         self._counts["closures_rejected"] += len(detection.verdicts) - len(accepted)
         self._counts["closures_published"] += len(new)
-        self._pairs.update((stamp_ns, one.candidate.stamp_ns) for one in new)
+        self._pairs.update(one.endpoints for one in new)
         self.recorded.add((stamp_ns, keyframe.session))
         for stage, milliseconds in detection.latency_ms.items():
             self._latency[stage].append(milliseconds)
@@ -173,14 +166,15 @@ class RunRecorder:
 
     def record_encounter(self, inter_closure: InterRobotClosure) -> None:
         """Write the closures with another rover of a fleet."""
-        rows = [[inter_closure.robot, *tables.closure_row(one, nan)] for one in inter_closure.closures]
+        rows = [[inter_closure.robot, *closure_row(one, nan)] for one in inter_closure.closures]
         with self._file.writing():
             self._file.append("closures_between", rows)
 
-    def record_pose(self, row: list[Any]) -> None:
-        """Write a row of `localization.csv`."""
+    def record_pose(self, stamp_ns: int, map_T_body: Array, covariance: Array, probability: float) -> None:
+        """Write a pose in the map to `localization.csv`; its covariance (6, 6) is in ROS order."""
+        numbers = *pose_numbers(map_T_body, covariance), probability
         with self._file.writing():
-            self._file.append("localization", [row])
+            self._file.append("localization", [[stamp_ns, *(f"{number:.6g}" for number in numbers)]])
 
     def count(self, frame: Frame) -> None:
         """Count a frame, also one that was processed before."""

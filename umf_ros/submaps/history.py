@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from umf_ros.core.config import Loop
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array
-from umf_ros.core.keyframes import is_past
-from umf_ros.places.database import PlaceDatabase
+from umf_ros.places.database import PlaceDatabase, is_past
 from umf_ros.submaps.merging import DriftMeter, needed_scans, submap_of
 from umf_ros.verification import constants as const
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any
@@ -82,7 +83,7 @@ class Hypothesis:
     def of(cls, query: Keyframe, candidate: Candidate, match: Keyframe, **known: Any) -> Hypothesis:
         """A hypothesis about a candidate whose keyframe is `match`."""
         names = ("similarity", "inliers_image", "inliers_cloud", "superfeatures")
-        measurements = {name: float(getattr(candidate, name)) for name in names}
+        measurements = known_only({name: float(getattr(candidate, name)) for name in names})
         return cls(query.stamp_ns, candidate, measurements, keyframes=(query, match), **known)
 
     @property
@@ -120,6 +121,11 @@ class Hypothesis:
     def reject(self, reason: RejectReason, detail: str = "") -> None:
         """Set the reason why this is no closure."""
         self.reason, self.detail, self.closure = reason, detail, None
+
+
+def known_only(measurements: dict[str, float]) -> dict[str, float]:
+    """Return the measurements without those that are NaN."""
+    return {name: value for name, value in measurements.items() if not math.isnan(value)}
 
 
 def kind_of(measurements: dict[str, float]) -> str:

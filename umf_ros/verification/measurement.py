@@ -14,7 +14,7 @@ import numpy as np
 from umf_ros.core.geometry import Array, make_pose, near
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import terrain_fit
-from umf_ros.verification.hypothesis import IMAGE, Hypothesis
+from umf_ros.verification.hypothesis import IMAGE, Hypothesis, known_only
 from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled
 from umf_ros.verification.scan_alignment import (
     Alignment,
@@ -71,7 +71,7 @@ def measure(hypothesis: Hypothesis) -> dict[str, float]:
     else:
         found = _measure_scans(alignment, *hypothesis.scans)
     position_std_m, heading_std_deg = nominal_deviations(alignment.information)
-    return found | {"position_std_m": position_std_m, "heading_std_deg": heading_std_deg}
+    return known_only(found | {"position_std_m": position_std_m, "heading_std_deg": heading_std_deg})
 
 
 def runner_up(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> dict[str, float]:
@@ -86,8 +86,8 @@ def runner_up(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> dict[str,
 
 def _missing(hypothesis: Hypothesis) -> float:
     """Share of all that stands, or where nothing does of all points, that should have a counterpart and has none."""
-    known = hypothesis.measurements["upright_counterparts"]
-    return 1.0 - (known if math.isfinite(known) else hypothesis.measurements["counterparts"])
+    measurements = hypothesis.measurements
+    return 1.0 - measurements.get("upright_counterparts", measurements["counterparts"])
 
 
 def closure_covariance(hypothesis: Hypothesis, model: CovarianceModel) -> Array:

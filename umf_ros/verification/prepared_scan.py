@@ -308,24 +308,15 @@ class ScanCache:
 
     def __init__(self) -> None:
         self._scans: OrderedDict[tuple[int, int], PreparedScan] = OrderedDict()
-        self._prefetched: dict[int, PreparedScan] = {}
 
     def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
         key = (keyframe.session, keyframe.stamp_ns)
-        scan = self._scans.pop(key, None) or self._prefetched.pop(keyframe.stamp_ns, None) or PreparedScan.of(keyframe)
+        scan = self._scans.pop(key, None) or PreparedScan.of(keyframe)
         self._scans[key] = scan
         if len(self._scans) > const.SCANS_KEPT:
             self._scans.popitem(last=False)
         return scan
 
-    def prefetch(self, frame: Frame) -> None:
-        """Make the scan ready of a frame that is about to become a keyframe."""
-        points, motion = thin_frame(frame)
-        scan = PreparedScan(points, frame.body_T_lidar, const.BLUR_M if motion is None else 0.0)
-        scan.make_ready()
-        self._prefetched = {frame.stamp_ns: scan}
-
     def clear(self) -> None:
         """Forget all scans, as when stamps start over."""
         self._scans.clear()
-        self._prefetched.clear()

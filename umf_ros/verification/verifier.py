@@ -10,12 +10,12 @@ from types import MappingProxyType
 import numpy as np
 
 from umf_ros.core.config import Verification
-from umf_ros.core.frames import Frame, Keyframe, LoopClosure
+from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading, near
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
 from umf_ros.verification.ambiguity import ambiguity, passage_rival
-from umf_ros.verification.hypothesis import Hypothesis, RejectReason
+from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
 from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses, prior_sigmas
 from umf_ros.verification.prepared_scan import ScanCache, views_decide
@@ -57,9 +57,9 @@ class Verifier:
         self._memory.reset()
         self._scans.clear()
 
-    def prefetch(self, frame: Frame) -> None:
-        """Make ready what is asked of a scan whose keyframe is verified next."""
-        self._scans.prefetch(frame)
+    def prefetch(self, keyframe: Keyframe) -> None:
+        """Prepare the scan of a keyframe that is verified next; it need not be embedded yet."""
+        self._scans[keyframe].make_ready()
 
     def verify(
         self, query: Keyframe, candidates: Sequence[Offered], guesses: Mapping[int, Array] = NO_GUESSES
@@ -147,7 +147,7 @@ class Verifier:
         for one in aligned:
             prior = prior_sigmas(*one.keyframes, one.pose, self._settings.odometry_drift)
             support = self._memory.support(*one.keyframes, one.pose)
-            one.measurements |= measure(one) | {"prior_sigmas": prior, "support": support}
+            one.measurements |= measure(one) | known_only({"prior_sigmas": prior, "support": support})
         for one in aligned:
             one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
             if one.scans and self._acceptance.at_best(one.measurements) >= hopeless:
@@ -155,7 +155,7 @@ class Verifier:
                 one.measurements |= ambiguity(*one.scans, one.pose, one.alignment.information)
             one.probability = self._probability(one)
             if one.scans and self._probable(one):
-                one.measurements["passage_rival"] = passage_rival(*one.scans, one.pose)
+                one.measurements |= known_only({"passage_rival": passage_rival(*one.scans, one.pose)})
         return aligned
 
     def _probability(self, hypothesis: Hypothesis) -> float:

@@ -30,15 +30,20 @@ def places(
     Search is exact up to 50,000 places and approximate beyond. Takes some minutes, and 7 GB in the folder for temporary
     files.
     """
+    import numpy as np
     from rich.console import Console
 
+    from umf_ros.core.errors import UmfError
     from umf_ros.core.io import write_atomically
     from umf_ros.lab.evaluation.places_bench import measure_places
-    from umf_ros.runs.run_file import all_descriptors
+    from umf_ros.runs.run_file import read_descriptors
 
     console = Console(stderr=True)
     largest = 150_000 if quick else 1_000_000
-    drive = all_descriptors(run) if run is not None else None
+    found = read_descriptors(run) if run is not None else {}
+    if run is not None and not found:
+        raise UmfError(f"{run} holds no descriptors of keyframes")
+    drive = np.stack(list(found.values())) if found else None
     thousand, many, most = measure_places((1000, 100_000, largest), drive, seed, console.print)
     figures = {
         "query_ms_1k": round(thousand.query_ms, 2),

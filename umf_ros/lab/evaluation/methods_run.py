@@ -39,7 +39,7 @@ from umf_ros.lab.evaluation.summary import ETNA_RECALL1, measure
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import load_weights
-from umf_ros.places.index import PlaceIndex
+from umf_ros.places.database import PlaceIndex
 
 RERANKED = {"umf_superfeatures": "superfeatures both", "umf_ransac": "ransac both"}
 """UMF's rerankers that stand beside the other methods."""

@@ -19,8 +19,7 @@ import numpy as np
 
 from umf_ros.core.config import Database, Loop
 from umf_ros.core.frames import Embedding, Keyframe, Points, StereoCamera
-from umf_ros.places.database import PlaceDatabase
-from umf_ros.places.index import PlaceIndex, Rows
+from umf_ros.places.database import PlaceDatabase, PlaceIndex, Rows
 from umf_ros.places.store import pack
 
 DIMENSION = 768

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from umf_ros.core.config import Loop, Verification
 from umf_ros.core.frames import Candidate, Embedding, Frame, Keyframe
 from umf_ros.core.geometry import Array
-from umf_ros.core.keyframes import is_past
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.datasets.sample import Rule, distances, label, places_of
+from umf_ros.places.database import is_past
 from umf_ros.verification.rerank import rerank
 
 THESIS_RULE = Rule(positive_m=12.0, positive_deg=30.0, negative_m=60.0, negative_deg=30.0)

@@ -21,9 +21,9 @@ from umf_ros.core.tasks import spread
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.evaluation.results import TextTable
 from umf_ros.replay import Replay
-from umf_ros.runs.findings import ExaminedRun
 from umf_ros.runs.reader import read_run, remember_recording
 from umf_ros.runs.report import finish_run, judge
+from umf_ros.runs.truth import JudgedRun
 from umf_ros.runs.writer import count_drops
 
 _NOTHING = "/none"
@@ -86,7 +86,7 @@ def stretches_of(bag: Path) -> list[Stretch]:
 
 def replay_all(
     bag: Path, config: Path | None, folder: Path, report: bool, workers: int, done: Callable[[int], None]
-) -> dict[str, ExaminedRun]:
+) -> dict[str, JudgedRun]:
     """Replay a recording with both sensors and with each alone; the runs by name, each judged by the truth.
 
     Raises:
@@ -114,7 +114,7 @@ def replay(task: SensorTask) -> None:
         finish_run(task.folder, recording, Console(file=StringIO()))
 
 
-def score(about: ExaminedRun, stretches: Sequence[Stretch]) -> dict[str, StretchScore]:
+def score(about: JudgedRun, stretches: Sequence[Stretch]) -> dict[str, StretchScore]:
     """Closures of a run on every stretch, by its name.
 
     Raises:
@@ -122,10 +122,9 @@ def score(about: ExaminedRun, stretches: Sequence[Stretch]) -> dict[str, Stretch
     """
     if about.run.truth is None:
         raise UmfError("the recording holds no ground truth to judge by")
-    stamps = about.places.stamps
-    again = np.array([len(about.places.same_places(row)) > 0 for row in range(len(stamps))], bool)
-    queries = np.array([one.closure.query_stamp_ns for one in about.judged.closures], np.int64)
-    right = np.array([one.is_true for one in about.judged.closures], bool)
+    stamps = about.run.stamps
+    again = np.array([len(about.same_places(row)) > 0 for row in range(len(stamps))], bool)
+    queries, right = about.closures.query_stamp_ns, about.closures.is_true
     closed = again & np.isin(stamps, queries[right])
     found = {}
     for one in stretches:

@@ -30,7 +30,6 @@ from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Loop, Verification
 from umf_ros.core.frames import Candidate, Frame, Keyframe
 from umf_ros.core.geometry import Array, heading, relative, wrap_angle
-from umf_ros.core.keyframes import Mask, is_past
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.fit.acceptance import (
     Example,
@@ -39,6 +38,7 @@ from umf_ros.lab.fit.acceptance import (
     inside_ellipsoid,
     save_acceptance,
 )
+from umf_ros.places.database import Mask, is_past
 from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, POSE_TOLERANCE_DEG, POSE_TOLERANCE_M
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, Logistic, load_acceptance, scores

@@ -9,7 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.config import KeyframePolicy, Loop, Settings, load_settings
 from umf_ros.core.geometry import make_pose
-from umf_ros.core.keyframes import KeyframeSelector, gap_remedy, is_past
+from umf_ros.detector import KeyframeSelector
+from umf_ros.places.database import is_past
+from umf_ros.runs.findings import gap_remedy
 
 
 def at(x_m: float, yaw_deg: float = 0.0) -> np.ndarray:
