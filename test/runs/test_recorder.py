@@ -22,8 +22,7 @@ from umf_ros.runs import writer as recorder_module
 from umf_ros.runs.run_file import ALWAYS, all_descriptors, read_descriptors
 from umf_ros.runs.tables import read_closures
 from umf_ros.runs.writer import RunRecorder, count_drops, read_summary
-from umf_ros.sensors.buffers import SURPLUS, InputCounter
-from umf_ros.sensors.synchronizer import INPUTS
+from umf_ros.sensors.synchronizer import INPUTS, SURPLUS, InputCounter
 from umf_ros.verification import Hypothesis, Measurement, RejectReason
 
 MEASUREMENT = Measurement(similarity=0.4, inliers_image=3.0)

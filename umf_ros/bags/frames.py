@@ -17,13 +17,12 @@ from umf_ros.core.config import Settings, Topics, topics_of
 from umf_ros.core.errors import BagError, MessageError, either
 from umf_ros.core.frames import Frame
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import TYPES, OdometrySample, stamp_ns
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.sessions import ODOMETRY, Input
-from umf_ros.sensors.synchronizer import Synchronizer
-from umf_ros.sensors.tf import TOPIC, OdometryFrames, StaticTransforms, TfExtrinsics
+from umf_ros.sensors.synchronizer import InputCounter, Synchronizer
+from umf_ros.sensors.tf import TOPIC, BodyFrames, StaticTransforms
 
 _log = logging.getLogger(__name__)
 
@@ -60,12 +59,9 @@ class FrameReader:
         self._bag, self._odometry, self._rows_taken = bag, odometry, 0
         self._synchronizer = Synchronizer(settings.sync, calibration, inputs, warn)
         self._samples: list[OdometrySample] = []
-        transforms = read_transforms(bag) if settings.uses_transforms else None
-        mounting, frames = None, None
-        if transforms is not None and transforms.version:
-            mounting = TfExtrinsics(calibration, transforms, settings.frames.base, warn)
-            frames = OdometryFrames(settings.frames, transforms, warn)
-        self._router = MessageRouter(self._synchronizer, topics, warn, self._samples.append, mounting, frames)
+        transforms = read_transforms(bag) if settings.uses_transforms else StaticTransforms()
+        frames = BodyFrames(settings.frames, transforms, warn, 0.0, calibration) if transforms.version else None
+        self._router = MessageRouter(self._synchronizer, topics, warn, self._samples.append, frames)
         if bag.warning:
             warn(bag.warning)
 

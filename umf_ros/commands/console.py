@@ -17,8 +17,8 @@ from umf_ros.bags.reader import Bag
 from umf_ros.core.config import Settings
 from umf_ros.detector import Detection
 from umf_ros.runs.reader import remember_recording
-from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
+from umf_ros.sensors.synchronizer import InputCounter
 
 Handler = Callable[[int, FrameType | None], Any] | int | signal.Handlers | None
 

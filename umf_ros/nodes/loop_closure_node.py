@@ -43,7 +43,7 @@ from umf_ros.runs.writer import RunRecorder, count_drops
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
-from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms, TfExtrinsics
+from umf_ros.sensors.tf import PATIENCE_S, BodyFrames, StaticTransforms
 from umf_ros.verification import Hypothesis
 
 if TYPE_CHECKING:
@@ -73,15 +73,9 @@ class LoopClosureNode(BaseNode):
         self._detector = LoopDetector(settings, embedder)
         self._synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(topics), warn)
         transforms = StaticTransforms()
-        self._odometry_frames = frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
-        mounting = TfExtrinsics(calibration, transforms, settings.frames.base, warn)
-        self._router = MessageRouter(
-            self._synchronizer,
-            topics,
-            warn,
-            mounting=mounting if settings.uses_transforms else None,
-            odometry_frames=frames,
-        )
+        mounted = calibration if settings.uses_transforms else None
+        self._body_frames = BodyFrames(settings.frames, transforms, warn, PATIENCE_S, mounted)
+        self._router = MessageRouter(self._synchronizer, topics, warn, frames=self._body_frames)
         self._recorder = RunRecorder(Path(self._results), settings, embedder.name) if self._results else None
         self._publisher = ClosurePublisher(self, settings.frames)
         self._lock = threading.Lock()
@@ -138,7 +132,7 @@ class LoopClosureNode(BaseNode):
             # before the database forgets them
             matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
         self._last = detection
-        self._publisher.odom = self._odometry_frames.odom
+        self._publisher.odom = self._body_frames.odom
         self._publisher.announce(detection, matches)
         for closure in detection.closures:
             self._closures += 1

@@ -41,7 +41,7 @@ from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.journal import JOURNAL, DurableGraph
 from umf_ros.sensors.decode import OdometrySample, decode_odometry
-from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms
+from umf_ros.sensors.tf import PATIENCE_S, BodyFrames, StaticTransforms
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works
@@ -88,7 +88,7 @@ class PoseGraphNode(BaseNode):
             self._worker.submit(lambda: self._settle_left())
         topics, transforms = topics_of(settings), StaticTransforms()
         warn = self.get_logger().warning
-        self._odometry_frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
+        self._odometry_frames = BodyFrames(settings.frames, transforms, warn, PATIENCE_S)
         self._hear_transforms(transforms)
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)

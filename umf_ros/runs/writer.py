@@ -25,8 +25,8 @@ from umf_ros.core.geometry import Array
 from umf_ros.core.io import create_run_folder, write_atomically
 from umf_ros.runs import tables
 from umf_ros.runs.run_file import NAME, RunFile, StoredOdometry
-from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
+from umf_ros.sensors.synchronizer import InputCounter
 
 if TYPE_CHECKING:
     from umf_ros.detector import Detection

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.errors import SensorFileError, either, one_line
 from umf_ros.core.frames import Frame, Image, Points, StereoCamera
-from umf_ros.sensors.assembly import Anchor, ScanLimits, assemble
-from umf_ros.sensors.buffers import OdometryBuffer, StampedImage
+from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, StampedImage, assemble
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import FURTHEST_RETURN_M, Cloud, decode_picture, real_returns
 
@@ -42,8 +41,6 @@ _PLY_KINDS = {
     **{"float": "f4", "double": "f8", "list": "list"},
 }
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
-_INTENSITY = ("intensity", "scalar_intensity", "reflectivity", "reflectance", "remission", "i")
-"""Names under which drivers and CloudCompare store the strength of a return, the usual ones first."""
 _MOST_NEGATIVE = 0.01
 """Share of negative numbers that no column of intensities has: every other coordinate is negative."""
 
@@ -64,7 +61,10 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
     try:
         content = path.read_bytes()
         columns = _parse_bin(content, bin_columns) if suffix == ".bin" else _PARSERS[suffix](content)
-        cloud = _cloud_of(columns)
+        missing = [axis for axis in "xyz" if axis not in columns]
+        if missing:
+            raise SensorFileError(f"no field {', '.join(missing)}")
+        cloud, _ = real_returns(columns, columns)
     except OSError as error:
         raise SensorFileError(f"cannot read {path}: {error.strerror}") from None
     except SensorFileError as error:
@@ -75,17 +75,6 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
         far = any(bool((np.abs(columns[axis]) > FURTHEST_RETURN_M).any()) for axis in "xyz")
         raise SensorFileError(f"{path} has {OUT_OF_REACH}" if far else f"{path} holds no return")
     return cloud
-
-
-def _cloud_of(columns: Columns) -> Cloud:
-    missing = [axis for axis in "xyz" if axis not in columns]
-    if missing:
-        raise SensorFileError(f"no field {', '.join(missing)}")
-    points = np.stack([columns[axis].astype(np.float32) for axis in "xyz"], axis=1)
-    name = next((name for name in _INTENSITY if name in columns), None)
-    intensity = None if name is None else columns[name].astype(np.float32)
-    real = real_returns(points, intensity)
-    return Cloud(points[real], None if intensity is None else intensity[real])
 
 
 def parse_pcd(content: bytes) -> Columns:

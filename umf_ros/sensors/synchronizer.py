@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from umf_ros.core.config import Sync
 from umf_ros.core.errors import MessageError
-from umf_ros.core.frames import Frame, StereoCamera
-from umf_ros.sensors.assembly import Anchor, ScanLimits, assemble
-from umf_ros.sensors.buffers import ImageBuffer, InputCounter, OdometryBuffer, StampedImage
+from umf_ros.core.frames import Frame, Image, StereoCamera
+from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, StampedImage, assemble
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.sessions import ODOMETRY, Input, Reset, SessionClock, StampedInput
+from umf_ros.sensors.sessions import ODOMETRY, Input, SessionClock, StampedInput
 
 _log = logging.getLogger(__name__)
 
@@ -26,6 +25,76 @@ STEREO_SLOP_NS = 17_000_000
 
 SILENCE_NS = 5_000_000_000
 """An input of which nothing has come in this much stream time is taken to be absent."""
+
+
+SURPLUS = "surplus"
+"""Reason of images that lie nearest to no scan: no fault, cameras are faster than LiDARs."""
+
+
+@dataclass(slots=True)
+class InputCounter:
+    """Messages of one input: `received == used + sum(dropped) + waiting` at any time; dropped ones by reason."""
+
+    received: int = 0
+    used: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def waiting(self) -> int:
+        """Messages whose fate is open."""
+        return self.received - self.used - self.dropped.total()
+
+    @property
+    def lost(self) -> int:
+        """Messages dropped for a reason that should not happen."""
+        return self.dropped.total() - self.dropped[SURPLUS]
+
+
+class ImageBuffer:
+    """The latest images of one camera, in the order of their stamps."""
+
+    def __init__(self, size: int, counter: InputCounter) -> None:
+        self._size = size
+        self._counter = counter
+        self._images: deque[StampedImage] = deque()
+        self.newest_ns: int | None = None
+
+    def add(self, stamp_ns: int, image: Image, late: bool = False) -> None:
+        """Append an image; the oldest leaves a full buffer."""
+        if len(self._images) == self._size:
+            self._forget("queue full")
+        self._images.append(StampedImage(stamp_ns, image, late))
+        self.newest_ns = stamp_ns
+
+    def passed(self, stamp_ns: int) -> bool:
+        """Whether no image to come can be nearer to the stamp than those that came."""
+        return self.newest_ns is not None and self.newest_ns >= stamp_ns
+
+    def nearest(self, stamp_ns: int, slop_ns: int) -> StampedImage | None:
+        """The image nearest to a stamp, or None when it is further than the slop; the earlier of two equals."""
+        nearest = min(self._images, key=lambda image: abs(image.stamp_ns - stamp_ns), default=None)
+        return nearest if nearest and abs(nearest.stamp_ns - stamp_ns) <= slop_ns else None
+
+    def use(self, image: StampedImage | None) -> None:
+        """Count an image as used, the first time."""
+        if image is not None and not image.used:
+            image.used = True
+            self._counter.used += 1
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Let go of older images."""
+        while self._images and self._images[0].stamp_ns < stamp_ns:
+            self._forget(SURPLUS)
+
+    def clear(self) -> None:
+        """Let go of everything."""
+        self.forget_before(2**63)
+        self.newest_ns = None
+
+    def _forget(self, reason: str) -> None:
+        image = self._images.popleft()
+        if not image.used:
+            self._counter.dropped["late" if image.late else reason] += 1
 
 
 class Synchronizer:
@@ -66,9 +135,7 @@ class Synchronizer:
         self.session = 0
         self._left = ImageBuffer(settings.queue_size, self.counters["left"])
         self._right = ImageBuffer(settings.queue_size, self.counters["right"])
-        self._odometry = OdometryBuffer(
-            round(settings.odometry_buffer_s * 1e9), round(settings.max_odometry_gap_s * 1e9)
-        )
+        self._odometry = OdometryBuffer(settings.odometry_buffer_s, settings.max_odometry_gap_s)
         self._anchors: deque[Anchor] = deque()
         self._frames: list[Frame] = []
         self._given_up_ns = -1  # images up to here come too late
@@ -80,7 +147,8 @@ class Synchronizer:
 
     def use_mounting(self, poses: dict[str, Any]) -> None:
         """Replace poses of the sensors, `body_T_camera` or `body_T_lidar` by name."""
-        self._calibration = replace(self._calibration, **poses)
+        if poses:
+            self._calibration = replace(self._calibration, **poses)
 
     def add(self, name: Input, stamp_ns: int, value: Any) -> None:
         """Add a measurement: an image as the camera sends it, (H, W) uint8; a `Cloud`; or a (4, 4) pose `odom_T_body`.
@@ -92,12 +160,11 @@ class Synchronizer:
         if name in ("left", "right") and value.shape[::-1] != expected:
             found = f"image of {value.shape[1]} x {value.shape[0]} pixels"
             raise MessageError("size", f"{found}, the calibration is for {expected[0]} x {expected[1]}")
-        ruling = self._clock.take(StampedInput(name, stamp_ns, value))
-        for one in ruling.dropped:
-            self.reject(one.name, one.fault)
-        if ruling.reset is not None:
-            self._begin_session(ruling.reset)
-        for one in ruling.usable:
+        reset, messages = self._clock.take(StampedInput(name, stamp_ns, value))
+        if reset is not None:
+            self._end_session(reset.of_clock)
+            self.session = self._clock.session
+        for one in messages:
             if one.fault:
                 self.reject(one.name, one.fault)
                 continue
@@ -123,15 +190,8 @@ class Synchronizer:
         """Complete the waiting frames with what is there, at the end of the stream, and pop them."""
         for one in self._clock.give_up():
             self.reject(one.name, one.fault)
-        self._clear()
+        self._end_session()
         return self.pop()
-
-    def _begin_session(self, reset: Reset) -> None:
-        if reset.of_clock:
-            self._clear()
-        self._complete_all()
-        self._odometry.clear()
-        self.session = self._clock.session
 
     def _use(self, name: Input, stamp_ns: int, value: Any) -> None:
         if name == "cloud":
@@ -146,16 +206,15 @@ class Synchronizer:
             if name == "left" and ("cloud" not in self._inputs or self._is_silent("cloud", stamp_ns)):
                 self._anchors.append(Anchor(stamp_ns, stamp_ns))
 
-    def _complete_all(self) -> None:
+    def _end_session(self, of_clock: bool = True) -> None:
+        """Complete the waiting frames with what is there; images go on where the odometry alone was reset."""
         while self._anchors:
             self._complete(self._anchors.popleft())
-
-    def _clear(self) -> None:
-        self._complete_all()
-        self._left.clear()
-        self._right.clear()
         self._odometry.clear()
-        self._given_up_ns = -1
+        if of_clock:
+            self._left.clear()
+            self._right.clear()
+            self._given_up_ns = -1
 
     def _build(self) -> None:
         """Complete the frames that wait for nothing more, in order."""
