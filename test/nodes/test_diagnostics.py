@@ -16,7 +16,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from umf_ros.core.config import Qos
 from umf_ros.nodes import diagnostics
 from umf_ros.nodes.conversions import sensor_qos
-from umf_ros.nodes.diagnostics import Heartbeat, InputWatch, Throttle, memory_mb, status
+from umf_ros.nodes.diagnostics import InputWatch, memory_mb, status
 
 TOPIC = "/watched/image"
 
@@ -194,18 +194,3 @@ def test_what_is_rare_may_be_silent(node: Node, clock: Clock) -> None:
     watch = InputWatch(node, "closures", TOPIC, Image, rare=True)
     clock.now_s += 60
     assert watch.status().level == DiagnosticStatus.OK and watch.warning == ""
-
-
-def test_every_line_has_a_throttle_of_its_own(clock: Clock) -> None:
-    throttle = Throttle()
-    assert [throttle.lets_pass(line, 30) for line in ("a", "b", "a")] == [True, True, False]
-    clock.now_s += 31
-    assert throttle.lets_pass("a", 30)
-
-
-def test_the_heartbeat_tells_the_longest_stall(clock: Clock) -> None:
-    heart = Heartbeat(0.05)
-    for pause_s in (0, 0.05, 0.25, 0.05):
-        clock.now_s += pause_s
-        heart.beat()
-    assert heart.longest_ms == pytest.approx(200)

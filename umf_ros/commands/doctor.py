@@ -145,7 +145,7 @@ def check_messages() -> Finding:
 
 def check_dds() -> Finding:
     """A publisher and a subscriber find each other and exchange an image."""
-    status, output = _run("-m", "umf_ros.nodes.dds_check")
+    status, output = _run("-m", "umf_ros.nodes.diagnostics")
     advice = "check ROS_DOMAIN_ID, RMW_IMPLEMENTATION, and that a firewall lets UDP multicast pass on loopback"
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
     return Finding("DDS", status == 0, f"{_last_line(output)} (domain {domain})", advice)

@@ -1,17 +1,22 @@
-"""Health of a node and of its inputs."""
+"""Health of a node and of its inputs; as a program: whether DDS works on this machine."""
 
 from __future__ import annotations
 
-import math
 import resource
+import sys
 import time
+from array import array
 from collections.abc import Mapping
 from pathlib import Path
 
+import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSReliabilityPolicy
+from rclpy.qos import QoSReliabilityPolicy, qos_profile_sensor_data
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from sensor_msgs.msg import Image
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -27,36 +32,6 @@ def memory_mb() -> float:
     """Resident memory of this process now."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 2**20
-
-
-class Throttle:
-    """Rate-limit log lines per key."""
-
-    def __init__(self) -> None:
-        self._passed_s: dict[str, float] = {}
-
-    def lets_pass(self, line: str, every_s: float) -> bool:
-        """Whether a line is due again."""
-        now_s = time.monotonic()
-        if now_s - self._passed_s.get(line, -math.inf) < every_s:
-            return False
-        self._passed_s[line] = now_s
-        return True
-
-
-class Heartbeat:
-    """Longest delay of the executor: `beat` is due every `period_s`."""
-
-    def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
-        self._last_s = math.inf
-        self.longest_ms = 0.0
-
-    def beat(self) -> None:
-        """Take the time."""
-        now_s = time.monotonic()
-        self.longest_ms = max(self.longest_ms, 1e3 * (now_s - self._last_s - self._period_s))
-        self._last_s = now_s
 
 
 class InputWatch:
@@ -158,3 +133,46 @@ def type_name(kind: type) -> str:
     """Name of a message class on the graph, as in `sensor_msgs/msg/Image`."""
     package, middle, *_ = kind.__module__.split(".")
     return f"{package}/{middle}/{kind.__name__}"
+
+
+DDS_TIMEOUT_S, DDS_TOPIC = 15.0, "umf_dds_check"
+
+
+def exchange() -> str:
+    """Send images from one DDS participant to another until one arrives; returns what went wrong, or nothing."""
+    contexts = Context(), Context()
+    for context in contexts:
+        rclpy.init(context=context)
+    sender, receiver = (Node(f"umf_dds_check_{number}", context=context) for number, context in enumerate(contexts))
+    executor = SingleThreadedExecutor(context=receiver.context)
+    executor.add_node(receiver)
+    arrived: list[Image] = []
+    publisher = sender.create_publisher(Image, DDS_TOPIC, 10)
+    receiver.create_subscription(Image, DDS_TOPIC, arrived.append, qos_profile_sensor_data)
+    image = Image(width=688, height=512, step=688, encoding="mono8", data=array("B", bytes(688 * 512)))
+    deadline = time.monotonic() + DDS_TIMEOUT_S
+    while not arrived and time.monotonic() < deadline:
+        if publisher.get_subscription_count():
+            publisher.publish(image)
+        executor.spin_once(timeout_sec=0.05)
+    connected = publisher.get_subscription_count() > 0
+    executor.remove_node(receiver)
+    for node in (sender, receiver):
+        node.destroy_node()
+        rclpy.try_shutdown(context=node.context)
+    if arrived and len(arrived[0].data) == len(image.data):
+        return ""
+    return "no message arrived" if connected else "publisher and subscriber did not find each other"
+
+
+def main() -> None:
+    """One line on stdout and 0 when an image arrived, on stderr and 1 when none did."""
+    started = time.monotonic()
+    fault = exchange()
+    if fault:
+        sys.exit(f"{fault} within {DDS_TIMEOUT_S:.0f} s")
+    sys.stdout.write(f"an image arrived after {time.monotonic() - started:.1f} s\n")
+
+
+if __name__ == "__main__":
+    main()

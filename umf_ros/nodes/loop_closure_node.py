@@ -172,7 +172,7 @@ class LoopClosureNode(BaseNode):
             "lag_s": lag_s,
             "memory_mb": memory_mb(),
             "last_error": self._last_fault or "none",
-            "executor_stall_max_ms": self._heartbeat.longest_ms,
+            "executor_stall_max_ms": self._stall_ms,
             **{f"fault_{kind}": count for kind, count in self._faults.items()},
             **{f"dropped_{name}": count for name, count in self._drops().items()},
             **_counts(self._synchronizer),

@@ -247,7 +247,7 @@ class PoseGraphNode(BaseNode):
         values["odometry_out_of_line"] = self._durable.feed.dropped
         values["odometry_held"] = self._durable.feed.held
         values["queue_waiting"] = self._worker.waiting
-        values["executor_stall_max_ms"] = self._heartbeat.longest_ms
+        values["executor_stall_max_ms"] = self._stall_ms
         values |= {state.value: count for state, count in graph.verdict_counts().items()}
         trouble = self._worker.dropped or any(name.startswith("optimiser") for name in graph.counts)
         text = f"{values.get('accepted', 0)} closures accepted"
