@@ -70,7 +70,7 @@ def test_a_rover_on_its_own_needs_nothing_of_a_fleet() -> None:
         "places.database",
         "replay",
         "commands.replay",
-        "commands.fleet",
+        "commands.stores",
         "nodes.loop_closure_node",
     ]
     statements = [without(missing), *(f"import umf_ros.{room}" for room in rooms)]

@@ -28,10 +28,30 @@ from rosbags.typesys.store import Typestore
 from zstandard import ZstdError, frame_content_size
 
 from umf_ros.core.errors import BagError
-from umf_ros.sensors.decode import LIVOX, LIVOX_DEFINITION
+from umf_ros.sensors.decode import LIVOX
 
 LARGEST_CHUNK = 2**28
 """Bytes of a chunk after unpacking, and of any record; recorders write some megabytes."""
+
+
+LIVOX_DEFINITION = """
+std_msgs/Header header
+uint64 timebase
+uint32 point_num
+uint8 lidar_id
+uint8[3] rsvd
+CustomPoint[] points
+================================================================================
+MSG: {package}/CustomPoint
+uint32 offset_time
+float32 x
+float32 y
+float32 z
+uint8 reflectivity
+uint8 tag
+uint8 line
+"""
+"""Type of message of Livox' drivers; recordings of them carry it too."""
 
 
 @dataclass(frozen=True, slots=True)

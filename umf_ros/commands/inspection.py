@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.presets import settings_for
@@ -17,17 +16,9 @@ from umf_ros.core.config import Settings, Topics
 from umf_ros.core.errors import MessageError, UmfError
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
 from umf_ros.core.keyframes import gap_remedy
+from umf_ros.core.trajectory import bracket
 from umf_ros.sensors.calibration import TO_BE_MEASURED
-from umf_ros.sensors.decode import (
-    CLOUD,
-    COMPRESSED,
-    IMAGE,
-    LIVOX,
-    decode_camera_info,
-    decode_cloud,
-    decode_image,
-    decode_odometry,
-)
+from umf_ros.sensors.decode import TYPES, decode_camera_info, decode_cloud, decode_image, decode_odometry
 from umf_ros.sensors.tf import TOPIC, StaticTransforms
 
 SAMPLES = 20
@@ -87,15 +78,18 @@ def inspect(bag: Bag) -> Inspected:
 
 def guess_topics(bag: Bag) -> Topics:
     """The topics of each input by type and name: of several the one that says left or right, else the fullest."""
-    by_type = {kind: [t for t, i in bag.topics.items() if i.type == kind and i.count] for kind in _TYPES_SEEN}
-    images = by_type[IMAGE] + by_type[COMPRESSED]
-    images = [topic for topic in images if not any(word in topic.lower() for word in ("depth", "mask", "semantic"))]
+    filled = [(topic, info) for topic, info in bag.topics.items() if info.count]
+    # plain images before compressed ones, otherwise the fullest topic first
+    by_name = {
+        name: [topic for kind in kinds for topic, info in filled if info.type == kind] for name, kinds in TYPES.items()
+    }
+    clouds, odometry = (sorted(by_name[name], key=lambda t: -bag.topics[t].count) for name in ("cloud", "odometry"))
+    words = ("depth", "mask", "semantic")
+    images = [topic for topic in by_name["left_image"] if not any(word in topic.lower() for word in words)]
     right = next((topic for topic in images if "right" in topic.lower()), "")
     left = next((topic for topic in images if "left" in topic.lower()), "")
     left = left or next((topic for topic in images if topic != right), "")
-    infos = by_type["sensor_msgs/msg/CameraInfo"]
-    clouds = sorted((topic for kind in (CLOUD, *LIVOX) for topic in by_type[kind]), key=lambda t: -bag.topics[t].count)
-    odometry = sorted(by_type["nav_msgs/msg/Odometry"], key=lambda topic: -bag.topics[topic].count)
+    infos = by_name["left_info"]
     return Topics(
         left_image=left,
         right_image=right if left else "",
@@ -104,9 +98,6 @@ def guess_topics(bag: Bag) -> Topics:
         cloud=clouds[0] if clouds else "",
         odometry=odometry[0] if odometry else "",
     )
-
-
-_TYPES_SEEN = (IMAGE, COMPRESSED, "sensor_msgs/msg/CameraInfo", CLOUD, *LIVOX, "nav_msgs/msg/Odometry")
 
 
 def _nearest(image: str, infos: list[str]) -> str:
@@ -214,7 +205,9 @@ def _about_pairs(bag: Bag, found: Inspected) -> Iterator[Advice]:
         seconds, nanoseconds = struct.unpack_from("<iI" if raw.data[1] & 1 else ">iI", raw.data, 4)
         stamps[raw.topic].append(seconds * 10**9 + nanoseconds)
     scans = np.array(stamps[topics.cloud])
-    away_ns = _distances(np.sort(stamps[topics.left_image]), scans)
+    images = np.sort(stamps[topics.left_image])
+    before, after, _ = bracket(images, scans)
+    away_ns = np.minimum(np.abs(scans - images[before]), np.abs(scans - images[after]))
     pairs, median_s = int((away_ns <= slop_s * 1e9).sum()), float(np.median(away_ns)) * 1e-9
     told = f"{pairs} of {len(scans)} scans have an image within {slop_s:g} s, {median_s:.3f} s in the median"
     found.found["pairs"] = told
@@ -230,12 +223,6 @@ def _about_gaps(bag: Bag, found: Inspected) -> Iterator[Advice]:
         what = f"{bag.duration_s:.1f} s are shorter than {gap}: no match is allowed"
         remedy = gap_remedy(bag.duration_s, None if found.topics.odometry else 0.0, settings)
         yield Advice("fault", what, f"drive longer, or set {remedy}")
-
-
-def _distances(images: NDArray[np.int64], scans: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Time in ns from each scan to the nearest image, whose stamps are sorted."""
-    after = np.clip(np.searchsorted(images, scans), 0, len(images) - 1)
-    return np.minimum(np.abs(scans - images[np.maximum(after - 1, 0)]), np.abs(scans - images[after]))
 
 
 def write_settings(found: Inspected, calibration: str) -> str:

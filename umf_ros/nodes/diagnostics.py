@@ -19,6 +19,8 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import Image
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+SILENT_S = 5.0
+"""Longest silence of an input without a warning, by the machine's clock."""
 
 
 def status(level: bytes, name: str, message: str, values: Mapping[str, object]) -> DiagnosticStatus:
@@ -41,22 +43,14 @@ class InputWatch:
         node: knows the graph of topics.
         name: of the input.
         topic: as it is subscribed, after remapping.
-        kind: message class; None where any will do.
+        kind: message class.
         rare: its silence is no fault as long as there is a publisher.
-        silent_after_s: longest silence without a warning, by the machine's clock.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        name: str,
-        topic: str,
-        kind: type | None = None,
-        rare: bool = False,
-        silent_after_s: float = 5.0,
-    ) -> None:
-        self._node, self._rare, self._silent_after_s = node, rare, silent_after_s
-        self._type = type_name(kind) if kind is not None else ""
+    def __init__(self, node: Node, name: str, topic: str, kind: type, rare: bool = False) -> None:
+        self._node, self._rare = node, rare
+        package, middle, *_ = kind.__module__.split(".")
+        self._type = f"{package}/{middle}/{kind.__name__}"  # as the graph names it
         self.name, self.topic, self.warning = name, topic, ""
         self.received = self.refused = self.lost = 0
         self.last_stamp_ns: int | None = None
@@ -94,7 +88,7 @@ class InputWatch:
         if all_refused:
             self.warning = f"{self.name}: {rate:.1f} Hz on {self.topic}, and all are refused"
             return status(WARN, f"input {self.name}", f"{rate:.1f} Hz, all refused", values)
-        if silent_s is not None and silent_s < self._silent_after_s:
+        if silent_s is not None and silent_s < SILENT_S:
             return status(OK, f"input {self.name}", f"{rate:.1f} Hz", values)
         publishers = self._node.get_publishers_info_by_topic(self.topic)
         values["publishers"] = len(publishers)
@@ -105,15 +99,15 @@ class InputWatch:
         if self._rare and any(info.topic_type == self._type for info in publishers):
             return status(OK, f"input {self.name}", f"{self.received} received", values)
         reason = self._reason(publishers, silent_s)
-        if now_s - self._born_s > self._silent_after_s:
+        if now_s - self._born_s > SILENT_S:
             self.warning = f"{self.name}: {reason}"
         return status(WARN, f"input {self.name}", reason, values)
 
     def _reason(self, publishers: list[TopicEndpointInfo], silent_s: float | None) -> str:
-        foreign = sorted({info.topic_type for info in publishers} - {self._type})
-        if publishers and self._type and len(foreign) == len({info.topic_type for info in publishers}):
-            return f"nothing received: {self.topic} carries {', '.join(foreign)}, expected {self._type}"
-        if not publishers:
+        kinds = {info.topic_type for info in publishers}
+        if kinds and self._type not in kinds:
+            return f"nothing received: {self.topic} carries {', '.join(sorted(kinds))}, expected {self._type}"
+        if not kinds:
             others = self._others()
             hint = f"; {', '.join(others)} {'is' if len(others) == 1 else 'are'} of that type" if others else ""
             return f"nothing received: no publisher on {self.topic}{hint}"
@@ -127,12 +121,6 @@ class InputWatch:
         # closures have the type of odometry
         fit = [name for name in names if name != self.topic and name.rpartition("/")[2] != "loop_closures"]
         return [name for name in fit if self._node.count_publishers(name)][:5]
-
-
-def type_name(kind: type) -> str:
-    """Name of a message class on the graph, as in `sensor_msgs/msg/Image`."""
-    package, middle, *_ = kind.__module__.split(".")
-    return f"{package}/{middle}/{kind.__name__}"
 
 
 DDS_TIMEOUT_S, DDS_TOPIC = 15.0, "umf_dds_check"

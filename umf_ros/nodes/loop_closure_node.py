@@ -21,7 +21,7 @@ from visualization_msgs.msg import MarkerArray
 
 from umf_ros.core.config import FrameIds, Settings, topics_of
 from umf_ros.core.frames import Frame, Keyframe, LoopClosure
-from umf_ros.core.geometry import rotation_angle
+from umf_ros.core.geometry import Array, rotation_angle
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import (
@@ -32,8 +32,7 @@ from umf_ros.nodes.conversions import (
     keyframe_frame,
     sensor_qos,
     to_header,
-    to_lines,
-    to_point,
+    to_markers,
     to_pose,
     to_time,
 )
@@ -226,8 +225,8 @@ class ClosurePublisher:
         self._keyframes = node.create_publisher(PoseStamped, "~/keyframes", CLOSURES_QOS)
         self._candidates = node.create_publisher(DiagnosticArray, "~/candidates", 10)
         self._markers = node.create_publisher(MarkerArray, "~/markers", LATCHED_QOS)
-        self._accepted: deque[list] = deque(maxlen=MAX_LINES)
-        self._rejected: deque[list] = deque(maxlen=MAX_LINES)
+        self._accepted: deque[Array] = deque(maxlen=MAX_LINES)
+        self._rejected: deque[Array] = deque(maxlen=MAX_LINES)
 
     def announce(self, detection: Detection, matches: dict[int, Keyframe]) -> None:
         """Publish one detection; `matches` are the matched keyframes by stamp, for the markers."""
@@ -268,16 +267,14 @@ class ClosurePublisher:
     def _draw(self, keyframe: Keyframe, verdicts: list[Hypothesis], matches: dict[int, Keyframe]) -> None:
         if keyframe.odom_T_body is None:
             return
-        here = to_point(keyframe.odom_T_body[:3, 3])
         for verdict in verdicts:
             match = matches.get(verdict.candidate.stamp_ns)
             if match is None or match.odom_T_body is None or match.session != keyframe.session:
                 continue
             lines = self._rejected if verdict.closure is None else self._accepted
-            lines.append([to_point(match.odom_T_body[:3, 3]), here])
+            lines.append(np.stack([match.odom_T_body[:3, 3], keyframe.odom_T_body[:3, 3]]))
         header = to_header(keyframe.stamp_ns, self.odom)
-        chosen = {"accepted": self._accepted, "rejected": self._rejected}
-        self._markers.publish(MarkerArray(markers=[to_lines(*item, header) for item in chosen.items()]))
+        self._markers.publish(to_markers(self._accepted, self._rejected, header))
 
 
 def describe(number: int, closure: LoopClosure) -> str:

@@ -224,8 +224,9 @@ class PoseGraphNode(BaseNode):
         stamps, poses = self._durable.graph.trajectory()
         self._path_publisher.publish(messages.path(stamps, poses, self._frames))
         verdicts, lines = self._durable.graph.closure_lines()
-        newest_ns = max(self._durable.feed.newest_ns, 0)
-        self._marker_publisher.publish(messages.markers(verdicts, lines, newest_ns, self._frames))
+        accepted = np.array([verdict.state is State.ACCEPTED for verdict in verdicts], bool)
+        header = messages.to_header(max(self._durable.feed.newest_ns, 0), self._frames.map)
+        self._marker_publisher.publish(messages.to_markers(lines[accepted], lines[~accepted], header))
 
     def _tick(self) -> None:
         if not self._keeps_up:  # once is enough, however long the worker is at something else

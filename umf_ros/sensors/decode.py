@@ -281,24 +281,6 @@ TYPES: dict[str, tuple[str, ...]] = {
     "odometry": ("nav_msgs/msg/Odometry",),
 }
 """Types of message that a recording may have on the topic of each name in `Topics`."""
-LIVOX_DEFINITION = """
-std_msgs/Header header
-uint64 timebase
-uint32 point_num
-uint8 lidar_id
-uint8[3] rsvd
-CustomPoint[] points
-================================================================================
-MSG: {package}/CustomPoint
-uint32 offset_time
-float32 x
-float32 y
-float32 z
-uint8 reflectivity
-uint8 tag
-uint8 line
-"""
-"""As the drivers of Livox define it; recordings of them carry it too."""
 
 
 def _decode_compressed(message: Any) -> Image:

@@ -6,6 +6,7 @@ import io
 import logging
 import struct
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -168,16 +169,11 @@ def _parse_text(body: bytes, record: Record, points: int) -> Columns:
 
 def _leading_numbers(body: bytes, width: int) -> list[list[float]]:
     """So many numbers at the start of each line; lines that begin otherwise are left out."""
-    rows = []
-    for line in body.split(b"\n") if width else ():
-        words = line.split(maxsplit=width)[:width]
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            continue
-        if len(values) == width:
-            rows.append(values)
-    return rows
+    rows: list[list[float]] = []
+    for line in body.split(b"\n"):
+        with suppress(ValueError):
+            rows.append([float(word) for word in line.split(maxsplit=width)[:width]])
+    return [row for row in rows if len(row) == width > 0]
 
 
 def _decompress(body: bytes) -> bytes:

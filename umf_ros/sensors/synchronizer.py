@@ -33,16 +33,11 @@ SURPLUS = "surplus"
 
 @dataclass(slots=True)
 class InputCounter:
-    """Messages of one input: `received == used + sum(dropped) + waiting` at any time; dropped ones by reason."""
+    """Messages of one input; the dropped ones by reason. Those that are neither used nor dropped are waiting."""
 
     received: int = 0
     used: int = 0
     dropped: Counter[str] = field(default_factory=Counter)
-
-    @property
-    def waiting(self) -> int:
-        """Messages whose fate is open."""
-        return self.received - self.used - self.dropped.total()
 
     @property
     def lost(self) -> int:
