@@ -27,7 +27,8 @@ from umf_ros.core.io import check_writable
 from umf_ros.nodes.conversions import from_time, latched
 from umf_ros.nodes.diagnostics import WARN, InputWatch
 from umf_ros.nodes.parameters import changed_settings, declare
-from umf_ros.sensors.tf import TOPIC, StaticTransforms
+from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.tf import PATIENCE_S, TOPIC, BodyFrames, StaticTransforms
 
 STATIC_QOS = latched(100)
 """Every broadcaster of static transforms has its own part of the tree."""
@@ -253,15 +254,17 @@ class BaseNode(LifecycleNode, ABC):
         watch = InputWatch(self, name, subscription.topic_name, kind, rare)
         self._watches.append(watch)
 
-    def _hear_transforms(self, transforms: StaticTransforms) -> None:
-        """Fill `transforms` from `/tf_static`; without tf2_msgs, which Jazzy from PyPI lacks, they stay empty."""
+    def _hear_transforms(self, calibration: Calibration | None = None) -> BodyFrames:
+        """Hear `/tf_static`, which moves odometry and a calibration's sensors; Jazzy from PyPI lacks its tf2_msgs."""
+        transforms, warn = StaticTransforms(), self.get_logger().warning
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError:
             if self._settings.frames.extrinsics == "tf":
                 self.get_logger().info("tf2_msgs is not installed: the sensors are where the calibration file says")
-            return
-        self.create_subscription(TFMessage, TOPIC, self._guarded("transforms", transforms.add), STATIC_QOS)
+        else:
+            self.create_subscription(TFMessage, TOPIC, self._guarded("transforms", transforms.add), STATIC_QOS)
+        return BodyFrames(self._settings.frames, transforms, warn, PATIENCE_S, calibration)
 
     def _offer(self, kind: type, name: str, action: Callable[[Any], str]) -> None:
         """Offer a service that answers what `action` makes of the request; any fault is a refusal."""

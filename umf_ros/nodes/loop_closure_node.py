@@ -42,7 +42,6 @@ from umf_ros.runs.writer import RunRecorder, count_drops
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
-from umf_ros.sensors.tf import PATIENCE_S, BodyFrames, StaticTransforms
 from umf_ros.verification import Hypothesis
 
 if TYPE_CHECKING:
@@ -71,9 +70,7 @@ class LoopClosureNode(BaseNode):
         calibration, topics = calibration_of(settings), topics_of(settings)
         self._detector = LoopDetector(settings, embedder)
         self._synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(topics), warn)
-        transforms = StaticTransforms()
-        mounted = calibration if settings.uses_transforms else None
-        self._body_frames = BodyFrames(settings.frames, transforms, warn, PATIENCE_S, mounted)
+        self._body_frames = self._hear_transforms(calibration if settings.uses_transforms else None)
         self._router = MessageRouter(self._synchronizer, topics, warn, frames=self._body_frames)
         self._recorder = RunRecorder(Path(self._results), settings, embedder.name) if self._results else None
         self._publisher = ClosurePublisher(self, settings.frames)
@@ -85,7 +82,6 @@ class LoopClosureNode(BaseNode):
         self._worker: Worker[Frame] = Worker(self._detect, self._complain, settings.worker.queue_size)
         self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._complain, 1)
         self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._complain, INTAKE_QUEUE)
-        self._hear_transforms(transforms)
         for name, topic in topics.model_dump().items():
             if topic:
                 take = partial(self._enqueue, topic)

@@ -41,7 +41,6 @@ from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.journal import JOURNAL, DurableGraph
 from umf_ros.sensors.decode import OdometrySample, decode_odometry
-from umf_ros.sensors.tf import PATIENCE_S, BodyFrames, StaticTransforms
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works
@@ -86,10 +85,8 @@ class PoseGraphNode(BaseNode):
         self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._complain, QUEUE)
         if self._durable.unsettled:
             self._worker.submit(lambda: self._settle_left())
-        topics, transforms = topics_of(settings), StaticTransforms()
-        warn = self.get_logger().warning
-        self._odometry_frames = BodyFrames(settings.frames, transforms, warn, PATIENCE_S)
-        self._hear_transforms(transforms)
+        topics = topics_of(settings)
+        self._odometry_frames = self._hear_transforms()
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
             self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
