@@ -214,7 +214,7 @@ class KeyframeSource:
         found = nearest_frames(FrameReader(bag, settings, warn=self._warn), list(moments.values()))
         for one, frame in zip(moments, found, strict=True):
             try:
-                self._keep(one, make_keyframe(frame.checked(), self._embedder))
+                self._keep(one, frame if isinstance(frame, UmfError) else make_keyframe(frame, self._embedder))
             except UmfError as error:
                 self._keep(one, error)
 

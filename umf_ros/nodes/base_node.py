@@ -55,8 +55,7 @@ class BaseNode(LifecycleNode, ABC):
     def __init__(self, name: str, results: str) -> None:
         """Declare the parameters; `results` says what the folder `results_dir` is for."""
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
-        self._settings, own = declare(self, results_dir=results)
-        self._results = own["results_dir"]
+        self._settings, self._results = declare(self, results)
         self._watches: list[InputWatch] = []
         self._own: list[Any] = []
         self._faults, self._last_fault = Counter[str](), ""

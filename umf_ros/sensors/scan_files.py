@@ -87,13 +87,12 @@ def parse_pcd(content: bytes) -> Columns:
         SensorFileError: it is no such file, or the data are not what the header says.
     """
     entries: dict[str, list[str]] = {}
-    start = 0
+    body = content
     while "DATA" not in entries:
-        end = content.find(b"\n", start)
-        if end < 0:
+        line, end, body = body.partition(b"\n")
+        if not end:
             raise SensorFileError("a PCD file without a DATA line")
-        words = content[start:end].decode("ascii", "replace").split()
-        start = end + 1
+        words = line.decode("ascii", "replace").split()
         if words and not words[0].startswith("#"):
             entries[words[0].upper()] = words[1:]
     try:
@@ -101,7 +100,6 @@ def parse_pcd(content: bytes) -> Columns:
         points = int(entries.get("POINTS", ["0"])[0])
     except (ValueError, IndexError, TypeError):
         raise SensorFileError("a PCD header that cannot be read") from None
-    body = content[start:]
     if kind == "ascii":
         return _parse_text(body, record, points)
     if kind == "binary":
@@ -211,18 +209,18 @@ def parse_ply(content: bytes) -> Columns:
     """
     if not content.startswith(b"ply"):
         raise SensorFileError("no PLY file")
-    end = content.find(b"end_header")
-    line_end = content.find(b"\n", end)
-    if end < 0 or line_end < 0:
+    header, _, rest = content.partition(b"end_header")
+    _, end, body = rest.partition(b"\n")
+    if not end:
         raise SensorFileError("a PLY header that breaks off")
     try:
-        form, elements = _parse_ply_header(content[:end].decode("ascii", "replace"))
+        form, elements = _parse_ply_header(header.decode("ascii", "replace"))
     except (ValueError, IndexError, KeyError):
         raise SensorFileError("a PLY header that cannot be read") from None
     at = next((number for number, (name, *_) in enumerate(elements) if name == "vertex"), None)
     if at is None:
         raise SensorFileError("a PLY file without vertices")
-    body, count = content[line_end + 1 :], elements[at][1]
+    count = elements[at][1]
     if form == "ascii":
         skipped = sum(number for _, number, _ in elements[:at])
         lines = [line for line in body.splitlines() if line.strip()][skipped : skipped + count]
