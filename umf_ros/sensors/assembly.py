@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.frames import Frame, Image, Points, ScanMotion
+from umf_ros.core.frames import Frame, Points, ScanMotion
 from umf_ros.core.geometry import Array, invert, relative, transform
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
+from umf_ros.sensors.sessions import StampedInput
 
 Mask = NDArray[np.bool_]
 
@@ -181,16 +182,6 @@ class ScanLimits:
             self._warn(text)
 
 
-@dataclass(slots=True)
-class StampedImage:
-    """An image (H, W) uint8, its exposure, and whether it came too late for its scan, or is used in a frame."""
-
-    stamp_ns: int
-    image: Image
-    late: bool = False
-    used: bool = False
-
-
 @dataclass(frozen=True, slots=True)
 class Anchor:
     """The measurement a frame is built around: a scan in the LiDAR frame, or an image where there is no LiDAR.
@@ -212,13 +203,13 @@ class Anchor:
 
 def assemble(
     anchor: Anchor,
-    left: StampedImage | None,
-    right: StampedImage | None,
+    left: StampedInput | None,
+    right: StampedInput | None,
     odometry: OdometryBuffer,
     calibration: Calibration,
     session: int,
 ) -> Frame:
-    """Build the frame at `anchor.stamp_ns`: images rectified, motion between the measurements removed."""
+    """Build the frame at `anchor.stamp_ns`: images (H, W) uint8 rectified, motion between the measurements removed."""
     odom_T_body = odometry.at(anchor.stamp_ns)
     points, intensity, motion = _scan(anchor, odometry, calibration, odom_T_body)
     exposed = odometry.at(left.stamp_ns) if left else None
@@ -231,8 +222,8 @@ def assemble(
         camera=calibration.camera,
         body_T_camera=body_T_camera,
         body_T_lidar=calibration.body_T_lidar,
-        left=rectify(left.image, 0) if left else None,
-        right=rectify(right.image, 1) if right else None,
+        left=rectify(left.value, 0) if left else None,
+        right=rectify(right.value, 1) if right else None,
         points=points,
         intensity=intensity,
         odom_T_body=odom_T_body,

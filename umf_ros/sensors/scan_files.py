@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from umf_ros.core.errors import SensorFileError, either, one_line
 from umf_ros.core.frames import Frame, Image, Points, StereoCamera
-from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, StampedImage, assemble
+from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, assemble
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import FURTHEST_RETURN_M, Cloud, decode_picture, real_returns
+from umf_ros.sensors.sessions import StampedInput
 
 _log = logging.getLogger(__name__)
 
@@ -351,6 +352,6 @@ def make_snapshot(
     them at the size the calibration is for. `warn` is called when a limit of the calibration is not applied.
     """
     usable = None if cloud is None else ScanLimits(calibration, warn).apply(cloud)
-    stamped_left, stamped_right = (None if image is None else StampedImage(stamp_ns, image) for image in (left, right))
-    anchor = Anchor(stamp_ns, stamp_ns, usable)
-    return assemble(anchor, stamped_left, stamped_right, OdometryBuffer(0, 0), calibration, session=0)
+    anchor, odometry = Anchor(stamp_ns, stamp_ns, usable), OdometryBuffer(0, 0)
+    images = (None if image is None else StampedInput("left", stamp_ns, image) for image in (left, right))
+    return assemble(anchor, *images, odometry, calibration, session=0)

@@ -29,8 +29,8 @@ class StampedInput:
     """A message as it arrives; of the odometry the value is (4, 4) `odom_T_body`.
 
     Attributes:
-        fault: why it does not go on from its input's newest message ("duplicate", "out of order", "stale"), or why
-            it was dropped ("clock jump", "position jump"); empty for an ordinary one.
+        fault: why it does not go on from its input's newest message ("duplicate", "out of order", "stale"), why it was
+            dropped ("clock jump", "position jump"), or "late" for its scan; empty for an ordinary one.
     """
 
     name: Input

@@ -10,8 +10,8 @@ from typing import Any
 
 from umf_ros.core.config import Sync
 from umf_ros.core.errors import MessageError
-from umf_ros.core.frames import Frame, Image, StereoCamera
-from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, StampedImage, assemble
+from umf_ros.core.frames import Frame, StereoCamera
+from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, assemble
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.sessions import ODOMETRY, Input, SessionClock, StampedInput
@@ -51,29 +51,30 @@ class ImageBuffer:
     def __init__(self, size: int, counter: InputCounter) -> None:
         self._size = size
         self._counter = counter
-        self._images: deque[StampedImage] = deque()
+        self._images: deque[StampedInput] = deque()
+        self._used_ns: set[int] = set()
         self.newest_ns: int | None = None
 
-    def add(self, stamp_ns: int, image: Image, late: bool = False) -> None:
+    def add(self, image: StampedInput) -> None:
         """Append an image; the oldest leaves a full buffer."""
         if len(self._images) == self._size:
             self._forget("queue full")
-        self._images.append(StampedImage(stamp_ns, image, late))
-        self.newest_ns = stamp_ns
+        self._images.append(image)
+        self.newest_ns = image.stamp_ns
 
     def passed(self, stamp_ns: int) -> bool:
         """Whether no image to come can be nearer to the stamp than those that came."""
         return self.newest_ns is not None and self.newest_ns >= stamp_ns
 
-    def nearest(self, stamp_ns: int, slop_ns: int) -> StampedImage | None:
+    def nearest(self, stamp_ns: int, slop_ns: int) -> StampedInput | None:
         """The image nearest to a stamp, or None when it is further than the slop; the earlier of two equals."""
         nearest = min(self._images, key=lambda image: abs(image.stamp_ns - stamp_ns), default=None)
         return nearest if nearest and abs(nearest.stamp_ns - stamp_ns) <= slop_ns else None
 
-    def use(self, image: StampedImage | None) -> None:
+    def use(self, image: StampedInput | None) -> None:
         """Count an image as used, the first time."""
-        if image is not None and not image.used:
-            image.used = True
+        if image is not None and image.stamp_ns not in self._used_ns:
+            self._used_ns.add(image.stamp_ns)
             self._counter.used += 1
 
     def forget_before(self, stamp_ns: int) -> None:
@@ -88,8 +89,10 @@ class ImageBuffer:
 
     def _forget(self, reason: str) -> None:
         image = self._images.popleft()
-        if not image.used:
-            self._counter.dropped["late" if image.late else reason] += 1
+        if image.stamp_ns in self._used_ns:
+            self._used_ns.remove(image.stamp_ns)
+        else:
+            self._counter.dropped[image.fault or reason] += 1
 
 
 class Synchronizer:
@@ -165,7 +168,7 @@ class Synchronizer:
                 continue
             self.counters[one.name].received += 1
             self._absent.discard(one.name)
-            self._use(one.name, one.stamp_ns, one.value)
+            self._use(one)
             self._build()
 
     def reject(self, name: Input, reason: str) -> None:
@@ -188,18 +191,18 @@ class Synchronizer:
         self._end_session()
         return self.pop()
 
-    def _use(self, name: Input, stamp_ns: int, value: Any) -> None:
-        if name == "cloud":
-            key = stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
-            self._anchors.append(Anchor(key, stamp_ns, self._limits.apply(value)))
-        elif name == ODOMETRY:
-            self._odometry.add(stamp_ns, value)
-            self.counters[name].used += 1
+    def _use(self, one: StampedInput) -> None:
+        if one.name == "cloud":
+            key = one.stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
+            self._anchors.append(Anchor(key, one.stamp_ns, self._limits.apply(one.value)))
+        elif one.name == ODOMETRY:
+            self._odometry.add(one.stamp_ns, one.value)
+            self.counters[one.name].used += 1
         else:
-            buffer = self._left if name == "left" else self._right
-            buffer.add(stamp_ns, value, late=stamp_ns <= self._given_up_ns)
-            if name == "left" and ("cloud" not in self._inputs or self._is_silent("cloud", stamp_ns)):
-                self._anchors.append(Anchor(stamp_ns, stamp_ns))
+            buffer = self._left if one.name == "left" else self._right
+            buffer.add(replace(one, fault="late") if one.stamp_ns <= self._given_up_ns else one)
+            if one.name == "left" and ("cloud" not in self._inputs or self._is_silent("cloud", one.stamp_ns)):
+                self._anchors.append(Anchor(one.stamp_ns, one.stamp_ns))
 
     def _end_session(self, of_clock: bool = True) -> None:
         """Complete the waiting frames with what is there; images go on where the odometry alone was reset."""
@@ -265,7 +268,7 @@ class Synchronizer:
         self._right.use(right)
         self._frames.append(assemble(anchor, left, right, self._odometry, self._calibration, self.session))
 
-    def _count_scan(self, cloud: Cloud, left: StampedImage | None) -> bool:
+    def _count_scan(self, cloud: Cloud, left: StampedInput | None) -> bool:
         """Count a scan as used or dropped; returns whether there will be a frame."""
         counter = self.counters["cloud"]
         without_image = left is None and (self._settings.require_image or not len(cloud.points))
