@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import small_gicp
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.inputs import Advice
@@ -76,15 +75,11 @@ def as_measured(frame: Frame) -> tuple[Points, float]:
     moments = frame.motion.moments_s
     turns = Rotation.from_rotvec(-moments[:, None] * frame.motion.rates[3:])
     measured = turns.apply(frame.points - moments[:, None] * frame.motion.rates[:3])
-    thinned = _one_per_cell(frame.points)
+    cell = np.floor(frame.points / SCAN_CELL_M).astype(np.int64) & CELL_MASK
+    # those that are left when points are thinned before they are aligned
+    thinned = np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)[1]
     levers: Array = np.square(frame.points[thinned].astype(float)).sum(axis=1)
     return measured.astype(np.float32), float(np.average(moments[thinned], weights=levers + 1e-9))
-
-
-def _one_per_cell(points: Points) -> NDArray[np.intp]:
-    """One of the points (N, 3) in every cell that they are thinned by before they are aligned."""
-    cell = np.floor(points / SCAN_CELL_M).astype(np.int64) & CELL_MASK
-    return np.asarray(np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)[1])
 
 
 def scan_step(earlier: Frame, later: Frame) -> Step | None:

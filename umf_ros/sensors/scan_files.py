@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.errors import SensorFileError, either, one_line
-from umf_ros.core.frames import Frame, Image, Points, StereoCamera
+from umf_ros.core.frames import Frame, Image, StereoCamera
 from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, assemble
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import FURTHEST_RETURN_M, Cloud, decode_picture, real_returns
@@ -266,10 +266,9 @@ def _ply_record(element: PlyElement, form: str) -> Record:
 
 
 def _parse_npy(content: bytes) -> Columns:
-    try:
+    array = None
+    with suppress(ValueError, EOFError, OSError):
         array = np.load(io.BytesIO(content), allow_pickle=False)
-    except (ValueError, EOFError, OSError):
-        raise SensorFileError("no array of numbers") from None
     if not isinstance(array, np.ndarray):
         raise SensorFileError("no array of numbers")
     if array.dtype.names:
@@ -283,19 +282,13 @@ def _parse_bin(content: bytes, columns: int) -> Columns:
     if len(content) % 4:
         raise SensorFileError(f"{len(content)} bytes are no float32 numbers")
     numbers = np.frombuffer(content, "<f4")
-    columns = columns or _columns_of(numbers)
-    if not columns or len(numbers) % columns:
+    fitting = [count for count in ((columns,) if columns else (4, 3)) if len(numbers) % count == 0]
+    if not fitting:
         shapes = f"(N, {columns})" if columns else "(N, 3) or (N, 4)"
         raise SensorFileError(f"{len(numbers)} numbers are no {shapes}; --bin-columns says how many a point has")
-    return _by_name(numbers.reshape(-1, columns))
-
-
-def _columns_of(numbers: Points) -> int:
-    """4 or 3 numbers per point; 0 where neither can be."""
-    fits = [columns for columns in (4, 3) if len(numbers) % columns == 0]
-    if len(numbers) and fits == [4, 3]:
-        return 3 if np.mean(numbers[3::4] < 0) > _MOST_NEGATIVE else 4
-    return fits[0] if fits else 0
+    if fitting == [4, 3] and len(numbers) and np.mean(numbers[3::4] < 0) > _MOST_NEGATIVE:
+        fitting = [3]
+    return _by_name(numbers.reshape(-1, fitting[0]))
 
 
 def _by_name(array: NDArray) -> Columns:
