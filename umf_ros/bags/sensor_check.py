@@ -18,7 +18,7 @@ from umf_ros.core.geometry import Array, invert
 from umf_ros.core.trajectory import Trajectory, interpolated
 from umf_ros.embedding.depth import disparities
 
-SCAN_CELL_M, SCAN_REACH_M, SCAN_NEIGHBOURS = 0.4, 1.0, 10  # by hand: consecutive scans, a quarter of a metre apart
+SCAN_CELL_M, SCAN_REACH_M = 0.4, 1.0  # by hand: consecutive scans, a quarter of a metre apart
 CELL_MASK = 2**21 - 1  # three coordinates in one number: a scan is far narrower than two million cells
 MIN_SCAN_POINTS = 200  # by hand: below, consecutive scans are not registered
 CORNERS, CORNER_QUALITY, CORNER_SPACING, CORNER_WINDOW, CORNER_LEVELS = 300, 0.01, 8, (21, 21), 4  # by hand
@@ -87,11 +87,13 @@ def scan_step(earlier: Frame, later: Frame) -> Step | None:
     (before, before_s), (after, after_s) = as_measured(earlier), as_measured(later)
     if min(len(before), len(after)) < MIN_SCAN_POINTS:
         return None
-    clouds = [
-        small_gicp.preprocess_points(one.astype(float), SCAN_CELL_M, SCAN_NEIGHBOURS, 1) for one in (before, after)
-    ]
-    (target, tree), (source, _) = clouds
-    found = small_gicp.align(target, source, tree, max_correspondence_distance=SCAN_REACH_M, num_threads=1)
+    found = small_gicp.align(
+        before.astype(float),
+        after.astype(float),
+        downsampling_resolution=SCAN_CELL_M,
+        max_correspondence_distance=SCAN_REACH_M,
+        num_threads=1,
+    )
     turn = Rotation.from_matrix(found.T_target_source[:3, :3]).as_rotvec()
     stamps = earlier.stamp_ns + round(before_s * 1e9), later.stamp_ns + round(after_s * 1e9)
     return Step(*stamps, turn, found.T_target_source[:3, 3]) if found.converged else None
