@@ -345,6 +345,6 @@ def make_snapshot(
     them at the size the calibration is for. `warn` is called when a limit of the calibration is not applied.
     """
     usable = None if cloud is None else ScanLimits(calibration, warn).apply(cloud)
-    anchor, odometry = Anchor(stamp_ns, stamp_ns, usable), OdometryBuffer(0, 0)
-    images = (None if image is None else StampedInput("left", stamp_ns, image) for image in (left, right))
-    return assemble(anchor, *images, odometry, calibration, session=0)
+    pair = [None if image is None else StampedInput("left", stamp_ns, image) for image in (left, right)]
+    anchor = Anchor(stamp_ns, stamp_ns, usable)
+    return assemble(anchor, pair[0], pair[1], OdometryBuffer(0, 0), calibration, session=0)
