@@ -63,12 +63,8 @@ def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajector
         BagError: the file cannot be read, or there is no such frame.
     """
     calibration = calibration_of(settings)
-    mountings = {
-        "body": np.eye(4),
-        "imu": calibration.body_T_imu,
-        "camera": calibration.body_T_camera,
-        "lidar": calibration.body_T_lidar,
-    }
+    mountings = {name: getattr(calibration, f"body_T_{name}") for name in ("imu", "camera", "lidar")}
+    mountings = {"body": np.eye(4), **mountings}
     if frame not in mountings:
         raise BagError(f"unknown frame {frame!r} of the odometry; expected one of {', '.join(mountings)}")
     return read_tum(path).of_body(mountings[frame])
