@@ -15,7 +15,7 @@ from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
 from umf_ros.core.errors import ConfigError
-from umf_ros.nodes.launching import check_parameter_file, full_name, is_true
+from umf_ros.nodes.start import check_parameter_file, full_name, is_true
 
 ARGUMENTS = [
     ("params_file", "", "parameter file; empty: the shipped config/loop_closure.yaml"),

@@ -32,8 +32,11 @@ def runtime() -> list[Path]:
     return sorted(path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "lab")
 
 
-LIGHT = ["commands/play.py", "commands/graph.py", "datasets/g2o.py", "evaluation/graph_plot.py", "live/*.py"]
-"""Files of the lab that `pip install .` serves too: recordings are played, graph files optimised and drawn."""
+LIGHT = [
+    *(f"commands/{name}.py" for name in ("play", "graph", "compare", "why")),
+    *("datasets/g2o.py", "evaluation/graph_plot.py", "live/*.py"),
+]
+"""Files of the lab that `pip install .` serves too: they play recordings, draw graph files, judge runs and pairs."""
 
 
 def light() -> list[Path]:
@@ -70,7 +73,7 @@ def test_a_rover_on_its_own_needs_nothing_of_a_fleet() -> None:
         "places.database",
         "replay",
         "commands.replay",
-        "commands.fleet",
+        "commands.stores",
         "nodes.loop_closure_node",
     ]
     statements = [without(missing), *(f"import umf_ros.{room}" for room in rooms)]
@@ -89,7 +92,7 @@ def test_the_runtime_imports_without_the_lab() -> None:
 
 def test_recordings_are_played_and_graph_files_read_without_the_packages_of_the_lab() -> None:
     names = modules(light())
-    assert len(names) == 8
+    assert len(names) == 10
     assert {name for path in light() for name in imports(path) if name.startswith("umf_ros.lab.")} <= set(names)
     statements = [without(lab_packages()), *(f"import {name}" for name in names)]
     assert imported_after("\n".join(statements), [*lab_packages(), *names]) == names

@@ -22,24 +22,24 @@ COMMANDS = {
     "inspect": "umf_ros.commands.inspect",
     "replay": "umf_ros.commands.replay",
     "map": "umf_ros.commands.map",
-    "compare": "umf_ros.commands.compare",
+    "compare": "umf_ros.lab.commands.compare",
     "sensors": "umf_ros.lab.commands.sensors",
     "play": "umf_ros.lab.commands.play",
     "report": "umf_ros.lab.commands.report",
     "evaluate": "umf_ros.lab.commands.evaluate",
-    "why": "umf_ros.commands.why",
+    "why": "umf_ros.lab.commands.why",
     "explain": "umf_ros.lab.commands.explain",
     "train": "umf_ros.lab.commands.train",
     "adapt": "umf_ros.lab.commands.adapt",
     "export": "umf_ros.lab.commands.export",
-    "bench": "umf_ros.lab.commands.bench",
+    "bench": "umf_ros.lab.commands.bench:app",
     "doctor": "umf_ros.commands.doctor",
-    "pretrain": "umf_ros.lab.commands.pretrain",
-    "graph": "umf_ros.lab.commands.graph",
-    "places": "umf_ros.commands.places",
-    "fleet": "umf_ros.commands.fleet",
+    "pretrain": "umf_ros.lab.commands.pretrain:app",
+    "graph": "umf_ros.lab.commands.graph:app",
+    "places": "umf_ros.commands.stores:places",
+    "fleet": "umf_ros.commands.stores:fleet",
 }
-"""The module of every subcommand, by name: those of the lab are known here by their names alone."""
+"""The module of every subcommand, and the group in it where there is one; those of the lab by their names alone."""
 
 
 def _print_version(wanted: bool) -> None:
@@ -53,7 +53,7 @@ Version = Annotated[bool, typer.Option("--version", callback=_print_version, is_
 
 @cache
 def umf() -> typer.Typer:
-    """The command with its subcommands: a module offers either `command` or, for a group of them, `app`."""
+    """The command with its subcommands."""
     app = typer.Typer(
         name="umf",
         help="Multimodal place recognition and loop closure for rovers with a camera and a LiDAR.",
@@ -63,12 +63,12 @@ def umf() -> typer.Typer:
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    for name, module_name in COMMANDS.items():
-        module = import_module(module_name)
-        if hasattr(module, "app"):
-            app.add_typer(module.app, name=name)
+    for name, place in COMMANDS.items():
+        module, _, group = place.partition(":")
+        if group:
+            app.add_typer(getattr(import_module(module), group), name=name)
         else:
-            app.command(name)(module.command)
+            app.command(name)(import_module(module).command)
     app.callback()(_options)
     return app
 

@@ -182,7 +182,7 @@ class Comparer:
         found = nearest_frames(FrameReader(bag, settings, warn=self._warn), list(wanted.values()))
         for one, frame in zip(wanted, found, strict=True):
             try:
-                self._cache[one] = make_keyframe(frame.checked(), self._embedder)
+                self._cache[one] = frame if isinstance(frame, UmfError) else make_keyframe(frame, self._embedder)
             except UmfError as error:
                 self._cache[one] = error
 

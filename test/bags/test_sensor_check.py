@@ -48,7 +48,7 @@ def test_sensors_as_they_are_agree(drive: Drive) -> None:
     assert seen.lidar is not None and seen.camera is not None and seen.forward is not None
     for one in (seen.lidar, seen.camera):
         assert abs(one.lag_s) < 0.1 and one.mounting_deg is not None and np.linalg.norm(one.mounting_deg) < 5
-    assert seen.stereo_scale == pytest.approx(1, abs=0.05) and seen.stereo_spread < 0.1
+    assert seen.stereo_scale == pytest.approx(1, abs=0.05)
     assert seen.forward[0] > 0.9 and seen.left_contrast > 10 and seen.returns > 1000
 
 

@@ -16,7 +16,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from umf_ros.core.config import Qos
 from umf_ros.nodes import diagnostics
 from umf_ros.nodes.conversions import sensor_qos
-from umf_ros.nodes.diagnostics import Heartbeat, InputWatch, Throttle, memory_mb, status
+from umf_ros.nodes.diagnostics import InputWatch, memory_mb, status
 
 TOPIC = "/watched/image"
 
@@ -56,7 +56,7 @@ def publish_on(node: Node, count: int, reliability: QoSReliabilityPolicy = QoSRe
 
 
 def test_a_topic_that_talks_is_fine_and_has_its_rate(node: Node, clock: Clock) -> None:
-    watch = InputWatch(node, "left_image", TOPIC)
+    watch = InputWatch(node, "left_image", TOPIC, Image)
     clock.now_s += 2
     for i in range(9):
         watch.saw(10**18 + i)
@@ -74,7 +74,7 @@ def test_a_topic_that_talks_is_fine_and_has_its_rate(node: Node, clock: Clock) -
 
 
 def test_the_rate_is_that_since_the_last_look(node: Node, clock: Clock) -> None:
-    watch = InputWatch(node, "cloud", TOPIC)
+    watch = InputWatch(node, "cloud", TOPIC, Image)
     rates = []
     for count in (5, 0, 20):
         clock.now_s += 1
@@ -86,7 +86,7 @@ def test_the_rate_is_that_since_the_last_look(node: Node, clock: Clock) -> None:
 
 def test_an_input_of_which_everything_is_refused_is_a_warning_while_it_is_so(node: Node, clock: Clock) -> None:
     """As when a driver was started again with other frames: the rate alone looks healthy."""
-    watch = InputWatch(node, "odometry", TOPIC)
+    watch = InputWatch(node, "odometry", TOPIC, Image)
     levels = []
     for refused in (0, 3, 4):
         clock.now_s += 1
@@ -99,7 +99,7 @@ def test_an_input_of_which_everything_is_refused_is_a_warning_while_it_is_so(nod
 
 
 def test_without_a_publisher_the_topic_is_named(node: Node, clock: Clock) -> None:
-    watch = InputWatch(node, "cloud", TOPIC)
+    watch = InputWatch(node, "cloud", TOPIC, Image)
     clock.now_s += 1
     line = watch.status()
     assert (line.level, line.message) == (DiagnosticStatus.WARN, f"nothing received: no publisher on {TOPIC}")
@@ -117,7 +117,7 @@ def test_without_a_publisher_the_topic_is_named(node: Node, clock: Clock) -> Non
 def test_publishers_that_are_not_heard_are_shown_with_their_qos(
     node: Node, clock: Clock, reliability: QoSReliabilityPolicy, shown: str
 ) -> None:
-    watch = InputWatch(node, "left_image", TOPIC)
+    watch = InputWatch(node, "left_image", TOPIC, Image)
     publish_on(node, 2, reliability)
     clock.now_s += 6
     line = watch.status()
@@ -127,7 +127,7 @@ def test_publishers_that_are_not_heard_are_shown_with_their_qos(
 
 
 def test_a_topic_that_falls_silent_is_a_warning_until_it_speaks_again(node: Node, clock: Clock) -> None:
-    watch = InputWatch(node, "cloud", TOPIC, silent_after_s=5)
+    watch = InputWatch(node, "cloud", TOPIC, Image)
     publish_on(node, 1)
     watch.saw(7)
     clock.now_s += 4.5
@@ -194,18 +194,3 @@ def test_what_is_rare_may_be_silent(node: Node, clock: Clock) -> None:
     watch = InputWatch(node, "closures", TOPIC, Image, rare=True)
     clock.now_s += 60
     assert watch.status().level == DiagnosticStatus.OK and watch.warning == ""
-
-
-def test_every_line_has_a_throttle_of_its_own(clock: Clock) -> None:
-    throttle = Throttle()
-    assert [throttle.lets_pass(line, 30) for line in ("a", "b", "a")] == [True, True, False]
-    clock.now_s += 31
-    assert throttle.lets_pass("a", 30)
-
-
-def test_the_heartbeat_tells_the_longest_stall(clock: Clock) -> None:
-    heart = Heartbeat(0.05)
-    for pause_s in (0, 0.05, 0.25, 0.05):
-        clock.now_s += pause_s
-        heart.beat()
-    assert heart.longest_ms == pytest.approx(200)

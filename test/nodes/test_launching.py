@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from umf_ros.core.errors import ConfigError
-from umf_ros.nodes.launching import check_parameter_file, full_name, is_true
+from umf_ros.nodes.start import check_parameter_file, full_name, is_true
 
 NODES = ["/red/loop_closure_node", "/red/pose_graph_node"]
 INNER = "ros__parameters: {loop.top_k: 7}"
@@ -78,5 +78,5 @@ def test_what_is_neither_true_nor_false_is_refused() -> None:
 def test_the_python_of_the_system_can_load_it() -> None:
     """It has the modules of ROS and YAML, but none of those in the venv of the nodes."""
     heavy = "{'numpy', 'pydantic', 'torch', 'rclpy', 'cv2'}"
-    code = f"import sys, umf_ros.nodes.launching; assert not {heavy} & set(sys.modules)"
+    code = f"import sys, umf_ros.nodes.start; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

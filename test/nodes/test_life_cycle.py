@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import gc
+import time
 from collections import Counter
 from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import TransitionEvent
 from processes import wait_until
 from rclpy.executors import SingleThreadedExecutor
@@ -18,6 +20,8 @@ from rclpy.parameter import Parameter
 from umf_ros.core.errors import OutputError
 from umf_ros.nodes import diagnostics
 from umf_ros.nodes.pose_graph_node import PoseGraphNode
+
+STALL = "executor_stall_max_ms"
 
 
 class Back(PoseGraphNode):
@@ -82,6 +86,30 @@ def test_a_player_that_is_still_starting_is_no_warning(
     assert "nothing received: no publisher on /odom" in logged(4)
     monkeypatch.undo()
     assert "nothing comes on /clock" in logged(35)
+
+
+def test_diagnostics_have_the_longest_stall_of_the_executor(node: Back) -> None:
+    stalls: list[float] = []
+
+    def hear(report: DiagnosticArray) -> None:
+        stalls.extend(float(one.value) for line in report.status for one in line.values if one.key == STALL)
+
+    node.create_subscription(DiagnosticArray, "/diagnostics", hear, 10)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    node.create_timer(0.2, lambda: time.sleep(0.4))
+    assert wait_until(lambda: bool(stalls) and stalls[-1] > 300, 20.0, lambda: executor.spin_once(timeout_sec=0.1))
+    executor.shutdown()
+
+
+def test_a_fault_that_goes_on_is_logged_now_and_then(node: Back, capfd: pytest.CaptureFixture[str]) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError("a fault in the program")
+
+    for name in ("one", "other", "one", "one"):
+        node._guarded(name, fail)()
+    captured = capfd.readouterr()
+    assert (captured.out + captured.err).count("a fault in the program") == 2
 
 
 def test_garbage_is_looked_for_among_what_comes_while_the_node_runs(node: Back) -> None:

@@ -18,6 +18,7 @@ from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_srvs.srv import SetBool, Trigger
 
 from umf_ros.core.config import Database, Settings
+from umf_ros.core.resources import find
 from umf_ros.detector import make_detector_embedder
 from umf_ros.nodes.conversions import to_time
 from umf_ros.places.database import PlaceDatabase
@@ -221,6 +222,15 @@ def test_one_parameter_changes_how_places_are_embedded(rig: Rig, tmp_path: Path,
     kept = PlaceDatabase(Database(path=str(tmp_path / "map.sqlite")), embedder.name, embedder.dimension)
     assert len(kept) >= 3 and embedder.name.startswith(method)
     kept.close()
+
+
+def test_guesses_of_the_calibration_are_told_when_it_starts(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.yaml"
+    path.write_text(find("config/calibration/simulated.yaml").read_text() + "# TO BE MEASURED: the baseline\n")
+    process = Process(MODULE, tmp_path / "node.log", *PARAMETERS, f"calibration:={path}")
+    process.wait_for("ready")
+    process.kill()
+    assert process.output.count("the calibration holds guesses, measure them: the baseline") == 1
 
 
 def test_a_silent_topic_is_explained(rig: Rig, node: Process) -> None:

@@ -15,6 +15,8 @@ from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.errors import ConfigError
 from umf_ros.nodes.parameters import CHANGEABLE, changed_settings, declare
 
+RESULTS = "where results go"
+
 made: list[tuple[Node, Context]] = []
 
 
@@ -38,7 +40,7 @@ def make_node(*overrides: str) -> Node:
 
 def test_without_overrides_every_setting_is_declared_with_its_default() -> None:
     node = make_node()
-    settings, _ = declare(node)
+    settings, _ = declare(node, RESULTS)
     assert settings == Settings()
     assert node.get_parameter("loop.top_k").value == 20
     descriptor = node.describe_parameter("keyframe.min_translation_m")
@@ -51,7 +53,7 @@ def test_without_overrides_every_setting_is_declared_with_its_default() -> None:
 
 def test_overrides_win_and_whole_numbers_pass_for_floats() -> None:
     node = make_node("loop.top_k:=7", "loop.min_time_gap_s:=50", "topics.cloud:=/points")
-    settings, _ = declare(node)
+    settings, _ = declare(node, RESULTS)
     assert (settings.loop.top_k, settings.loop.min_time_gap_s, settings.topics.cloud) == (7, 50.0, "/points")
     assert node.get_parameter("loop.min_time_gap_s").value == 50.0
 
@@ -63,7 +65,7 @@ def test_a_parameter_file_reads_like_for_the_command_line(tmp_path) -> None:
     rclpy.init(args=["--ros-args", "--params-file", str(path)], context=context)
     node = Node("probe", context=context, automatically_declare_parameters_from_overrides=True)
     made.append((node, context))
-    assert declare(node)[0] == load_settings(path)
+    assert declare(node, RESULTS)[0] == load_settings(path)
 
 
 @pytest.mark.parametrize(
@@ -85,13 +87,13 @@ def test_a_parameter_file_reads_like_for_the_command_line(tmp_path) -> None:
 )
 def test_what_is_wrong_is_named(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
-        declare(make_node(override), results_dir="somewhere")
+        declare(make_node(override), "somewhere")
     assert "\n" not in str(caught.value)
 
 
 def test_everything_that_is_wrong_is_named_at_once() -> None:
     with pytest.raises(ConfigError) as caught:
-        declare(make_node("loop.topk:=7", "loop.top_k:=0", "keyframe.min_period:=1.0"))
+        declare(make_node("loop.topk:=7", "loop.top_k:=0", "keyframe.min_period:=1.0"), RESULTS)
     told = str(caught.value)
     assert "unknown parameter loop.topk" in told and "unknown parameter keyframe.min_period" in told
     assert "loop.top_k: " in told and "\n" not in told
@@ -99,7 +101,7 @@ def test_everything_that_is_wrong_is_named_at_once() -> None:
 
 def test_every_parameter_is_described_typed_and_as_a_rule_read_only() -> None:
     node = make_node("verification.max_shift_m:=11", "pose_graph.max_gap_s:=3")
-    declare(node, results_dir="where results go")
+    declare(node, RESULTS)
     described = {name: node.describe_parameter(name) for name in documented_names()}
     assert [name for name, found in described.items() if not found.description] == []
     changing = [name for name, found in described.items() if not found.read_only]
@@ -120,26 +122,26 @@ def documented_names() -> list[str]:
 
 def test_a_running_node_keeps_its_parameters() -> None:
     node = make_node()
-    declare(node)
+    declare(node, RESULTS)
     (answer,) = node.set_parameters([Parameter("embedding.threads", value=3)])
     assert not answer.successful and "read-only" in answer.reason
     assert node.get_parameter("embedding.threads").value == 0
 
 
 def test_a_topic_can_be_switched_off_with_an_empty_name() -> None:
-    settings, _ = declare(make_node("topics.odometry:=''"))
+    settings, _ = declare(make_node("topics.odometry:=''"), RESULTS)
     assert settings.topics.odometry == ""
 
 
 def test_qos_overrides_of_ros_are_left_to_ros() -> None:
-    settings, _ = declare(make_node("qos_overrides./odom.subscription.depth:=3"))
+    settings, _ = declare(make_node("qos_overrides./odom.subscription.depth:=3"), RESULTS)
     assert settings == Settings()
 
 
 def test_a_node_has_parameters_of_its_own() -> None:
     node = make_node("results_dir:=/somewhere", "use_sim_time:=true")
-    _, own = declare(node, results_dir="where results go")
-    assert own == {"results_dir": "/somewhere"}
+    _, folder = declare(node, RESULTS)
+    assert folder == "/somewhere"
     assert node.get_parameter("results_dir").value == "/somewhere"
     assert node.get_parameter("use_sim_time").value is True
 
@@ -154,7 +156,7 @@ def test_changes_are_checked_like_overrides() -> None:
 
 def test_ros_itself_refuses_what_is_out_of_range() -> None:
     node = make_node()
-    declare(node)
+    declare(node, RESULTS)
     (answer,) = node.set_parameters([Parameter("verification.min_probability", value=1.5)])
     assert not answer.successful
     (answer,) = node.set_parameters([Parameter("verification.min_probability", value=0.97)])
@@ -163,7 +165,7 @@ def test_ros_itself_refuses_what_is_out_of_range() -> None:
 
 def test_autostart_is_true_or_false() -> None:
     node = make_node("autostart:=false")
-    declare(node)
+    declare(node, RESULTS)
     assert node.get_parameter("autostart").value is False
     with pytest.raises(ConfigError, match="autostart: expected true or false, got 3"):
-        declare(make_node("autostart:=3"))
+        declare(make_node("autostart:=3"), RESULTS)

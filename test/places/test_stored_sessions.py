@@ -8,7 +8,7 @@ import pytest
 from conftest import make_keyframe
 from typer.testing import CliRunner
 
-from umf_ros.commands.places import app
+from umf_ros.commands.stores import places as app
 from umf_ros.core.config import Database
 from umf_ros.core.errors import UmfError
 from umf_ros.places.database import PlaceDatabase

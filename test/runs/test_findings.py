@@ -142,8 +142,8 @@ def test_causes_come_before_what_they_bring_about(tmp_path: Path) -> None:
     assert [finding.severity for finding in look_first(about)] == ["warning", "fault", "note"]
 
 
-LIDAR = Disagreement(0.0, np.array([0.0, 9.0, 1.0]), 0.1, 99)
-FINE = Disagreement(0.0, np.array([0.5, 1.0, -2.5]), 0.1, 99)
+LIDAR = Disagreement(0.0, np.array([0.0, 9.0, 1.0]))
+FINE = Disagreement(0.0, np.array([0.5, 1.0, -2.5]))
 
 
 @pytest.mark.parametrize(
@@ -157,9 +157,9 @@ FINE = Disagreement(0.0, np.array([0.5, 1.0, -2.5]), 0.1, 99)
         (SensorReport(lidar=LIDAR, camera=FINE), "the LiDAR's mounting is off by 9 deg, mostly about y (+9 deg)"),
         (SensorReport(lidar=LIDAR, camera=LIDAR), "the odometry is not of the body frame"),
         (SensorReport(forward=np.array([0, 0, 0.9])), "the odometry is not of the body: by its poses"),
-        (SensorReport(lidar=Disagreement(-0.5, None, 0.1, 99), camera=FINE), "the LiDAR's clock is about +0.5 s off"),
+        (SensorReport(lidar=Disagreement(-0.5, None), camera=FINE), "the LiDAR's clock is about +0.5 s off"),
         (
-            SensorReport(lidar=Disagreement(0.4, None, 0.1, 99), camera=Disagreement(0.4, None, 0.1, 99)),
+            SensorReport(lidar=Disagreement(0.4, None), camera=Disagreement(0.4, None)),
             "the odometry's clock is about +0.4 s off those of camera and LiDAR",
         ),
     ],
@@ -173,7 +173,7 @@ def test_what_is_wrong_with_the_sensors_is_said_with_its_number(
 
 
 def test_sensors_that_agree_are_not_mentioned(tmp_path: Path) -> None:
-    fine = SensorReport(90, 50.0, 50.0, 9000.0, 200.0, 1.01, 0.02, FINE, FINE, np.array([0.99, 0.1, 0.0]))
+    fine = SensorReport(50.0, 50.0, 9000.0, 200.0, 1.01, FINE, FINE, np.array([0.99, 0.1, 0.0]))
     assert look_first(examined(tmp_path, [closure(50, 10)], verdict=accepted(), sensors=fine)) == []
 
 

@@ -20,8 +20,7 @@ from umf_ros.detector import Detection
 from umf_ros.runs import writer as recorder_module
 from umf_ros.runs.run_file import ALWAYS, read_closures, read_descriptors
 from umf_ros.runs.writer import RunRecorder, count_drops, read_summary
-from umf_ros.sensors.buffers import SURPLUS, InputCounter
-from umf_ros.sensors.synchronizer import INPUTS
+from umf_ros.sensors.synchronizer import INPUTS, SURPLUS, InputCounter
 from umf_ros.verification import Hypothesis, RejectReason
 
 MEASUREMENTS = {"similarity": 0.4, "inliers_image": 3.0}

@@ -128,6 +128,15 @@ def test_a_real_return_one_metre_away_stays() -> None:
     assert len(decode_cloud(cloud(0, scan(np.array([[0.0, 1.0, 0.0]]), intensity=50))).points) == 1
 
 
+def test_a_return_of_livox_one_metre_away_stays() -> None:
+    rows = [(0.0, 1.0, 0.0, 50, 7), (0.0, 0.0, 0.0, 0, 8), (2.0, 0.0, 0.0, 0, 9)]
+    points = [SimpleNamespace(x=x, y=y, z=z, reflectivity=r, offset_time=t) for x, y, z, r, t in rows]
+    decoded = decode_cloud(SimpleNamespace(points=points))
+    assert decoded.points.tolist() == [[0, 1, 0], [2, 0, 0]]
+    assert decoded.intensity is not None and decoded.intensity.tolist() == [50, 0]
+    assert decoded.time_offset_ns is not None and decoded.time_offset_ns.tolist() == [7, 9]
+
+
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("kind", ["f4", "f8"])
 def test_fields_are_read_by_name_and_type_in_any_order(order: str, kind: str) -> None:

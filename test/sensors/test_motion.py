@@ -7,8 +7,8 @@ from recordings import drive
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, invert, make_pose, transform
-from umf_ros.sensors.assembly import deskew
-from umf_ros.sensors.buffers import OdometryBuffer
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.sensors.assembly import OdometryBuffer, deskew
 
 START_NS = 1_625_680_800_000_000_000
 S = 10**9
@@ -19,7 +19,7 @@ def ns(second: float) -> int:
 
 
 def filled(seconds: Array, length_s: float = 10.0, max_gap_s: float = 1.0) -> OdometryBuffer:
-    buffer = OdometryBuffer(round(length_s * S), round(max_gap_s * S))
+    buffer = OdometryBuffer(length_s, max_gap_s)
     for second in seconds:
         buffer.add(ns(second), drive(second))
     return buffer
@@ -53,13 +53,13 @@ def test_old_poses_are_forgotten() -> None:
 
 def test_a_path_begins_and_ends_where_it_is_asked_to() -> None:
     buffer = filled(np.arange(0, 3, 0.1))
-    stamps, poses = buffer.path(ns(0.25), ns(0.55))
-    assert stamps.tolist() == [ns(0.25), ns(0.3), ns(0.4), ns(0.5), ns(0.55)]
-    np.testing.assert_allclose(poses[0][:3, 3], drive(0.25)[:3, 3], atol=1e-3)
+    path = buffer.path(ns(0.25), ns(0.55))
+    assert path.stamps_ns.tolist() == [ns(0.25), ns(0.3), ns(0.4), ns(0.5), ns(0.55)]
+    np.testing.assert_allclose(path.poses[0, :3, 3], drive(0.25)[:3, 3], atol=1e-3)
     # beyond the newest pose nothing is known
-    stamps, poses = buffer.path(ns(2.85), ns(3.2))
-    assert stamps.tolist() == [ns(2.85), ns(2.9)] and len(poses) == 2
-    assert buffer.path(ns(7), ns(8))[1] == []
+    path = buffer.path(ns(2.85), ns(3.2))
+    assert path.stamps_ns.tolist() == [ns(2.85), ns(2.9)] and len(path.poses) == 2
+    assert len(buffer.path(ns(7), ns(8))) == 0
 
 
 def test_points_are_where_they_would_be_seen_from_one_pose() -> None:
@@ -69,7 +69,7 @@ def test_points_are_where_they_would_be_seen_from_one_pose() -> None:
     seen = np.stack([transform(invert(drive(t)), point[None])[0] for t, point in zip(seconds, world, strict=True)])
     stamps = START_NS + np.round(seconds * S).astype(np.int64)
     path_at = np.arange(0, 0.201, 0.02)
-    path = (START_NS + np.round(path_at * S).astype(np.int64), [drive(t) for t in path_at])
+    path = Trajectory(START_NS + np.round(path_at * S).astype(np.int64), np.stack([drive(t) for t in path_at]))
     freed = deskew(seen.astype(np.float32), stamps, path, drive(0.1))
     assert freed.dtype == np.float32
     np.testing.assert_allclose(freed, transform(invert(drive(0.1)), world), atol=3e-3)
@@ -82,12 +82,12 @@ def test_a_standing_rover_changes_nothing() -> None:
     pose = make_pose(Rotation.random(random_state=rng).as_matrix(), [5, 6, 7])
     points = rng.uniform(-20, 20, (50, 3)).astype(np.float32)
     stamps = START_NS + np.arange(50) * 4_000_000
-    freed = deskew(points, stamps, (stamps[[0, -1]], [pose, pose]), pose)
+    freed = deskew(points, stamps, Trajectory(stamps[[0, -1]], np.stack([pose, pose])), pose)
     np.testing.assert_allclose(freed, points, atol=1e-5)
 
 
 def test_outside_of_the_path_the_rover_is_taken_to_stand() -> None:
-    path = (np.array([ns(0.0), ns(0.1)]), [drive(0.0), drive(0.1)])
+    path = Trajectory(np.array([ns(0.0), ns(0.1)]), np.stack([drive(0.0), drive(0.1)]))
     points = np.tile(np.array([[10, 0, 0]], np.float32), (4, 1))
     stamps = np.array([ns(-0.5), ns(0.0), ns(0.1), ns(0.9)])
     freed = deskew(points, stamps, path, drive(0.0))
@@ -98,7 +98,7 @@ def test_outside_of_the_path_the_rover_is_taken_to_stand() -> None:
 
 def test_the_key_may_lie_anywhere_on_the_path() -> None:
     path_at = np.arange(0, 0.21, 0.05)
-    path = (START_NS + np.round(path_at * S).astype(np.int64), [drive(t) for t in path_at])
+    path = Trajectory(START_NS + np.round(path_at * S).astype(np.int64), np.stack([drive(t) for t in path_at]))
     point, stamp = np.array([[12, 3, 0.5]], np.float32), np.array([ns(0.1)])
     world = transform(drive(0.1), point)
     for key in (0.0, 0.1, 0.2):

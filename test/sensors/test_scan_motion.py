@@ -7,13 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, make_pose
-from umf_ros.sensors.assembly import UNKNOWN_NOISE, odometry_noise, scan_motion, twists
-from umf_ros.sensors.buffers import OdometryBuffer
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.sensors.assembly import UNKNOWN_NOISE, OdometryBuffer, odometry_noise, scan_motion, twists
 
 SCAN_NS = 200_000_000
 
 
-def drive(noise: Array, rate_hz: float = 25.0, seconds: float = 60.0) -> tuple[Array, list[Array]]:
+def drive(noise: Array, rate_hz: float = 25.0, seconds: float = 60.0) -> Trajectory:
     """A rover at 1 m/s that sways and turns gently; `noise` are six standard deviations per root of a second."""
     rng = np.random.default_rng(4)
     times = np.arange(0, seconds, 1 / rate_hz)
@@ -24,7 +24,7 @@ def drive(noise: Array, rate_hz: float = 25.0, seconds: float = 60.0) -> tuple[A
         make_pose(turn.as_matrix(), step + np.array([time, 0, 0]))
         for turn, time, step in zip(turns, times, walk[:, :3], strict=True)
     ]
-    return (times * 1e9).astype(np.int64), poses
+    return Trajectory((times * 1e9).astype(np.int64), np.stack(poses))
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 25.0, 200.0])
@@ -41,23 +41,24 @@ def test_smooth_motion_is_no_noise() -> None:
 
 def test_of_a_jitter_counts_what_bends_a_scan() -> None:
     """A scan whose stamp's pose jitters by s against its other poses errs by about s."""
-    stamps, poses = drive(np.zeros(6))
+    smooth = drive(np.zeros(6))
     rng = np.random.default_rng(5)
-    shaken = [pose @ make_pose(np.eye(3), 0.01 * rng.standard_normal(3)) for pose in poses]
-    mean_error = np.sqrt(odometry_noise((stamps, shaken), SCAN_NS)[:3] * SCAN_NS * 1e-9 / 3)
+    shaken = np.stack([pose @ make_pose(np.eye(3), 0.01 * rng.standard_normal(3)) for pose in smooth.poses])
+    mean_error = np.sqrt(odometry_noise(Trajectory(smooth.stamps_ns, shaken), SCAN_NS)[:3] * SCAN_NS * 1e-9 / 3)
     np.testing.assert_allclose(mean_error, 0.01, rtol=0.4)
 
 
 def test_a_history_too_short_tells_nothing() -> None:
-    stamps, poses = drive(np.zeros(6))
-    assert odometry_noise((stamps[:20], poses[:20]), SCAN_NS) is UNKNOWN_NOISE
-    assert odometry_noise((stamps[:0], []), SCAN_NS) is UNKNOWN_NOISE
-    assert odometry_noise((stamps, poses), 0) is UNKNOWN_NOISE
+    path = drive(np.zeros(6))
+    assert odometry_noise(Trajectory(path.stamps_ns[:20], path.poses[:20]), SCAN_NS) is UNKNOWN_NOISE
+    assert odometry_noise(Trajectory(path.stamps_ns[:0], path.poses[:0]), SCAN_NS) is UNKNOWN_NOISE
+    assert odometry_noise(path, 0) is UNKNOWN_NOISE
 
 
 def test_the_motion_of_a_scan_has_its_rates_and_moments() -> None:
-    buffer = OdometryBuffer(10**10, 10**9)
-    for stamp, pose in zip(*drive(np.zeros(6)), strict=True):
+    buffer = OdometryBuffer(10.0, 1.0)
+    path = drive(np.zeros(6))
+    for stamp, pose in zip(path.stamps_ns, path.poses, strict=True):
         buffer.add(int(stamp), pose)
     start, end = 40 * 10**9, 40 * 10**9 + SCAN_NS
     found = scan_motion(np.array([0.0, 0.1, 0.2]), (start, end), buffer.path(start, end), buffer)

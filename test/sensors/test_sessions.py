@@ -7,7 +7,7 @@ import pytest
 from recordings import drive
 
 from umf_ros.core.geometry import Array, make_pose
-from umf_ros.sensors.sessions import Input, OdometrySessionSplitter, SessionClock, StampedInput
+from umf_ros.sensors.sessions import DROPPED, Input, OdometrySessionSplitter, SessionClock, StampedInput
 
 S = 10**9
 T0 = 1_625_680_800 * S
@@ -24,27 +24,28 @@ def heard(*messages: tuple[Input, float]) -> SessionClock:
     return clock
 
 
+def faults(clock: SessionClock, name: Input, second: float) -> list[str]:
+    _, decided = clock.take(StampedInput(name, ns(second), np.eye(4)))
+    return [one.fault for one in decided]
+
+
 @pytest.mark.parametrize(
     ("second", "fault", "held"),
     [(5.1, "", False), (5.0, "duplicate", False), (4.5, "out of order", False), (4.0, "", True), (0.0, "", True)],
 )
 def test_a_stamp_is_judged_by_its_own_input(second: float, fault: str, held: bool) -> None:
     clock = heard(("left", 5.0), ("cloud", 9.0))
-    usable = clock.take(StampedInput("left", ns(second))).usable
-    assert [one.fault for one in usable] == ([] if held else [fault])
-    (first,) = clock.take(StampedInput("odometry", ns(0), np.eye(4))).usable  # the first of its input
-    assert first.fault == "" and clock.session == 0
+    assert faults(clock, "left", second) == ([] if held else [fault])
+    assert faults(clock, "odometry", 0.0) == [""] and clock.session == 0  # the first of its input
 
 
 def test_two_inputs_that_went_back_agree_and_the_clock_runs_anew() -> None:
     clock = heard(("left", 5.0), ("cloud", 9.0))
     assert clock.start_ns == ns(5.0) and clock.newest_ns("cloud") == ns(9.0)
-    assert clock.take(StampedInput("left", ns(0.5), "image")).usable == []
-    ruling = clock.take(StampedInput("cloud", ns(0.6)))
-    assert (
-        ruling.reset is not None and ruling.reset.of_clock and ruling.reset.reason == "the clock of the left went back"
-    )
-    assert [(one.name, one.value) for one in ruling.usable] == [("left", "image"), ("cloud", None)]
+    assert clock.take(StampedInput("left", ns(0.5), "image")) == (None, [])
+    reset, decided = clock.take(StampedInput("cloud", ns(0.6)))
+    assert reset is not None and reset.of_clock and reset.reason == "the clock of the left went back"
+    assert [(one.name, one.value) for one in decided] == [("left", "image"), ("cloud", None)]
     assert (clock.session, clock.start_ns, clock.newest_ns("odometry")) == (1, ns(0.5), None)
 
 
@@ -52,8 +53,7 @@ def test_what_comes_late_from_before_a_reset_is_stale() -> None:
     clock = heard(("left", 5.0), ("cloud", 9.0), ("left", 0.5), ("left", 0.6))
     assert clock.session == 1
     # nearer to the end of the session before than to the new beginning
-    assert [one.fault for one in clock.take(StampedInput("cloud", ns(8.9))).usable] == ["stale"]
-    assert [one.fault for one in clock.take(StampedInput("cloud", ns(0.7))).usable] == [""]
+    assert faults(clock, "cloud", 8.9) == ["stale"] and faults(clock, "cloud", 0.7) == [""]
 
 
 def test_what_is_still_held_at_the_end_was_wrong() -> None:
@@ -69,11 +69,11 @@ def test_what_is_still_held_at_the_end_was_wrong() -> None:
 def test_an_odometry_reset_leaves_the_other_inputs_in_line() -> None:
     clock = heard(("left", 5.0), ("odometry", 5.0))
     away = make_pose(np.eye(3), [50, 0, 0])
-    assert clock.take(StampedInput("odometry", ns(5.1), away)).usable == []
-    assert [one.fault for one in clock.take(StampedInput("left", ns(5.1))).usable] == [""]
-    ruling = clock.take(StampedInput("odometry", ns(5.2), away))
-    assert ruling.reset is not None and not ruling.reset.of_clock and len(ruling.usable) == 2
-    assert [one.fault for one in clock.take(StampedInput("left", ns(5.1))).usable] == ["duplicate"]
+    assert clock.take(StampedInput("odometry", ns(5.1), away)) == (None, [])
+    assert faults(clock, "left", 5.1) == [""]
+    reset, decided = clock.take(StampedInput("odometry", ns(5.2), away))
+    assert reset is not None and not reset.of_clock and [one.fault for one in decided] == ["", ""]
+    assert faults(clock, "left", 5.1) == ["duplicate"]
 
 
 class Chains:
@@ -120,9 +120,9 @@ def test_a_process_that_hears_the_odometry_alone_finds_the_same_sessions_of_it(
             stamp, pose = (12 * S, pose) if number == 500 else (stamp, make_pose(np.eye(3), [-90.0, 0, 0]))
         if name == "odometry":
             feed.take(stamp, pose)
-        ruling = clock.take(StampedInput(name, stamp, pose))
-        if ruling.reset is not None:
+        reset, decided = clock.take(StampedInput(name, stamp, pose))
+        if reset is not None:
             sessions.append([])
-        sessions[-1] += [one.stamp_ns for one in ruling.usable if one.name == "odometry"]
+        sessions[-1] += [one.stamp_ns for one in decided if one.name == "odometry" and one.fault not in DROPPED]
     assert graph.sessions == sessions
     assert len(sessions) == 1 + {looped: 2, stepped_back: 1, unchanged: 0}[clock_of] + (reset_s < 25)

@@ -65,10 +65,9 @@ def test_usable_stamps_of_an_input_rise_within_a_session(messages: list[tuple[In
     newest: dict[tuple[int, Input], int] = {}
     returned = 0
     for name, stamp_ms in messages:
-        update = clock.take(StampedInput(name, T0 + stamp_ms * MS, np.eye(4)))
-        returned += len(update.usable) + len(update.dropped)
-        assert all(one.fault for one in update.dropped)
-        for one in update.usable:
+        _, decided = clock.take(StampedInput(name, T0 + stamp_ms * MS, np.eye(4)))
+        returned += len(decided)
+        for one in decided:
             if not one.fault:
                 key = (clock.session, one.name)
                 assert one.stamp_ns > newest.get(key, -1)
@@ -84,6 +83,6 @@ def test_two_inputs_set_back_begin_one_session(back_s: int, length_s: int) -> No
         for name in inputs:
             clock.take(StampedInput(name, T0 + second * S))
     updates = [clock.take(StampedInput(name, T0 + (length_s - back_s) * S)) for name in inputs]
-    assert [update.reset is not None for update in updates] == [False, True]
-    assert [one.name for one in updates[1].usable] == ["left", "cloud"]
+    assert [reset is not None for reset, _ in updates] == [False, True]
+    assert [one.name for one in updates[1][1]] == ["left", "cloud"]
     assert clock.session == 1

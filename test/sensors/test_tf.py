@@ -14,7 +14,7 @@ from umf_ros.core.geometry import Array, make_pose
 from umf_ros.sensors.calibration import Calibration, load_calibration
 from umf_ros.sensors.router import MessageRouter
 from umf_ros.sensors.synchronizer import Synchronizer
-from umf_ros.sensors.tf import OdometryFrames, StaticTransforms, TfExtrinsics
+from umf_ros.sensors.tf import BodyFrames, StaticTransforms
 
 
 @pytest.fixture
@@ -66,38 +66,38 @@ def test_extrinsics_come_from_the_transforms_and_else_from_the_file(calibration:
     told: list[str] = []
     transforms = tree(("base_link", "lidar", at(0.7)))
     synchronizer = Synchronizer(Sync(), calibration, {"cloud"})
-    mounting = TfExtrinsics(calibration, transforms, "base_link", told.append)
-    intake = MessageRouter(synchronizer, Topics(), told.append, mounting=mounting)
+    frames = BodyFrames(FrameIds(), transforms, told.append, calibration=calibration)
+    intake = MessageRouter(synchronizer, Topics(), told.append, frames=frames)
     for number, name in enumerate(("lidar", "lidar", "unknown")):
         message = cloud(START_NS + number * 10**9, scan(np.full((3, 3), 4.0)))
         message.header.frame_id = name
         intake.take(CLOUD, message)
-    frames = synchronizer.pop() + synchronizer.flush()
-    np.testing.assert_allclose(frames[0].body_T_lidar, at(0.7))
-    np.testing.assert_allclose(frames[0].body_T_camera, calibration.body_T_camera)
+    frame = (synchronizer.pop() + synchronizer.flush())[0]
+    np.testing.assert_allclose(frame.body_T_lidar, at(0.7))
+    np.testing.assert_allclose(frame.body_T_camera, calibration.body_T_camera)
     assert len(told) == 1 and "its pose is that of lidar in base_link" in told[0]
 
 
 def test_a_camera_frame_that_is_not_optical_is_not_believed(calibration: Calibration) -> None:
     told: list[str] = []
     transforms = tree(("base_link", "camera_link", at(0.4)), ("base_link", "camera_optical", OPTICAL))
-    mounting = TfExtrinsics(calibration, transforms, "base_link", told.append)
-    assert mounting.update("camera", "camera_link") == {} and "not an optical frame" in told[0]
-    np.testing.assert_allclose(mounting.update("camera", "camera_optical")["body_T_camera"], OPTICAL, atol=1e-12)
-    assert mounting.update("camera", "camera_optical") == {}
+    frames = BodyFrames(FrameIds(), transforms, told.append, calibration=calibration)
+    assert frames.mounting("camera", "camera_link") == {} and "not an optical frame" in told[0]
+    np.testing.assert_allclose(frames.mounting("camera", "camera_optical")["body_T_camera"], OPTICAL, atol=1e-12)
+    assert frames.mounting("camera", "camera_optical") == {}
 
 
 def test_a_transform_that_comes_late_is_used_then(calibration: Calibration) -> None:
     transforms = StaticTransforms()
-    mounting = TfExtrinsics(calibration, transforms, "base_link", lambda _: None)
-    assert mounting.update("lidar", "lidar") == {}
+    frames = BodyFrames(FrameIds(), transforms, lambda _: None, calibration=calibration)
+    assert frames.mounting("lidar", "lidar") == {}
     transforms.add(SimpleNamespace(transforms=[stamped("base_link", "lidar", at(2))]))
-    np.testing.assert_allclose(mounting.update("lidar", "lidar")["body_T_lidar"], at(2))
+    np.testing.assert_allclose(frames.mounting("lidar", "lidar")["body_T_lidar"], at(2))
 
 
 def test_odometry_of_another_part_is_carried_to_the_body() -> None:
     told: list[str] = []
-    frames = OdometryFrames(FrameIds(), tree(("base_link", "imu", at(0.5))), told.append)
+    frames = BodyFrames(FrameIds(), tree(("base_link", "imu", at(0.5))), told.append)
     message = odometry(START_NS, np.eye(4))
     message.child_frame_id, message.header.frame_id = "imu", "vio"
     np.testing.assert_allclose(frames.to_body(message, at(3)), at(2.5), atol=1e-12)
@@ -108,7 +108,7 @@ def test_odometry_of_another_part_waits_for_transforms_that_come_late() -> None:
     """Both nodes begin with the same pose, whichever of them hears the latched transforms first."""
     told: list[str] = []
     transforms = StaticTransforms()
-    frames = OdometryFrames(FrameIds(), transforms, told.append, patience_s=2.0)
+    frames = BodyFrames(FrameIds(), transforms, told.append, patience_s=2.0)
     messages = [odometry(START_NS + second * 10**9, np.eye(4)) for second in range(4)]
     for message in messages:
         message.child_frame_id = "imu"
@@ -118,7 +118,7 @@ def test_odometry_of_another_part_waits_for_transforms_that_come_late() -> None:
         assert caught.value.kind == "transforms"
     transforms.add(SimpleNamespace(transforms=[stamped("base_link", "imu", at(0.5))]))
     np.testing.assert_allclose(frames.to_body(messages[1], at(3)), at(2.5), atol=1e-12)
-    patient = OdometryFrames(FrameIds(), StaticTransforms(), told.append, patience_s=2.0)
+    patient = BodyFrames(FrameIds(), StaticTransforms(), told.append, patience_s=2.0)
     with pytest.raises(MessageError, match="waits for /tf_static"):
         patient.to_body(messages[0], at(3))
     assert told == []
@@ -128,7 +128,7 @@ def test_odometry_of_another_part_waits_for_transforms_that_come_late() -> None:
 
 def test_unknown_parts_are_told_and_two_sources_on_a_topic_refused() -> None:
     told: list[str] = []
-    frames = OdometryFrames(FrameIds(), StaticTransforms(), told.append)
+    frames = BodyFrames(FrameIds(), StaticTransforms(), told.append)
     message = odometry(START_NS, np.eye(4))
     message.child_frame_id = "wheels"
     np.testing.assert_array_equal(frames.to_body(message, at(3)), at(3))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,12 @@ from umf_ros.core.config import Settings, Topics, topics_of
 from umf_ros.core.errors import BagError, MessageError, either
 from umf_ros.core.frames import Frame
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import TYPES, OdometrySample, stamp_ns
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.sessions import ODOMETRY, Input
-from umf_ros.sensors.synchronizer import Synchronizer
-from umf_ros.sensors.tf import TOPIC, OdometryFrames, StaticTransforms, TfExtrinsics
+from umf_ros.sensors.synchronizer import InputCounter, Synchronizer
+from umf_ros.sensors.tf import TOPIC, BodyFrames, StaticTransforms
 
 _log = logging.getLogger(__name__)
 
@@ -60,12 +58,9 @@ class FrameReader:
         self._bag, self._odometry, self._rows_taken = bag, odometry, 0
         self._synchronizer = Synchronizer(settings.sync, calibration, inputs, warn)
         self._samples: list[OdometrySample] = []
-        transforms = read_transforms(bag) if settings.uses_transforms else None
-        mounting, frames = None, None
-        if transforms is not None and transforms.version:
-            mounting = TfExtrinsics(calibration, transforms, settings.frames.base, warn)
-            frames = OdometryFrames(settings.frames, transforms, warn)
-        self._router = MessageRouter(self._synchronizer, topics, warn, self._samples.append, mounting, frames)
+        transforms = read_transforms(bag) if settings.uses_transforms else StaticTransforms()
+        frames = BodyFrames(settings.frames, transforms, warn, 0.0, calibration) if transforms.version else None
+        self._router = MessageRouter(self._synchronizer, topics, warn, self._samples.append, frames)
         if bag.warning:
             warn(bag.warning)
 
@@ -152,25 +147,6 @@ Moment = int | float
 """Nanoseconds since the epoch, or seconds from the start of the recording."""
 
 
-@dataclass(frozen=True, slots=True)
-class FoundFrame:
-    """The frame nearest to a moment, and its distance in time."""
-
-    frame: Frame
-    moment: Moment
-    away_ns: int
-
-    def checked(self) -> Frame:
-        """The frame.
-
-        Raises:
-            BagError: it is further than a second from the moment.
-        """
-        if self.away_ns > REACH_NS:
-            raise BagError(f"no frame within a second of {self.moment}; the nearest is at {self.frame.stamp_ns} ns")
-        return self.frame
-
-
 def parse_moment(text: str) -> Moment:
     """Nanoseconds since the epoch (16 digits or more), seconds since the epoch, or seconds from the start.
 
@@ -201,8 +177,8 @@ def split_reference(text: str) -> tuple[Path, str] | None:
     return Path(name), moment
 
 
-def nearest_frames(frames: Iterable[Frame], moments: list[Moment]) -> list[FoundFrame]:
-    """The frame of a recording nearest to each moment; reads no further than it must.
+def nearest_frames(frames: Iterable[Frame], moments: list[Moment]) -> list[Frame | BagError]:
+    """The frame nearest to each moment, an error where none is within a second; reads no further than it must.
 
     Raises:
         BagError: the recording has no frame.
@@ -221,6 +197,8 @@ def nearest_frames(frames: Iterable[Frame], moments: list[Moment]) -> list[Found
     if not best:
         raise BagError("the recording has no frame with an image or a scan")
     return [
-        FoundFrame(frame, moment, abs(frame.stamp_ns - stamp))
+        frame
+        if abs(frame.stamp_ns - stamp) <= REACH_NS
+        else BagError(f"no frame within a second of {moment}; the nearest is at {frame.stamp_ns} ns")
         for frame, stamp, moment in zip(best, wanted, moments, strict=True)
     ]

@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 from umf_ros.bags.reader import Bag
 from umf_ros.core.config import Settings, topics_of
-from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.decode import TYPES
 from umf_ros.sensors.sessions import Input
+from umf_ros.sensors.synchronizer import InputCounter
 
 Severity = Literal["fault", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("fault", "warning", "note")

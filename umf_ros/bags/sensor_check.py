@@ -10,16 +10,15 @@ from typing import Any
 import cv2
 import numpy as np
 import small_gicp
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.inputs import Advice
 from umf_ros.core.frames import Frame, Image, Points
-from umf_ros.core.geometry import Array
-from umf_ros.core.trajectory import Trajectory
+from umf_ros.core.geometry import Array, invert
+from umf_ros.core.trajectory import Trajectory, interpolated
 from umf_ros.embedding.depth import disparities
 
-SCAN_CELL_M, SCAN_REACH_M, SCAN_NEIGHBOURS = 0.4, 1.0, 10  # by hand: consecutive scans, a quarter of a metre apart
+SCAN_CELL_M, SCAN_REACH_M = 0.4, 1.0  # by hand: consecutive scans, a quarter of a metre apart
 CELL_MASK = 2**21 - 1  # three coordinates in one number: a scan is far narrower than two million cells
 MIN_SCAN_POINTS = 200  # by hand: below, consecutive scans are not registered
 CORNERS, CORNER_QUALITY, CORNER_SPACING, CORNER_WINDOW, CORNER_LEVELS = 300, 0.01, 8, (21, 21), 4  # by hand
@@ -58,14 +57,10 @@ class Disagreement:
         lag_s: to be added to the sensor's stamps.
         mounting_deg: (3,) rotation vector that turns the sensor's motion into the odometry's, body axes; None where
             the motion does not tell.
-        residual_deg: difference of the turns that remains: the mean of the axes' medians by their product.
-        steps: number of pairs.
     """
 
     lag_s: float
     mounting_deg: Array | None
-    residual_deg: float
-    steps: int
 
 
 def as_measured(frame: Frame) -> tuple[Points, float]:
@@ -80,15 +75,11 @@ def as_measured(frame: Frame) -> tuple[Points, float]:
     moments = frame.motion.moments_s
     turns = Rotation.from_rotvec(-moments[:, None] * frame.motion.rates[3:])
     measured = turns.apply(frame.points - moments[:, None] * frame.motion.rates[:3])
-    thinned = _one_per_cell(frame.points)
+    cell = np.floor(frame.points / SCAN_CELL_M).astype(np.int64) & CELL_MASK
+    # those that are left when points are thinned before they are aligned
+    thinned = np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)[1]
     levers: Array = np.square(frame.points[thinned].astype(float)).sum(axis=1)
     return measured.astype(np.float32), float(np.average(moments[thinned], weights=levers + 1e-9))
-
-
-def _one_per_cell(points: Points) -> NDArray[np.intp]:
-    """One of the points (N, 3) in every cell that they are thinned by before they are aligned."""
-    cell = np.floor(points / SCAN_CELL_M).astype(np.int64) & CELL_MASK
-    return np.asarray(np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)[1])
 
 
 def scan_step(earlier: Frame, later: Frame) -> Step | None:
@@ -96,11 +87,13 @@ def scan_step(earlier: Frame, later: Frame) -> Step | None:
     (before, before_s), (after, after_s) = as_measured(earlier), as_measured(later)
     if min(len(before), len(after)) < MIN_SCAN_POINTS:
         return None
-    clouds = [
-        small_gicp.preprocess_points(one.astype(float), SCAN_CELL_M, SCAN_NEIGHBOURS, 1) for one in (before, after)
-    ]
-    (target, tree), (source, _) = clouds
-    found = small_gicp.align(target, source, tree, max_correspondence_distance=SCAN_REACH_M, num_threads=1)
+    found = small_gicp.align(
+        before.astype(float),
+        after.astype(float),
+        downsampling_resolution=SCAN_CELL_M,
+        max_correspondence_distance=SCAN_REACH_M,
+        num_threads=1,
+    )
     turn = Rotation.from_matrix(found.T_target_source[:3, :3]).as_rotvec()
     stamps = earlier.stamp_ns + round(before_s * 1e9), later.stamp_ns + round(after_s * 1e9)
     return Step(*stamps, turn, found.T_target_source[:3, 3]) if found.converged else None
@@ -149,22 +142,19 @@ def compare_motion(steps: list[Step], odometry: Trajectory) -> Disagreement | No
     """
     if len(steps) < MIN_PAIRS or len(odometry) < MIN_PAIRS:
         return None
-    first_ns = int(odometry.stamps_ns[0])
-    times = (odometry.stamps_ns - first_ns) * 1e-9
-    turns = Slerp(times, Rotation.from_matrix(odometry.poses[:, :3, :3]))
-    spans: Array = np.array([(step.start_ns - first_ns, step.end_ns - first_ns) for step in steps]) * 1e-9
+    spans = np.array([(step.start_ns, step.end_ns) for step in steps])
     seen_turns = np.array([step.turn for step in steps])
     seen_ways = _directions(np.array([step.shift for step in steps]))
     tried: list[tuple[float, float, Array, bool]] = []
     for lag in LAGS_S:
-        inside = (spans[:, 0] + lag >= times[0]) & (spans[:, 1] + lag <= times[-1])
+        moved = spans + round(lag * 1e9)
+        inside = (moved[:, 0] >= odometry.stamps_ns[0]) & (moved[:, 1] <= odometry.stamps_ns[-1])
         if inside.sum() < MIN_PAIRS:
             continue
-        first, last = (spans[inside] + lag).T
-        stated = (turns(first).inv() * turns(last)).as_rotvec()
-        driven = _positions(last, times, odometry) - _positions(first, times, odometry)
-        ways = _directions(turns(first).inv().apply(driven))
-        rotation, residuals, known = _one_rotation(seen_turns[inside], stated, seen_ways[inside], ways)
+        first, last = (interpolated(odometry.stamps_ns, odometry.poses, stamps) for stamps in moved[inside].T)
+        stated = invert(first) @ last
+        turns, ways = Rotation.from_matrix(stated[:, :3, :3]).as_rotvec(), _directions(stated[:, :3, 3])
+        rotation, residuals, known = _one_rotation(seen_turns[inside], turns, seen_ways[inside], ways)
         tried.append((_spread(residuals), float(lag), rotation, known))
     if not tried:
         return None
@@ -179,7 +169,7 @@ def compare_motion(steps: list[Step], odometry: Trajectory) -> Disagreement | No
     if best != in_step and 0 < best < len(tried) - 1:
         lag += _lowest(sizes[best - 1 : best + 2]) * (tried[best + 1][1] - lag)
     mounting = np.degrees(Rotation.from_matrix(rotation).as_rotvec()) if known else None
-    return Disagreement(round(lag, 2), mounting, float(np.degrees(residual)), len(steps))
+    return Disagreement(round(lag, 2), mounting)
 
 
 def _spread(residuals: Array) -> float:
@@ -197,7 +187,6 @@ def _lowest(three: list[float]) -> float:
 def _one_rotation(turns: Array, stated: Array, ways: Array, stated_ways: Array) -> tuple[Array, Array, bool]:
     """Rotation (3, 3) that turns (N, 3) into stated (N, 3), robustly; the (N, 3) that is left; whether it is known."""
     weights = np.ones(len(turns))
-    rotation, residuals, known = np.eye(3), np.zeros_like(turns), False
     for _ in range(ROUNDS):
         weighed = weights[:, None]
         sums = (turns * weighed).T @ stated / NOISE_RAD**2 + (ways * weighed).T @ stated_ways / NOISE_DIRECTION**2
@@ -207,12 +196,7 @@ def _one_rotation(turns: Array, stated: Array, ways: Array, stated_ways: Array) 
         residuals = turns @ rotation.T - stated
         size = np.linalg.norm(residuals, axis=1)
         weights = 1 / (1 + (size / max(float(np.median(size)), 1e-9)) ** 2)
-        known = bool(sizes[1] > KNOWN * sizes[0])
-    return rotation, residuals, known
-
-
-def _positions(at: Array, times: Array, odometry: Trajectory) -> Array:
-    return np.stack([np.interp(at, times, odometry.poses[:, axis, 3]) for axis in range(3)], axis=1)
+    return rotation, residuals, bool(sizes[1] > KNOWN * sizes[0])
 
 
 def _directions(vectors: Array) -> Array:
@@ -233,23 +217,19 @@ class SensorReport:
     """Measurements of a recording; NaN and None where there was nothing to measure them on.
 
     Attributes:
-        frames: that were looked at.
         left_contrast, right_contrast: median standard deviation of an image's grey values.
         returns: median number of a scan's returns.
         intensity_max: largest intensity; NaN where the driver sends none.
         stereo_scale: median of stereo's depth by the LiDAR's.
-        stereo_spread: half of the ratios are nearer to their median than this, as a logarithm.
         lidar, camera: how their motion differs from the odometry's.
         forward: (3,) mean direction of motion by odometry, body axes.
     """
 
-    frames: int = 0
     left_contrast: float = nan
     right_contrast: float = nan
     returns: float = nan
     intensity_max: float = nan
     stereo_scale: float = nan
-    stereo_spread: float = nan
     lidar: Disagreement | None = None
     camera: Disagreement | None = None
     forward: Array | None = None
@@ -259,13 +239,14 @@ class SensorCheck:
     """Looks at the frames of a recording as they pass, for a report at the end."""
 
     def __init__(self) -> None:
-        self._contrasts: dict[str, list[float]] = {"left": [], "right": []}
+        self._contrasts: tuple[list[float], list[float]] = [], []
         self._returns: list[float] = []
         self._intensity_max = nan
         self._depth_ratios: list[Array] = []
         self._frames = 0
         self._last: Frame | None = None
-        self._steps: dict[str, list[Step]] = {"lidar": [], "camera": []}
+        self._scan_steps: list[Step] = []
+        self._view_steps: list[Step] = []
 
     def take(self, frame: Frame) -> None:
         """Look at one frame, in the order of their stamps."""
@@ -283,23 +264,16 @@ class SensorCheck:
     def report(self, odometry: Trajectory | None) -> SensorReport:
         """Hold the measurements against the odometry as it was recorded."""
         ratios = np.concatenate(self._depth_ratios) if self._depth_ratios else np.empty(0)
+        left, right, returns = (_median(values) for values in (*self._contrasts, self._returns))
         scale = float(np.median(ratios)) if len(ratios) >= MIN_DEPTHS else nan
-        return SensorReport(
-            frames=self._frames,
-            left_contrast=_median(self._contrasts["left"]),
-            right_contrast=_median(self._contrasts["right"]),
-            returns=_median(self._returns),
-            intensity_max=self._intensity_max,
-            stereo_scale=scale,
-            stereo_spread=float(np.median(np.abs(np.log(ratios / scale)))) if scale > 0 else nan,
-            lidar=compare_motion(self._steps["lidar"], odometry) if odometry else None,
-            camera=compare_motion(self._steps["camera"], odometry) if odometry else None,
-            forward=_forward(odometry) if odometry else None,
-        )
+        if odometry is None:
+            return SensorReport(left, right, returns, self._intensity_max, scale)
+        lidar, camera = (compare_motion(steps, odometry) for steps in (self._scan_steps, self._view_steps))
+        return SensorReport(left, right, returns, self._intensity_max, scale, lidar, camera, _forward(odometry))
 
     def _look(self, frame: Frame) -> None:
         if self._frames % 4 == 1:
-            for image, contrasts in zip((frame.left, frame.right), self._contrasts.values(), strict=True):
+            for image, contrasts in zip((frame.left, frame.right), self._contrasts, strict=True):
                 if image is not None:
                     contrasts.append(float(image[::4, ::4].std()))
         if frame.points is not None:
@@ -322,20 +296,17 @@ class SensorCheck:
             self._depth_ratios.append(ratio[np.isfinite(ratio)])
 
     def _step(self, earlier: Frame, later: Frame) -> None:
-        if sum(map(len, self._steps.values())) >= 2 * MAX_STEPS or _stands(earlier, later):
+        if len(self._scan_steps) + len(self._view_steps) >= 2 * MAX_STEPS:
+            return
+        poses = earlier.odom_T_body, later.odom_T_body
+        if poses[0] is not None and poses[1] is not None and np.linalg.norm((poses[1] - poses[0])[:3, 3]) < MOVES_M:
             return
         if earlier.points is not None and later.points is not None:
             found = scan_step(earlier, later)
-            self._steps["lidar"] += [found] if found else []
+            self._scan_steps += [found] if found else []
         if earlier.image_stamp_ns and later.image_stamp_ns:
             found = view_step(earlier, later)
-            self._steps["camera"] += [found] if found else []
-
-
-def _stands(earlier: Frame, later: Frame) -> bool:
-    if earlier.odom_T_body is None or later.odom_T_body is None:
-        return False
-    return bool(np.linalg.norm(later.odom_T_body[:3, 3] - earlier.odom_T_body[:3, 3]) < MOVES_M)
+            self._view_steps += [found] if found else []
 
 
 def _forward(odometry: Trajectory) -> Array | None:
@@ -344,12 +315,10 @@ def _forward(odometry: Trajectory) -> Array | None:
         return None
     kept = np.searchsorted(odometry.stamps_ns, np.arange(odometry.stamps_ns[0], odometry.stamps_ns[-1], 500_000_000))
     poses = odometry.poses[np.unique(kept)]
-    ways = np.einsum("nji,nj->ni", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
+    ways = (invert(poses[:-1]) @ poses[1:])[:, :3, 3]
     length = np.linalg.norm(ways, axis=1)
-    if not (moved := ways[length > 2 * MOVES_M]).size:
-        return None
-    mean = (moved / np.linalg.norm(moved, axis=1, keepdims=True)).mean(axis=0)
-    return np.asarray(mean)
+    moved = length > 2 * MOVES_M
+    return np.asarray((ways[moved] / length[moved, None]).mean(axis=0)) if moved.any() else None
 
 
 def _median(values: list[float]) -> float:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import lz4.frame
 from mcap.data_stream import ReadDataStream
@@ -28,10 +28,30 @@ from rosbags.typesys.store import Typestore
 from zstandard import ZstdError, frame_content_size
 
 from umf_ros.core.errors import BagError
-from umf_ros.sensors.decode import LIVOX, LIVOX_DEFINITION
+from umf_ros.sensors.decode import LIVOX
 
 LARGEST_CHUNK = 2**28
 """Bytes of a chunk after unpacking, and of any record; recorders write some megabytes."""
+
+
+LIVOX_DEFINITION = """
+std_msgs/Header header
+uint64 timebase
+uint32 point_num
+uint8 lidar_id
+uint8[3] rsvd
+CustomPoint[] points
+================================================================================
+MSG: {package}/CustomPoint
+uint32 offset_time
+float32 x
+float32 y
+float32 z
+uint8 reflectivity
+uint8 tag
+uint8 line
+"""
+"""Type of message of Livox' drivers; recordings of them carry it too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,20 +70,6 @@ class RawMessage:
     log_ns: int
     type: str
     data: bytes
-
-
-class RecordedFile(Protocol):
-    """One file of a recording: number and type of its messages by topic, and the time of the first and the last."""
-
-    counts: Counter[str]
-    types: dict[str, str]
-    start_ns: int
-    end_ns: int
-    warning: str
-
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of some topics in the order of their recording."""
-        ...
 
 
 @cache
@@ -101,86 +107,75 @@ SORTING_WINDOW_NS = 1_000_000_000
 """Without an index, messages are put in order as far as they lie this close together."""
 MOST_WAITING = 2**28
 """Bytes of messages that wait for earlier ones; those of a recorder's second are some dozens of megabytes."""
+PlacedMessage = tuple[int, tuple[int, int], RawMessage]
+"""The time before which no message comes any more, a place in the file that decides between equal times, a message."""
 
 
-def _open_mcap(path: Path) -> RecordedFile:
-    try:
-        return _IndexedFile(path)
-    except (*_DAMAGE, OSError):  # too short to seek in
-        return _BrokenFile(path)
-
-
-class _IndexedFile:
-    """A complete file."""
+class McapFile:
+    """An mcap file, read by its index; without one, as a killed recorder leaves it, up to where it breaks off."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self.warning = path, ""
-        with path.open("rb") as stream:
+        self._path, self._fault, self.warning = path, "", ""
+        self._chunks: list[ChunkIndex] = []
+        self.types: dict[str, str] = {}
+        self.counts: Counter[str] = Counter()
+        try:
+            self._read_index()
+        except (*_DAMAGE, OSError):  # too short to seek in
+            self._read_through()
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Messages of some topics in the order of their recording."""
+        return _in_order(self._by_index(topics) if self._chunks else self._up_to_the_end(topics))
+
+    def _read_index(self) -> None:
+        with self._path.open("rb") as stream:
             summary = make_reader(stream).get_summary()
         if summary is None or summary.statistics is None or not summary.chunk_indexes:
             raise ValueError("no index")
         channels = {key: channel for key, channel in summary.channels.items() if channel.message_encoding == "cdr"}
         if summary.channels and not channels:
             encodings = ", ".join(sorted({channel.message_encoding for channel in summary.channels.values()}))
-            raise BagError(f"{path} holds messages encoded as {encodings}; only those of ROS 2 (cdr) can be read")
-        _check_chunks(path, summary.chunk_indexes)
+            raise BagError(f"{self._path} holds messages encoded as {encodings}; only those of ROS 2 (cdr) can be read")
+        _check_chunks(self._path, summary.chunk_indexes)
         self._channels = {
             key: (channel.topic, summary.schemas[channel.schema_id].name) for key, channel in channels.items()
         }
-        self._chunks = sorted(
-            summary.chunk_indexes, key=lambda index: (index.message_start_time, index.chunk_start_offset)
-        )
         self.types = dict(self._channels.values())
-        self.counts: Counter[str] = Counter()
         for key, count in summary.statistics.channel_message_counts.items():
             if key in channels:
                 self.counts[channels[key].topic] += count
-        self.start_ns = summary.statistics.message_start_time
-        self.end_ns = summary.statistics.message_end_time
+        self.start_ns, self.end_ns = summary.statistics.message_start_time, summary.statistics.message_end_time
+        self._chunks = sorted(summary.chunk_indexes, key=lambda one: (one.message_start_time, one.chunk_start_offset))
 
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        wanted = {key: channel for key, channel in self._channels.items() if channel[0] in topics}
-        buffer = _ReorderBuffer()
-        with self._path.open("rb") as stream:
-            for index in self._chunks:
-                if index.message_index_offsets and not wanted.keys() & index.message_index_offsets.keys():
-                    continue
-                yield from buffer.until(index.message_start_time)
-                stream.seek(index.chunk_start_offset + 9)
-                for number, record in enumerate(_unpacked(Chunk.read(ReadDataStream(stream)))):
-                    if isinstance(record, Message) and record.channel_id in wanted:
-                        topic, kind = wanted[record.channel_id]
-                        message = RawMessage(topic, record.log_time, kind, record.data)
-                        yield from buffer.take(message, (index.chunk_start_offset, number))
-        yield from buffer.until()
-
-
-class _BrokenFile:
-    """A file without an index, as a recorder leaves it that was killed: read up to where it breaks off."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._fault = ""
-        self.types: dict[str, str] = {}
-        self.counts: Counter[str] = Counter()
+    def _read_through(self) -> None:
         self.start_ns, self.end_ns = 2**63, 0
         for message in self._stream():
             self.types[message.topic] = message.type
             self.counts[message.topic] += 1
             self.start_ns = min(self.start_ns, message.log_ns)
             self.end_ns = max(self.end_ns, message.log_ns)
-        self.warning = ""
         if self._fault:
-            seconds = max(0, self.end_ns - self.start_ns) * 1e-9
-            self.warning = f"{path} breaks off; its first {seconds:.1f} s ({self.counts.total()} messages) are readable"
+            seconds, count = max(0, self.end_ns - self.start_ns) * 1e-9, self.counts.total()
+            self.warning = f"{self._path} breaks off; its first {seconds:.1f} s ({count} messages) are readable"
 
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        buffer = _ReorderBuffer()
+    def _by_index(self, topics: Collection[str]) -> Iterator[PlacedMessage]:
+        wanted = {key: channel for key, channel in self._channels.items() if channel[0] in topics}
+        with self._path.open("rb") as stream:
+            for index in self._chunks:
+                if index.message_index_offsets and not wanted.keys() & index.message_index_offsets.keys():
+                    continue
+                stream.seek(index.chunk_start_offset + 9)
+                for number, record in enumerate(_unpacked(Chunk.read(ReadDataStream(stream)))):
+                    if isinstance(record, Message) and record.channel_id in wanted:
+                        topic, kind = wanted[record.channel_id]
+                        message = RawMessage(topic, record.log_time, kind, record.data)
+                        yield index.message_start_time, (index.chunk_start_offset, number), message
+
+    def _up_to_the_end(self, topics: Collection[str]) -> Iterator[PlacedMessage]:
         for number, message in enumerate(self._stream()):
             if message.topic in topics:
-                yield from buffer.take(message, (0, number))
-                yield from buffer.until(message.log_ns - SORTING_WINDOW_NS)
-        yield from buffer.until()
+                yield message.log_ns - SORTING_WINDOW_NS, (0, number), message
 
     def _stream(self) -> Iterator[RawMessage]:
         """Messages as they lie in the file."""
@@ -206,29 +201,19 @@ class _BrokenFile:
                 self._fault = str(error) or type(error).__name__
 
 
-class _ReorderBuffer:
-    """Sorts messages by time within limits of memory: on overflow they pass unsorted."""
-
-    def __init__(self) -> None:
-        self._waiting: list[tuple[int, tuple[int, int], RawMessage]] = []
-        self._held = 0
-
-    def take(self, message: RawMessage, place: tuple[int, int]) -> Iterator[RawMessage]:
-        """Add one, whose place in the file decides between equal times; yields those that do not fit."""
-        heapq.heappush(self._waiting, (message.log_ns, place, message))
-        self._held += len(message.data)
-        while self._held > MOST_WAITING:
-            yield self._first()
-
-    def until(self, log_ns: int = 2**64) -> Iterator[RawMessage]:
-        """Yield the messages before a time, by default all."""
-        while self._waiting and self._waiting[0][0] < log_ns:
-            yield self._first()
-
-    def _first(self) -> RawMessage:
-        message = heapq.heappop(self._waiting)[2]
-        self._held -= len(message.data)
-        return message
+def _in_order(messages: Iterable[PlacedMessage]) -> Iterator[RawMessage]:
+    """Sort messages by time within limits of memory: on overflow they pass unsorted."""
+    waiting: list[tuple[int, tuple[int, int], RawMessage]] = []
+    held = 0
+    for bound_ns, place, message in messages:
+        heapq.heappush(waiting, (message.log_ns, place, message))
+        held += len(message.data)
+        while waiting and (waiting[0][0] < bound_ns or held > MOST_WAITING):
+            first = heapq.heappop(waiting)[2]
+            held -= len(first.data)
+            yield first
+    while waiting:
+        yield heapq.heappop(waiting)[2]
 
 
 def _unpacked(chunk: Chunk) -> Iterable[McapRecord]:
@@ -265,7 +250,7 @@ _LIMITED: dict[Any, Any] = {bz2.decompress: partial(unpack, "bz2"), lz4.frame.de
 """Decompressors of chunks, and those with a limit that replace them."""
 
 
-class _RosbagsFile:
+class RosbagsFile:
     """A folder of ROS 2, a db3 file, or a ROS 1 bag.
 
     The messages of ROS 1 come out as those of ROS 2; types that ROS 2 does not know are left out.
@@ -285,6 +270,7 @@ class _RosbagsFile:
             self.counts[connection.topic] += connection.msgcount
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Messages of some topics in the order of their recording."""
         with self._reader(self._path) as reader:
             wanted = [connection for connection in self._readable(reader) if connection.topic in topics]
             for place, chunk in getattr(reader, "chunks", {}).items():  # of ROS 1
@@ -308,6 +294,9 @@ def _warning_of_log(path: Path) -> str:
     return ""
 
 
+RecordedFile = McapFile | RosbagsFile
+"""One file of a recording: number and type of its messages by topic, and the time of the first and the last."""
+
 _MCAP, _SQLITE, _ROS1 = b"\x89MCAP0\r\n", b"SQLite format 3\x00", b"#ROSBAG V2.0"
 
 
@@ -326,20 +315,20 @@ def open_files(path: Path) -> list[RecordedFile]:
     if not start:
         raise BagError(f"{path} is empty")
     if start.startswith(_MCAP):
-        return [_open_mcap(path)]
+        return [McapFile(path)]
     if start.startswith((_SQLITE, _ROS1)):
-        return [_RosbagsFile(path, ros1=start.startswith(_ROS1))]
+        return [RosbagsFile(path, ros1=start.startswith(_ROS1))]
     raise BagError(f"{path} is no recording: neither mcap nor db3 nor a ROS 1 bag")
 
 
 def _open_folder(path: Path) -> list[RecordedFile]:
     mcap, db3 = (_in_number_order(one for one in path.glob(f"*.{kind}") if one.is_file()) for kind in ("mcap", "db3"))
     if mcap:
-        return [_open_mcap(one) for one in mcap]
+        return [McapFile(one) for one in mcap]
     if (path / "metadata.yaml").is_file():
-        return [_RosbagsFile(path)]
+        return [RosbagsFile(path)]
     if db3:  # the recorder was killed before it wrote its metadata
-        return [_RosbagsFile(one) for one in db3]
+        return [RosbagsFile(one) for one in db3]
     raise BagError(f"{path} is no recording: it holds neither metadata.yaml nor mcap or db3 files")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
@@ -64,12 +63,8 @@ def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajector
         BagError: the file cannot be read, or there is no such frame.
     """
     calibration = calibration_of(settings)
-    mountings = {
-        "body": np.eye(4),
-        "imu": calibration.body_T_imu,
-        "camera": calibration.body_T_camera,
-        "lidar": calibration.body_T_lidar,
-    }
+    mountings = {name: getattr(calibration, f"body_T_{name}") for name in ("imu", "camera", "lidar")}
+    mountings = {"body": np.eye(4), **mountings}
     if frame not in mountings:
         raise BagError(f"unknown frame {frame!r} of the odometry; expected one of {', '.join(mountings)}")
     return read_tum(path).of_body(mountings[frame])
@@ -84,9 +79,7 @@ def read_ground_truth(bag: Bag | None, path: str | Path | None = None) -> Trajec
     if path is not None:
         if Path(path).suffix.lower() != ".pos":
             return read_tum(path)
-        stamps, positions = read_rtklib(path)
-        poses = RigidTransform.from_translation(positions).as_matrix()
-        return Trajectory(stamps, poses, has_orientation=False)
+        return read_rtklib(path)
     if bag is None or GROUND_TRUTH_TOPIC not in bag.topics:
         return None
     found: list[tuple[int, Array]] = []
@@ -122,8 +115,8 @@ def _checked(nanoseconds: int) -> int:
     return nanoseconds
 
 
-def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> tuple[NDArray[np.int64], Array]:
-    """Stamps (N,) in UTC nanoseconds and (N, 3) positions east, north, up in metres from the first one.
+def read_rtklib(path: str | Path) -> Trajectory:
+    """Positions east, north and up of the first one, in metres, without orientation, and their stamps in UTC.
 
     Lines are `date time lat lon height Q ...` or `week seconds lat lon height Q ...`, in GPS time, degrees and metres.
 
@@ -140,12 +133,13 @@ def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> tuple[N
         except (ValueError, IndexError, OverflowError):
             expected = "expected date time lat lon height Q"
             raise BagError(f"{path}, line {number}: {expected}, found {line.strip()[:60]!r}") from None
-        if quality <= worst_quality and (not stamps or stamp > stamps[-1]):
+        if quality <= WORST_QUALITY and (not stamps or stamp > stamps[-1]):
             stamps.append(stamp)
             geodetic.append((latitude, longitude, height))
     if not stamps:
-        raise BagError(f"{path} holds no position of quality {worst_quality} or better")
-    return np.array(stamps, np.int64), east_north_up(np.array(geodetic))
+        raise BagError(f"{path} holds no position of quality {WORST_QUALITY} or better")
+    poses = RigidTransform.from_translation(east_north_up(np.array(geodetic))).as_matrix()
+    return Trajectory(np.array(stamps, np.int64), poses, has_orientation=False)
 
 
 def _parse(fields: list[str]) -> tuple[int, float, float, float, int]:

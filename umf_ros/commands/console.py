@@ -1,24 +1,17 @@
-"""The console of a replay: progress, warnings about the inputs, and an orderly end on Ctrl-C or SIGTERM."""
+"""The console of a replay: progress, how warnings look, and an orderly end on Ctrl-C or SIGTERM."""
 
 from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from umf_ros.bags.inputs import absent_inputs, input_counts
-from umf_ros.bags.reader import Bag
-from umf_ros.core.config import Settings
 from umf_ros.detector import Detection
-from umf_ros.runs.reader import remember_recording
-from umf_ros.sensors.buffers import InputCounter
-from umf_ros.sensors.sessions import Input
 
 Handler = Callable[[int, FrameType | None], Any] | int | signal.Handlers | None
 
@@ -56,53 +49,6 @@ def _in_graph(counts: Mapping[str, int]) -> str:
     words = {"in the graph": counts.get("accepted", 0), "pending": pending, "rejected": rejected}
     told = ", ".join(f"{count} {word}" for word, count in words.items() if count)
     return f" ({told})" if told else ""
-
-
-class InputConsole:
-    """Prints each line about the inputs once, and writes them into the summary of the run.
-
-    Attributes:
-        told: the lines so far.
-    """
-
-    def __init__(self, console: Console, bag: Bag) -> None:
-        self._console = console
-        self._bag = bag
-        self._warnings: list[str] = []
-        self.told: frozenset[str] = frozenset()
-
-    def warn(self, text: str) -> None:
-        """Print a warning, and keep it for the summary."""
-        self._warnings.append(text)
-        self._tell(text)
-
-    def tell_absent(self, settings: Settings, odometry_from_file: bool) -> None:
-        """Print the inputs that the recording lacks, one line each."""
-        for finding in absent_inputs(self._bag, settings, odometry_from_file):
-            self._tell(finding.line)
-
-    def remember(
-        self,
-        folder: Path,
-        counters: Mapping[Input, InputCounter],
-        interrupted: bool,
-        odometry: Path | None,
-        odometry_frame: str,
-    ) -> None:
-        """Keep in the summary what the report needs of the inputs."""
-        remember_recording(
-            folder,
-            self._bag,
-            inputs=input_counts(counters),
-            warnings=self._warnings,
-            interrupted=interrupted,
-            odometry_file={"path": str(odometry.resolve()), "frame": odometry_frame} if odometry else None,
-        )
-
-    def _tell(self, text: str) -> None:
-        if text not in self.told:
-            self.told |= {text}
-            self._console.print(text, **WARNING)
 
 
 @contextmanager

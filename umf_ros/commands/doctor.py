@@ -27,6 +27,7 @@ _PACKAGES = {
     "safetensors": ("safetensors", "0.4"),
     "small_gicp": ("small_gicp", "1"),
     "gtsam": ("gtsam", "4.3"),
+    "faiss": ("faiss-cpu", "1.8"),
     "mcap": ("mcap", "1.2"),
     "rosbags": ("rosbags", "0.11.2"),
     "pydantic": ("pydantic", "2.7"),
@@ -87,9 +88,9 @@ def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
     yield "Python", check_python
     for module, (distribution, minimum) in _PACKAGES.items():
         yield distribution, partial(check_package, module, distribution, minimum)
-    yield "openvino", partial(check_optional, "openvino", "openvino", "2025", _WITHOUT_OPENVINO)
+    yield "openvino", partial(check_package, "openvino", "openvino", "2025", _WITHOUT_OPENVINO)
     for module, (distribution, minimum) in LAB_PACKAGES.items():
-        yield distribution, partial(check_optional, module, distribution, minimum, _WITHOUT_LAB)
+        yield distribution, partial(check_package, module, distribution, minimum, _WITHOUT_LAB)
     yield "ROS 2 Python", check_rclpy
     yield "ROS 2 messages", check_messages
     yield "DDS", check_dds
@@ -104,11 +105,14 @@ def check_python() -> Finding:
     return Finding("Python", sys.version_info[:2] in ((3, 11), (3, 12)), found, "use Python 3.11 or 3.12")
 
 
-def check_package(module: str, distribution: str, minimum: str) -> Finding:
-    """Import a package in a process of its own: a broken one may take the process with it."""
+def check_package(module: str, distribution: str, minimum: str, without: str = "") -> Finding:
+    """Import a package in a process of its own: a broken one may take the process with it.
+
+    One that a rover can do without, as `without` says, may be missing; where it is there it has to work.
+    """
     advice = f"pip install '{distribution}>={minimum}', or make install"
     if importlib.util.find_spec(module) is None:
-        return Finding(distribution, False, "not installed", advice)
+        return Finding(distribution, bool(without), f"not installed; {without}" if without else "not installed", advice)
     status, output = _run("-c", f"import {module}; print(getattr({module}, '__version__', ''))")
     if status != 0:
         if "libusb" in output:
@@ -116,13 +120,6 @@ def check_package(module: str, distribution: str, minimum: str) -> Finding:
         return Finding(distribution, False, _last_line(output) or f"import ends with status {status}", advice)
     found = _version(distribution) or _last_line(output)
     return Finding(distribution, _at_least(found, minimum), found, f"{minimum} or newer is needed: {advice}")
-
-
-def check_optional(module: str, distribution: str, minimum: str, without: str) -> Finding:
-    """A package that a rover can do without, as `without` says; one that is there has to work."""
-    if importlib.util.find_spec(module) is None:
-        return Finding(distribution, True, f"not installed; {without}")
-    return check_package(module, distribution, minimum)
 
 
 def check_rclpy() -> Finding:
@@ -145,7 +142,7 @@ def check_messages() -> Finding:
 
 def check_dds() -> Finding:
     """A publisher and a subscriber find each other and exchange an image."""
-    status, output = _run("-m", "umf_ros.nodes.dds_check")
+    status, output = _run("-m", "umf_ros.nodes.diagnostics")
     advice = "check ROS_DOMAIN_ID, RMW_IMPLEMENTATION, and that a firewall lets UDP multicast pass on loopback"
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
     return Finding("DDS", status == 0, f"{_last_line(output)} (domain {domain})", advice)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.presets import settings_for
@@ -16,18 +15,10 @@ from umf_ros.bags.reader import Bag, decode
 from umf_ros.core.config import Settings, Topics
 from umf_ros.core.errors import MessageError, UmfError
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
+from umf_ros.core.trajectory import bracket
 from umf_ros.runs.findings import gap_remedy
 from umf_ros.sensors.calibration import TO_BE_MEASURED
-from umf_ros.sensors.decode import (
-    CLOUD,
-    COMPRESSED,
-    IMAGE,
-    LIVOX,
-    decode_camera_info,
-    decode_cloud,
-    decode_image,
-    decode_odometry,
-)
+from umf_ros.sensors.decode import TYPES, decode_camera_info, decode_cloud, decode_image, decode_odometry
 from umf_ros.sensors.tf import TOPIC, StaticTransforms
 
 SAMPLES = 20
@@ -49,20 +40,16 @@ class Inspected:
     Attributes:
         topics: that would be used.
         found: words about each input, by its name in `Topics`, and about `pairs` of scan and image.
-        frames: `header.frame_id` of each input.
+        messages: the first usable one of each input, by its name in `Topics`.
         advice: what is wrong or missing, with what helps.
-        info: left and right camera_info, as far as there are.
-        image_size: width and height, or None.
         settings: that would be used without --config; None where the recording is of no known data set.
         unknown: why it is of none.
     """
 
     topics: Topics
     found: dict[str, str] = field(default_factory=dict)
-    frames: dict[str, str] = field(default_factory=dict)
+    messages: dict[str, Any] = field(default_factory=dict)
     advice: list[Advice] = field(default_factory=list)
-    info: dict[str, Any] = field(default_factory=dict)
-    image_size: tuple[int, int] | None = None
     settings: Settings | None = None
     unknown: str = ""
 
@@ -87,15 +74,18 @@ def inspect(bag: Bag) -> Inspected:
 
 def guess_topics(bag: Bag) -> Topics:
     """The topics of each input by type and name: of several the one that says left or right, else the fullest."""
-    by_type = {kind: [t for t, i in bag.topics.items() if i.type == kind and i.count] for kind in _TYPES_SEEN}
-    images = by_type[IMAGE] + by_type[COMPRESSED]
-    images = [topic for topic in images if not any(word in topic.lower() for word in ("depth", "mask", "semantic"))]
+    filled = [(topic, info) for topic, info in bag.topics.items() if info.count]
+    # plain images before compressed ones, otherwise the fullest topic first
+    by_name = {
+        name: [topic for kind in kinds for topic, info in filled if info.type == kind] for name, kinds in TYPES.items()
+    }
+    clouds, odometry = (sorted(by_name[name], key=lambda t: -bag.topics[t].count) for name in ("cloud", "odometry"))
+    words = ("depth", "mask", "semantic")
+    images = [topic for topic in by_name["left_image"] if not any(word in topic.lower() for word in words)]
     right = next((topic for topic in images if "right" in topic.lower()), "")
     left = next((topic for topic in images if "left" in topic.lower()), "")
     left = left or next((topic for topic in images if topic != right), "")
-    infos = by_type["sensor_msgs/msg/CameraInfo"]
-    clouds = sorted((topic for kind in (CLOUD, *LIVOX) for topic in by_type[kind]), key=lambda t: -bag.topics[t].count)
-    odometry = sorted(by_type["nav_msgs/msg/Odometry"], key=lambda topic: -bag.topics[topic].count)
+    infos = by_name["left_info"]
     return Topics(
         left_image=left,
         right_image=right if left else "",
@@ -104,9 +94,6 @@ def guess_topics(bag: Bag) -> Topics:
         cloud=clouds[0] if clouds else "",
         odometry=odometry[0] if odometry else "",
     )
-
-
-_TYPES_SEEN = (IMAGE, COMPRESSED, "sensor_msgs/msg/CameraInfo", CLOUD, *LIVOX, "nav_msgs/msg/Odometry")
 
 
 def _nearest(image: str, infos: list[str]) -> str:
@@ -131,9 +118,8 @@ def _read_samples(bag: Bag, found: Inspected) -> None:
         left[raw.topic] -= 1
         try:
             message = decode(raw)
-            found.found[name] = _DESCRIBE[name](message, found)
-            found.frames.setdefault(name, message.header.frame_id)
-            left[raw.topic] = 0
+            found.found[name] = _DESCRIBE[name](message)
+            found.messages[name], left[raw.topic] = message, 0
         except MessageError as error:
             faults[name] = str(error)
     for name, fault in faults.items():
@@ -142,14 +128,13 @@ def _read_samples(bag: Bag, found: Inspected) -> None:
             found.advice.append(Advice("fault", f"{topic}: {fault}", "no message of the first ones can be used"))
 
 
-def _image_words(message: Any, found: Inspected) -> str:
+def _image_words(message: Any) -> str:
     image = decode_image(message)
-    found.image_size = image.shape[1], image.shape[0]
     kind = getattr(message, "encoding", "") or message.format
     return f"{image.shape[1]} x {image.shape[0]}, {kind}, grey values vary by {image.std():.0f}"
 
 
-def _cloud_words(message: Any, _: Inspected) -> str:
+def _cloud_words(message: Any) -> str:
     cloud = decode_cloud(message)
     words = [f"{len(cloud.points)} returns"]
     words.append("no intensity" if cloud.intensity is None else f"intensity up to {cloud.intensity.max(initial=0):.4g}")
@@ -159,14 +144,13 @@ def _cloud_words(message: Any, _: Inspected) -> str:
     return ", ".join(words)
 
 
-def _info_words(side: str, message: Any, found: Inspected) -> str:
-    found.info[side] = message
+def _info_words(message: Any) -> str:
     camera = decode_camera_info(message)
     distorted = np.any(np.asarray(message.d, float))
     return f"{camera.width} x {camera.height}, fx {camera.fx:.1f}" + (", with distortion" if distorted else "")
 
 
-def _odometry_words(message: Any, _: Inspected) -> str:
+def _odometry_words(message: Any) -> str:
     decode_odometry(message)
     return f"of {message.child_frame_id or 'no named frame'} in {message.header.frame_id or 'no named frame'}"
 
@@ -175,8 +159,8 @@ _DESCRIBE: dict[str, Any] = {
     "left_image": _image_words,
     "right_image": _image_words,
     "cloud": _cloud_words,
-    "left_info": lambda message, found: _info_words("left", message, found),
-    "right_info": lambda message, found: _info_words("right", message, found),
+    "left_info": _info_words,
+    "right_info": _info_words,
     "odometry": _odometry_words,
 }
 
@@ -214,7 +198,9 @@ def _about_pairs(bag: Bag, found: Inspected) -> Iterator[Advice]:
         seconds, nanoseconds = struct.unpack_from("<iI" if raw.data[1] & 1 else ">iI", raw.data, 4)
         stamps[raw.topic].append(seconds * 10**9 + nanoseconds)
     scans = np.array(stamps[topics.cloud])
-    away_ns = _distances(np.sort(stamps[topics.left_image]), scans)
+    images = np.sort(stamps[topics.left_image])
+    before, after, _ = bracket(images, scans)
+    away_ns = np.minimum(np.abs(scans - images[before]), np.abs(scans - images[after]))
     pairs, median_s = int((away_ns <= slop_s * 1e9).sum()), float(np.median(away_ns)) * 1e-9
     told = f"{pairs} of {len(scans)} scans have an image within {slop_s:g} s, {median_s:.3f} s in the median"
     found.found["pairs"] = told
@@ -232,12 +218,6 @@ def _about_gaps(bag: Bag, found: Inspected) -> Iterator[Advice]:
         yield Advice("fault", what, f"drive longer, or set {remedy}")
 
 
-def _distances(images: NDArray[np.int64], scans: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Time in ns from each scan to the nearest image, whose stamps are sorted."""
-    after = np.clip(np.searchsorted(images, scans), 0, len(images) - 1)
-    return np.minimum(np.abs(scans - images[np.maximum(after - 1, 0)]), np.abs(scans - images[after]))
-
-
 def write_settings(found: Inspected, calibration: str) -> str:
     """A first parameter file: the topics, and the calibration beside it."""
     defaults = Topics().model_dump()
@@ -253,11 +233,12 @@ def write_calibration(found: Inspected, transforms: StaticTransforms) -> str:
     """A first calibration: intrinsics of the camera_info, mountings of /tf_static, and what has to be measured."""
     lines = ["# Written by umf inspect. Metres, quaternions x y z w; poses in the body frame (x ahead, y left, z up)."]
     lines += _camera_lines(found)
-    frames = [found.frames.get(name, "") for name in ("cloud", "left_image")]
-    bodies = [name for frame in frames for name in BODIES if frame and transforms.find(name, frame) is not None]
+    frames = {name: message.header.frame_id for name, message in found.messages.items()}
+    named = [frames[name] for name in ("cloud", "left_image") if frames.get(name)]
+    bodies = [body for frame in named for body in BODIES if transforms.find(body, frame) is not None]
     body = bodies[0] if bodies else ""
     for key, name, usual in (("body_T_camera", "left_image", OPTICAL), ("body_T_lidar", "cloud", np.eye(4))):
-        frame = found.frames.get(name, "")
+        frame = frames.get(name, "")
         known = transforms.find(body, frame) if body and frame else None
         note = f"of {frame} in {body}, from {TOPIC}" if known is not None else GUESS
         lines += _pose_lines(key, usual if known is None else known, note)
@@ -268,9 +249,10 @@ def write_calibration(found: Inspected, transforms: StaticTransforms) -> str:
 
 
 def _camera_lines(found: Inspected) -> list[str]:
-    left, right = found.info.get("left"), found.info.get("right")
+    left, right = (found.messages.get(name) for name in ("left_info", "right_info"))
     if left is None:
-        width, height = found.image_size or (640, 480)
+        image = found.messages.get("left_image")
+        height, width = (480, 640) if image is None else decode_image(image).shape
         focal = 0.8 * width
         numbers = {"width": width, "height": height, "fx": focal, "fy": focal, "cx": width / 2, "cy": height / 2}
         return [f"camera:  # {GUESS}", *_mapping(numbers | {"baseline": 0.0})]

@@ -56,12 +56,6 @@ def check_map(folder: Path | None) -> None:
         raise UmfError(f"{folder} holds no map: map.json is missing (umf map makes one)")
 
 
-def check_run(folder: Path) -> None:
-    """Check that a folder holds a finished run."""
-    if not (folder / "summary.json").is_file():
-        raise UmfError(f"{folder} holds no finished run: summary.json is missing")
-
-
 def open_recording(
     bag: Path,
     config: Path | None = None,

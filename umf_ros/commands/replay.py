@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -73,11 +74,13 @@ def command(
 
     from rich.console import Console
 
+    from umf_ros.bags.inputs import absent_inputs, input_counts
     from umf_ros.bags.trajectories import read_ground_truth
-    from umf_ros.commands.console import FrameProgress, InputConsole, stop_on_interrupt, undisturbed
+    from umf_ros.commands.console import WARNING, FrameProgress, stop_on_interrupt, undisturbed
     from umf_ros.core.watchdog import watching
     from umf_ros.detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
+    from umf_ros.runs.reader import remember_recording
     from umf_ros.runs.report import finish_run
     from umf_ros.runs.rerun_log import RerunLog
     from umf_ros.runs.writer import count_drops, create_folder, finish_folder, unfinished_folder, with_places
@@ -93,10 +96,9 @@ def command(
         mode=mode or ("localization" if map_folder else None),
         map=str(map_folder) if map_folder else None,
     )
-    inputs = InputConsole(console, recording)
-    reader = open_frames(recording, settings, inputs.warn, odometry, odometry_frame)
-    if ground_truth is not None:
-        read_ground_truth(recording, ground_truth)  # its errors are reported now, not after the run
+    warnings: list[str] = []
+    reader = open_frames(recording, settings, partial(_warn, console, warnings), odometry, odometry_frame)
+    read_ground_truth(None, ground_truth)  # its errors are reported now, not after the run
     if settings.localizing and rerun:
         raise ConfigError("--rerun shows a run that maps: leave it out with --map")
     network = make_detector_embedder(settings)
@@ -106,7 +108,9 @@ def command(
     begun = unfinished_folder(out, bag, settings) if resume and not settings.localizing else None
     folder = begun or create_folder(out, bag)
     detector = detector or LoopDetector(with_places(settings, folder), network)
-    inputs.tell_absent(settings, odometry is not None)
+    absent = [one.line for one in absent_inputs(recording, settings, odometry is not None)]
+    for line in absent:
+        console.print(line, **WARNING)
     replay = Replay(folder, settings, detector, begun is not None)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
         stream = reader.stream()
@@ -125,13 +129,30 @@ def command(
             finish_folder(folder)
         if viewer:
             viewer.finish(folder)
-        inputs.remember(folder, reader.counters, interrupted(), odometry, odometry_frame)
+        remember_recording(
+            folder,
+            recording,
+            inputs=input_counts(reader.counters),
+            warnings=warnings,
+            interrupted=interrupted(),
+            odometry_file={"path": str(odometry.resolve()), "frame": odometry_frame} if odometry else None,
+        )
         if settings.localizing:
             status = _report_localization(console, folder, replay.counts, newest)
         else:
-            status = finish_run(folder, recording, console, ground_truth, inputs.told).exit_code
+            shown = frozenset(warnings + absent)
+            status = finish_run(folder, recording, console, ground_truth, shown).exit_code
     replay.raise_if_frames_failed()
     raise typer.Exit(status)
+
+
+def _warn(console: Console, warnings: list[str], text: str) -> None:
+    """Print a warning once, and keep it for the summary."""
+    from umf_ros.commands.console import WARNING
+
+    if text not in warnings:
+        warnings.append(text)
+        console.print(text, **WARNING)
 
 
 def _report_localization(console: Console, folder: Path, counts: dict[str, Any], newest: Localization | None) -> int:

@@ -57,11 +57,11 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    def at(self, stamps_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+    def at(self, stamps_ns: NDArray[np.int64], max_gap_s: float = MAX_GAP_S) -> tuple[Array, NDArray[np.bool_]]:
         """Interpolated (K, 4, 4) poses at (K,) stamps, and (K,) whether each is known.
 
         Positions are interpolated linearly, rotations along the shortest arc. A pose is known between
-        two poses no further apart than `MAX_GAP_S`; the others are the identity.
+        two poses no further apart than `max_gap_s`; the others are the identity.
         """
         stamps = np.asarray(stamps_ns, np.int64)
         poses = np.tile(np.eye(4), (len(stamps), 1, 1))
@@ -69,7 +69,7 @@ class Trajectory:
             return poses, np.zeros(len(stamps), bool)
         before, after, _ = bracket(self.stamps_ns, stamps)
         known = (self.stamps_ns[0] <= stamps) & (stamps <= self.stamps_ns[-1])
-        known &= self.stamps_ns[after] - self.stamps_ns[before] <= MAX_GAP_S * 1e9
+        known &= self.stamps_ns[after] - self.stamps_ns[before] <= max_gap_s * 1e9
         poses[known] = interpolated(self.stamps_ns, self.poses, stamps[known])
         return poses, known
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import math
+import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
@@ -23,9 +25,10 @@ from umf_ros.core.config import Settings, Topics
 from umf_ros.core.errors import MessageError, OutputError, UmfError
 from umf_ros.core.io import check_writable
 from umf_ros.nodes.conversions import from_time, latched
-from umf_ros.nodes.diagnostics import WARN, Heartbeat, InputWatch, Throttle
+from umf_ros.nodes.diagnostics import WARN, InputWatch
 from umf_ros.nodes.parameters import changed_settings, declare
-from umf_ros.sensors.tf import TOPIC, StaticTransforms
+from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.tf import PATIENCE_S, TOPIC, BodyFrames, StaticTransforms
 
 STATIC_QOS = latched(100)
 """Every broadcaster of static transforms has its own part of the tree."""
@@ -52,12 +55,11 @@ class BaseNode(LifecycleNode, ABC):
     def __init__(self, name: str, results: str) -> None:
         """Declare the parameters; `results` says what the folder `results_dir` is for."""
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
-        self._settings, own = declare(self, results_dir=results)
-        self._results = own["results_dir"]
+        self._settings, self._results = declare(self, results)
         self._watches: list[InputWatch] = []
         self._own: list[Any] = []
         self._faults, self._last_fault = Counter[str](), ""
-        self._throttle = Throttle()
+        self._logged_s: dict[str, float] = {}
         self._clockless_s = 0.0
         self._active = self._opened = self._leaving = False
         self._unwritten: Exception | None = None
@@ -66,8 +68,8 @@ class BaseNode(LifecycleNode, ABC):
         self.add_post_set_parameters_callback(self._use_parameters)
         self._wall = Clock(clock_type=ClockType.STEADY_TIME)
         # the machine's clock: a watch that stands still with /clock watches nothing
-        self._heartbeat = Heartbeat(HEARTBEAT_S)
-        self.create_timer(HEARTBEAT_S, self._heartbeat.beat, clock=self._wall)
+        self._stall_ms, self._beat_s = 0.0, math.inf
+        self.create_timer(HEARTBEAT_S, self._beat, clock=self._wall)
         self.create_timer(WATCH_S, self._guarded("watch", lambda: self._watch()), clock=self._wall)
         if self.get_parameter("autostart").value:
             self._configure()
@@ -188,10 +190,24 @@ class BaseNode(LifecycleNode, ABC):
             watch.begin()  # the player is still starting: its topics are silent for that reason alone
         self._tick()
         for watch in self._watches:
-            if watch.warning and self._throttle.lets_pass(f"input {watch.name}", 30.0):
+            if watch.warning and self._is_due(f"input {watch.name}", 30.0):
                 self.get_logger().warning(watch.warning)
-        if self._clockless_s >= CLOCK_PATIENCE_S and self._throttle.lets_pass("clock", 30.0):
+        if self._clockless_s >= CLOCK_PATIENCE_S and self._is_due("clock", 30.0):
             self.get_logger().warning(SIM_TIME_SILENT)
+
+    def _beat(self) -> None:
+        """Measure how late the executor is at most, ms."""
+        now_s = time.monotonic()
+        self._stall_ms = max(self._stall_ms, 1e3 * (now_s - self._beat_s - HEARTBEAT_S))
+        self._beat_s = now_s
+
+    def _is_due(self, line: str, every_s: float) -> bool:
+        """Rate-limit log lines: whether this one is due again."""
+        now_s = time.monotonic()
+        if now_s - self._logged_s.get(line, -math.inf) < every_s:
+            return False
+        self._logged_s[line] = now_s
+        return True
 
     def _lacks_clock(self) -> bool:
         return bool(self.get_parameter("use_sim_time").value) and self.get_clock().now().nanoseconds == 0
@@ -237,15 +253,17 @@ class BaseNode(LifecycleNode, ABC):
         watch = InputWatch(self, name, subscription.topic_name, kind, rare)
         self._watches.append(watch)
 
-    def _hear_transforms(self, transforms: StaticTransforms) -> None:
-        """Fill `transforms` from `/tf_static`; without tf2_msgs, which Jazzy from PyPI lacks, they stay empty."""
+    def _hear_transforms(self, calibration: Calibration | None = None) -> BodyFrames:
+        """Hear `/tf_static`, which moves odometry and a calibration's sensors; Jazzy from PyPI lacks its tf2_msgs."""
+        transforms, warn = StaticTransforms(), self.get_logger().warning
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError:
             if self._settings.frames.extrinsics == "tf":
                 self.get_logger().info("tf2_msgs is not installed: the sensors are where the calibration file says")
-            return
-        self.create_subscription(TFMessage, TOPIC, self._guarded("transforms", transforms.add), STATIC_QOS)
+        else:
+            self.create_subscription(TFMessage, TOPIC, self._guarded("transforms", transforms.add), STATIC_QOS)
+        return BodyFrames(self._settings.frames, transforms, warn, PATIENCE_S, calibration)
 
     def _offer(self, kind: type, name: str, action: Callable[[Any], str]) -> None:
         """Offer a service that answers what `action` makes of the request; any fault is a refusal."""
@@ -293,7 +311,7 @@ class BaseNode(LifecycleNode, ABC):
             return
         text = " ".join(str(error).split())[:300]
         self._last_fault = text if isinstance(error, OutputError) else f"{where}{kind}: {text}"
-        if self._throttle.lets_pass(f"fault {what} {kind}", 10.0):
+        if self._is_due(f"fault {what} {kind}", 10.0):
             self.get_logger().error(f"{where}{kind}: {text} ({self._faults[kind]} so far); the node goes on")
 
     @property

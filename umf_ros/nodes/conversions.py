@@ -19,7 +19,6 @@ from umf_ros.core.config import FrameIds, Qos
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, to_quaternion
-from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose
 
 
@@ -82,15 +81,16 @@ def to_header(stamp_ns: int, frame: str) -> Header:
     return Header(stamp=to_time(stamp_ns), frame_id=frame)
 
 
-def to_lines(name: str, lines: Iterable[Iterable[Point]], header: Header) -> Marker:
-    """The "accepted" closures as green lines, or the "rejected" ones as red."""
-    accepted = name == "accepted"
-    marker = Marker(header=header, ns=name, id=int(not accepted), type=Marker.LINE_LIST, action=Marker.ADD)
-    marker.pose.orientation.w = 1.0
-    marker.scale.x = 0.05
-    marker.color = GREEN if accepted else RED
-    marker.points = [point for line in lines for point in line]
-    return marker
+def to_markers(accepted: Iterable[Array], rejected: Iterable[Array], header: Header) -> MarkerArray:
+    """Closures as lines (2, 3) m from match to query, the newest last: accepted green, the others red."""
+    array = MarkerArray()
+    for number, (name, colour, lines) in enumerate((("accepted", GREEN, accepted), ("rejected", RED, rejected))):
+        marker = Marker(header=header, ns=name, id=number, type=Marker.LINE_LIST, action=Marker.ADD, color=colour)
+        marker.pose.orientation.w = 1.0
+        marker.scale.x = 0.05
+        marker.points = [to_point(end) for line in list(lines)[-MAX_LINES:] for end in line]
+        array.markers.append(marker)
+    return array
 
 
 def keyframe_frame(stamp_ns: int, robot: str = "") -> str:
@@ -193,12 +193,3 @@ def transform(stamp_ns: int, map_T_odom: Array, frames: FrameIds) -> TransformSt
     message.transform.translation = Vector3(x=rigid.position.x, y=rigid.position.y, z=rigid.position.z)
     message.transform.rotation = rigid.orientation
     return message
-
-
-def markers(verdicts: list[ClosureVerdict], lines: Array, stamp_ns: int, frames: FrameIds) -> MarkerArray:
-    """Closures as lines from match to query: accepted green, the others red."""
-    accepted = np.array([verdict.state is State.ACCEPTED for verdict in verdicts], bool)
-    header = to_header(stamp_ns, frames.map)
-    chosen = {"accepted": lines[accepted], "rejected": lines[~accepted]}
-    points = {name: [map(to_point, line) for line in some[-MAX_LINES:]] for name, some in chosen.items()}
-    return MarkerArray(markers=[to_lines(name, some, header) for name, some in points.items()])

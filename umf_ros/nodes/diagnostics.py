@@ -1,19 +1,26 @@
-"""Health of a node and of its inputs."""
+"""Health of a node and of its inputs; as a program: whether DDS works on this machine."""
 
 from __future__ import annotations
 
-import math
 import resource
+import sys
 import time
+from array import array
 from collections.abc import Mapping
 from pathlib import Path
 
+import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSReliabilityPolicy
+from rclpy.qos import QoSReliabilityPolicy, qos_profile_sensor_data
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from sensor_msgs.msg import Image
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+SILENT_S = 5.0
+"""Longest silence of an input without a warning, by the machine's clock."""
 
 
 def status(level: bytes, name: str, message: str, values: Mapping[str, object]) -> DiagnosticStatus:
@@ -29,36 +36,6 @@ def memory_mb() -> float:
     return pages * resource.getpagesize() / 2**20
 
 
-class Throttle:
-    """Rate-limit log lines per key."""
-
-    def __init__(self) -> None:
-        self._passed_s: dict[str, float] = {}
-
-    def lets_pass(self, line: str, every_s: float) -> bool:
-        """Whether a line is due again."""
-        now_s = time.monotonic()
-        if now_s - self._passed_s.get(line, -math.inf) < every_s:
-            return False
-        self._passed_s[line] = now_s
-        return True
-
-
-class Heartbeat:
-    """Longest delay of the executor: `beat` is due every `period_s`."""
-
-    def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
-        self._last_s = math.inf
-        self.longest_ms = 0.0
-
-    def beat(self) -> None:
-        """Take the time."""
-        now_s = time.monotonic()
-        self.longest_ms = max(self.longest_ms, 1e3 * (now_s - self._last_s - self._period_s))
-        self._last_s = now_s
-
-
 class InputWatch:
     """Counts the messages of one input topic and explains why none arrive.
 
@@ -66,22 +43,14 @@ class InputWatch:
         node: knows the graph of topics.
         name: of the input.
         topic: as it is subscribed, after remapping.
-        kind: message class; None where any will do.
+        kind: message class.
         rare: its silence is no fault as long as there is a publisher.
-        silent_after_s: longest silence without a warning, by the machine's clock.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        name: str,
-        topic: str,
-        kind: type | None = None,
-        rare: bool = False,
-        silent_after_s: float = 5.0,
-    ) -> None:
-        self._node, self._rare, self._silent_after_s = node, rare, silent_after_s
-        self._type = type_name(kind) if kind is not None else ""
+    def __init__(self, node: Node, name: str, topic: str, kind: type, rare: bool = False) -> None:
+        self._node, self._rare = node, rare
+        package, middle, *_ = kind.__module__.split(".")
+        self._type = f"{package}/{middle}/{kind.__name__}"  # as the graph names it
         self.name, self.topic, self.warning = name, topic, ""
         self.received = self.refused = self.lost = 0
         self.last_stamp_ns: int | None = None
@@ -119,7 +88,7 @@ class InputWatch:
         if all_refused:
             self.warning = f"{self.name}: {rate:.1f} Hz on {self.topic}, and all are refused"
             return status(WARN, f"input {self.name}", f"{rate:.1f} Hz, all refused", values)
-        if silent_s is not None and silent_s < self._silent_after_s:
+        if silent_s is not None and silent_s < SILENT_S:
             return status(OK, f"input {self.name}", f"{rate:.1f} Hz", values)
         publishers = self._node.get_publishers_info_by_topic(self.topic)
         values["publishers"] = len(publishers)
@@ -130,15 +99,15 @@ class InputWatch:
         if self._rare and any(info.topic_type == self._type for info in publishers):
             return status(OK, f"input {self.name}", f"{self.received} received", values)
         reason = self._reason(publishers, silent_s)
-        if now_s - self._born_s > self._silent_after_s:
+        if now_s - self._born_s > SILENT_S:
             self.warning = f"{self.name}: {reason}"
         return status(WARN, f"input {self.name}", reason, values)
 
     def _reason(self, publishers: list[TopicEndpointInfo], silent_s: float | None) -> str:
-        foreign = sorted({info.topic_type for info in publishers} - {self._type})
-        if publishers and self._type and len(foreign) == len({info.topic_type for info in publishers}):
-            return f"nothing received: {self.topic} carries {', '.join(foreign)}, expected {self._type}"
-        if not publishers:
+        kinds = {info.topic_type for info in publishers}
+        if kinds and self._type not in kinds:
+            return f"nothing received: {self.topic} carries {', '.join(sorted(kinds))}, expected {self._type}"
+        if not kinds:
             others = self._others()
             hint = f"; {', '.join(others)} {'is' if len(others) == 1 else 'are'} of that type" if others else ""
             return f"nothing received: no publisher on {self.topic}{hint}"
@@ -154,7 +123,44 @@ class InputWatch:
         return [name for name in fit if self._node.count_publishers(name)][:5]
 
 
-def type_name(kind: type) -> str:
-    """Name of a message class on the graph, as in `sensor_msgs/msg/Image`."""
-    package, middle, *_ = kind.__module__.split(".")
-    return f"{package}/{middle}/{kind.__name__}"
+DDS_TIMEOUT_S, DDS_TOPIC = 15.0, "umf_dds_check"
+
+
+def exchange() -> str:
+    """Send images from one DDS participant to another until one arrives; returns what went wrong, or nothing."""
+    contexts = Context(), Context()
+    for context in contexts:
+        rclpy.init(context=context)
+    sender, receiver = (Node(f"umf_dds_check_{number}", context=context) for number, context in enumerate(contexts))
+    executor = SingleThreadedExecutor(context=receiver.context)
+    executor.add_node(receiver)
+    arrived: list[Image] = []
+    publisher = sender.create_publisher(Image, DDS_TOPIC, 10)
+    receiver.create_subscription(Image, DDS_TOPIC, arrived.append, qos_profile_sensor_data)
+    image = Image(width=688, height=512, step=688, encoding="mono8", data=array("B", bytes(688 * 512)))
+    deadline = time.monotonic() + DDS_TIMEOUT_S
+    while not arrived and time.monotonic() < deadline:
+        if publisher.get_subscription_count():
+            publisher.publish(image)
+        executor.spin_once(timeout_sec=0.05)
+    connected = publisher.get_subscription_count() > 0
+    executor.remove_node(receiver)
+    for node in (sender, receiver):
+        node.destroy_node()
+        rclpy.try_shutdown(context=node.context)
+    if arrived and len(arrived[0].data) == len(image.data):
+        return ""
+    return "no message arrived" if connected else "publisher and subscriber did not find each other"
+
+
+def main() -> None:
+    """One line on stdout and 0 when an image arrived, on stderr and 1 when none did."""
+    started = time.monotonic()
+    fault = exchange()
+    if fault:
+        sys.exit(f"{fault} within {DDS_TIMEOUT_S:.0f} s")
+    sys.stdout.write(f"an image arrived after {time.monotonic() - started:.1f} s\n")
+
+
+if __name__ == "__main__":
+    main()

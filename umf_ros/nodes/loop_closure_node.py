@@ -21,7 +21,7 @@ from visualization_msgs.msg import MarkerArray
 
 from umf_ros.core.config import FrameIds, Settings, topics_of
 from umf_ros.core.frames import Frame, Keyframe, LoopClosure
-from umf_ros.core.geometry import rotation_angle
+from umf_ros.core.geometry import Array, rotation_angle
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import (
@@ -32,8 +32,7 @@ from umf_ros.nodes.conversions import (
     keyframe_frame,
     sensor_qos,
     to_header,
-    to_lines,
-    to_point,
+    to_markers,
     to_pose,
     to_time,
 )
@@ -43,7 +42,6 @@ from umf_ros.runs.writer import RunRecorder, count_drops
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
-from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms, TfExtrinsics
 from umf_ros.verification import Hypothesis
 
 if TYPE_CHECKING:
@@ -72,16 +70,8 @@ class LoopClosureNode(BaseNode):
         calibration, topics = calibration_of(settings), topics_of(settings)
         self._detector = LoopDetector(settings, embedder)
         self._synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(topics), warn)
-        transforms = StaticTransforms()
-        self._odometry_frames = frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
-        mounting = TfExtrinsics(calibration, transforms, settings.frames.base, warn)
-        self._router = MessageRouter(
-            self._synchronizer,
-            topics,
-            warn,
-            mounting=mounting if settings.uses_transforms else None,
-            odometry_frames=frames,
-        )
+        self._body_frames = self._hear_transforms(calibration if settings.uses_transforms else None)
+        self._router = MessageRouter(self._synchronizer, topics, warn, frames=self._body_frames)
         self._recorder = RunRecorder(Path(self._results), settings, embedder.name) if self._results else None
         self._publisher = ClosurePublisher(self, settings.frames)
         self._lock = threading.Lock()
@@ -92,7 +82,6 @@ class LoopClosureNode(BaseNode):
         self._worker: Worker[Frame] = Worker(self._detect, self._complain, settings.worker.queue_size)
         self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._complain, 1)
         self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._complain, INTAKE_QUEUE)
-        self._hear_transforms(transforms)
         for name, topic in topics.model_dump().items():
             if topic:
                 take = partial(self._enqueue, topic)
@@ -138,7 +127,7 @@ class LoopClosureNode(BaseNode):
             # before the database forgets them
             matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
         self._last = detection
-        self._publisher.odom = self._odometry_frames.odom
+        self._publisher.odom = self._body_frames.odom
         self._publisher.announce(detection, matches)
         for closure in detection.closures:
             self._closures += 1
@@ -178,7 +167,7 @@ class LoopClosureNode(BaseNode):
             "lag_s": lag_s,
             "memory_mb": memory_mb(),
             "last_error": self._last_fault or "none",
-            "executor_stall_max_ms": self._heartbeat.longest_ms,
+            "executor_stall_max_ms": self._stall_ms,
             **{f"fault_{kind}": count for kind, count in self._faults.items()},
             **{f"dropped_{name}": count for name, count in self._drops().items()},
             **_counts(self._synchronizer),
@@ -232,8 +221,8 @@ class ClosurePublisher:
         self._keyframes = node.create_publisher(PoseStamped, "~/keyframes", CLOSURES_QOS)
         self._candidates = node.create_publisher(DiagnosticArray, "~/candidates", 10)
         self._markers = node.create_publisher(MarkerArray, "~/markers", LATCHED_QOS)
-        self._accepted: deque[list] = deque(maxlen=MAX_LINES)
-        self._rejected: deque[list] = deque(maxlen=MAX_LINES)
+        self._accepted: deque[Array] = deque(maxlen=MAX_LINES)
+        self._rejected: deque[Array] = deque(maxlen=MAX_LINES)
 
     def announce(self, detection: Detection, matches: dict[int, Keyframe]) -> None:
         """Publish one detection; `matches` are the matched keyframes by stamp, for the markers."""
@@ -274,16 +263,14 @@ class ClosurePublisher:
     def _draw(self, keyframe: Keyframe, verdicts: list[Hypothesis], matches: dict[int, Keyframe]) -> None:
         if keyframe.odom_T_body is None:
             return
-        here = to_point(keyframe.odom_T_body[:3, 3])
         for verdict in verdicts:
             match = matches.get(verdict.candidate.stamp_ns)
             if match is None or match.odom_T_body is None or match.session != keyframe.session:
                 continue
             lines = self._rejected if verdict.closure is None else self._accepted
-            lines.append([to_point(match.odom_T_body[:3, 3]), here])
+            lines.append(np.stack([match.odom_T_body[:3, 3], keyframe.odom_T_body[:3, 3]]))
         header = to_header(keyframe.stamp_ns, self.odom)
-        chosen = {"accepted": self._accepted, "rejected": self._rejected}
-        self._markers.publish(MarkerArray(markers=[to_lines(*item, header) for item in chosen.items()]))
+        self._markers.publish(to_markers(self._accepted, self._rejected, header))
 
 
 def describe(number: int, closure: LoopClosure) -> str:

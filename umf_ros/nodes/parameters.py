@@ -18,6 +18,7 @@ from umf_ros.core.errors import ConfigError
 
 # parameters rclpy itself brings along
 BUILT_IN = ("use_sim_time", "qos_overrides", "start_type_description_service")
+AUTOSTART = "configure and activate at once; false: wait for the services of the life cycle"
 SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
 CHANGEABLE = (
     "loop.",
@@ -34,12 +35,12 @@ CHANGEABLE = (
 """Settings that may change while a node runs: they take effect with the next keyframe or closure."""
 
 
-def declare(node: Node, **own: str) -> tuple[Settings, dict[str, str]]:
-    """Declare all settings and `autostart` on `node`; returns them with the overrides of file, launch and command line.
+def declare(node: Node, results: str) -> tuple[Settings, str]:
+    """Declare all settings, `results_dir` and `autostart` on `node`, with the overrides of files and arguments.
 
-    The node must have been made with `automatically_declare_parameters_from_overrides=True`: only so
-    can an unknown name be told from a known one. Whole numbers are taken where a float is declared.
-    `own` are further text parameters by name, with their description; their values are returned too.
+    The node must have been made with `automatically_declare_parameters_from_overrides=True`: only so can an unknown
+    name be told from a known one. Whole numbers are taken where a float is declared. `results` describes the folder
+    `results_dir`. Returns the settings and that folder.
 
     Raises:
         ConfigError: a parameter is unknown, of the wrong type or out of range.
@@ -47,25 +48,21 @@ def declare(node: Node, **own: str) -> tuple[Settings, dict[str, str]]:
     # rclpy annotates plain values here, but hands out Parameter objects
     overrides: dict[str, Any] = dict(node.get_parameters_by_prefix(""))
     given = {name: one.value for name, one in overrides.items() if not name.startswith(BUILT_IN)}
-    texts = {name: given.pop(name, "") for name in own}
-    autostart = given.pop("autostart", True)
-    wrong = [f"{name}: expected text, got {value!r}" for name, value in texts.items() if not isinstance(value, str)]
-    if not isinstance(autostart, bool):
-        wrong.append(f"autostart: expected true or false, got {autostart!r}")
+    for name in given:
+        node.undeclare_parameter(name)
+    folder, autostart = given.pop("results_dir", ""), given.pop("autostart", True)
+    wrong = [] if isinstance(folder, str) else [f"results_dir: expected text, got {folder!r}"]
+    wrong += [] if isinstance(autostart, bool) else [f"autostart: expected true or false, got {autostart!r}"]
     if wrong:
         raise ConfigError("; ".join(wrong))
     settings = parse_settings(nest(given))
-    for name in [*given, *(name for name in (*own, "autostart") if node.has_parameter(name))]:
-        node.undeclare_parameter(name)
     declared = [(name, value, describe(name, field)) for name, field, value in _leaves(settings)]
-    own["autostart"] = "configure and activate at once; false: wait for the services of the life cycle"
-    for name, text in own.items():
-        value = texts.get(name, autostart)
+    for name, value, text in (("results_dir", folder, results), ("autostart", autostart, AUTOSTART)):
         declared.append((name, value, ParameterDescriptor(description=text, read_only=True)))
     for name, value, descriptor in declared:
         # the overrides are in `value` already, with the right type
         node.declare_parameter(name, value, descriptor, ignore_override=True)
-    return settings, texts
+    return settings, folder
 
 
 def changed_settings(settings: Settings, parameters: Sequence[Parameter]) -> Settings:

@@ -41,7 +41,6 @@ from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.pose_graph.journal import JOURNAL, DurableGraph
 from umf_ros.sensors.decode import OdometrySample, decode_odometry
-from umf_ros.sensors.tf import PATIENCE_S, OdometryFrames, StaticTransforms
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works
@@ -86,10 +85,8 @@ class PoseGraphNode(BaseNode):
         self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._complain, QUEUE)
         if self._durable.unsettled:
             self._worker.submit(lambda: self._settle_left())
-        topics, transforms = topics_of(settings), StaticTransforms()
-        warn = self.get_logger().warning
-        self._odometry_frames = OdometryFrames(settings.frames, transforms, warn, PATIENCE_S)
-        self._hear_transforms(transforms)
+        topics = topics_of(settings)
+        self._odometry_frames = self._hear_transforms()
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
             self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
@@ -224,8 +221,9 @@ class PoseGraphNode(BaseNode):
         stamps, poses = self._durable.graph.trajectory()
         self._path_publisher.publish(messages.path(stamps, poses, self._frames))
         verdicts, lines = self._durable.graph.closure_lines()
-        newest_ns = max(self._durable.feed.newest_ns, 0)
-        self._marker_publisher.publish(messages.markers(verdicts, lines, newest_ns, self._frames))
+        accepted = np.array([verdict.state is State.ACCEPTED for verdict in verdicts], bool)
+        header = messages.to_header(max(self._durable.feed.newest_ns, 0), self._frames.map)
+        self._marker_publisher.publish(messages.to_markers(lines[accepted], lines[~accepted], header))
 
     def _tick(self) -> None:
         if not self._keeps_up:  # once is enough, however long the worker is at something else
@@ -247,7 +245,7 @@ class PoseGraphNode(BaseNode):
         values["odometry_out_of_line"] = self._durable.feed.dropped
         values["odometry_held"] = self._durable.feed.held
         values["queue_waiting"] = self._worker.waiting
-        values["executor_stall_max_ms"] = self._heartbeat.longest_ms
+        values["executor_stall_max_ms"] = self._stall_ms
         values |= {state.value: count for state, count in graph.verdict_counts().items()}
         trouble = self._worker.dropped or any(name.startswith("optimiser") for name in graph.counts)
         text = f"{values.get('accepted', 0)} closures accepted"

@@ -56,15 +56,10 @@ class Worker(Generic[Item]):
         """Items submitted and not yet done."""
         return len(self._queue) + self._busy
 
-    def drain(self, timeout_s: float | None = None) -> bool:
-        """Wait until everything submitted is done; False when the time is up first."""
-        with self._wake:
-            return self._wake.wait_for(lambda: not self._queue and not self._busy, timeout_s)
-
     def close(self, timeout_s: float = 10.0) -> None:
         """Finish what is queued, then end the thread; what is left after `timeout_s` is dropped."""
-        self.drain(timeout_s)
         with self._wake:
+            self._wake.wait_for(lambda: not self._queue and not self._busy, timeout_s)
             self._closing = True
             self.dropped += len(self._queue)
             self._queue.clear()

@@ -33,8 +33,8 @@ from umf_ros.runs.run_file import (
     inlier_rows,
     pose_numbers,
 )
-from umf_ros.sensors.buffers import InputCounter
 from umf_ros.sensors.sessions import Input
+from umf_ros.sensors.synchronizer import InputCounter
 
 if TYPE_CHECKING:
     from umf_ros.detector import Detection

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,13 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Frame, Points, ScanMotion
 from umf_ros.core.geometry import Array, invert, relative, transform
-from umf_ros.sensors.buffers import OdometryBuffer, StampedImage
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
+from umf_ros.sensors.sessions import StampedInput
 
 Mask = NDArray[np.bool_]
-Path = tuple[NDArray[np.int64], list[Array]]
-"""Stamps and poses `odom_T_body`."""
 
 HISTORY_NS = 5_000_000_000
 """Over so long the noise of the odometry is measured; by hand: some twenty scans, on the same ground at one speed."""
@@ -33,35 +33,81 @@ UNKNOWN_NOISE = np.array([1e-4] * 3 + [2e-5] * 3)
 """Taken where the history is too short: 1 cm and .25 deg per root of a second; by hand."""
 
 
-def scan_motion(moments_s: Array, span_ns: tuple[int, int], path: Path, odometry: OdometryBuffer) -> ScanMotion:
+class OdometryBuffer:
+    """The poses of the odometry in the latest `length_s`, interpolated across gaps up to `max_gap_s`."""
+
+    def __init__(self, length_s: float, max_gap_s: float) -> None:
+        self._length_ns, self._max_gap_s = round(length_s * 1e9), max_gap_s
+        self._stamps: list[int] = []
+        self._poses: list[Array] = []
+
+    def add(self, stamp_ns: int, odom_T_body: Array) -> None:
+        """Append a pose, later than all before."""
+        self._stamps.append(stamp_ns)
+        self._poses.append(odom_T_body)
+        # lists are cut rarely and in bulk; bisection wants lists
+        if self._stamps[0] < stamp_ns - 2 * self._length_ns:
+            old = bisect_left(self._stamps, stamp_ns - self._length_ns)
+            del self._stamps[:old], self._poses[:old]
+
+    def passed(self, stamp_ns: int) -> bool:
+        """Whether the odometry has reached a stamp."""
+        return bool(self._stamps) and self._stamps[-1] >= stamp_ns
+
+    def at(self, stamp_ns: int) -> Array | None:
+        """`odom_T_body` at a stamp, or None outside of what is known."""
+        poses = self.path(stamp_ns, stamp_ns).poses
+        return poses[0] if len(poses) else None
+
+    def path(self, start_ns: int, end_ns: int) -> Trajectory:
+        """Poses `odom_T_body` from start to end, both interpolated, as far as they are known; maybe none."""
+        first, last = bisect_left(self._stamps, start_ns), bisect_left(self._stamps, end_ns)
+        stamps = np.unique(np.array([start_ns, *self._stamps[first:last], end_ns], np.int64))
+        poses, known = self._between(max(first - 1, 0), last + 1).at(stamps, self._max_gap_s)
+        return Trajectory(stamps[known], poses[known])
+
+    def samples(self, start_ns: int, end_ns: int) -> Trajectory:
+        """Poses from start to end as they came, no further back than the buffer's length before the end."""
+        first = bisect_left(self._stamps, max(start_ns, end_ns - self._length_ns))
+        return self._between(first, bisect_right(self._stamps, end_ns))
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._stamps.clear()
+        self._poses.clear()
+
+    def _between(self, first: int, last: int) -> Trajectory:
+        poses = np.array(self._poses[first:last]).reshape(-1, 4, 4)
+        return Trajectory(np.array(self._stamps[first:last], np.int64), poses)
+
+
+def scan_motion(moments_s: Array, span_ns: tuple[int, int], path: Trajectory, odometry: OdometryBuffer) -> ScanMotion:
     """Return the motion during a scan whose points were measured `moments_s` (N,) s after the frame's stamp.
 
     `span_ns` are the stamps of the first and the last point, `path` the odometry over the scan, at least one pose.
     """
-    stamps, poses = path
-    lasted_s = float(stamps[-1] - stamps[0]) * 1e-9
-    rates = twists(np.stack([poses[0], poses[-1]]))[0] / lasted_s if lasted_s > 0 else np.zeros(6)
+    lasted_s = float(path.stamps_ns[-1] - path.stamps_ns[0]) * 1e-9
+    rates = twists(path.poses[[0, -1]])[0] / lasted_s if lasted_s > 0 else np.zeros(6)
     history = odometry.samples(span_ns[1] - HISTORY_NS, span_ns[1])
     return ScanMotion(moments_s.astype(np.float32), rates, odometry_noise(history, span_ns[1] - span_ns[0]))
 
 
-def odometry_noise(history: Path, duration_ns: int) -> Array:
+def odometry_noise(history: Trajectory, duration_ns: int) -> Array:
     """Variance (6,) that the odometry's error gains in a second: x y z rx ry rz about the body's axes, m^2/s, rad^2/s.
 
     A rover moves smoothly, its odometry beside it at random. Third differences of the steps over the duration of a scan
     leave this noise, as much of it as bends such a scan. Rougher motion counts as noise too: the odometry may not have
     followed it. `history` are poses before the end of the scan, at about equal distances in time.
     """
-    stamps, poses = history
-    if len(stamps) < 2 or duration_ns <= 0:
+    if len(history) < 2 or duration_ns <= 0:
         return UNKNOWN_NOISE
-    spacing_ns = float(np.median(np.diff(stamps)))
+    spacing_ns = float(np.median(np.diff(history.stamps_ns)))
     stride = max(1, int(duration_ns / spacing_ns / FINEST))
     lag = max(1, round(duration_ns / spacing_ns / stride))
-    used = poses[::-1][::stride][::-1]
+    used = history.poses[::-1][::stride][::-1]
     if len(used) < 2 * len(BINOMIALS) * lag:
         return UNKNOWN_NOISE
-    steps = twists(np.stack(used), lag)
+    steps = twists(used, lag)
     count = len(steps) - (len(BINOMIALS) - 1) * lag
     left = np.sum([binomial * steps[i * lag : i * lag + count] for i, binomial in enumerate(BINOMIALS)], axis=0)
     return np.asarray(np.mean(left**2, axis=0) / STEPS / (lag * stride * spacing_ns * 1e-9))
@@ -157,13 +203,13 @@ class Anchor:
 
 def assemble(
     anchor: Anchor,
-    left: StampedImage | None,
-    right: StampedImage | None,
+    left: StampedInput | None,
+    right: StampedInput | None,
     odometry: OdometryBuffer,
     calibration: Calibration,
     session: int,
 ) -> Frame:
-    """Build the frame at `anchor.stamp_ns`: images rectified, motion between the measurements removed."""
+    """Build the frame at `anchor.stamp_ns`: images (H, W) uint8 rectified, motion between the measurements removed."""
     odom_T_body = odometry.at(anchor.stamp_ns)
     points, intensity, motion = _scan(anchor, odometry, calibration, odom_T_body)
     exposed = odometry.at(left.stamp_ns) if left else None
@@ -176,8 +222,8 @@ def assemble(
         camera=calibration.camera,
         body_T_camera=body_T_camera,
         body_T_lidar=calibration.body_T_lidar,
-        left=rectify(left.image, 0) if left else None,
-        right=rectify(right.image, 1) if right else None,
+        left=rectify(left.value, 0) if left else None,
+        right=rectify(right.value, 1) if right else None,
         points=points,
         intensity=intensity,
         odom_T_body=odom_T_body,
@@ -198,30 +244,24 @@ def _scan(
     motion = None
     if odom_T_body is not None and cloud.time_offset_ns is not None:
         path = odometry.path(*anchor.span_ns())
-        if path[1]:
+        if len(path):
             stamps = anchor.measured_ns + cloud.time_offset_ns
             points = deskew(points, stamps, path, odom_T_body)
             motion = scan_motion((stamps - anchor.stamp_ns) * 1e-9, anchor.span_ns(), path, odometry)
     return points, cloud.intensity, motion
 
 
-def deskew(
-    points: Points,
-    point_stamps_ns: NDArray[np.int64],
-    path: tuple[NDArray[np.int64], list[Array]],
-    odom_T_body: Array,
-) -> Points:
+def deskew(points: Points, point_stamps_ns: NDArray[np.int64], path: Trajectory, odom_T_body: Array) -> Points:
     """Points (N, 3) float32, m, each in the body frame at its own stamp (N,), as measured from the pose `odom_T_body`.
 
-    `path` are stamps and poses of the odometry over the scan, at least one. Between them the motion is taken as
+    `path` is the odometry over the scan, at least one pose. Between them the motion is taken as
     uniform; before the first and after the last the rover is taken to stand.
     """
-    stamps, poses = path
-    moved = np.stack([invert(odom_T_body) @ pose for pose in poses])
+    moved = invert(odom_T_body) @ path.poses
     turns = Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()
     # relative to the first stamp: nanoseconds since the epoch do not fit a float
-    times = (stamps - stamps[0]).astype(float)
-    at = (point_stamps_ns - stamps[0]).astype(float)
+    times = (path.stamps_ns - path.stamps_ns[0]).astype(float)
+    at = (point_stamps_ns - path.stamps_ns[0]).astype(float)
     motion = np.hstack([turns, moved[:, :3, 3]])
     each = np.stack([np.interp(at, times, column) for column in motion.T], axis=1)
     return np.asarray(Rotation.from_rotvec(each[:, :3]).apply(points) + each[:, 3:], np.float32)

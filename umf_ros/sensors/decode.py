@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -42,8 +43,8 @@ NARROWEST_RAD, WIDEST_RAD = 0.02, 3.1
 """Angles of view that a rectified camera can have."""
 LARGEST_RECORD = 4096
 """Bytes of a point; drivers have some dozens."""
-INTENSITY_NAMES = ("intensity", "reflectivity", "reflectance", "i")
-"""Fields of the strength of a return, by driver."""
+INTENSITY_NAMES = ("intensity", "scalar_intensity", "reflectivity", "reflectance", "remission", "i")
+"""Fields of the strength of a return, by driver; the second is CloudCompare's."""
 TIME_NAMES = ("point_time_offset", "offset_time", "t", "time", "time_offset", "timestamp")
 """Fields of the time of a point: whole numbers are ns, others s; Blickfeld, Livox, Ouster, Velodyne, Hesai."""
 FURTHEST_RETURN_M = 1e4
@@ -133,27 +134,27 @@ def decode_cloud(message: Any) -> Cloud:
     Raises:
         MessageError: of kind "fields", "datatype", "step" or "truncated".
     """
-    if not hasattr(message, "fields"):
-        return _decode_livox(message)
-    records = _cloud_records(message)
-    names = records.dtype.names or ()
-    points = np.stack([records[axis] for axis in "xyz"], axis=1, dtype=np.float32, casting="unsafe")
-    strength = next((name for name in INTENSITY_NAMES if name in names), None)
-    intensity = None if strength is None else records[strength].astype(np.float32)
-    real = real_returns(points, intensity)
-    offsets = _time_offsets_ns(records[real], message)
-    return Cloud(points[real], None if intensity is None else intensity[real], offsets)
+    records = _cloud_records(message) if hasattr(message, "fields") else _livox_records(message)
+    cloud, real = real_returns(records, records.dtype.names or ())
+    return replace(cloud, time_offset_ns=_time_offsets_ns(records[real], message))
 
 
-def real_returns(points: Points, intensity: Points | None) -> NDArray[np.bool_]:
-    """(N,) which of the points (N, 3), m, are echoes: away from the sensor, not too far, and no dummy of the Cube-1."""
-    x, y, z = points.T
+def real_returns(columns: Any, names: Collection[str]) -> tuple[Cloud, NDArray[np.bool_]]:
+    """The echoes among points, and (N,) which these are: away from the sensor, not too far, no dummy of the Cube-1.
+
+    `columns` holds (N,) numbers by name, `names` are those there are, x, y and z in metres among them.
+    """
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is too far
+        points = np.stack([columns[axis] for axis in "xyz"], axis=1, dtype=np.float32, casting="unsafe")
+        strength = next((name for name in INTENSITY_NAMES if name in names), None)
+        intensity = None if strength is None else columns[strength].astype(np.float32)
+        x, y, z = points.T
         squared = x * x + y * y + z * z
     dummy = np.abs(squared - NO_RETURN_RANGE_M**2) < 2e-5
     if intensity is not None:
         dummy &= intensity == 0
-    return (squared > 0) & (squared <= FURTHEST_RETURN_M**2) & ~dummy  # neither holds of what is not a number
+    real = (squared > 0) & (squared <= FURTHEST_RETURN_M**2) & ~dummy  # neither holds of what is not a number
+    return Cloud(points[real], None if intensity is None else intensity[real]), real
 
 
 def _time_offsets_ns(records: NDArray[Any], message: Any) -> NDArray[np.int64] | None:
@@ -280,24 +281,6 @@ TYPES: dict[str, tuple[str, ...]] = {
     "odometry": ("nav_msgs/msg/Odometry",),
 }
 """Types of message that a recording may have on the topic of each name in `Topics`."""
-LIVOX_DEFINITION = """
-std_msgs/Header header
-uint64 timebase
-uint32 point_num
-uint8 lidar_id
-uint8[3] rsvd
-CustomPoint[] points
-================================================================================
-MSG: {package}/CustomPoint
-uint32 offset_time
-float32 x
-float32 y
-float32 z
-uint8 reflectivity
-uint8 tag
-uint8 line
-"""
-"""As the drivers of Livox define it; recordings of them carry it too."""
 
 
 def _decode_compressed(message: Any) -> Image:
@@ -320,9 +303,7 @@ def decode_picture(content: bytes) -> Image | None:
     return None if image is None else np.asarray(image, np.uint8)
 
 
-def _decode_livox(message: Any) -> Cloud:
-    points = message.points
-    columns = np.array([(p.x, p.y, p.z, p.reflectivity, p.offset_time) for p in points], float).reshape(-1, 5)
-    xyz, intensity = columns[:, :3].astype(np.float32), columns[:, 3].astype(np.float32)
-    real: NDArray[np.bool_] = real_returns(xyz, None)
-    return Cloud(xyz[real], intensity[real], columns[real, 4].astype(np.int64))
+def _livox_records(message: Any) -> NDArray[Any]:
+    rows = [(point.x, point.y, point.z, point.reflectivity, point.offset_time) for point in message.points]
+    names, kinds = ("x", "y", "z", "reflectivity", "offset_time"), ("f4", "f4", "f4", "u1", "u4")
+    return np.array(rows, list(zip(names, kinds, strict=True)))

@@ -19,7 +19,7 @@ from umf_ros.sensors.decode import (
 )
 from umf_ros.sensors.sessions import ODOMETRY, Input
 from umf_ros.sensors.synchronizer import SILENCE_NS, Synchronizer
-from umf_ros.sensors.tf import OdometryFrames, TfExtrinsics
+from umf_ros.sensors.tf import BodyFrames
 
 _INPUTS: dict[str, Input] = {
     "left_image": "left",
@@ -49,11 +49,10 @@ class MessageRouter:
         topics: Topics,
         warn: Callable[[str], None],
         hear_odometry: Callable[[OdometrySample], None] = lambda _: None,
-        mounting: TfExtrinsics | None = None,
-        odometry_frames: OdometryFrames | None = None,
+        frames: BodyFrames | None = None,
     ) -> None:
-        """Give `hear_odometry` every sample; `mounting` None: as calibrated; `odometry_frames` None: of the body."""
-        self._mounting, self._odometry_frames = mounting, odometry_frames
+        """Give `hear_odometry` every sample; without `frames` sensors are as calibrated, and odometry is the body's."""
+        self._frames = frames
         self._synchronizer = synchronizer
         self._hear_odometry = hear_odometry
         self._warn = warn
@@ -75,13 +74,16 @@ class MessageRouter:
         entry = self._entries[topic]
         try:
             if entry == ODOMETRY:
-                sample, frames = decode_odometry(message), self._odometry_frames
-                pose = frames.to_body(message, sample.odom_T_body) if frames else sample.odom_T_body
-                self.take_odometry(OdometrySample(sample.stamp_ns, pose))
+                sample = decode_odometry(message)
+                if self._frames is not None:
+                    sample = sample._replace(odom_T_body=self._frames.to_body(message, sample.odom_T_body))
+                self.take_odometry(sample)
             elif entry in ("left_info", "right_info"):
                 self._use_info(entry, message)
             else:
-                self._mount(entry, message)
+                if self._frames is not None and entry != "right_image":
+                    sensor = "lidar" if entry == "cloud" else "camera"
+                    self._synchronizer.use_mounting(self._frames.mounting(sensor, message.header.frame_id))
                 decode = decode_cloud if entry == "cloud" else decode_image
                 self._synchronizer.add(_INPUTS[entry], stamp_ns(message), decode(message))
         except MessageError as error:
@@ -101,14 +103,6 @@ class MessageRouter:
         if (topic, error.kind) not in self._warned:
             self._warned.add((topic, error.kind))
             self._warn(f"{topic}: {error}; such messages are skipped")
-
-    def _mount(self, entry: str, message: Any) -> None:
-        if self._mounting is None or entry == "right_image":
-            return
-        sensor = "lidar" if entry == "cloud" else "camera"
-        poses = self._mounting.update(sensor, message.header.frame_id)
-        if poses:
-            self._synchronizer.use_mounting(poses)
 
     def _use_info(self, entry: str, message: Any) -> None:
         """Use the camera_info of the pair, or the left one alone when the right camera stays silent.

@@ -6,6 +6,7 @@ import io
 import logging
 import struct
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.errors import SensorFileError, either, one_line
-from umf_ros.core.frames import Frame, Image, Points, StereoCamera
-from umf_ros.sensors.assembly import Anchor, ScanLimits, assemble
-from umf_ros.sensors.buffers import OdometryBuffer, StampedImage
+from umf_ros.core.frames import Frame, Image, StereoCamera
+from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, assemble
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import FURTHEST_RETURN_M, Cloud, decode_picture, real_returns
+from umf_ros.sensors.sessions import StampedInput
 
 _log = logging.getLogger(__name__)
 
@@ -42,8 +43,6 @@ _PLY_KINDS = {
     **{"float": "f4", "double": "f8", "list": "list"},
 }
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
-_INTENSITY = ("intensity", "scalar_intensity", "reflectivity", "reflectance", "remission", "i")
-"""Names under which drivers and CloudCompare store the strength of a return, the usual ones first."""
 _MOST_NEGATIVE = 0.01
 """Share of negative numbers that no column of intensities has: every other coordinate is negative."""
 
@@ -64,7 +63,10 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
     try:
         content = path.read_bytes()
         columns = _parse_bin(content, bin_columns) if suffix == ".bin" else _PARSERS[suffix](content)
-        cloud = _cloud_of(columns)
+        missing = [axis for axis in "xyz" if axis not in columns]
+        if missing:
+            raise SensorFileError(f"no field {', '.join(missing)}")
+        cloud, _ = real_returns(columns, columns)
     except OSError as error:
         raise SensorFileError(f"cannot read {path}: {error.strerror}") from None
     except SensorFileError as error:
@@ -77,17 +79,6 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
     return cloud
 
 
-def _cloud_of(columns: Columns) -> Cloud:
-    missing = [axis for axis in "xyz" if axis not in columns]
-    if missing:
-        raise SensorFileError(f"no field {', '.join(missing)}")
-    points = np.stack([columns[axis].astype(np.float32) for axis in "xyz"], axis=1)
-    name = next((name for name in _INTENSITY if name in columns), None)
-    intensity = None if name is None else columns[name].astype(np.float32)
-    real = real_returns(points, intensity)
-    return Cloud(points[real], None if intensity is None else intensity[real])
-
-
 def parse_pcd(content: bytes) -> Columns:
     """Return the fields of the points, (N,) each or (N, count), by name in lower case.
 
@@ -97,13 +88,12 @@ def parse_pcd(content: bytes) -> Columns:
         SensorFileError: it is no such file, or the data are not what the header says.
     """
     entries: dict[str, list[str]] = {}
-    start = 0
+    body = content
     while "DATA" not in entries:
-        end = content.find(b"\n", start)
-        if end < 0:
+        line, end, body = body.partition(b"\n")
+        if not end:
             raise SensorFileError("a PCD file without a DATA line")
-        words = content[start:end].decode("ascii", "replace").split()
-        start = end + 1
+        words = line.decode("ascii", "replace").split()
         if words and not words[0].startswith("#"):
             entries[words[0].upper()] = words[1:]
     try:
@@ -111,7 +101,6 @@ def parse_pcd(content: bytes) -> Columns:
         points = int(entries.get("POINTS", ["0"])[0])
     except (ValueError, IndexError, TypeError):
         raise SensorFileError("a PCD header that cannot be read") from None
-    body = content[start:]
     if kind == "ascii":
         return _parse_text(body, record, points)
     if kind == "binary":
@@ -179,16 +168,11 @@ def _parse_text(body: bytes, record: Record, points: int) -> Columns:
 
 def _leading_numbers(body: bytes, width: int) -> list[list[float]]:
     """So many numbers at the start of each line; lines that begin otherwise are left out."""
-    rows = []
-    for line in body.split(b"\n") if width else ():
-        words = line.split(maxsplit=width)[:width]
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            continue
-        if len(values) == width:
-            rows.append(values)
-    return rows
+    rows: list[list[float]] = []
+    for line in body.split(b"\n"):
+        with suppress(ValueError):
+            rows.append([float(word) for word in line.split(maxsplit=width)[:width]])
+    return [row for row in rows if len(row) == width > 0]
 
 
 def _decompress(body: bytes) -> bytes:
@@ -226,18 +210,18 @@ def parse_ply(content: bytes) -> Columns:
     """
     if not content.startswith(b"ply"):
         raise SensorFileError("no PLY file")
-    end = content.find(b"end_header")
-    line_end = content.find(b"\n", end)
-    if end < 0 or line_end < 0:
+    header, _, rest = content.partition(b"end_header")
+    _, end, body = rest.partition(b"\n")
+    if not end:
         raise SensorFileError("a PLY header that breaks off")
     try:
-        form, elements = _parse_ply_header(content[:end].decode("ascii", "replace"))
+        form, elements = _parse_ply_header(header.decode("ascii", "replace"))
     except (ValueError, IndexError, KeyError):
         raise SensorFileError("a PLY header that cannot be read") from None
     at = next((number for number, (name, *_) in enumerate(elements) if name == "vertex"), None)
     if at is None:
         raise SensorFileError("a PLY file without vertices")
-    body, count = content[line_end + 1 :], elements[at][1]
+    count = elements[at][1]
     if form == "ascii":
         skipped = sum(number for _, number, _ in elements[:at])
         lines = [line for line in body.splitlines() if line.strip()][skipped : skipped + count]
@@ -282,10 +266,9 @@ def _ply_record(element: PlyElement, form: str) -> Record:
 
 
 def _parse_npy(content: bytes) -> Columns:
-    try:
+    array = None
+    with suppress(ValueError, EOFError, OSError):
         array = np.load(io.BytesIO(content), allow_pickle=False)
-    except (ValueError, EOFError, OSError):
-        raise SensorFileError("no array of numbers") from None
     if not isinstance(array, np.ndarray):
         raise SensorFileError("no array of numbers")
     if array.dtype.names:
@@ -299,19 +282,13 @@ def _parse_bin(content: bytes, columns: int) -> Columns:
     if len(content) % 4:
         raise SensorFileError(f"{len(content)} bytes are no float32 numbers")
     numbers = np.frombuffer(content, "<f4")
-    columns = columns or _columns_of(numbers)
-    if not columns or len(numbers) % columns:
+    fitting = [count for count in ((columns,) if columns else (4, 3)) if len(numbers) % count == 0]
+    if not fitting:
         shapes = f"(N, {columns})" if columns else "(N, 3) or (N, 4)"
         raise SensorFileError(f"{len(numbers)} numbers are no {shapes}; --bin-columns says how many a point has")
-    return _by_name(numbers.reshape(-1, columns))
-
-
-def _columns_of(numbers: Points) -> int:
-    """4 or 3 numbers per point; 0 where neither can be."""
-    fits = [columns for columns in (4, 3) if len(numbers) % columns == 0]
-    if len(numbers) and fits == [4, 3]:
-        return 3 if np.mean(numbers[3::4] < 0) > _MOST_NEGATIVE else 4
-    return fits[0] if fits else 0
+    if fitting == [4, 3] and len(numbers) and np.mean(numbers[3::4] < 0) > _MOST_NEGATIVE:
+        fitting = [3]
+    return _by_name(numbers.reshape(-1, fitting[0]))
 
 
 def _by_name(array: NDArray) -> Columns:
@@ -368,6 +345,6 @@ def make_snapshot(
     them at the size the calibration is for. `warn` is called when a limit of the calibration is not applied.
     """
     usable = None if cloud is None else ScanLimits(calibration, warn).apply(cloud)
-    stamped_left, stamped_right = (None if image is None else StampedImage(stamp_ns, image) for image in (left, right))
+    pair = [None if image is None else StampedInput("left", stamp_ns, image) for image in (left, right)]
     anchor = Anchor(stamp_ns, stamp_ns, usable)
-    return assemble(anchor, stamped_left, stamped_right, OdometryBuffer(0, 0), calibration, session=0)
+    return assemble(anchor, pair[0], pair[1], OdometryBuffer(0, 0), calibration, session=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -20,6 +20,8 @@ AGREEMENT_NS = 5_000_000_000
 """Two messages out of line tell of the same new session when their stamps lie this close together."""
 FASTEST_M_PER_S = 20.0
 LEAST_JUMP_M = 2.0
+DROPPED = ("clock jump", "position jump")
+"""Faults of messages that were held and turned out to be wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +29,8 @@ class StampedInput:
     """A message as it arrives; of the odometry the value is (4, 4) `odom_T_body`.
 
     Attributes:
-        fault: why it does not go on from its input's newest message ("duplicate", "out of order", "stale"), or why
-            it was dropped ("clock jump", "position jump"); empty for an ordinary one.
+        fault: why it does not go on from its input's newest message ("duplicate", "out of order", "stale"), why it was
+            dropped ("clock jump", "position jump"), or "late" for its scan; empty for an ordinary one.
     """
 
     name: Input
@@ -43,21 +45,6 @@ class Reset:
 
     reason: str
     of_clock: bool
-
-
-@dataclass(frozen=True, slots=True)
-class SessionUpdate:
-    """The result of one more message.
-
-    Attributes:
-        reset: a new session begins before the messages to use, or None.
-        usable: messages to use, in the order of their arrival; none while the message is held.
-        dropped: messages that were held and turned out to be wrong.
-    """
-
-    reset: Reset | None = None
-    usable: list[StampedInput] = field(default_factory=list)
-    dropped: list[StampedInput] = field(default_factory=list)
 
 
 class SessionClock:
@@ -81,18 +68,22 @@ class SessionClock:
         """Latest stamp of some inputs on this clock, or None before their first."""
         return max((self._newest[name].stamp_ns for name in names if name in self._newest), default=None)
 
-    def take(self, arrival: StampedInput) -> SessionUpdate:
-        """Take one message."""
+    def take(self, arrival: StampedInput) -> tuple[Reset | None, list[StampedInput]]:
+        """Take one message; return why a new session begins, and the messages that are decided by now.
+
+        Dropped messages come first, then those of the running session in the order of their arrival; none while the
+        message is held.
+        """
         newest = self._newest.get(arrival.name)
         reset = None if newest is None else _reset(newest, arrival)
         if reset is None:
-            return SessionUpdate(usable=[self._advance(arrival)], dropped=self._drop({arrival.name}))
-        agreeing = {name for name, held in self._held.items() if _agree(*held, arrival, reset)}
-        if not agreeing:
-            dropped = self._drop({arrival.name})
-            self._held[arrival.name] = arrival, reset
-            return SessionUpdate(dropped=dropped)
-        return self._begin(agreeing, arrival)
+            return None, [*self._drop({arrival.name}), self._advance(arrival)]
+        agreeing = [name for name, held in self._held.items() if _agree(*held, arrival, reset)]
+        if agreeing:
+            return self._begin(agreeing, arrival)
+        dropped = self._drop({arrival.name})
+        self._held[arrival.name] = arrival, reset
+        return None, dropped
 
     @property
     def held(self) -> int:
@@ -103,8 +94,8 @@ class SessionClock:
         """Drop what is still held, at the end of the stream."""
         return self._drop(set(self._held))
 
-    def _begin(self, agreeing: set[Input], arrival: StampedInput) -> SessionUpdate:
-        held = [self._held.pop(name) for name in list(self._held) if name in agreeing]
+    def _begin(self, agreeing: list[Input], arrival: StampedInput) -> tuple[Reset, list[StampedInput]]:
+        held = [self._held.pop(name) for name in agreeing]
         reset = held[0][1]
         self.session += 1
         if reset.of_clock:
@@ -113,11 +104,11 @@ class SessionClock:
         else:
             del self._newest[arrival.name]
         dropped = self._drop(set(self._held) if reset.of_clock else {arrival.name})
-        return SessionUpdate(reset, [self._advance(one) for one in (*(one for one, _ in held), arrival)], dropped)
+        return reset, [*dropped, *(self._advance(one) for one, _ in held), self._advance(arrival)]
 
     def _drop(self, names: set[Input]) -> list[StampedInput]:
         pairs = [self._held.pop(name) for name in list(self._held) if name in names]
-        return [replace(one, fault="clock jump" if reset.of_clock else "position jump") for one, reset in pairs]
+        return [replace(one, fault=DROPPED[0] if reset.of_clock else DROPPED[1]) for one, reset in pairs]
 
     def _advance(self, arrival: StampedInput) -> StampedInput:
         """Take note of a message that is in line, and tell its fault."""
@@ -214,15 +205,17 @@ class OdometrySessionSplitter:
             self._recent.clear()
             self._graph.begin_session()
         self._recent.append((stamp_ns, odom_T_body))
-        ruling = self._clock.take(StampedInput(ODOMETRY, stamp_ns, odom_T_body))
-        self.dropped += len(ruling.dropped)
-        if ruling.reset is not None:
+        reset, messages = self._clock.take(StampedInput(ODOMETRY, stamp_ns, odom_T_body))
+        if reset is not None:
             self._graph.begin_session()
             self.newest_ns = -1
-        for one in ruling.usable:  # late ones too: the graph sorts them in
-            self._graph.add_odometry(one.stamp_ns, one.value)
+        for one in messages:
+            if one.fault in DROPPED:
+                self.dropped += 1
+                continue
+            self._graph.add_odometry(one.stamp_ns, one.value)  # late ones too: the graph sorts them in
             self.newest_ns = max(self.newest_ns, one.stamp_ns)
-        return ruling.reset or restart
+        return reset or restart
 
     def _restart(self, stamp_ns: int, odom_T_body: Array) -> Reset | None:
         """Why the odometry after an interruption is not that of before; None when it is, or nothing was before."""

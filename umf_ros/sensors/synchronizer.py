@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from umf_ros.core.config import Sync
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import Frame, StereoCamera
-from umf_ros.sensors.assembly import Anchor, ScanLimits, assemble
-from umf_ros.sensors.buffers import ImageBuffer, InputCounter, OdometryBuffer, StampedImage
+from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, assemble
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.sessions import ODOMETRY, Input, Reset, SessionClock, StampedInput
+from umf_ros.sensors.sessions import ODOMETRY, Input, SessionClock, StampedInput
 
 _log = logging.getLogger(__name__)
 
@@ -26,6 +25,74 @@ STEREO_SLOP_NS = 17_000_000
 
 SILENCE_NS = 5_000_000_000
 """An input of which nothing has come in this much stream time is taken to be absent."""
+
+
+SURPLUS = "surplus"
+"""Reason of images that lie nearest to no scan: no fault, cameras are faster than LiDARs."""
+
+
+@dataclass(slots=True)
+class InputCounter:
+    """Messages of one input; the dropped ones by reason. Those that are neither used nor dropped are waiting."""
+
+    received: int = 0
+    used: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def lost(self) -> int:
+        """Messages dropped for a reason that should not happen."""
+        return self.dropped.total() - self.dropped[SURPLUS]
+
+
+class ImageBuffer:
+    """The latest images of one camera, in the order of their stamps."""
+
+    def __init__(self, size: int, counter: InputCounter) -> None:
+        self._size = size
+        self._counter = counter
+        self._images: deque[StampedInput] = deque()
+        self._used_ns: set[int] = set()
+        self.newest_ns: int | None = None
+
+    def add(self, image: StampedInput) -> None:
+        """Append an image; the oldest leaves a full buffer."""
+        if len(self._images) == self._size:
+            self._forget("queue full")
+        self._images.append(image)
+        self.newest_ns = image.stamp_ns
+
+    def passed(self, stamp_ns: int) -> bool:
+        """Whether no image to come can be nearer to the stamp than those that came."""
+        return self.newest_ns is not None and self.newest_ns >= stamp_ns
+
+    def nearest(self, stamp_ns: int, slop_ns: int) -> StampedInput | None:
+        """The image nearest to a stamp, or None when it is further than the slop; the earlier of two equals."""
+        nearest = min(self._images, key=lambda image: abs(image.stamp_ns - stamp_ns), default=None)
+        return nearest if nearest and abs(nearest.stamp_ns - stamp_ns) <= slop_ns else None
+
+    def use(self, image: StampedInput | None) -> None:
+        """Count an image as used, the first time."""
+        if image is not None and image.stamp_ns not in self._used_ns:
+            self._used_ns.add(image.stamp_ns)
+            self._counter.used += 1
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Let go of older images."""
+        while self._images and self._images[0].stamp_ns < stamp_ns:
+            self._forget(SURPLUS)
+
+    def clear(self) -> None:
+        """Let go of everything."""
+        self.forget_before(2**63)
+        self.newest_ns = None
+
+    def _forget(self, reason: str) -> None:
+        image = self._images.popleft()
+        if image.stamp_ns in self._used_ns:
+            self._used_ns.remove(image.stamp_ns)
+        else:
+            self._counter.dropped[image.fault or reason] += 1
 
 
 class Synchronizer:
@@ -66,9 +133,7 @@ class Synchronizer:
         self.session = 0
         self._left = ImageBuffer(settings.queue_size, self.counters["left"])
         self._right = ImageBuffer(settings.queue_size, self.counters["right"])
-        self._odometry = OdometryBuffer(
-            round(settings.odometry_buffer_s * 1e9), round(settings.max_odometry_gap_s * 1e9)
-        )
+        self._odometry = OdometryBuffer(settings.odometry_buffer_s, settings.max_odometry_gap_s)
         self._anchors: deque[Anchor] = deque()
         self._frames: list[Frame] = []
         self._given_up_ns = -1  # images up to here come too late
@@ -80,7 +145,8 @@ class Synchronizer:
 
     def use_mounting(self, poses: dict[str, Any]) -> None:
         """Replace poses of the sensors, `body_T_camera` or `body_T_lidar` by name."""
-        self._calibration = replace(self._calibration, **poses)
+        if poses:
+            self._calibration = replace(self._calibration, **poses)
 
     def add(self, name: Input, stamp_ns: int, value: Any) -> None:
         """Add a measurement: an image as the camera sends it, (H, W) uint8; a `Cloud`; or a (4, 4) pose `odom_T_body`.
@@ -92,18 +158,17 @@ class Synchronizer:
         if name in ("left", "right") and value.shape[::-1] != expected:
             found = f"image of {value.shape[1]} x {value.shape[0]} pixels"
             raise MessageError("size", f"{found}, the calibration is for {expected[0]} x {expected[1]}")
-        ruling = self._clock.take(StampedInput(name, stamp_ns, value))
-        for one in ruling.dropped:
-            self.reject(one.name, one.fault)
-        if ruling.reset is not None:
-            self._begin_session(ruling.reset)
-        for one in ruling.usable:
+        reset, messages = self._clock.take(StampedInput(name, stamp_ns, value))
+        if reset is not None:
+            self._end_session(reset.of_clock)
+            self.session = self._clock.session
+        for one in messages:
             if one.fault:
                 self.reject(one.name, one.fault)
                 continue
             self.counters[one.name].received += 1
             self._absent.discard(one.name)
-            self._use(one.name, one.stamp_ns, one.value)
+            self._use(one)
             self._build()
 
     def reject(self, name: Input, reason: str) -> None:
@@ -123,39 +188,31 @@ class Synchronizer:
         """Complete the waiting frames with what is there, at the end of the stream, and pop them."""
         for one in self._clock.give_up():
             self.reject(one.name, one.fault)
-        self._clear()
+        self._end_session()
         return self.pop()
 
-    def _begin_session(self, reset: Reset) -> None:
-        if reset.of_clock:
-            self._clear()
-        self._complete_all()
-        self._odometry.clear()
-        self.session = self._clock.session
-
-    def _use(self, name: Input, stamp_ns: int, value: Any) -> None:
-        if name == "cloud":
-            key = stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
-            self._anchors.append(Anchor(key, stamp_ns, self._limits.apply(value)))
-        elif name == ODOMETRY:
-            self._odometry.add(stamp_ns, value)
-            self.counters[name].used += 1
+    def _use(self, one: StampedInput) -> None:
+        if one.name == "cloud":
+            key = one.stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
+            self._anchors.append(Anchor(key, one.stamp_ns, self._limits.apply(one.value)))
+        elif one.name == ODOMETRY:
+            self._odometry.add(one.stamp_ns, one.value)
+            self.counters[one.name].used += 1
         else:
-            buffer = self._left if name == "left" else self._right
-            buffer.add(stamp_ns, value, late=stamp_ns <= self._given_up_ns)
-            if name == "left" and ("cloud" not in self._inputs or self._is_silent("cloud", stamp_ns)):
-                self._anchors.append(Anchor(stamp_ns, stamp_ns))
+            buffer = self._left if one.name == "left" else self._right
+            buffer.add(replace(one, fault="late") if one.stamp_ns <= self._given_up_ns else one)
+            if one.name == "left" and ("cloud" not in self._inputs or self._is_silent("cloud", one.stamp_ns)):
+                self._anchors.append(Anchor(one.stamp_ns, one.stamp_ns))
 
-    def _complete_all(self) -> None:
+    def _end_session(self, of_clock: bool = True) -> None:
+        """Complete the waiting frames with what is there; images go on where the odometry alone was reset."""
         while self._anchors:
             self._complete(self._anchors.popleft())
-
-    def _clear(self) -> None:
-        self._complete_all()
-        self._left.clear()
-        self._right.clear()
         self._odometry.clear()
-        self._given_up_ns = -1
+        if of_clock:
+            self._left.clear()
+            self._right.clear()
+            self._given_up_ns = -1
 
     def _build(self) -> None:
         """Complete the frames that wait for nothing more, in order."""
@@ -211,7 +268,7 @@ class Synchronizer:
         self._right.use(right)
         self._frames.append(assemble(anchor, left, right, self._odometry, self._calibration, self.session))
 
-    def _count_scan(self, cloud: Cloud, left: StampedImage | None) -> bool:
+    def _count_scan(self, cloud: Cloud, left: StampedInput | None) -> bool:
         """Count a scan as used or dropped; returns whether there will be a frame."""
         counter = self.counters["cloud"]
         without_image = left is None and (self._settings.require_image or not len(cloud.points))

@@ -59,63 +59,59 @@ class StaticTransforms:
         return poses
 
 
-class TfExtrinsics:
-    """The calibration, with the poses of camera and LiDAR in the body frame `base` as soon as the transforms have them.
+class BodyFrames:
+    """Converts poses of sensors and of odometry to those of the body, as far as static transforms state them.
 
-    `warn` is called with one line that says which pose is used, and how far it is from the calibration's.
+    Odometry of another part of the robot waits `patience_s` for the transforms, by its stamps; then it is taken as the
+    body's, with a warning. Another source of odometry on the same topic is refused. `odom` is the name of the
+    odometry's frame: that of the messages, where they name one.
     """
 
     def __init__(
-        self, calibration: Calibration, transforms: StaticTransforms, base: str, warn: Callable[[str], None]
+        self,
+        frames: FrameIds,
+        transforms: StaticTransforms,
+        warn: Callable[[str], None],
+        patience_s: float = 0.0,
+        calibration: Calibration | None = None,
     ) -> None:
-        self._poses = {"camera": calibration.body_T_camera, "lidar": calibration.body_T_lidar}
-        self._rectifier = calibration.rectifier
-        self._base, self._transforms, self._warn = base, transforms, warn
-        self._known: dict[str, tuple[str, int]] = {}
-
-    def update(self, sensor: str, frame_id: str) -> dict[str, Any]:
-        """Return new poses, `body_T_camera` and `body_T_lidar` by name, given the frame of a "camera" or a "lidar"."""
-        state = frame_id, self._transforms.version
-        if self._known.get(sensor) == state:
-            return {}
-        self._known[sensor] = state
-        pose = self._find(sensor, frame_id)
-        return {} if pose is None else {f"body_T_{sensor}": pose}
-
-    def _find(self, sensor: str, frame: str) -> Array | None:
-        pose = self._transforms.find(self._base, frame) if frame else None
-        if pose is None:
-            return None
-        if sensor == "camera":
-            if pose[2, 2] > _UP:
-                self._warn(f"{frame} is not an optical frame (its z axis is up): the calibration's pose is kept")
-                return None
-            if self._rectifier is not None:
-                pose = pose @ self._rectifier.raw_T_rectified
-        if np.allclose(pose, self._poses[sensor], atol=1e-6):
-            return None
-        apart_m = float(np.linalg.norm(pose[:3, 3] - self._poses[sensor][:3, 3]))
-        self._warn(f"{sensor}: its pose is that of {frame} in {self._base} on {TOPIC}, {apart_m:.2f} m from the file's")
-        self._poses[sensor] = pose
-        return pose
-
-
-class OdometryFrames:
-    """Converts odometry of any part of the robot to the body's; another source on the same topic is refused.
-
-    Odometry of another part waits `patience_s` for the transforms, by its stamps; then it is taken as the body's, with
-    a warning. `odom` is the name of the odometry's frame: that of the messages, where they name one.
-    """
-
-    def __init__(
-        self, frames: FrameIds, transforms: StaticTransforms, warn: Callable[[str], None], patience_s: float = 0.0
-    ) -> None:
+        """Without a calibration `mounting` has no poses: sensors stay where they are."""
         self._base, self._transforms, self._warn = frames.base, transforms, warn
+        self._calibration = calibration
+        self._mounted: dict[str, tuple[str, int]] = {}
+        self._poses: dict[str, Array] = {}
         self._patience_ns = int(patience_s * 1e9)
         self._names: tuple[str, str] | None = None
         self._part_T_body: Array | None = None
         self._first_ns = 0
         self.odom = frames.odom
+
+    def mounting(self, sensor: str, frame_id: str) -> dict[str, Any]:
+        """Return the new pose of a "camera" or a "lidar", as `body_T_camera` or `body_T_lidar`; empty: as before.
+
+        A new pose is one line of warning that says how far it is from that of the calibration.
+        """
+        state = frame_id, self._transforms.version
+        if self._calibration is None or self._mounted.get(sensor) == state:
+            return {}
+        self._mounted[sensor] = state
+        pose = self._transforms.find(self._base, frame_id) if frame_id else None
+        if pose is None:
+            return {}
+        if sensor == "camera" and pose[2, 2] > _UP:
+            self._warn(f"{frame_id} is not an optical frame (its z axis is up): the calibration's pose is kept")
+            return {}
+        if sensor == "camera" and self._calibration.rectifier is not None:
+            pose = pose @ self._calibration.rectifier.raw_T_rectified
+        name = f"body_T_{sensor}"
+        before = self._poses.get(name, getattr(self._calibration, name))
+        if np.allclose(pose, before, atol=1e-6):
+            return {}
+        apart_m = float(np.linalg.norm(pose[:3, 3] - before[:3, 3]))
+        where = f"its pose is that of {frame_id} in {self._base} on {TOPIC}"
+        self._warn(f"{sensor}: {where}, {apart_m:.2f} m from the file's")
+        self._poses[name] = pose
+        return {name: pose}
 
     def to_body(self, message: Any, odom_T_part: Array) -> Array:
         """(4, 4) `odom_T_body` of a nav_msgs/Odometry whose pose is `odom_T_part`.

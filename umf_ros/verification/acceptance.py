@@ -91,7 +91,9 @@ CRITERIA: dict[str, dict[str, Criterion]] = {
     },
     IMAGE: {
         "inliers": Criterion(
-            lambda known: math.log1p(known["inliers_image"] + known["inliers_cloud"]), math.log(10), math.log(100)
+            lambda known: math.log1p(known.get("inliers_image", 0.0) + known.get("inliers_cloud", 0.0)),
+            math.log(10),
+            math.log(100),
         ),
         "similarity": _of("similarity", 0.3, 0.9),
         "support": _of("support", 0.0, 3.0),

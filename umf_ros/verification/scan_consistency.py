@@ -41,7 +41,7 @@ def compare_scans(match: PreparedScan, query: PreparedScan, pose: Array) -> dict
                 _share(distance > const.UNEXPLAINED * reach, seen & upright, np.nan),
             )
         )
-    common, contradiction, counterparts, upright_counterparts, unexplained = np.fmax(*both).tolist()
+    common, contradiction, counterparts, upright_counterparts, unexplained = np.fmax(*np.array(both)).tolist()
     return {
         "common": -common,
         "contradiction": contradiction,

@@ -145,17 +145,20 @@ class Verifier:
         """
         aligned = self._aligned(hypotheses)
         for one in aligned:
-            prior = prior_sigmas(*one.keyframes, one.pose, self._settings.odometry_drift)
-            support = self._memory.support(*one.keyframes, one.pose)
+            query, match = one.keyframes
+            prior = prior_sigmas(query, match, one.pose, self._settings.odometry_drift)
+            support = self._memory.support(query, match, one.pose)
             one.measurements |= measure(one) | known_only({"prior_sigmas": prior, "support": support})
         for one in aligned:
             one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
             if one.scans and self._acceptance.at_best(one.measurements) >= hopeless:
                 assert one.alignment is not None
-                one.measurements |= ambiguity(*one.scans, one.pose, one.alignment.information)
+                theirs, ours = one.scans
+                one.measurements |= ambiguity(theirs, ours, one.pose, one.alignment.information)
             one.probability = self._probability(one)
             if one.scans and self._probable(one):
-                one.measurements |= known_only({"passage_rival": passage_rival(*one.scans, one.pose)})
+                theirs, ours = one.scans
+                one.measurements |= known_only({"passage_rival": passage_rival(theirs, ours, one.pose)})
         return aligned
 
     def _probability(self, hypothesis: Hypothesis) -> float:

@@ -67,12 +67,12 @@ def once(condition: Callable[[], bool], action: Callable[[], object]) -> threadi
 
 def test_a_program_that_ends_before_it_is_ready_is_told_with_its_log(tmp_path: Path) -> None:
     lines: list[str] = []
-    process = NodeProcess("umf_ros.nodes.dds_check", [], tmp_path, lines.append)
-    with pytest.raises(UmfError, match=rf"dds_check ended with status 0; see {tmp_path}/dds_check\.log"):
+    process = NodeProcess("umf_ros.nodes.diagnostics", [], tmp_path, lines.append)
+    with pytest.raises(UmfError, match=rf"diagnostics ended with status 0; see {tmp_path}/diagnostics\.log"):
         process.wait_ready()
     assert process.stop() and process.exit_code == 0
     assert len(lines) == 1 and lines[0].startswith("an image arrived after")
-    assert (tmp_path / "dds_check.log").read_text() == lines[0] + "\n"
+    assert (tmp_path / "diagnostics.log").read_text() == lines[0] + "\n"
 
 
 def test_what_a_program_complains_of_is_shown_and_logged(tmp_path: Path) -> None:

@@ -170,9 +170,9 @@ def test_positions_written_for_rtklib_are_read_back(tmp_path, start_ns):
     track = motion_sensors.measure_gnss(motion, motion.duration_s, seed=2)
     path = tmp_path / "a.pos"
     path.write_text(motion_sensors.rtklib_text(track, start_ns))
-    stamps, positions = read_rtklib(path)
-    assert np.abs(stamps - start_ns - np.round(track.times_s * 1e9)).max() < 1_000_000
-    np.testing.assert_allclose(positions, east_north_up(track.geodetic), atol=2e-3)
+    found = read_rtklib(path)
+    assert np.abs(found.stamps_ns - start_ns - np.round(track.times_s * 1e9)).max() < 1_000_000
+    np.testing.assert_allclose(found.poses[:, :3, 3], east_north_up(track.geodetic), atol=2e-3)
 
 
 def test_the_twist_of_the_odometry_is_that_of_its_poses():

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from umf_ros.commands.recordings import BagPath, ConfigPath, DatasetName, EmbedderName, WeightsPath, open_recording
+from umf_ros.core.errors import BagError
 
 if TYPE_CHECKING:
     from umf_ros.bags.frames import Moment
@@ -38,7 +39,11 @@ def command(
     network = make_detector_embedder(settings)
     with console.status("looking for the two moments"):
         found = nearest_frames(FrameReader(recording, settings), moments)
-    frames = [one.checked() for one in found]
+    frames = []
+    for one in found:
+        if isinstance(one, BagError):
+            raise one
+        frames.append(one)
     query_keyframe, match_keyframe = (make_keyframe(frame, network) for frame in frames)
     explanation = explain(query_keyframe, match_keyframe, settings.verification)
     draw(explanation, frames[0].left, frames[1].left, out)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from umf_ros.commands.recordings import TruthPath, check_files, check_run
+from umf_ros.commands.recordings import TruthPath, check_files
 
 
 def command(
@@ -27,7 +27,8 @@ def command(
     from umf_ros.bags.reader import open_bag
     from umf_ros.replay import recover_run
     from umf_ros.runs.report import finish_run
+    from umf_ros.runs.writer import read_summary
 
     recover_run(folder)
-    check_run(folder)
+    read_summary(folder)
     finish_run(folder, open_bag(bag), Console(), ground_truth)

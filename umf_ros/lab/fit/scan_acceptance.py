@@ -278,8 +278,8 @@ def in_domains(
 ) -> list[Example]:
     """Examples of all domains."""
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        kinds = sorted({passage.kind for passage in PASSAGES})
-        waiting = [pool.submit(_in_domain, domain, settings, pairs, folder, kept) for domain in (*DOMAINS, *kinds)]
+        chosen: list[Domain | str] = [*DOMAINS, *sorted({passage.kind for passage in PASSAGES})]
+        waiting = [pool.submit(_in_domain, domain, settings, pairs, folder, kept) for domain in chosen]
         found = [one.result() for one in track(waiting, "domains", transient=True)]
     return [example for domain in found for example in domain]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.commands.recordings import TruthPath, check_run
+from umf_ros.commands.recordings import TruthPath
 from umf_ros.core.errors import UmfError
 
 if TYPE_CHECKING:
@@ -43,7 +43,6 @@ def command(
     from umf_ros.runs.writer import read_summary
 
     recover_run(folder)
-    check_run(folder)
     summary = read_summary(folder)
     known = bag or Path(summary.get("recording", {}).get("path", ""))
     recording: Bag | None = open_bag(known) if bag or known.is_file() or (known.is_dir() and known.name) else None

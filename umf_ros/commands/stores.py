@@ -1,10 +1,11 @@
-"""`umf fleet`: the server that the rovers of a fleet share their places by."""
+"""`umf places` and `umf fleet`: administration of stored places, on a rover and on the server of a fleet."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,7 +15,39 @@ from umf_ros.core.errors import UmfError
 if TYPE_CHECKING:
     from psycopg import Connection
 
-app = typer.Typer(help="Set up the server of a fleet (parameter database.backend: postgres); for its administrator.")
+places = typer.Typer(help="Look at a store of places (parameter database.path), or delete sessions of it.")
+fleet = typer.Typer(help="Set up the server of a fleet (parameter database.backend: postgres); for its administrator.")
+
+StorePath = Annotated[Path, typer.Argument(help="File of the parameter database.path.")]
+
+
+@places.command("list")
+def list_sessions(store: StorePath) -> None:
+    """List the sessions of a store: number, keyframes, and when."""
+    from datetime import UTC, datetime
+
+    from umf_ros.places.store import stored_sessions
+
+    for session in stored_sessions(store):
+        first, last = (datetime.fromtimestamp(ns // 10**9, UTC) for ns in (session.first_ns, session.last_ns))
+        span = f"{first:%Y-%m-%d %H:%M:%S} to {last:%Y-%m-%d %H:%M:%S} UTC"
+        typer.echo(f"session {session.number}: {session.keyframes} keyframes, {span}")
+
+
+@places.command("delete")
+def delete(
+    store: StorePath,
+    session: Annotated[list[int], typer.Option("--session", help="Number of a session; may be given repeatedly.")],
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Delete sessions of a store for good, after a confirmation."""
+    from umf_ros.places.store import check_sessions, delete_sessions
+
+    check_sessions(store, session)
+    if not yes:
+        typer.confirm(f"Delete session {', '.join(map(str, session))} of {store} for good?", abort=True)
+    typer.echo(f"{delete_sessions(store, session)} keyframes deleted")
+
 
 Address = Annotated[
     str,
@@ -22,8 +55,8 @@ Address = Annotated[
 ]
 
 
-@app.command("setup")
-def setup(
+@fleet.command("setup")
+def set_up(
     server: Address,
     embedder: Annotated[str, typer.Option(help="Network of all rovers, as umf doctor names it.")] = "umf_scene",
     dimension: Annotated[int, typer.Option(min=1, max=4000, help="Numbers per descriptor of it.")] = 768,
@@ -36,8 +69,8 @@ def setup(
     typer.echo(f"the tables are of version {after}" + (", as before" if before == after else f", were of {before}"))
 
 
-@app.command("add")
-def add(server: Address, rover: Annotated[str, typer.Argument(help="Name of the rover.")]) -> None:
+@fleet.command("add")
+def add_rover(server: Address, rover: Annotated[str, typer.Argument(help="Name of the rover.")]) -> None:
     """Let a rover in, or give it a new password; the password is read from the terminal or from standard input."""
     if not rover.replace("_", "").isalnum() or len(rover) > 63:
         raise UmfError(f"{rover!r} is no name for a rover: letters, digits and _, 63 at most")
@@ -45,9 +78,9 @@ def add(server: Address, rover: Annotated[str, typer.Argument(help="Name of the 
     if not secret:
         raise UmfError("a rover needs a password")
     with _connected(server) as connection:
-        from umf_ros.fleet.server import add_rover
+        from umf_ros.fleet import server as fleet_server
 
-        add_rover(connection, rover, secret)
+        fleet_server.add_rover(connection, rover, secret)
     typer.echo(f"{rover} may come in; database.server: postgresql://{rover}@...")
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from command_line import only_line, umf
 from recordings import CALIBRATION
+from sources import ROOT
 
-from umf_ros.commands import compare as command_module
 from umf_ros.comparison import RESULT_COLUMNS, VIEW_COLUMNS, Comparer
 
 NUMBERS = RESULT_COLUMNS[: RESULT_COLUMNS.index("reason")]
@@ -119,5 +119,5 @@ def test_what_is_wrong_is_one_line(here: Path, arguments: list[str], text: str) 
 
 
 def test_the_command_is_documented() -> None:
-    page = (Path(command_module.__file__).parents[2] / "docs" / "compare.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "compare.md").read_text(encoding="utf-8")
     assert all(f"`{name}" in page for name in ("match_T_query", "accepted", "--bin-columns", "--calibration"))
