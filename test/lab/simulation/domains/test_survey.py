@@ -66,8 +66,9 @@ def test_every_visit_covers_the_same_stretch_and_the_last_one_goes_back():
             assert abs(np.degrees(gap)) < 60  # less would be too much to ask in the corners
 
 
-def test_a_narrow_sensor_is_sent_back_too():
-    scans = survey(Domain("rosette70", "corridor", "low"), SEED, 8.0, 40.0)
+@pytest.mark.parametrize("sensor", ["rosette70", "solid360"])
+def test_a_narrow_sensor_is_sent_back_as_one_that_sees_all_around_is(sensor):
+    scans = survey(Domain(sensor, "corridor", "low"), SEED, 8.0, 40.0)
     assert {scan.label for scan in scans} == {"first", "offset", "opposite"}
 
 
