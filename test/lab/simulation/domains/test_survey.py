@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 import pytest
+from scipy.spatial.transform import Rotation
 
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.geometry import heading, transform, wrap_angle
-from umf_ros.lab.simulation.domains import DOMAINS, Domain, survey
+from umf_ros.lab.simulation.domains import DOMAINS, STRANGE_DOMAINS, Domain, survey
 from umf_ros.lab.simulation.domains.scanners import SCANNERS
 from umf_ros.lab.simulation.domains.survey import MOUNTS, PLACES
 
@@ -28,7 +29,17 @@ def off(place, scans):
 
 @pytest.mark.parametrize(
     "domain",
-    [Domain("spin16", "street", "tilted"), Domain("rosette70", "quarry", "rover"), Domain("cube1", "corridor", "low")],
+    [
+        Domain("spin16", "street", "tilted"),
+        Domain("rosette70", "quarry", "rover"),
+        Domain("cube1", "corridor", "low"),
+        Domain("mid360", "lander", "legged"),
+        Domain("spin32_20hz", "warehouse", "legged"),
+        Domain("rotating2d", "rooms", "low"),
+        Domain("spin16", "snow", "mast"),
+        Domain("spin16", "tunnel", "rolling"),
+        Domain("spin16", "quarry", "rover", revisited_by="cube1"),
+    ],
     ids=lambda domain: domain.name,
 )
 def test_scans_lie_on_the_place_at_their_true_poses(domain):
@@ -81,11 +92,39 @@ def test_a_tilted_sensor_is_tilted_and_a_calibrated_one_upright():
 
 
 def test_the_benchmarks_domains_exist_and_use_every_sensor_place_and_mount():
+    every = (*DOMAINS, *STRANGE_DOMAINS)
     assert len(DOMAINS) >= 12
-    assert len({domain.name for domain in DOMAINS}) == len(DOMAINS)
-    assert {domain.sensor for domain in DOMAINS} == set(SCANNERS) - {"spin32"}  # that of the passages
-    assert {domain.place for domain in DOMAINS} == set(PLACES)
-    assert {domain.mount for domain in DOMAINS} == set(MOUNTS)
+    assert len(STRANGE_DOMAINS) >= 8
+    assert len({domain.name for domain in every}) == len(every)
+    assert {domain.sensor for domain in every} == set(SCANNERS)
+    assert {domain.place for domain in every} == set(PLACES)
+    assert {domain.mount for domain in every} == set(MOUNTS)
+
+
+def test_a_place_may_be_revisited_by_another_sensor():
+    domain = Domain("spin64", "street", "rover", revisited_by="cube1")
+    assert domain.name == "spin64+cube1-street-rover"
+    first, *others = (
+        [scan.sweep for scan in survey(domain, SEED, 10.0, 40.0) if scan.label == label]
+        for label in ("first", "offset", "opposite")
+    )
+    for sweep in first:
+        assert sweep.offset_s is None  # spin64 has no times
+        assert sweep.points[:, 0].min() < -3
+    for sweep in others[0] + others[1]:
+        assert sweep.offset_s.max() > 0.15
+        assert sweep.points[:, 0].min() > 0
+
+
+def test_a_legged_robot_rolls_and_pitches_by_degrees_about_twice_a_second():
+    mount, times = MOUNTS["legged"], np.arange(0, 10, 0.01)
+    angles = np.array([Rotation.from_matrix(mount.sway(time, 0.2)[:3, :3]).as_euler("ZYX")[1:] for time in times])
+    assert np.degrees(np.abs(angles).max(axis=0)) == pytest.approx([4, 4], abs=0.3)
+    crossings = (np.diff(np.sign(angles), axis=0) != 0).sum(axis=0)
+    assert (crossings / 20 > 1.5).all()
+    assert (crossings / 20 < 2.5).all()
+    scans = survey(Domain("spin32_20hz", "corridor", "legged"), SEED, 10.0, 60.0)
+    assert [scan.world_T_lidar[2, 3] for scan in scans] == pytest.approx([0.5] * len(scans), abs=0.02)
 
 
 def test_a_negative_seed_is_refused():

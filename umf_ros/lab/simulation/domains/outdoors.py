@@ -1,10 +1,11 @@
-"""Places in the open: orchards and woods, a quarry, and the rover's own landscapes."""
+"""Places in the open: orchards and woods, a quarry, a plain with or without a lander, the rover's own landscapes."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.domains.solids import Scene, Solids
@@ -100,7 +101,7 @@ class Quarry:
         self._ground = Undulation(self._heights(rng), QUARRY_CELL_M)
         solids = Solids()
         solids.ground(self._ground.heights, QUARRY_CELL_M, rng.uniform(0.3, 0.5))
-        self._blocks(solids, rng)
+        scatter(solids, self, (90, 34.0, 0.25, 3.0), rng)
         self._scene = solids.scene()
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
@@ -121,13 +122,109 @@ class Quarry:
         rough = 0.3 * spectral_noise(QUARRY_CELLS, 3.6, rng, 3, 30) + 0.04 * spectral_noise(QUARRY_CELLS, 2.5, rng, 30)
         return np.asarray(terraces + rough, np.float32)
 
-    def _blocks(self, solids: Solids, rng: np.random.Generator) -> None:
-        for place in rng.uniform(-34, 34, (90, 2)):
-            size = 0.25 * rng.random() ** -0.6
-            if size > 3 or distance_to(self.trail, place) < self.lateral_m + 0.8 + size:
-                continue
-            centre = [*place, float(self.height(*place)) + 0.2 * size]
-            solids.blob(centre, size * rng.uniform(0.6, 1.1, 3), rng, rng.uniform(0.3, 0.5))
+
+def scatter(
+    solids: Solids, place: Quarry | Plain, extent: tuple[int, float, float, float], rng: np.random.Generator
+) -> None:
+    """Put boulders beside the trail.
+
+    Args:
+        solids: takes them.
+        place: its ground and trail.
+        extent: number, how far from the origin in x and y, smallest and largest radius, m.
+        rng: of places and shapes.
+    """
+    count, reach, smallest, largest = extent
+    for at in rng.uniform(-reach, reach, (count, 2)):
+        size = smallest * rng.random() ** -0.6
+        if size > largest or distance_to(place.trail, at) < place.lateral_m + 0.8 + size:
+            continue
+        centre = [*at, float(place.height(*at)) + 0.2 * size]
+        solids.blob(centre, size * rng.uniform(0.6, 1.1, 3), rng, rng.uniform(0.3, 0.5))
+
+
+PLAIN_CELLS, PLAIN_CELL_M = 301, 0.5
+CRATES = 9
+
+
+class Plain:
+    """Almost flat snow with scattered rocks, or regolith with a lander, crates, masts and cables beside the trail."""
+
+    lateral_m = 1.5
+
+    def __init__(self, seed: int, lander: bool) -> None:
+        self._seed, self._lander = seed, lander
+        rng = np.random.default_rng([seed, 77, int(lander)])
+        waves = rng.uniform(0.05, 0.15) * spectral_noise(PLAIN_CELLS, 4.2, rng, 1, 10)
+        drifts = rng.uniform(0.01, 0.02) * spectral_noise(PLAIN_CELLS, 2.6, rng, 20, 120)
+        self._ground = Undulation(waves + drifts, PLAIN_CELL_M)
+        self.trail = wobbly_ring(rng.uniform(13, 17) if lander else rng.uniform(18, 24), 0.2, rng)
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Height of the ground under points, m."""
+        return self._ground.height(x, y)
+
+    def scene(self, visit: int) -> Scene:
+        """Ground, rocks and lander stay, a quarter of the crates moves."""
+        solids, rng = Solids(), np.random.default_rng([self._seed, 78])
+        solids.ground(self._ground.heights, PLAIN_CELL_M, 0.2 if self._lander else 0.8)
+        scatter(solids, self, (60, 40.0, 0.12, 0.8) if self._lander else (220, 55.0, 0.2, 1.5), rng)
+        if self._lander:
+            self._equipment(solids, rng, np.random.default_rng([self._seed, 79, visit]))
+        return solids.scene()
+
+    def _equipment(self, solids: Solids, rng: np.random.Generator, moves: np.random.Generator) -> None:
+        """The lander beside the trail some 30 m from its start; crates and masts, of which three have cables to it."""
+        landed = self._beside(300, 8.0)
+        _lander(solids, landed, rng)
+        for number in range(CRATES):
+            at = self._beside(int(rng.integers(len(self.trail))), rng.uniform(3.5, 9.0) * rng.choice([-1, 1]))
+            size, yaw = rng.uniform(0.4, 1.3, 3), rng.uniform(0, np.pi)
+            if number < 3:
+                steps = np.linspace(0, 1, 30)[:, None]
+                cable = (at + (landed - at) * steps)[:, :2] + np.sin(np.pi * steps) * rng.normal(0, 0.3, (30, 2))
+                solids.bar(np.column_stack([cable, self.height(*cable.T) + 0.02]), 0.025, 0.3)
+                solids.bar(np.array([at, at + np.array([0, 0, rng.uniform(1.5, 3.5)])]), 0.05, 0.6)
+            elif moves.random() < 0.25:
+                at = self._beside(int(moves.integers(len(self.trail))), moves.uniform(3.5, 9.0))
+            solids.box(at, size, yaw, rng.uniform(0.3, 0.7))
+
+    def _beside(self, index: int, away_m: float) -> Array:
+        """(3,) a place on the ground so far outside the trail, inside it where negative."""
+        point = self.trail[index]
+        at = point * (1 + away_m / np.linalg.norm(point))
+        return np.array([*at, float(self.height(*at)) - 0.02])
+
+
+def _lander(solids: Solids, foot: Array, rng: np.random.Generator) -> None:
+    """A stage on four legs with a ramp on one side, a smaller one on top, a solar panel and a dish."""
+    yaw, width = rng.uniform(0, 2 * np.pi), rng.uniform(2.2, 3.0)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+
+    def at(*place: float) -> Array:
+        return foot + turn @ np.array(place)
+
+    solids.box(at(0, 0, 1.1), [width, width, 1.3], yaw, 0.6)
+    solids.box(at(0.2, 0, 2.4), [0.6 * width, 0.5 * width, rng.uniform(0.7, 1.2)], yaw, 0.5)
+    for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
+        pad = at(0.95 * width * x, 0.95 * width * y, 0.05)
+        for upper in (at(0.5 * width * x, 0.5 * width * y, 2.2), at(0.4 * width * x, 0.4 * width * y, 1.1)):
+            solids.bar(np.array([upper, pad]), 0.06, 0.5)
+        solids.box(pad, [0.6, 0.6, 0.12], yaw, 0.5)
+    ramp = [[at(x, y, z) for y in (-0.6, 0.6)] for x, z in ((width / 2, 1.1), (width / 2 + 2.0, 0.05))]
+    solids.sheet(np.array(ramp), 0.5)
+    solids.box(at(-0.5 * width - 1.0, 0, 2.0), [2.0, 1.4, 0.05], yaw, 0.2)
+    mast, tip = at(0.4 * width, 0.4 * width, 2.4), at(0.4 * width, 0.4 * width, 3.6)
+    solids.bar(np.array([mast, tip]), 0.05, 0.5)
+    _dish(solids, tip, rng.uniform(0.5, 0.8), (rng.uniform(0, 2 * np.pi), rng.uniform(0.3, 1.0)))
+
+
+def _dish(solids: Solids, vertex: Array, radius: float, aim: tuple[float, float]) -> None:
+    """A paraboloid that looks to azimuth and elevation `aim`, rad, from its vertex (3,)."""
+    away, around = np.meshgrid(np.linspace(0, radius, 5), np.linspace(0, 2 * np.pi, 17), indexing="ij")
+    bowl = np.stack([away**2 / (2 * radius), away * np.cos(around), away * np.sin(around)], -1)
+    looks = Rotation.from_euler("ZY", [aim[0], -aim[1]]).as_matrix()
+    solids.sheet(bowl @ looks.T + vertex, 0.7)
 
 
 class Landscape:

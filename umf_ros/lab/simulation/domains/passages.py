@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import uniform_filter
 
 from umf_ros.core.geometry import Array, make_pose
+from umf_ros.lab.simulation.domains.indoors import Bore
 from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner, stamp_moment, sweep
 from umf_ros.lab.simulation.domains.solids import Scene, Solids
 from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, SAME_WAY, DomainScan, Mount, SweepMotion
@@ -74,35 +74,10 @@ def hallway(solids: Solids, rng: np.random.Generator, moves: np.random.Generator
 
 def tunnel(solids: Solids, rng: np.random.Generator, moves: np.random.Generator, relief: bool) -> None:
     """A vault; with relief its rock is uneven by centimetres, else it is lined; ribs or niches at equal distances."""
-    radius, upright = rng.uniform(1.5, 3.0), rng.uniform(0.8, 1.6)
     solids.slab([-HALF_LENGTH_M, -6], [HALF_LENGTH_M, 6], 0.0, 0.3)
-    angle = np.linspace(0, np.pi, 40)
-    outline = np.vstack([[radius, 0.0], np.column_stack([radius * np.cos(angle), upright + radius * np.sin(angle)])])
-    outline = np.vstack([outline, [-radius, 0.0]])
-    x = np.arange(-HALF_LENGTH_M, HALF_LENGTH_M + 0.1, 0.25)
-    out = outline - np.array([0.0, upright])
-    out[[0, -1], 1] = 0.0
-    out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-6)
-    rough: Array = np.zeros((len(x), len(outline)))
-    if relief:
-        rough = _smooth(rng.standard_normal(rough.shape), 2) * rng.uniform(0.01, 0.04)
-    vertices = np.empty((len(x), len(outline), 3))
-    vertices[..., 0] = x[:, None]
-    vertices[..., 1:] = outline[None] + rough[..., None] * out[None]
-    _sheet(solids, vertices, 0.4)
-    if rng.random() < 0.5:  # ribs
-        step, thick = rng.uniform(2.0, 6.0), rng.uniform(0.03, 0.12)
-        inner = (outline - [0.0, upright]) * (1 - thick / radius) + [0.0, upright]
-        for at in np.arange(-HALF_LENGTH_M + step, HALF_LENGTH_M, step):
-            arch = np.empty((2, len(inner), 3))
-            arch[..., 1:] = inner
-            arch[:, :, 0] = np.array([at - 0.1, at + 0.1])[:, None]
-            _sheet(solids, arch, 0.4)
-    for at in np.cumsum(rng.uniform(10, 25, 8)) - HALF_LENGTH_M:  # cabinets
-        side = rng.choice([-1, 1])
-        solids.box([at, side * (radius - 0.15), 0.6], [rng.uniform(0.4, 1.0), 0.3, 0.9], 0.0, 0.5)
-    if moves.random() < 0.5:
-        solids.box([moves.uniform(-15, 15), radius - 0.5, 0.0], [1.2, 0.5, 0.8], 0.0, 0.4)
+    bore = Bore.drawn(HALF_LENGTH_M, rng)
+    bore.line(solids, rng, relief)
+    bore.fit_out(solids, rng, moves)
 
 
 def aisle(solids: Solids, rng: np.random.Generator, moves: np.random.Generator, relief: bool) -> None:
@@ -284,20 +259,3 @@ def _fittings(solids: Solids, hall: Hall, rng: np.random.Generator) -> None:
         solids.box([at, side * (hall.width / 2 - size[1] / 2), rng.uniform(0.1, 1.3)], size, 0.0, 0.5)
     for at in np.arange(-hall.half_length + 1, hall.half_length, rng.uniform(2.4, 4.0)):
         solids.box([at, 0.0, hall.height - 0.06], [1.2, 0.3, 0.06], 0.0, 0.6)
-
-
-def _sheet(solids: Solids, vertices: Array, reflectance: float) -> None:
-    """A surface through a grid (A, B, 3) of points."""
-    rows, columns = vertices.shape[:2]
-    index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
-    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
-    solids.add(vertices.reshape(-1, 3), triangles, reflectance)
-
-
-def _smooth(values: Array, times: int) -> Array:
-    """Neighbours averaged so many times, then of standard deviation 1."""
-    for _ in range(times):
-        values = uniform_filter(values, 3, mode="nearest")
-    smoothed: Array = values / values.std()
-    return smoothed

@@ -65,7 +65,9 @@ def rosette(width_deg: float, pulses: int, phase: float) -> Pattern:
     return Pattern(np.stack(directions, 1).astype(np.float32), moment.astype(np.float32))
 
 
-def dome(low_deg: float, high_deg: float, pulses: int, phase: float) -> Pattern:
+def dome(
+    low_deg: float, high_deg: float, pulses: int, phase: float, turns: float = 19.618, nods: float = 53.27
+) -> Pattern:
     """A solid-state sensor that sees all around: a mirror turns fast and nods out of step with its turns.
 
     Args:
@@ -73,12 +75,32 @@ def dome(low_deg: float, high_deg: float, pulses: int, phase: float) -> Pattern:
         high_deg: highest elevation.
         pulses: per scan.
         phase: 0 to 1, where the mirror stands when the scan starts.
+        turns: of the mirror in a scan.
+        nods: up and down in a scan.
     """
     moment = np.arange(pulses) / pulses
-    azimuth = 2 * np.pi * (19.618 * moment + phase)
-    nod = np.abs((2 * (53.27 * moment + 3.1 * phase)) % 2 - 1)
+    azimuth = 2 * np.pi * (turns * moment + phase)
+    nod = np.abs((2 * (nods * moment + 3.1 * phase)) % 2 - 1)
     elevation = np.radians(low_deg + (high_deg - low_deg) * nod)
     return Pattern(_directions(azimuth, elevation), moment.astype(np.float32))
+
+
+def rotating_line(width_deg: float, lines: int, beams: int, phase: float) -> Pattern:
+    """A 2-D scanner that turns about the y axis, once in a scan; its plane contains this axis.
+
+    Args:
+        width_deg: of a line.
+        lines: in a scan.
+        beams: pulses of a line.
+        phase: 0 to 1, how far the scanner has turned when the scan starts.
+    """
+    # the scanner's own mirror makes a full turn for each line and measures during `width_deg` of it
+    share = np.linspace(0, width_deg / 360, beams)
+    moment = ((np.arange(lines)[:, None] + share) / lines).ravel()
+    turn = np.pi - 2 * np.pi * (moment + phase)
+    across = np.tile(np.radians(np.linspace(-width_deg / 2, width_deg / 2, beams)), lines)
+    directions = [np.cos(across) * np.cos(turn), np.sin(across), np.cos(across) * np.sin(turn)]
+    return Pattern(np.stack(directions, 1).astype(np.float32), moment.astype(np.float32))
 
 
 def _directions(azimuth: Array, elevation: Array) -> Field:
@@ -127,11 +149,18 @@ SCANNERS: dict[str, Scanner] = {
         timed=True,
         all_round=True,
     ),
+    "spin32_20hz": Scanner(
+        partial(spinning, tuple(np.arange(-16.0, 16.0)), 1000), 0.05, 80.0, 0.02, 255.0, timed=True, all_round=True
+    ),
     "spin64": Scanner(partial(spinning, _HDL64_DEG, 1000), 0.1, 100.0, 0.02, 1.0, timed=False, all_round=True),
     "spin128": Scanner(
         partial(spinning, tuple(np.linspace(-22.5, 22.5, 128)), 512), 0.1, 90.0, 0.02, 255.0, timed=True, all_round=True
     ),
     "solid360": Scanner(partial(dome, -7.0, 52.0, 40_000), 0.2, 40.0, 0.02, 0.0, timed=False, all_round=True),
+    "mid360": Scanner(
+        partial(dome, -7.0, 52.0, 20_000, turns=37.317, nods=23.06), 0.1, 40.0, 0.02, 255.0, timed=True, all_round=True
+    ),
+    "rotating2d": Scanner(partial(rotating_line, 270.0, 60, 1081), 1.5, 30.0, 0.03, 0.0, timed=True, all_round=True),
     "rosette70": Scanner(partial(rosette, 70.4, 24_000), 0.1, 150.0, 0.02, 255.0, timed=True, all_round=False),
 }
 

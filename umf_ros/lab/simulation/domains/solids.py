@@ -96,6 +96,30 @@ class Solids:
         (x0, y0), (x1, y1) = np.asarray(low, float), np.asarray(high, float)
         self.add([[x0, y0, z], [x1, y0, z], [x0, y1, z], [x1, y1, z]], _halves(np.array([[0, 1, 2, 3]])), reflectance)
 
+    def sheet(self, vertices: Array, reflectance: float = 0.4) -> None:
+        """A surface through a grid (A, B, 3) of points."""
+        rows, columns = vertices.shape[:2]
+        index = np.arange(rows * columns).reshape(rows, columns)
+        a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
+        triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+        self.add(vertices.reshape(-1, 3), triangles, reflectance)
+
+    def bar(self, path: Array, radius: float, reflectance: float = 0.4) -> None:
+        """A four-sided tube along a path (N, 3), such as a strut or a cable."""
+        along = np.gradient(path, axis=0)
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        aside = np.cross(along, np.where(np.abs(along[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]))
+        aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+        above = np.cross(aside, along)
+        ring = np.stack([aside, above, -aside, -above, aside], 1)
+        self.sheet(path[:, None] + radius * ring, reflectance)
+
+    def bend(self, radius: float) -> None:
+        """Bend all bodies so far to a ring around the origin: x becomes the arc along it, y points to the centre."""
+        for number, points in enumerate(self._vertices):
+            angle, away = points[:, 0] / radius, radius - points[:, 1]
+            self._vertices[number] = np.column_stack([away * np.cos(angle), away * np.sin(angle), points[:, 2]])
+
     def ground(self, heights: Field, cell_m: float, reflectance: float = 0.25) -> None:
         """A square of heights (C, C), indexed [y, x], around the origin."""
         axis = (np.arange(len(heights)) - (len(heights) - 1) / 2) * cell_m

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, interpolate, make_pose, transform
-from umf_ros.lab.simulation.domains.indoors import Corridor, Rooms
-from umf_ros.lab.simulation.domains.outdoors import Landscape, Quarry, Trees
+from umf_ros.lab.simulation.domains.indoors import Corridor, Rooms, Rows, Tunnel
+from umf_ros.lab.simulation.domains.outdoors import Landscape, Plain, Quarry, Trees
 from umf_ros.lab.simulation.domains.scanners import SCANNERS, Scanner, Sweep, stamp_moment, sweep
 from umf_ros.lab.simulation.domains.solids import Scene
 from umf_ros.lab.simulation.domains.street import Street
@@ -36,6 +36,7 @@ class Mount:
         speed_m_s: of the carrier.
         sway_deg: amplitude of the carrier's rolling and pitching while it drives.
         calibrated: whether scans come in the upright body frame on the ground, rather than the LiDAR's own.
+        sway_hz: about how often it rolls and pitches in a second.
     """
 
     height_m: float
@@ -43,6 +44,7 @@ class Mount:
     speed_m_s: float
     sway_deg: float
     calibrated: bool
+    sway_hz: float = 1.0
 
     def body_T_lidar(self, rng: np.random.Generator) -> Array:
         """Pose of the LiDAR on one carrier."""
@@ -51,7 +53,7 @@ class Mount:
 
     def sway(self, time_s: float, phase: float) -> Array:
         """The carrier's rolling and pitching (4, 4) at a time, about its place on the ground."""
-        cycle = 2 * np.pi * (time_s + phase)
+        cycle = 2 * np.pi * (self.sway_hz * time_s + phase)
         roll, pitch = np.radians(self.sway_deg) * np.array([np.sin(1.1 * cycle), np.sin(0.8 * cycle + 1)])
         return make_pose(Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_matrix(), np.zeros(3))
 
@@ -63,6 +65,7 @@ MOUNTS: dict[str, Mount] = {
     "mast": Mount(2.5, 5.0, 1.0, 1.0, calibrated=False),
     "tilted": Mount(1.0, 20.0, 1.0, 0.5, calibrated=False),
     "rolling": Mount(0.8, 3.0, 1.5, 4.0, calibrated=False),
+    "legged": Mount(0.5, 2.0, 0.8, 4.0, calibrated=False, sway_hz=2.0),
 }
 
 
@@ -115,6 +118,12 @@ PLACES: dict[str, Kind] = {
     "moon": Kind(partial(_landscape, family="moon"), 1.0),
     "canyon": Kind(partial(_landscape, family="canyon"), 1.0),
     "dunes": Kind(partial(_landscape, family="dunes"), 1.0),
+    "snow": Kind(partial(Plain, lander=False), 1.0),
+    "lander": Kind(partial(Plain, lander=True), 0.8),
+    "tunnel": Kind(partial(Tunnel, features=True), 0.5),
+    "smooth_tunnel": Kind(partial(Tunnel, features=False), 0.5),
+    "warehouse": Kind(partial(Rows, plants=False), 0.7),
+    "greenhouse": Kind(partial(Rows, plants=True), 0.6),
 }
 
 
@@ -131,16 +140,19 @@ class Domain:
         sensor: LiDAR.
         place: kind of place.
         mount: how the LiDAR is carried.
+        revisited_by: the LiDAR of later visits where it is another one.
     """
 
     sensor: str
     place: str
     mount: str
+    revisited_by: str = ""
 
     @property
     def name(self) -> str:
         """Sensor, place and mount."""
-        return f"{self.sensor}-{self.place}-{self.mount}"
+        sensors = f"{self.sensor}+{self.revisited_by}" if self.revisited_by else self.sensor
+        return f"{sensors}-{self.place}-{self.mount}"
 
     @property
     def scale(self) -> float:
@@ -149,8 +161,13 @@ class Domain:
 
     @property
     def scanner(self) -> Scanner:
-        """The LiDAR."""
+        """The LiDAR of the first visit."""
         return SCANNERS[self.sensor]
+
+    @property
+    def query_scanner(self) -> Scanner:
+        """The LiDAR of later visits."""
+        return SCANNERS[self.revisited_by or self.sensor]
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +211,22 @@ DOMAINS: tuple[Domain, ...] = (
     Domain("rosette70", "orchard", "rolling"),
     Domain("rosette70", "corridor", "low"),
 )
-"""The combinations that the benchmarks run; any other can be surveyed too."""
+"""The combinations that the benchmarks run and that the decision is fitted to; any other can be surveyed too."""
+
+STRANGE_DOMAINS: tuple[Domain, ...] = (
+    Domain("mid360", "woods", "legged"),
+    Domain("spin32_20hz", "warehouse", "legged"),
+    Domain("rotating2d", "rooms", "low"),
+    Domain("spin16", "snow", "mast"),
+    Domain("spin32", "snow", "rolling"),
+    Domain("spin16", "tunnel", "rolling"),
+    Domain("spin16", "smooth_tunnel", "rolling"),
+    Domain("solid360", "greenhouse", "rover"),
+    Domain("spin64", "greenhouse", "low"),
+    Domain("cube1", "lander", "rover"),
+    Domain("spin64", "quarry", "rover", revisited_by="cube1"),
+)
+"""Combinations that nothing is fitted to."""
 
 
 def survey(domain: Domain, seed: int, step_m: float, longest_m: float, place: Place | None = None) -> list[DomainScan]:
@@ -211,14 +243,14 @@ def survey(domain: Domain, seed: int, step_m: float, longest_m: float, place: Pl
         ConfigError: negative seed.
     """
     place = place or PLACES[domain.place].build(check_seed(seed))
-    mount, scanner = MOUNTS[domain.mount], domain.scanner
+    mount = MOUNTS[domain.mount]
     carrier = np.random.default_rng([seed, 51])
     body_T_lidar = mount.body_T_lidar(carrier)
     scans: list[DomainScan] = []
     for visit, label in enumerate((FIRST, SAME_WAY, OTHER_WAY)):
         visited: list[DomainScan] = []
         rng = np.random.default_rng([seed, 52, visit])
-        scene = place.scene(visit)
+        scene, scanner = place.scene(visit), domain.scanner if label == FIRST else domain.query_scanner
         for world_T_body in _drive(place, label, (step_m * domain.scale, longest_m * domain.scale), rng):
             phase, start_s = rng.random(), rng.random()
             motion = SweepMotion(
