@@ -27,6 +27,7 @@ from umf_ros.lab.fit.acceptance import (
     Example,
     bounds_of,
     fit_decision,
+    load_examples,
     save_acceptance,
     save_examples,
 )
@@ -37,10 +38,8 @@ from umf_ros.lab.simulation.domains.pairs import (
     ScannedPlace,
     ScanPair,
     pairs_of,
-    passage_places,
     places_of,
 )
-from umf_ros.lab.simulation.domains.passages import PASSAGES
 from umf_ros.lab.simulation.drives import SurveyedDrive, embedded, kept, worlds
 from umf_ros.lab.simulation.scenes import TRAPS
 from umf_ros.lab.simulation.world import VALIDATION
@@ -90,18 +89,14 @@ def is_right(metres: float, degrees: float) -> bool | None:
 
 
 def kept_examples(
-    domain: Domain | str, seeds: range, pairs: int, scans: Path | None, embedder: Embedder, kept: Path | None
+    domain: Domain, seeds: range, pairs: int, scans: Path | None, embedder: Embedder, kept: Path | None
 ) -> list[Example]:
-    """Examples of a domain, or of a kind of passage; from a file in the folder `kept` where an earlier call left it."""
-    name = domain if isinstance(domain, str) else domain.name
-    path = kept / f"examples_{name}_{seeds.start}_{len(seeds)}_{pairs}.pkl" if kept else None
+    """The same as `examples_of`, from a file in the folder `kept` where an earlier call left it."""
+    path = kept / f"examples_{domain.name}_{seeds.start}_{len(seeds)}_{pairs}.pkl" if kept else None
     if path is not None and path.exists():
         found: list[Example] = pickle.loads(path.read_bytes())
         return found
-    if isinstance(domain, str):
-        found = list(passage_examples(domain, seeds, pairs, embedder))
-    else:
-        found = list(examples_of(domain, seeds, pairs, scans, embedder))
+    found = list(examples_of(domain, seeds, pairs, scans, embedder))
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(pickle.dumps(found))
@@ -121,38 +116,21 @@ def examples_of(domain: Domain, seeds: range, pairs: int, scans: Path | None, em
     for number, pair in enumerate(chosen):
         view = VIEWS[number % len(VIEWS)]
         query, match = (_seen(place.keyframe, view, domain.scanner.all_round) for place in (pair.query, pair.match))
-        yield from _examples(Tried(query, match, pair), verifier, (domain.name, domain.scanner.all_round), rng)
-        if pair.query.before is not None:
-            merged = Tried(pair.query.before, pair.match.around or pair.match.keyframe, pair)
-            yield from _examples(merged, verifier, (domain.name, True), rng)
+        yield from _examples(Tried(query, match, pair), verifier, domain, rng)
 
 
-def passage_examples(kind: str, seeds: range, pairs: int, embedder: Embedder) -> Iterator[Example]:
-    """Examples from pairs of stations in passages of one kind, each with a sensor, mount and relief of its own."""
-    passages = [passage for passage in PASSAGES if passage.kind == kind]
-    rng, verifier = np.random.default_rng([seeds.start, 61]), Verifier(Verification())
-    for seed in seeds:
-        passage = passages[int(rng.integers(len(passages)))]
-        places = passage_places(passage, seed, embedder)
-        for _ in range(pairs // len(seeds)):
-            query, match = (places[index] for index in rng.choice(len(places), 2, replace=False))
-            tried = Tried(query.keyframe, match.keyframe, ScanPair(query, match, "same way"))
-            yield from _examples(tried, verifier, (kind, passage.scanner.all_round), rng)
-
-
-def _examples(
-    tried: Tried, verifier: Verifier, domain: tuple[str, bool], rng: np.random.Generator
-) -> Iterator[Example]:
+def _examples(tried: Tried, verifier: Verifier, domain: Domain, rng: np.random.Generator) -> Iterator[Example]:
     """Poses that verification finds, and its measurements at poses that it may find another time."""
     verifier.reset()
     candidates = [(Candidate(0, tried.match.stamp_ns, tried.pair.similarity), tried.match)]
-    name, all_round = domain
     examined = [one for one in verifier.examine(tried.query, candidates) if one.kind == SCAN]
     found = [(one.pose, one.measurements) for one in examined]
     scans = PreparedScan.of(tried.match), PreparedScan.of(tried.query)
     if all(scan.usable for scan in scans):
         ranked, _ = rerank(tried.query, candidates, Verification())[0]
-        found += [_aligned(tried, ranked, scans, guess, examined) for guess in _guesses(tried, all_round, rng)]
+        found += [
+            _aligned(tried, ranked, scans, guess, examined) for guess in _guesses(tried, domain.scanner.all_round, rng)
+        ]
     kept: list[Array] = []
     for pose, measurements in found:
         right = tried.is_right(pose)
@@ -164,7 +142,7 @@ def _examples(
         ):
             continue
         kept.append(pose)
-        yield Example(measurements, right, name)
+        yield Example(measurements, right, domain.name)
 
 
 def _guesses(tried: Tried, all_round: bool, rng: np.random.Generator) -> list[Array]:
@@ -249,15 +227,20 @@ def main(
     jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1,
     examples: Annotated[Path | None, typer.Option(help="keeps the domains' examples, for the same code")] = None,
     out: Annotated[Path, typer.Option(help="where the model goes")] = DEFAULT_OUT,
+    again: Annotated[bool, typer.Option("--again", help="fit to the examples that the shipped model has")] = False,
 ) -> None:
     """Examine candidates of validation worlds, fit acceptance and covariance to them, and write the model.
 
-    Run it again whenever the weights of the network change; no other step is needed.
+    Run it again whenever the weights of the network change; no other step is needed. After a change of the criteria
+    alone, `--again` suffices.
 
     Prints how many poses were right, what share of them a model fitted to the other worlds accepts, how many
     wrong ones, and how many errors lie inside the 95 % ellipsoid. Zero wrong is what counts.
     """
     console = Console()
+    if again:
+        _write(console, fit(load_examples(EXAMPLES)), out, "--again")
+        return
     settings = EmbeddingSettings(method=method, weights=weights, threads=1)
     elsewhere = in_domains(settings, pairs, folder, examples, jobs)
     embedder = make_embedder(settings)
@@ -266,10 +249,16 @@ def main(
         with console.status(f"simulating world {number} ({family}, aliasing {aliasing:g})"):
             drive = kept(drives, number, family, aliasing)
         surveyed.append((drive, embedded(drive, embedder)))
-    model, results = fit([example for survey in surveyed for example in examine(*survey)] + elsewhere)
+    along = [example for survey in surveyed for example in examine(*survey)]
+    save_examples(found := along + elsewhere + _sprung_traps(), EXAMPLES)
+    _write(console, fit(found), out, f"--worlds {count}")
+
+
+def _write(console: Console, fitted: tuple[AcceptanceModel, dict[str, float]], out: Path, options: str) -> None:
+    model, results = fitted
     for name, value in results.items():
         console.print(f"{name:32} {value:.4g}")
-    save_acceptance(model, out, {SCAN: f"python -m umf_ros.lab.fit.scan_acceptance --worlds {count}"}, results)
+    save_acceptance(model, out, {SCAN: f"python -m umf_ros.lab.fit.scan_acceptance {options}"}, results)
     console.print(f"wrote {out}")
 
 
@@ -278,14 +267,13 @@ def in_domains(
 ) -> list[Example]:
     """Examples of all domains."""
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        chosen: list[Domain | str] = [*DOMAINS, *sorted({passage.kind for passage in PASSAGES})]
-        waiting = [pool.submit(_in_domain, domain, settings, pairs, folder, kept) for domain in chosen]
+        waiting = [pool.submit(_in_domain, domain, settings, pairs, folder, kept) for domain in DOMAINS]
         found = [one.result() for one in track(waiting, "domains", transient=True)]
     return [example for domain in found for example in domain]
 
 
 def _in_domain(
-    domain: Domain | str, settings: EmbeddingSettings, pairs: int, folder: Path | None, kept: Path | None
+    domain: Domain, settings: EmbeddingSettings, pairs: int, folder: Path | None, kept: Path | None
 ) -> list[Example]:
     return kept_examples(domain, SURVEYS, pairs, folder, make_embedder(settings), kept)
 
@@ -296,8 +284,7 @@ def fit(examples: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
     The shipped model's parts for other kinds than scans stay.
     """
     shipped = load_acceptance()
-    mine = [example for example in examples + _sprung_traps() if example.kind == SCAN]
-    save_examples(mine, EXAMPLES)
+    mine = [example for example in examples if example.kind == SCAN]
     model, odds = fit_decision(mine, SCAN, THRESHOLD)
     bounds = shipped.bounds | {SCAN: bounds_of(mine, SCAN)}
     fitted = replace(shipped, models=dict(shipped.models) | {SCAN: model}, bounds=bounds)
