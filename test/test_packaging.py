@@ -80,10 +80,10 @@ def test_everything_is_installed_to_share(install: Path) -> None:
         "config/calibration/simulated.yaml",
         "config/calibration/s3li_etna.yaml",
         "launch/loop_closure.launch.py",
-        "models/umf_light.safetensors",
-        "models/umf_light.json",
+        "models/umf_scene.openvino",
         "models/umf_scene.safetensors",
         "models/umf_scene.json",
+        "models/xfeat.openvino",
         "models/xfeat.safetensors",
         "models/xfeat.json",
     ):

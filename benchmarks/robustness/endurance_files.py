@@ -159,7 +159,7 @@ def write_files(folder: Path, rng: Rng) -> dict[str, tuple[bytes, Read]]:
         "poses.tum": (poses.encode(), lambda path: read_ground_truth(None, path)),
         "positions.pos": (positions.encode(), lambda path: read_ground_truth(None, path)),
         "scan.pcd": (scan.encode(), read_scan),
-        "weights.safetensors": (find("models/umf_light.safetensors").read_bytes(), load_weights),
+        "weights.safetensors": (find("models/umf_scene.safetensors").read_bytes(), load_weights),
         "table.pickle": (table, load_pickle),
         "frame.pickle": (b"cpandas\nDataFrame\n)\x81}(X\x04\x00\x00\x00_mgrI3\nub.", load_data_frame),
     }

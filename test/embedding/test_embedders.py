@@ -42,11 +42,6 @@ def weights(tmp_path_factory):
     return path
 
 
-@pytest.fixture(autouse=True)
-def shared_cache(converted, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(converted))
-
-
 @pytest.fixture
 def embedder(weights):
     return UmfEmbedder(weights, EmbeddingSettings(runtime="torch", threads=1), FeatureRequest(supers=True))
@@ -106,19 +101,16 @@ def test_positions_belong_to_the_image_given(embedder, shape):
     assert positions[:, 0].max() > shape[1] / 2
 
 
-def test_openvino_agrees_with_torch_and_is_kept(tmp_path, monkeypatch):
-    """With the shipped weights: OpenVINO's CPU plugin hangs on networks as narrow as the tests' own."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def test_the_shipped_model_agrees_with_its_weights():
+    """Eight bits change a descriptor by less than views of neighbouring places differ."""
     plain = UmfEmbedder(None, EmbeddingSettings(runtime="torch", threads=1), FeatureRequest(supers=True))
     fast = UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), FeatureRequest(supers=True))
-    kept = UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), FeatureRequest(supers=True))
-    assert len(list((tmp_path / "cache" / "umf_ros").glob("*.xml"))) == 1
+    assert plain.name.startswith("umf_scene-") and fast.name.startswith("umf_scene-int8-")
     for frame in (some_frame(), some_frame(1, left=None), some_frame(2, points=None, intensity=None)):
-        wanted = plain.embed(frame)
-        for other in (fast.embed(frame), kept.embed(frame)):
-            assert wanted.descriptor @ other.descriptor > 0.9999
-            if wanted.cloud is not None:
-                assert len(wanted.cloud.positions) == len(other.cloud.positions)
+        wanted, found = plain.embed(frame), fast.embed(frame)
+        assert 0.98 < wanted.descriptor @ found.descriptor < 0.99999
+        if wanted.cloud is not None:
+            assert abs(len(wanted.cloud.positions) - len(found.cloud.positions)) < 0.1 * len(wanted.cloud.positions)
 
 
 def test_what_is_not_asked_for_is_left_out_and_changes_nothing_else():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -31,10 +29,8 @@ def frame(image: Image | None) -> Frame:
 
 
 @pytest.fixture(scope="module")
-def embedder(converted: Path) -> WithXFeat:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(converted))
-        return with_xfeat(ThumbnailEmbedder(), EmbeddingSettings(threads=1))
+def embedder() -> WithXFeat:
+    return with_xfeat(ThumbnailEmbedder(), EmbeddingSettings(threads=1))
 
 
 def features(embedder: WithXFeat, image: Image) -> LocalFeatures:
@@ -70,7 +66,8 @@ def test_runtimes_agree(embedder: WithXFeat) -> None:
     one, two = features(embedder, scene()), features(other, scene())
     pairs = mutual_neighbours(similarities(one.descriptors, two.descriptors))
     apart = np.linalg.norm(one.positions[pairs[:, 0]] - two.positions[pairs[:, 1]], axis=1)
-    assert len(pairs) > 0.95 * len(one.positions) and np.quantile(apart, 0.95) < 0.1
+    # eight bits of one against single precision of the other
+    assert len(pairs) > 0.8 * len(one.positions) and np.median(apart) < 0.1 and np.quantile(apart, 0.8) < 0.7
 
 
 def test_pictures_of_any_size_are_seen_whole(embedder: WithXFeat) -> None:
@@ -99,8 +96,7 @@ def test_samples_are_bilinear_and_held_at_the_edge() -> None:
     np.testing.assert_allclose(sample(maps, np.array([[1.5, 0.5], [-2, 0], [9, 9]])).ravel(), [3.5, 0, 11])
 
 
-def test_the_name_tells_features_apart(converted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(converted))
+def test_the_name_tells_features_apart() -> None:
     plain = EmbeddingSettings(method="thumbnail", threads=1)
     assert make_embedder(plain).name == "thumbnail"
     chosen = make_detector_embedder(Settings(embedding=plain))

@@ -1,19 +1,20 @@
-"""Runtimes of the networks, and the cache of converted models."""
+"""Runtimes of the networks, and the models beside their weights."""
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from tiny_worlds import TINY, some_scan
-from torch import Tensor, nn
 
 from umf_ros.core.config import EmbeddingSettings
-from umf_ros.core.errors import ConfigError, OutputError, WeightsError
+from umf_ros.core.errors import ConfigError, WeightsError
 from umf_ros.core.resources import find
 from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.inputs import pack, prepare_scan
@@ -21,35 +22,20 @@ from umf_ros.embedding.runtimes import (
     OUTPUTS,
     SUPERS,
     OpenVinoRuntime,
-    cache_path,
-    convert,
+    Runtime,
     import_openvino,
-    load_or_convert,
     make_runtime,
-    make_xfeat_runtime,
+    name_outputs,
     outputs_of,
-    save_model,
 )
-from umf_ros.embedding.torch_runtimes import FlatUmf, TorchRuntime, to_tensors
-from umf_ros.networks.config import locate_weights
+from umf_ros.embedding.torch_runtimes import TorchRuntime, to_tensors
+from umf_ros.lab.training.networks import save_weights
+from umf_ros.networks.config import XFEAT_OUTPUTS, locate_weights
 from umf_ros.networks.umf import UMF
+from umf_ros.networks.weights import load_weights
 
-
-class Scale(nn.Module):
-    def __init__(self, factor: float) -> None:
-        super().__init__()
-        self.factor = factor
-
-    def forward(self, values: Tensor, offset: Tensor) -> Tensor:
-        return self.factor * values + offset
-
-
-EXAMPLE = {"values": torch.zeros(1, 3), "offset": torch.zeros(1, 3)}
-
-
-def answer(model: object) -> list[float]:
-    values, offset = np.ones((1, 3), np.float32), np.full((1, 3), 0.5, np.float32)
-    return OpenVinoRuntime(model, 1).run([values, offset])[0].tolist()
+XFEAT = find("models/xfeat.safetensors")
+IMAGE = np.random.default_rng(0).uniform(0, 255, (1, 1, 64, 96)).astype(np.float32)
 
 
 @pytest.fixture
@@ -58,11 +44,29 @@ def network() -> UMF:
     return UMF(TINY)
 
 
-def test_torch_runtime_gives_the_outputs_of_the_network(network):
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """A copy of XFeat's weights, with the model beside it."""
+    for suffix in (".safetensors", ".openvino"):
+        shutil.copy(XFEAT.with_suffix(suffix), tmp_path)
+    return tmp_path / XFEAT.name
+
+
+def settings(runtime: str = "auto") -> EmbeddingSettings:
+    return EmbeddingSettings.model_validate({"runtime": runtime, "threads": 1})
+
+
+def xfeat(weights: Path, runtime: str = "auto") -> Runtime:
+    return make_runtime(weights, settings(runtime), XFEAT_OUTPUTS)
+
+
+def test_torch_runtime_gives_the_outputs_of_the_network(network, tmp_path):
     image = np.random.default_rng(0).normal(size=TINY.image_size).astype(np.float32)
     batch = pack([image], [prepare_scan(some_scan(0), None, TINY)], TINY)
     outputs = outputs_of(FeatureRequest(supers=True))
-    found = dict(zip(outputs, TorchRuntime(FlatUmf(network, outputs), "cpu", 1).run(batch), strict=True))
+    save_weights(network, tmp_path / "tiny.safetensors", {})
+    network = load_weights(tmp_path / "tiny.safetensors")
+    found = TorchRuntime(tmp_path / "tiny.safetensors", outputs, "cpu", 1).run(batch)
     wanted = network.eval()(to_tensors(batch), super_features=True)
     assert set(found) == {*OUTPUTS, *SUPERS}
     np.testing.assert_allclose(found["descriptor"], wanted.descriptor[0].detach(), atol=1e-6)
@@ -74,67 +78,76 @@ def test_torch_runtime_gives_the_outputs_of_the_network(network):
 def test_only_requested_outputs_are_computed():
     assert outputs_of(FeatureRequest()) == OUTPUTS
     assert outputs_of(FeatureRequest(supers=True)) == (*OUTPUTS, *SUPERS)
-    assert outputs_of(FeatureRequest(image=False)) == ("descriptor", "cloud", "cloud_saliency")
+    assert outputs_of(FeatureRequest(image=False)) == ("descriptor", "cloud_local", "cloud_saliency")
+    assert set(OpenVinoRuntime(XFEAT, XFEAT_OUTPUTS[:2], 1).run([IMAGE])) == set(XFEAT_OUTPUTS[:2])
 
 
 @pytest.mark.parametrize(("runtime", "device"), [("openvino", "cuda"), ("torch", "abacus"), ("auto", "abacus")])
 def test_an_unusable_runtime_or_device_is_refused_in_one_line(runtime, device):
     with pytest.raises(ConfigError, match="embedding") as raised:
-        make_runtime(locate_weights(None), EmbeddingSettings(runtime=runtime, device=device), FeatureRequest())
+        make_runtime(locate_weights(None), EmbeddingSettings(runtime=runtime, device=device), OUTPUTS)
     assert "\n" not in str(raised.value)
 
 
-def test_a_converted_model_has_named_inputs_of_fixed_size():
-    model = convert(Scale(2.0), EXAMPLE)
-    assert [port.any_name for port in model.inputs] == ["values", "offset"]
-    assert [tuple(port.shape) for port in model.inputs] == [(1, 3), (1, 3)]
-    assert answer(model) == [2.5] * 3
+def test_weights_with_a_model_beside_them_run_in_openvino_and_others_in_torch(copy):
+    assert xfeat(copy).precision == "int8"
+    assert xfeat(copy, "torch").precision == "float32"
+    copy.with_suffix(".openvino").unlink()
+    assert isinstance(xfeat(copy), TorchRuntime)
+    with pytest.raises(ConfigError, match=r"cannot use openvino: xfeat.openvino is not beside the weights.*umf export"):
+        xfeat(copy, "openvino")
 
 
-def test_a_model_is_converted_once_and_then_cached(tmp_path):
-    path = tmp_path / "cache" / "model.xml"
-    assert answer(load_or_convert(path, lambda: convert(Scale(2.0), EXAMPLE))) == [2.5] * 3
-    assert sorted(file.name for file in path.parent.iterdir()) == ["model.bin", "model.xml"]
-    assert answer(load_or_convert(path, lambda: pytest.fail("converted again"))) == [2.5] * 3
+def test_without_openvino_torch_runs_the_same_weights(monkeypatch):
+    from umf_ros.embedding import runtimes
+
+    monkeypatch.setattr(runtimes, "find_spec", lambda name: None)
+    assert isinstance(xfeat(XFEAT), TorchRuntime)
+    with pytest.raises(ConfigError, match="it is not installed"):
+        xfeat(XFEAT, "openvino")
 
 
-@pytest.mark.parametrize("part", [".xml", ".bin"])
-def test_a_damaged_cached_model_is_converted_again(tmp_path, part):
-    path = tmp_path / "model.xml"
-    save_model(convert(Scale(2.0), EXAMPLE), path)
-    path.with_suffix(part).write_bytes(b"<net" if part == ".xml" else b"")
-    assert answer(load_or_convert(path, lambda: convert(Scale(3.0), EXAMPLE))) == [3.5] * 3
-    assert answer(load_or_convert(path, lambda: pytest.fail("converted again"))) == [3.5] * 3
+def test_a_model_of_other_weights_is_refused(copy):
+    copy.write_bytes(copy.read_bytes() + b" ")
+    with pytest.raises(WeightsError, match=r"xfeat.openvino was made from other weights; .* umf export"):
+        xfeat(copy)
 
 
-def test_a_model_runs_without_a_writable_cache(tmp_path):
-    (tmp_path / "file").write_text("")
-    path = tmp_path / "file" / "model.xml"
-    assert answer(load_or_convert(path, lambda: convert(Scale(2.0), EXAMPLE))) == [2.5] * 3
-    with pytest.raises(OutputError, match="cannot write"):
-        save_model(convert(Scale(2.0), EXAMPLE), path)
+@pytest.mark.parametrize("keep", [0, 1000, 400_000])
+def test_a_damaged_model_is_refused_in_one_line(copy, keep):
+    model = copy.with_suffix(".openvino")
+    model.write_bytes(model.read_bytes()[:keep])
+    with pytest.raises(WeightsError, match=r"xfeat.openvino is damaged: .") as raised:
+        xfeat(copy)
+    assert "\n" not in str(raised.value)
 
 
-def test_the_cache_path_depends_on_weights_and_outputs(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    one, other = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
-    one.write_bytes(b"one")
-    other.write_bytes(b"other")
-    paths = {cache_path(one), cache_path(one, OUTPUTS), cache_path(other)}
-    assert len(paths) == 3 and {path.parent for path in paths} == {tmp_path / "cache" / "umf_ros"}
-    other.write_bytes(b"one")
-    assert cache_path(other) == cache_path(one)  # the path depends on the content, not on the name
+def test_the_name_tells_precisions_apart(copy):
+    fast, plain = (name_outputs(copy, xfeat(copy, name)) for name in ("openvino", "torch"))
+    assert fast.startswith("xfeat-int8-") and plain.startswith("xfeat-") and "int8" not in plain
+    assert name_outputs(XFEAT, xfeat(XFEAT)) == fast  # of the content, not of the place
+    assert name_outputs(copy, xfeat(copy), b"other preprocessing") != fast
+
+
+def test_a_store_of_another_precision_is_refused_in_one_line(tmp_path):
+    from umf_ros.core.config import Database
+    from umf_ros.core.errors import UmfError
+    from umf_ros.places.database import PlaceDatabase
+
+    plain, fast = (name_outputs(XFEAT, xfeat(XFEAT, name)) for name in ("torch", "openvino"))
+    PlaceDatabase(Database(path=str(tmp_path / "places.db")), plain, 64).close()
+    with pytest.raises(UmfError, match=f"places.db was made with embedder {plain}, not {fast}$"):
+        PlaceDatabase(Database(path=str(tmp_path / "places.db")), fast, 64)
 
 
 def test_ctrl_c_after_destroyed_networks_does_not_crash() -> None:
     script = """
 import gc, os, signal
-import torch
+from umf_ros.core.resources import find
 from umf_ros.embedding import runtimes
 for _ in range(2):
-    model = runtimes.import_openvino().convert_model(torch.nn.Linear(4, 4), example_input=torch.zeros(1, 4))
-    compiled = runtimes.OpenVinoRuntime(model, 1)
-    del compiled, model
+    compiled = runtimes.OpenVinoRuntime(find("models/xfeat.safetensors"), runtimes.XFEAT_OUTPUTS, 1)
+    del compiled
     gc.collect()
 signal.signal(signal.SIGINT, lambda *_: print("alive"))
 os.kill(os.getpid(), signal.SIGINT)
@@ -143,12 +156,14 @@ os.kill(os.getpid(), signal.SIGINT)
     assert (done.returncode, done.stdout) == (0, "alive\n"), done.stderr
 
 
-def test_conversion_does_not_load_the_telemetry() -> None:
+def test_openvino_is_loaded_without_its_telemetry_and_without_torch() -> None:
     script = """
-import sys, torch
-from umf_ros.embedding.runtimes import convert
-convert(torch.nn.Linear(4, 4), {"x": torch.zeros(1, 4)})
-print([name for name, module in sys.modules.items() if "openvino_telemetry" in name and module], len(sys.modules) > 9)
+import sys
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.core.resources import find
+from umf_ros.embedding.runtimes import XFEAT_OUTPUTS, make_runtime
+make_runtime(find("models/xfeat.safetensors"), EmbeddingSettings(threads=1), XFEAT_OUTPUTS)
+print([name for name in ("openvino_telemetry", "torch", "nncf") if sys.modules.get(name)], "openvino" in sys.modules)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "[] True\n"), done.stderr
@@ -164,9 +179,8 @@ def test_the_first_inference_runs_in_the_thread_that_makes_the_runtime(monkeypat
         return really(self, *arguments)
 
     monkeypatch.setattr(openvino.CompiledModel, "__call__", infer)
-    settings = EmbeddingSettings(runtime="openvino", threads=1)
-    make_runtime(locate_weights(None), settings, FeatureRequest())
-    make_xfeat_runtime(find("models/xfeat.safetensors"), settings)
+    make_runtime(locate_weights(None), settings("openvino"), OUTPUTS)
+    xfeat(XFEAT, "openvino")
     assert threads == [threading.current_thread()] * 2
 
 
@@ -176,9 +190,10 @@ import numpy as np
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.resources import find
 from umf_ros.core.watchdog import watching
-from umf_ros.embedding.runtimes import make_xfeat_runtime
+from umf_ros.embedding.runtimes import XFEAT_OUTPUTS, make_runtime
 
-runtimes = [make_xfeat_runtime(find("models/xfeat.safetensors"), EmbeddingSettings(threads=1)) for _ in range(6)]
+weights, settings = find("models/xfeat.safetensors"), EmbeddingSettings(threads=1)
+runtimes = [make_runtime(weights, settings, XFEAT_OUTPUTS) for _ in range(6)]
 begin = threading.Barrier(len(runtimes))
 
 def infer(runtime):
@@ -202,6 +217,6 @@ def test_concurrent_inference_does_not_deadlock():
 def test_a_network_that_cannot_run_is_refused_at_the_start(monkeypatch):
     from umf_ros.embedding import runtimes
 
-    monkeypatch.setattr(runtimes, "XFEAT_BLANK", np.zeros((1, 3, 384, 512), np.float32))  # three channels
+    monkeypatch.setattr(runtimes, "XFEAT_SHAPE", (1, 3, 384, 512))  # three channels
     with pytest.raises(WeightsError, match=r"xfeat.safetensors cannot be run: ."):
-        make_xfeat_runtime(find("models/xfeat.safetensors"), EmbeddingSettings(runtime="openvino", threads=1))
+        xfeat(XFEAT, "openvino")

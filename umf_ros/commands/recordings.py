@@ -25,7 +25,7 @@ BagPath = Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .
 ConfigPath = Annotated[Path | None, typer.Option("--config", help="Parameter file (YAML).")]
 DatasetName = Annotated[str, typer.Option("--dataset", help=f"{either(['auto', *dataset_names()])}.")]
 EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"How places are embedded: {choices()}.")]
-WeightsPath = Annotated[Path | None, typer.Option("--weights", help="Weights file, or umf_light; default: umf_scene.")]
+WeightsPath = Annotated[Path | None, typer.Option("--weights", help="Weights file; default: umf_scene.")]
 OdometryPath = Annotated[
     Path | None, typer.Option("--odometry", help="Odometry as a TUM file, where the recording has none.")
 ]

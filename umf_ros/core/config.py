@@ -99,7 +99,7 @@ class EmbeddingSettings(Group):
     method: str = Field("umf", description="embedder by name: umf, or another of docs/benchmarks.md")
     weights: str = Field(
         "",
-        description="safetensors file, or umf_scene or umf_light; empty: umf_scene, or another method's own",
+        description="safetensors file; empty: umf_scene, or another method's own",
     )
     runtime: Literal["auto", "torch", "openvino"] = Field("auto", description="what runs the network")
     device: str = Field("cpu", description="torch device")

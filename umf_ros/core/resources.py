@@ -9,7 +9,7 @@ from pathlib import Path
 from umf_ros.core.errors import UmfError
 
 DEFAULT_DATASET = "simulated"
-LAB_PACKAGES = {"open3d": ("open3d", "0.19"), "sklearn": ("scikit-learn", "1.4")}
+LAB_PACKAGES = {"nncf": ("nncf", "3.4"), "open3d": ("open3d", "0.19"), "sklearn": ("scikit-learn", "1.4")}
 """Packages that a rover does not need: distribution and first version known to work, by module."""
 FLEET_PACKAGES = ("pgvector", "psycopg", "ray")
 """Modules that only a rover of a fleet or a cluster needs."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -18,8 +17,8 @@ from umf_ros.core.resources import find
 from umf_ros.embedding.depth import lift_features
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.inputs import is_blank
-from umf_ros.embedding.runtimes import Runtime, make_xfeat_runtime
-from umf_ros.networks.config import XFEAT_CELL, XFEAT_STRIDE
+from umf_ros.embedding.runtimes import Runtime, make_runtime, name_outputs
+from umf_ros.networks.config import XFEAT_CELL, XFEAT_OUTPUTS, XFEAT_STRIDE
 
 WEIGHTS = "models/xfeat.safetensors"
 LIMIT = 500
@@ -38,7 +37,7 @@ class XFeatExtractor:
     """
 
     def __init__(self, weights: Path, runtime: Runtime) -> None:
-        self.name = f"{weights.stem}-{hashlib.sha256(weights.read_bytes()).hexdigest()[:8]}"
+        self.name = name_outputs(weights, runtime)
         self._runtime = runtime
 
     def extract(self, image: Image) -> LocalFeatures:
@@ -46,9 +45,9 @@ class XFeatExtractor:
         height, width = image.shape
         size = network_size(width, height)
         shrunk = image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        descriptors, corners, reliability = self._runtime.run([shrunk.astype(np.float32)[None, None]])
-        pixels, score = key_points(corners[0], reliability[0])
-        found = sample(descriptors, (pixels + 0.5) / XFEAT_CELL - 0.5)
+        maps = self._runtime.run([shrunk.astype(np.float32)[None, None]])
+        pixels, score = key_points(maps["corners"][0], maps["reliability"][0])
+        found = sample(maps["descriptors"], (pixels + 0.5) / XFEAT_CELL - 0.5)
         found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
         positions = (pixels + 0.5) * (np.array([width, height]) / size) - 0.5
         unknown = np.full((len(pixels), 3), np.nan, np.float32)
@@ -85,7 +84,7 @@ class WithXFeat:
 def with_xfeat(embedder: Embedder, settings: EmbeddingSettings) -> WithXFeat:
     """Return the embedder with the shipped XFeat, on the runtime that the settings name."""
     weights = find(WEIGHTS)
-    return WithXFeat(embedder, XFeatExtractor(weights, make_xfeat_runtime(weights, settings)))
+    return WithXFeat(embedder, XFeatExtractor(weights, make_runtime(weights, settings, XFEAT_OUTPUTS)))
 
 
 def network_size(width: int, height: int) -> tuple[int, int]:

@@ -1,64 +1,92 @@
-"""Inference runtimes: OpenVINO where it is installed, torch otherwise; torch is imported only when it is needed."""
+"""Inference runtimes: OpenVINO where a model lies beside the weights, torch otherwise; torch is imported when needed.
+
+`umf export` writes the models. Nothing is converted or quantised here.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+import zipfile
+from collections.abc import Sequence
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.config import EmbeddingSettings
-from umf_ros.core.errors import ConfigError, OutputError, WeightsError, one_line
+from umf_ros.core.errors import ConfigError, WeightsError, one_line
 from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.inputs import blank_input
-from umf_ros.networks.config import read_config
-
-if TYPE_CHECKING:
-    from torch import nn
+from umf_ros.networks.config import XFEAT_OUTPUTS, read_config
 
 Arrays = Sequence[NDArray[Any]]
+Outputs = dict[str, NDArray[np.float32]]
 XFEAT_SHAPE = 1, 1, 384, 512
-XFEAT_BLANK = np.zeros(XFEAT_SHAPE, np.float32)
-OUTPUTS = ("descriptor", "image", "image_saliency", "cloud", "cloud_saliency")
+OUTPUTS = ("descriptor", "image_local", "image_saliency", "cloud_local", "cloud_saliency")
+"""None of them is the name of an input: OpenVINO renames a tensor that has another's name."""
 SUPERS = ("super_image", "super_image_strength", "super_cloud", "super_cloud_strength")
-CACHE_FORMAT = 2
-"""Version of the cached models; another number converts all of them again."""
+MODEL_SUFFIX = ".openvino"
+"""Suffix of the zip archive of `model.xml` and `model.bin` beside a weights file."""
+FACTS = "umf_ros"
+"""Section of a model's `rt_info`: `precision`, and `weights`, the SHA-256 of the weights it was made from."""
 
 
 class Runtime(Protocol):
-    """Runs a network."""
+    """Runs a network.
 
-    def run(self, inputs: Arrays) -> list[NDArray[np.float32]]:
-        """Return the outputs of a batch of one, without the batch axis."""
+    Attributes:
+        precision: "float32" or "int8".
+        file: the outputs depend on its content.
+    """
+
+    precision: str
+    file: Path
+
+    def run(self, inputs: Arrays) -> Outputs:
+        """Return the outputs of a batch of one by name, without the batch axis."""
         ...
 
 
 class OpenVinoRuntime:
-    """OpenVINO on the CPU, in single precision.
+    """OpenVINO on the CPU; layers that are not quantised run in single precision.
 
     Args:
-        model: OpenVINO model.
+        weights: the model lies beside this file.
+        outputs: names of the outputs to compute.
         threads: number of CPU threads.
+
+    Raises:
+        WeightsError: the model is damaged, or was made from other weights.
     """
 
-    def __init__(self, model: Any, threads: int) -> None:
+    def __init__(self, weights: Path, outputs: tuple[str, ...], threads: int) -> None:
+        path = weights.with_suffix(MODEL_SUFFIX)
+        try:
+            with zipfile.ZipFile(path) as archive:
+                model = openvino_core().read_model(archive.read("model.xml"), archive.read("model.bin"))
+            self.precision, made_from = (model.get_rt_info([FACTS, name]).value for name in ("precision", "weights"))
+        except Exception as error:  # of a damaged file anything may be raised
+            raise WeightsError(f"{path} is damaged: {one_line(error)}") from None
+        if made_from != hashlib.sha256(weights.read_bytes()).hexdigest():
+            raise WeightsError(f"{path} was made from other weights; delete it, or make it again with umf export")
+        for result in model.get_results():
+            if result.input(0).get_source_output().get_names().isdisjoint(outputs):
+                model.remove_result(result)
+        self.file = weights if self.precision == "float32" else path
         # half precision changes similarities by more than a threshold tolerates
         options: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": threads}
         options |= {"NUM_STREAMS": 1, "PERFORMANCE_HINT": "LATENCY"}
         self._model = openvino_core().compile_model(model, "CPU", options)
 
-    def run(self, inputs: Arrays) -> list[NDArray[np.float32]]:
+    def run(self, inputs: Arrays) -> Outputs:
         """See `Runtime`."""
         found = self._model(list(inputs))
-        return [found[port][0].astype(np.float32) for port in self._model.outputs]
+        return {port.any_name: found[port][0].astype(np.float32) for port in self._model.outputs}
 
 
 def outputs_of(asked: FeatureRequest) -> tuple[str, ...]:
@@ -67,62 +95,45 @@ def outputs_of(asked: FeatureRequest) -> tuple[str, ...]:
     return own + (SUPERS if asked.supers else ())
 
 
-def make_runtime(weights: Path, settings: EmbeddingSettings, asked: FeatureRequest) -> Runtime:
-    """Return the runtime of the UMF network; its outputs are in the order of `outputs_of(asked)`.
+def make_runtime(weights: Path, settings: EmbeddingSettings, outputs: tuple[str, ...]) -> Runtime:
+    """Return the runtime of the UMF network, or for `XFEAT_OUTPUTS` of XFeat.
+
+    XFeat reads images (1, 1, H, W) whose sides are multiples of 32 pixels. Its outputs are descriptors
+    (64, H / 8, W / 8), corners (1, H, W), the probabilities of key points, and reliability (1, H / 8, W / 8).
+
+    The first inference runs in the thread that makes the runtime, before any other thread uses the library: OpenVINO's
+    binding initialises itself then, and two threads that do so at the same moment deadlock.
 
     Args:
         weights: safetensors file of the network.
         settings: runtime ("auto" prefers OpenVINO on a CPU), device and threads (0: number of cores).
-        asked: local features to compute.
+        outputs: names of the outputs to compute.
 
     Raises:
-        WeightsError: the weights cannot be used.
-        ConfigError: OpenVINO is requested but not installed, or does not run on the device.
+        WeightsError: the weights or the model beside them cannot be used.
+        ConfigError: OpenVINO is requested, but is not installed, has no model, or does not run on the device.
     """
-    outputs = outputs_of(asked)
+    of_xfeat = outputs == XFEAT_OUTPUTS
+    blank: Arrays = [np.zeros(XFEAT_SHAPE, np.float32)] if of_xfeat else blank_input(read_config(weights))
+    threads = settings.threads or len(os.sched_getaffinity(0))
+    runtime: Runtime
+    if _wants_openvino(weights, settings):
+        runtime = OpenVinoRuntime(weights, outputs, threads)
+    else:
+        from umf_ros.embedding.torch_runtimes import TorchRuntime
 
-    def load() -> nn.Module:
-        from umf_ros.embedding.torch_runtimes import load_flat
-
-        return load_flat(weights, outputs)
-
-    runtime = _make(weights, settings, outputs, load, lambda: convert_umf(weights, outputs))
-    warm_up(weights, lambda: runtime.run(blank_input(read_config(weights))))
-    return runtime
-
-
-def make_xfeat_runtime(weights: Path, settings: EmbeddingSettings) -> Runtime:
-    """Return the runtime of XFeat, for images (1, 1, H, W) whose sides are multiples of 32 pixels.
-
-    Its outputs are descriptors (64, H / 8, W / 8), key points (1, H, W) and reliability (1, H / 8, W / 8).
-
-    Raises:
-        WeightsError: the weights cannot be used.
-        ConfigError: as `make_runtime`.
-    """
-
-    def load() -> nn.Module:
-        from umf_ros.networks.xfeat import load_xfeat
-
-        return load_xfeat(weights)
-
-    runtime = _make(weights, settings, (), load, lambda: _convert_xfeat(load()))
-    warm_up(weights, lambda: runtime.run([XFEAT_BLANK]))
-    return runtime
-
-
-def warm_up(weights: Path, infer: Callable[[], object]) -> None:
-    """Run the first inference in the thread that makes the runtime, before any other thread uses the library.
-
-    OpenVINO's binding initialises itself at its first inference; two threads that do so at the same moment deadlock.
-
-    Raises:
-        WeightsError: the network cannot be run.
-    """
+        runtime = TorchRuntime(weights, outputs, settings.device, threads)
     try:
-        infer()
+        runtime.run(blank)
     except Exception as error:
         raise WeightsError(f"{weights} cannot be run: {one_line(error)}") from None
+    return runtime
+
+
+def name_outputs(weights: Path, runtime: Runtime, preprocessing: bytes = b"") -> str:
+    """Return the name of what a runtime computes: outputs of other weights, precision or preprocessing differ in it."""
+    mark = "" if runtime.precision == "float32" else f"-{runtime.precision}"
+    return f"{weights.stem}{mark}-{hashlib.sha256(runtime.file.read_bytes() + preprocessing).hexdigest()[:8]}"
 
 
 def import_openvino() -> Any:
@@ -143,88 +154,15 @@ def openvino_core() -> Any:
     return import_openvino().Core()
 
 
-def convert(network: nn.Module, example: dict[str, Any]) -> Any:
-    """Return the OpenVINO model of a network, with named inputs of the shapes of the example tensors."""
-    model = import_openvino().convert_model(network, example_input=tuple(example.values()))
-    shapes = [tuple(tensor.shape) for tensor in example.values()]
-    model.reshape(dict(zip(model.inputs, shapes, strict=True)))
-    for port, name in zip(model.inputs, example, strict=True):
-        port.get_tensor().set_names({name})
-    return model
-
-
-def convert_umf(weights: Path, outputs: tuple[str, ...]) -> Any:
-    """Return the OpenVINO model of the UMF network with the given outputs.
-
-    Raises:
-        WeightsError: the weights cannot be used.
-    """
-    from umf_ros.embedding.torch_runtimes import load_flat, to_tensors
-
-    return convert(load_flat(weights, outputs), to_tensors(blank_input(read_config(weights)))._asdict())
-
-
-def _convert_xfeat(network: nn.Module) -> Any:
-    import torch
-
-    model = convert(network, {"image": torch.zeros(XFEAT_SHAPE)})
-    model.reshape([1, 1, -1, -1])
-    return model
-
-
-def save_model(model: Any, path: Path) -> None:
-    """Write an OpenVINO model as `path` (.xml) and its weights beside it (.bin).
-
-    Raises:
-        OutputError: the files cannot be written.
-    """
-    unfinished = path.with_name(f"{path.stem}.{os.getpid()}.xml")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        import_openvino().save_model(model, unfinished, compress_to_fp16=False)
-        unfinished.with_suffix(".bin").replace(path.with_suffix(".bin"))
-        unfinished.replace(path)
-    except (OSError, RuntimeError) as error:
-        raise OutputError(f"cannot write {path}: {one_line(error)}") from None
-
-
-def load_or_convert(path: Path, make: Callable[[], Any]) -> Any:
-    """Return the OpenVINO model at `path`; convert it and save it there if it is missing or damaged."""
-    if path.is_file():
-        with suppress(RuntimeError):
-            return openvino_core().read_model(path)
-    model = make()
-    with suppress(OutputError):  # a read-only home directory only costs time
-        save_model(model, path)
-    return model
-
-
-def cache_path(weights: Path, outputs: tuple[str, ...] = ()) -> Path:
-    """Return the path of the cached model; it depends on the weights, the outputs and the version of OpenVINO."""
-    digest = hashlib.sha256(weights.read_bytes())
-    digest.update(f"{import_openvino().__version__} {' '.join(outputs)} {CACHE_FORMAT}".encode())
-    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(home) / "umf_ros" / f"{digest.hexdigest()[:20]}.xml"
-
-
-def _make(
-    weights: Path,
-    settings: EmbeddingSettings,
-    outputs: tuple[str, ...],
-    load: Callable[[], nn.Module],
-    convert_weights: Callable[[], Any],
-) -> Runtime:
-    threads = settings.threads or len(os.sched_getaffinity(0))
-    if _wants_openvino(settings):
-        return OpenVinoRuntime(load_or_convert(cache_path(weights, outputs), convert_weights), threads)
-    from umf_ros.embedding.torch_runtimes import TorchRuntime
-
-    return TorchRuntime(load(), settings.device, threads)
-
-
-def _wants_openvino(settings: EmbeddingSettings) -> bool:
-    installed, on_cpu = find_spec("openvino") is not None, settings.device == "cpu"
-    if settings.runtime == "openvino" and not (installed and on_cpu):
-        why = "it is not installed" if not installed else f"it does not run on {settings.device!r} here"
+def _wants_openvino(weights: Path, settings: EmbeddingSettings) -> bool:
+    missing = {
+        "it is not installed": find_spec("openvino") is None,
+        f"it does not run on {settings.device!r} here": settings.device != "cpu",
+        f"{weights.with_suffix(MODEL_SUFFIX).name} is not beside the weights; make it with umf export": (
+            not weights.with_suffix(MODEL_SUFFIX).is_file()
+        ),
+    }
+    why = next((reason for reason, found in missing.items() if found), None)
+    if settings.runtime == "openvino" and why:
         raise ConfigError(f"embedding.runtime: cannot use openvino: {why}")
-    return settings.runtime != "torch" and on_cpu and installed
+    return settings.runtime != "torch" and not why

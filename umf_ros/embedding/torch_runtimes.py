@@ -13,8 +13,10 @@ from torch import Tensor, nn
 
 from umf_ros.core.errors import ConfigError
 from umf_ros.embedding.inputs import InputArrays
+from umf_ros.networks.config import XFEAT_OUTPUTS
 from umf_ros.networks.umf import UMF, NetworkInput, NetworkOutput
 from umf_ros.networks.weights import load_weights
+from umf_ros.networks.xfeat import load_xfeat
 
 
 def to_tensors(batch: InputArrays) -> NetworkInput:
@@ -40,9 +42,9 @@ class FlatUmf(nn.Module):
         found: NetworkOutput = self.network(NetworkInput(*inputs), super_features="super_image" in self.outputs)
         named: dict[str, Tensor] = {
             "descriptor": found.descriptor,
-            "image": found.image.descriptors,
+            "image_local": found.image.descriptors,
             "image_saliency": found.image.saliency,
-            "cloud": found.cloud.descriptors,
+            "cloud_local": found.cloud.descriptors,
             "cloud_saliency": found.cloud.saliency,
         }
         for name in ("super_image", "super_cloud"):
@@ -65,15 +67,21 @@ class TorchRuntime:
     """Inference in torch, in single precision; a `runtimes.Runtime`.
 
     Args:
-        network: maps tensors to a tuple of tensors.
+        weights: file of the UMF network, or for `XFEAT_OUTPUTS` of XFeat.
+        outputs: names of the outputs to compute.
         device: torch device.
         threads: number of CPU threads.
 
     Raises:
+        WeightsError: the weights cannot be used.
         ConfigError: torch does not know the device.
     """
 
-    def __init__(self, network: nn.Module, device: str, threads: int) -> None:
+    precision = "float32"
+
+    def __init__(self, weights: Path, outputs: tuple[str, ...], device: str, threads: int) -> None:
+        self.file, self._outputs = weights, outputs
+        network = load_xfeat(weights) if outputs == XFEAT_OUTPUTS else load_flat(weights, outputs)
         if device == "cpu":
             torch.set_num_threads(threads)
         try:
@@ -82,8 +90,9 @@ class TorchRuntime:
         except (RuntimeError, AssertionError) as error:
             raise ConfigError(f"embedding.device: cannot use {device!r}: {str(error).splitlines()[0]}") from None
 
-    def run(self, inputs: Sequence[NDArray[Any]]) -> list[NDArray[np.float32]]:
-        """Return the outputs of a batch of one, without the batch axis."""
+    def run(self, inputs: Sequence[NDArray[Any]]) -> dict[str, NDArray[np.float32]]:
+        """See `runtimes.Runtime`."""
         with torch.inference_mode():
             found = self._network(*(torch.from_numpy(array).to(self._device) for array in inputs))
-        return [value[0].float().cpu().numpy() for value in found]
+        values = (value[0].float().cpu().numpy() for value in found)
+        return dict(zip(self._outputs, values, strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from umf_ros.core.geometry import Array, invert, transform
 from umf_ros.core.levelling import level
 from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.inputs import VoxelScan, is_blank, pack, prepare_image, prepare_scan
-from umf_ros.embedding.runtimes import make_runtime, outputs_of
+from umf_ros.embedding.runtimes import Outputs, make_runtime, name_outputs, outputs_of
 from umf_ros.networks.config import locate_weights, read_config
 
 KEYPOINTS = 400
@@ -22,7 +21,6 @@ MIN_SALIENCY = 0.01
 """In fair shares of attention; it limits the features of a poor view, and `KEYPOINTS` those of a rich one."""
 PREPROCESSING = b"scans without the tilt of their mount"
 """Part of the name of the descriptors; it changes with the preprocessing."""
-Outputs = dict[str, NDArray[np.float32]]
 
 
 def select_salient(saliency: Points, group: NDArray[np.int64], threshold: float, limit: int) -> NDArray[np.int64]:
@@ -85,14 +83,12 @@ class UmfEmbedder:
     ) -> None:
         path = locate_weights(weights)
         self._config = read_config(path)
-        # descriptors of other weights or another preprocessing cannot be compared: their names differ
-        self.name = f"{path.stem}-{hashlib.sha256(path.read_bytes() + PREPROCESSING).hexdigest()[:8]}"
         self.dimension = self._config.length
         self._asked = asked
         rows, columns = (side // 4 for side in self._config.image_size)
         self._regions = cell_regions(rows, columns)
-        self._outputs = outputs_of(asked)
-        self._runtime = make_runtime(path, settings or EmbeddingSettings(), asked)
+        self._runtime = make_runtime(path, settings or EmbeddingSettings(), outputs_of(asked))
+        self.name = name_outputs(path, self._runtime, PREPROCESSING)
 
     def embed(self, frame: Frame) -> Embedding:
         """Embed one frame; a black image and an empty scan count as missing."""
@@ -100,8 +96,7 @@ class UmfEmbedder:
         level_T_body = np.eye(4) if frame.points is None else level(frame.points, keep_slope=True)
         points = None if frame.points is None else transform(level_T_body, frame.points)
         scan = prepare_scan(points, frame.intensity, self._config)
-        values = self._runtime.run(pack([prepare_image(image, self._config)], [scan], self._config))
-        found = dict(zip(self._outputs, values, strict=True))
+        found = self._runtime.run(pack([prepare_image(image, self._config)], [scan], self._config))
         supers = self._supers(found) if self._asked.supers else (None, None)
         return Embedding(
             descriptor=found["descriptor"],
@@ -118,13 +113,13 @@ class UmfEmbedder:
         row, column = np.divmod(chosen, columns)
         across, down = shape[1] / columns, shape[0] / rows
         pixels = np.stack([(column + 0.5) * across - 0.5, (row + 0.5) * down - 0.5], axis=1).astype(np.float32)
-        return _features(pixels, np.full((len(chosen), 3), np.nan, np.float32), found["image"], saliency, chosen)
+        return _features(pixels, np.full((len(chosen), 3), np.nan, np.float32), found["image_local"], saliency, chosen)
 
     def _cloud_features(self, found: Outputs, scan: VoxelScan, level_T_body: Array) -> LocalFeatures:
         saliency = np.where(scan.fine_mask, found["cloud_saliency"], 0)
         chosen = select_salient(saliency, ground_regions(scan.centroids), MIN_SALIENCY, KEYPOINTS)
         points = transform(invert(level_T_body), scan.centroids[chosen])
-        return _features(points, points, found["cloud"], saliency, chosen)
+        return _features(points, points, found["cloud_local"], saliency, chosen)
 
     def _supers(self, found: Outputs) -> tuple[SuperFeatures, SuperFeatures]:
         image = SuperFeatures(found["super_image"].astype(np.float16), found["super_image_strength"])

@@ -22,6 +22,8 @@ XFEAT_CELL = 8
 """Side, in pixels, of the cell of one descriptor of XFeat."""
 XFEAT_STRIDE = 32
 """Stride of the deepest layer of XFeat, in pixels; sides of images are multiples of it."""
+XFEAT_OUTPUTS = ("descriptors", "corners", "reliability")
+"""Names of the outputs of XFeat."""
 LARGEST = 8192
 """Upper limit of every size in a weights file."""
 _MOST = {"voxel_blocks": 64, "layers": 64, "super_iterations": 64, "width": 1024}
@@ -117,7 +119,7 @@ class NetworkConfig:
             raise WeightsError(f"weights of another architecture: {one_line(error)}") from None
 
 
-SHIPPED = ("umf_scene", "umf_light")
+SHIPPED = ("umf_scene",)
 DEFAULT = "umf_scene"
 
 

@@ -111,6 +111,22 @@ def cell_positions(*shape: int) -> Tensor:
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, len(shape))
 
 
+class VoxelPositions(nn.Module):
+    """Position encodings of the cells of a cubic grid, from one table per axis; a table of all cells has megabytes."""
+
+    def __init__(self, cells: int, channels: int) -> None:
+        super().__init__()
+        self.cells, self.channels = cells, channels
+        self.axis: Tensor
+        self.register_buffer("axis", sine_encoding(cell_positions(cells), channels // 6 * 2), persistent=False)
+
+    def forward(self, index: Tensor) -> Tensor:
+        """Return the encodings (..., channels) of cells with flat indices (...)."""
+        x, y, z = index // self.cells**2, index // self.cells % self.cells, index % self.cells
+        code = torch.cat([self.axis[x], self.axis[y], self.axis[z]], dim=-1)
+        return nn.functional.pad(code, (0, self.channels - code.shape[-1]))
+
+
 @dataclass(frozen=True, slots=True)
 class Tokens:
     """Tokens of one modality.

@@ -11,7 +11,15 @@ from torch import Tensor, nn
 from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.efficientnet import SceneDescriptor
 from umf_ros.networks.encoders import CELLS, ImageEncoder, VoxelEncoder
-from umf_ros.networks.fusion import AbsentToken, Fused, Fusion, Tokens, cell_positions, sine_encoding
+from umf_ros.networks.fusion import (
+    AbsentToken,
+    Fused,
+    Fusion,
+    Tokens,
+    VoxelPositions,
+    cell_positions,
+    sine_encoding,
+)
 from umf_ros.networks.local_features import CloudLocal, ImageLocal, IterativeAttention, LocalMap, SuperMap
 
 Branch = Literal["both", "image", "cloud"]
@@ -95,19 +103,11 @@ class UMF(nn.Module):
         self.super_image = IterativeAttention(config.local, *config.image_supers, config.super_iterations)
         self.super_cloud = IterativeAttention(config.local, *config.cloud_supers, config.super_iterations)
         self.cells: Tensor
-        self.coarse_voxels: Tensor
-        self.voxels: Tensor
-        self._add_positions(config)
-
-    def _add_positions(self, config: NetworkConfig) -> None:
         height, width = config.image_size
-        cells = cell_positions(height // 16, width // 16)
-        quarter = CELLS // 4
-        self.register_buffer("cells", sine_encoding(cells, config.tokens), persistent=False)
-        coarse = sine_encoding(cell_positions(quarter, quarter, quarter), config.tokens)
-        fine = sine_encoding(cell_positions(CELLS, CELLS, CELLS), config.local)
-        self.register_buffer("coarse_voxels", coarse, persistent=False)
-        self.register_buffer("voxels", fine, persistent=False)
+        cells = sine_encoding(cell_positions(height // 16, width // 16), config.tokens)
+        self.register_buffer("cells", cells, persistent=False)
+        self.coarse_voxels = VoxelPositions(CELLS // 4, config.tokens)
+        self.voxels = VoxelPositions(CELLS, config.local)
 
     def encode(self, batch: NetworkInput, branch: Branch = "both") -> Features:
         """Run the encoders and add the positions to the tokens; the features of an omitted branch are zero."""
@@ -129,7 +129,7 @@ class UMF(nn.Module):
         else:
             cloud, fine_cloud = self.voxel_encoder(batch.grid, batch.coarse_index, batch.fine_index)
             cloud = self.cloud_tokens(cloud)
-            cloud = cloud + self.coarse_voxels[batch.coarse_index].to(cloud.dtype)
+            cloud = cloud + self.coarse_voxels(batch.coarse_index).to(cloud.dtype)
         return Features(Tokens(image, everywhere), Tokens(cloud, batch.coarse_mask), fine_image, fine_cloud, scene)
 
     def fuse(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> Fused:
@@ -143,7 +143,7 @@ class UMF(nn.Module):
 
     def describe_local(self, features: Features, batch: NetworkInput) -> tuple[LocalMap, LocalMap]:
         """Local features of the images and of the scans."""
-        positions = self.voxels[batch.fine_index]
+        positions = self.voxels(batch.fine_index)
         cloud = self.cloud_local(features.fine_cloud, positions, batch.fine_mask)
         return self.image_local(features.fine_image), cloud
 

@@ -41,11 +41,6 @@ class DrivenLine(LineWorld):
         return (visit for visit in self if visit.pass_index in wanted)
 
 
-@pytest.fixture(autouse=True)
-def shared_cache(converted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(converted))
-
-
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
     torch.manual_seed(0)

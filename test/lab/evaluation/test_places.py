@@ -79,10 +79,7 @@ def test_a_wrong_truth_lowers_the_figures(folder: Path) -> None:
     assert found["walls.recall5"] >= found["walls.recall1"]
 
 
-def test_the_command_reranks_with_the_network_and_writes_the_figures(
-    folder: Path, converted: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(converted))
+def test_the_command_reranks_with_the_network_and_writes_the_figures(folder: Path) -> None:
     app = typer.Typer()
     app.command()(evaluate.command)
     (folder / "results").mkdir()

@@ -206,8 +206,7 @@ def textured(stamp: int) -> Frame:
     return replace(frame_of(stamp, 1), left=image, points=points, intensity=np.zeros(2000, np.float32))
 
 
-def test_a_network_is_timed_in_both_runtimes(tmp_path: Path, converted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(converted))
+def test_a_network_is_timed_in_both_runtimes(tmp_path: Path) -> None:
     torch.manual_seed(0)
     weights = tmp_path / "tiny.safetensors"
     save_weights(UMF(TINY), weights, {})

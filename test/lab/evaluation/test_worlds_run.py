@@ -65,11 +65,6 @@ def weights(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture(autouse=True)
-def shared_cache(converted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(converted))
-
-
 def test_tables_figures_and_pictures_of_a_small_network(
     weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

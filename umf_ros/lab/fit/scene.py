@@ -73,9 +73,10 @@ class SceneFit:
 
 
 def with_scene(trained: UMF, trunk: EfficientNetLite0, length: int) -> UMF:
-    """The trained network with a scene part that says nothing yet: it finds what it found before."""
+    """The trained network with a scene part that adds nothing yet; a scene part that it had is replaced."""
     network = UMF(replace(trained.config, scene=length))
-    network.load_state_dict(trained.state_dict(), strict=False)
+    own = {name: value for name, value in trained.state_dict().items() if not name.startswith("scene.")}
+    network.load_state_dict(own, strict=False)
     assert network.scene is not None
     network.scene.trunk.load_state_dict(trunk.state_dict())
     torch.nn.init.zeros_(network.scene.projection.weight)
@@ -257,7 +258,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=24, help="how many")
     parser.add_argument("--stride", type=int, default=3, help="every n-th image of a pass")
     parser.add_argument("--checkpoint", type=Path, required=True, help="published weights of EfficientNet-Lite0")
-    parser.add_argument("--start", type=Path, default=None, help="trained weights; default: umf_light")
+    parser.add_argument("--start", type=Path, default=None, help="trained weights; default: umf_scene")
     parser.add_argument("--pooled", type=Path, default=Path("runs/pooled"), help="where pooled worlds are kept")
     parser.add_argument("--out", type=Path, default=Path("runs/umf_scene.safetensors"), help="weights to write")
     parser.add_argument("--length", type=int, default=512, help="of the scene's part of the descriptor")
@@ -271,7 +272,7 @@ def main() -> None:
 
     torch.set_num_threads(1)
     torch.manual_seed(settings.seed)
-    start = locate_weights(chosen.start or Path("umf_light"))
+    start = locate_weights(chosen.start)
     network = with_scene(load_weights(start), pretrained_trunk(chosen.checkpoint, DEPTH), chosen.length)
     chosen.pooled.mkdir(parents=True, exist_ok=True)
     seeds, worlds = range(chosen.first, chosen.first + chosen.worlds), []

@@ -365,7 +365,7 @@ class MetricLoss(nn.Module):
         fine_cloud = attenuate(features.fine_cloud[rows], share)
         image = network.image_local(fine_image)
         index, mask = batch.input.fine_index[rows], batch.input.fine_mask[rows]
-        cloud = network.cloud_local(fine_cloud, network.voxels[index], mask)
+        cloud = network.cloud_local(fine_cloud, network.voxels(index), mask)
         count = len(rows) // 2
         first = torch.arange(count, device=rows.device)
         pairs = first, first + count

@@ -1,0 +1,104 @@
+"""Time of the two networks in their shipped precision as a share of single precision, and how alike the outputs are."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from umf_ros.core.frames import Frame
+from umf_ros.core.resources import find
+from umf_ros.embedding.embedder import FeatureRequest
+from umf_ros.embedding.inputs import read_frame
+from umf_ros.embedding.runtimes import MODEL_SUFFIX, Arrays, OpenVinoRuntime, outputs_of
+from umf_ros.lab.fit.quantisation import export_model, image_input, rendered_frames, save_model
+from umf_ros.lab.simulation.world import VALIDATION
+from umf_ros.networks.config import XFEAT_OUTPUTS, read_config
+
+OF_DETECTOR = outputs_of(FeatureRequest(image=False))
+"""Outputs of UMF that the detector asks for: its image features are those of XFeat."""
+
+
+def main(
+    worlds: Annotated[int, typer.Option(min=1, help="Validation worlds, 16 frames each.")] = 2,
+    repeats: Annotated[int, typer.Option(min=1, help="How often each frame is embedded.")] = 3,
+    frames_folder: Annotated[Path, typer.Option("--frames", help="Folder of rendered frames.")] = Path(
+        "runs/calibration"
+    ),
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
+) -> None:
+    """Run both networks in both precisions on one thread; what else runs on the machine slows both alike."""
+    seeds = range(VALIDATION.start, VALIDATION.start + worlds)
+    frames = [frame for frame in rendered_frames(frames_folder, seeds, print) if frame.left is not None]
+    frames = [frame for frame in frames if frame.points is not None]
+    figures = {name: measure(name, frames, repeats) for name in ("umf_scene", "xfeat")}
+    total = {kind: sum(found[f"{kind}_ms"] for found in figures.values()) for kind in ("float32", "shipped")}
+    show(figures, total["shipped"] / total["float32"])
+    if json_file is not None:
+        content = {"networks": figures, "ratio": total["shipped"] / total["float32"], "frames": len(frames)}
+        json_file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def measure(name: str, frames: Sequence[Frame], repeats: int) -> dict[str, Any]:
+    """Return the medians of one network: ms in both precisions, and the cosine between descriptors.
+
+    Both precisions run each input one after the other.
+    """
+    weights = find(f"models/{name}.safetensors")
+    umf = name != "xfeat"
+    outputs = OF_DETECTOR if umf else XFEAT_OUTPUTS
+    inputs = [read_frame(frame, read_config(weights)) if umf else image_input(frame) for frame in frames]
+    shipped = OpenVinoRuntime(weights, outputs, threads=1)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / weights.name
+        copy.write_bytes(weights.read_bytes())
+        save_model(export_model(weights, "float32", Path(folder), print, outputs), copy.with_suffix(MODEL_SUFFIX))
+        single = OpenVinoRuntime(copy, outputs, threads=1)
+    descriptor = "descriptor" if umf else "descriptors"
+    cosines = [
+        cosine(shipped.run(values)[descriptor], single.run(values)[descriptor]) for values in inputs
+    ]  # the first run of a shape compiles
+    taken: dict[str, list[float]] = {"float32": [], "shipped": []}
+    for values in inputs * repeats:
+        taken["float32"].append(timed(single, values))
+        taken["shipped"].append(timed(shipped, values))
+    milliseconds = {f"{kind}_ms": 1e3 * float(np.median(times)) for kind, times in taken.items()}
+    found = {"precision": shipped.precision, "cosine_median": float(np.median(cosines)), "cosine_least": min(cosines)}
+    return found | milliseconds | {"ratio": milliseconds["shipped_ms"] / milliseconds["float32_ms"]}
+
+
+def timed(runtime: OpenVinoRuntime, values: Arrays) -> float:
+    """Return the seconds of one inference."""
+    started = time.perf_counter()
+    runtime.run(values)
+    return time.perf_counter() - started
+
+
+def cosine(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+    """Return the median cosine between two descriptors (D,), or two maps of descriptors (D, H, W)."""
+    product = (one * other).sum(axis=0)
+    return float(np.median(product / (np.linalg.norm(one, axis=0) * np.linalg.norm(other, axis=0))))
+
+
+def show(figures: dict[str, dict[str, Any]], ratio: float) -> None:
+    """Print the figures."""
+    table = Table("network", "precision", "float32 [ms]", "shipped [ms]", "ratio", "cosine: median", "least")
+    for name, found in figures.items():
+        times = (f"{found[kind]:.1f}" for kind in ("float32_ms", "shipped_ms"))
+        cosines = (f"{found[kind]:.4f}" for kind in ("cosine_median", "cosine_least"))
+        table.add_row(name, found["precision"], *times, f"{found['ratio']:.2f}", *cosines)
+    table.add_row("both", "", "", "", f"{ratio:.2f}", "", "")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)
