@@ -140,7 +140,7 @@ class Verification(Group):
     refine_best: int = Field(4, ge=1, le=50, description="best candidates that get a metric pose")
     max_closures: int = Field(1, ge=1, le=50, description="closures published per keyframe at most")
     max_turn_deg: float = Field(0.0, ge=0, le=180, description="closures turned further are refused, deg; 0: none")
-    max_shift_m: float = Field(0.0, ge=0, description="closures farther apart are refused, m; 0: none")
+    max_shift_m: float = Field(11.5, ge=0, description="closures farther apart are refused, m; 0: none")
     odometry_drift: float = Field(
         0.05, gt=0, le=1, description="odometry error per distance driven, for the soft prior"
     )
