@@ -132,13 +132,14 @@ class PoseGraph:
     def prepare(self, within_s: float) -> None:
         """Do a part of the work of `settle`, for so long at most: at the end of a long mission it takes minutes."""
         self._refresh()
-        last_ns = [chain.stamps[-1] if len(chain.stamps) else 0 for chain in self._sessions.chains]
-
-        def is_complete(placed: PlacedClosure) -> bool:
-            match, query, closure = placed
-            return last_ns[match] > closure.match_stamp_ns and last_ns[query] > closure.query_stamp_ns
-
-        self._reprocess(within_s, is_complete)
+        last_ns = [chain.stamps[-1:] for chain in self._sessions.chains]
+        self._reprocess(
+            within_s,
+            lambda one: (
+                all(last_ns[one.match] > one.closure.match_stamp_ns)
+                and all(last_ns[one.query] > one.closure.query_stamp_ns)
+            ),
+        )
 
     def settle(self, within_s: float = float("inf")) -> list[ClosureVerdict] | None:
         """Decide finally and solve for the exact optimum, as at the end of a mission.

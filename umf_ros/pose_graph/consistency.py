@@ -231,8 +231,6 @@ class NoiseScaleEstimator:
 
     def add(self, loops: Loops, place: int) -> None:
         """Take in N loops of one place, to which others may have been added before."""
-        if not len(loops):
-            return
         new = _likelihoods(loops).sum(axis=0)
         self._of_place[place] = self._of_place.get(place, 0.0) + new
         self._likelihood = self._likelihood + new

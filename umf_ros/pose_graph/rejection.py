@@ -105,7 +105,8 @@ class OutlierRejection:
         before = list(self.verdicts)
         rows = [self._take(placed) for placed in arrived]
         unsolved = bool(self.placed) and self._map is None  # the solver failed when they came
-        if self._rescale() or unsolved or (rows and self._sessions.outgrown):
+        begun = set(self._sessions.begun) - set(self._sessions.vertices["session"].tolist())
+        if self._rescale() or unsolved or (rows and begun):
             self._solve()
             rows = list(range(len(self.placed)))
         self._decide({*rows, *self._brought_close})

@@ -41,10 +41,11 @@ class Sessions:
         self._solver = GraphSolver()
         self.scale = NoiseScale()
         self.chains = [OdometryChain(settings)] if chains is None else chains
-        self.components = list(range(len(self.chains)))
+        self.components: list[int] = []
         self.vertices: PathPoints = np.empty(0, POINT)
         self.solution: Graph | None = None
-        self._paths = {session: _uncorrected(self.chains[session]) for session in self.begun}
+        self._paths: dict[int, CorrectedPath] = {}
+        self.update()
 
     def begin(self) -> None:
         """Start a session."""
@@ -56,7 +57,10 @@ class Sessions:
         late = [session for session, chain in enumerate(self.chains) if chain.update()]
         for session in self.begun:
             if session in late or session not in self._paths:
-                self._paths[session] = _uncorrected(self.chains[session])
+                first = self.chains[session].stamps[:1].copy()
+                self._paths[session] = CorrectedPath(
+                    self.chains[session].at(first), self.chains[session].poses_at(first)
+                )
         if late:
             self._solver = GraphSolver()
         return bool(late)
@@ -65,11 +69,6 @@ class Sessions:
     def begun(self) -> list[int]:
         """Sessions with odometry."""
         return [session for session, chain in enumerate(self.chains) if len(chain.stamps)]
-
-    @property
-    def outgrown(self) -> bool:
-        """Whether a session has odometry but no pose in the last solution."""
-        return not set(self.begun) <= set(self.vertices["session"].tolist())
 
     def find(self, stamp_ns: int, before: int | None = None) -> int | None:
         """The newest session (not newer than `before`) whose odometry covers the stamp, or None."""
@@ -194,11 +193,6 @@ class Sessions:
                     moves[session] = moves[kept] if known else move @ moves[session]
                     components[session] = kept
         return components, moves
-
-
-def _uncorrected(chain: OdometryChain) -> CorrectedPath:
-    first = chain.stamps[:1].copy()
-    return CorrectedPath(chain.at(first), chain.poses_at(first))
 
 
 def _paths_through(points: PathPoints, poses: Array) -> dict[int, CorrectedPath]:
