@@ -31,6 +31,7 @@ ODOMETRY, CLOSURE, REVOKED, STARTED, UNSETTLED = "odometry", "closure", "revoked
 # "decided" is of earlier versions
 _NUMBERS = {ODOMETRY: 16, CLOSURE: 53, REVOKED: 0, STARTED: 0, UNSETTLED: 0, "decided": 0}
 _EVENT = "INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)"
+_EVENTS = "SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"
 JOURNAL = "pose_graph.sqlite"
 """Name of the file in a folder of results."""
 
@@ -179,14 +180,12 @@ class DurableGraph:
 
     def _resume(self, file: SqliteFile) -> None:
         with file.reading() as connection:
-            verdicts = {
-                (match, query): _decision(*columns)
-                for match, query, *columns in connection.execute("SELECT * FROM verdict")
-            }
+            known = connection.execute("SELECT match_ns, query_ns, state, reason, residual, residual_m FROM verdict")
+            verdicts = {(match, query): _decision(*columns) for match, query, *columns in known}
             mark = connection.execute("PRAGMA user_version").fetchone()[0]
             last = connection.execute("SELECT kind FROM event ORDER BY id DESC LIMIT 1").fetchone()
             revoked: list[tuple[int, int]] = []
-            feed(self.graph, self._inputs(connection.execute("SELECT * FROM event ORDER BY id"), revoked), self.feed)
+            feed(self.graph, self._inputs(connection.execute(_EVENTS), revoked), self.feed)
         self.unsettled = last is not None and last[0] == UNSETTLED
         self.graph.resume(verdicts if mark == self._mark else {})
         for pair in revoked:
@@ -207,7 +206,7 @@ class DurableGraph:
         self, events: Iterable[tuple[Any, ...]], revoked: list[tuple[int, int]]
     ) -> Iterator[LoopClosure | StoredOdometry]:
         """Odometry and closures of logged events; adds pairs of keyframes whose closures were revoked."""
-        for _, kind, first_ns, second_ns, data in events:
+        for kind, first_ns, second_ns, data in events:
             numbers = np.frombuffer(data, np.float64)
             if len(numbers) != _NUMBERS.get(kind, -1):
                 raise ValueError(f"an event {str(kind)[:40]!r} of {len(numbers)} numbers")

@@ -335,8 +335,7 @@ class PoseGraph:
     def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
         """Verdicts of the N closures with known endpoints, and (N, 2, 3) map positions of match and query."""
         self._refresh()
-        ends = (self._rejection.closures["match"], self._rejection.closures["query"])
-        positions = [self._sessions.at(end)[:, :3, 3] for end in ends]
+        positions = [self._sessions.at(self._rejection.closures[end])[:, :3, 3] for end in ("match", "query")]
         return list(self._rejection.verdicts), np.stack(positions, axis=1)
 
     def graph(self) -> Graph:
