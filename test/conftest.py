@@ -34,7 +34,7 @@ MARKED = {
     "browser": ("runs/test_browser.py",),
     "slow": (
         *("lab", "benchmarks", "maps", "submaps", "commands", "comparison", "verification", "pose_graph", "embedding"),
-        *("baselines", "runs", "pose_graph/test_journal.py", "bags/test_hostile.py"),
+        *("baselines", "runs", "test_durable_graph.py", "bags/test_hostile.py"),
         *("test_packaging.py", "test_replay.py", "test_tasks.py", "test_imports.py"),
     ),
 }

@@ -25,9 +25,10 @@ from umf_ros.core.geometry import (
     relative,
     rotation_angle,
 )
+from umf_ros.core.odometry_noise import OdometryNoise
 from umf_ros.core.trajectory import Trajectory, write_tum
+from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State, check_closure, check_pose
-from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
 
 ACCEPTED_ODDS = log(0.999 / 0.001)
 """A pose is reported from these odds on, nats (*by hand*: one wrong in a thousand)."""
@@ -42,7 +43,6 @@ _KEPT_MESSAGES = 3000
 _SAME_M, _SAME_RAD = 0.5, 0.1
 # lower bound of the uncertainty of the poses in the map
 _MAP_SIGMAS = np.array([0.005, 0.005, 0.005, 0.05, 0.05, 0.05])
-_TURN_M_PER_RAD = 0.5
 _SPACING_M = 0.25
 
 
@@ -107,7 +107,7 @@ class Localizer:
 
     def __init__(self, poses: Trajectory, settings: PoseGraphSettings) -> None:
         self._map = dict(zip(poses.stamps_ns.tolist(), poses.poses, strict=True))
-        self._settings = settings
+        self._settings, self._noise = settings, OdometryNoise.stated(settings)
         self.relocalised = 0
         self.counts = {"agreed": 0, "contradicted": 0, "searching": 0, "unusable": 0}
         self.begin_session()
@@ -130,8 +130,8 @@ class Localizer:
             last = self._samples[-1]
             if stamp_ns <= last.stamp_ns:
                 return False
-            step = relative(last.pose, odom_T_body)
-            path_m = last.path_m + float(np.linalg.norm(step[:3, 3])) + _TURN_M_PER_RAD * rotation_angle(step)
+            # a rover that stands gathers no evidence, however long
+            path_m = last.path_m + float(self._noise.path_lengths(last.pose[None], odom_T_body[None], np.zeros(1))[0])
         self._samples.append(_Sample(stamp_ns, np.asarray(odom_T_body, float), path_m))
         for _ in range(len(self._pending)):
             self.add_closure(self._pending.popleft())
@@ -209,10 +209,9 @@ class Localizer:
         """Pose and covariance of a hypothesis, propagated by odometry to another sample."""
         step = relative(one.at.pose, at.pose)
         path_m = abs(at.path_m - one.at.path_m)
-        turn = np.deg2rad(self._settings.odometry_sigma_deg) ** 2
-        noise = path_m * np.diag([turn] * 3 + [self._settings.odometry_sigma_m**2] * 3)
+        noise = self._noise.covariances(np.array([path_m]))[0]
         # an error of heading made on the path is a translation at its end
-        noise[3:, 3:] += np.eye(3) * turn * path_m**3 / 3
+        noise[3:, 3:] += noise[:3, :3] * path_m**2 / 3
         return one.pose @ step, propagate(adjoint(invert(step)), one.covariance) + noise
 
     def _same(self, one: _PoseHypothesis, other: _PoseHypothesis) -> bool:
@@ -260,35 +259,14 @@ _STATES = {
 """State of a closure by what the localizer counted it as."""
 
 
-class MapFollower:
-    """Localisation in a map behind the interface of `DurableGraph` and its graph, for `pose_graph_node`.
-
-    It keeps the trajectory only; closures are counted by their state.
-
-    Attributes:
-        feed: splits the odometry into sessions.
-        counts: odometry messages and closures, by their state.
-    """
-
-    taken_up = changed = 0
-    unsettled = False
+class MapFollower(PoseGraph):
+    """Localisation in a map as a pose graph for `pose_graph_node`; closures are counted by their state and not kept."""
 
     def __init__(self, settings: Settings) -> None:
-        self._settings = settings
-        self.end()
-
-    def end(self) -> None:
-        """Forget the pose and the trajectory: the rover may be anywhere."""
-        self._localizer = Localizer(read_poses(Path(self._settings.map)), self._settings.pose_graph)
-        self.feed = OdometrySessionSplitter(self._localizer)
+        super().__init__(settings.pose_graph)
+        self._localizer = Localizer(read_poses(Path(settings.map)), settings.pose_graph)
         self._poses: list[Localization] = []
         self._states: Counter[State] = Counter()
-        self.counts: Counter[str] = Counter()
-
-    @property
-    def graph(self) -> MapFollower:
-        """Itself: there is no graph."""
-        return self
 
     @property
     def probability(self) -> float:
@@ -296,15 +274,18 @@ class MapFollower:
         found = self._localizer.estimate()
         return 0.0 if found is None else found.probability
 
-    def take_odometry(self, stamp_ns: int, odom_T_body: Array) -> Reset | None:
-        """Take one message; returns the reason if a new session begins with it."""
-        reset = self.feed.take(stamp_ns, odom_T_body)
-        found = self._localizer.estimate()
+    def begin_session(self) -> None:
+        """Forget the pose: the rover may be anywhere."""
+        self._localizer.begin_session()
+
+    def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
+        """Take one message; returns whether it could be used."""
+        usable, found = self._localizer.add_odometry(stamp_ns, odom_T_body), self._localizer.estimate()
         if found is not None:
             last = self._poses[-1].map_T_body[:3, 3] if self._poses else np.full(3, np.inf)
             if np.linalg.norm(found.map_T_body[:3, 3] - last) >= _SPACING_M:
                 self._poses.append(found)
-        return reset
+        return usable
 
     def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
         """Take a closure with the map; returns its verdict."""
@@ -324,7 +305,7 @@ class MapFollower:
         found = self._localizer.estimate()
         return np.zeros((6, 6)) if found is None else found.covariance
 
-    def trajectory(self) -> tuple[NDArray[np.int64], Array]:
+    def trajectory(self, optimized: bool = True) -> tuple[NDArray[np.int64], Array]:
         """Stamps (N,) in ns and `map_T_body` (N, 4, 4) since the rover was localised, 0.25 m apart."""
         stamps = np.array([one.stamp_ns for one in self._poses], np.int64)
         return stamps, np.array([one.map_T_body for one in self._poses]).reshape(-1, 4, 4)
@@ -333,36 +314,13 @@ class MapFollower:
         """Number of closures by state."""
         return Counter(self._states)
 
-    # there is no graph, no file and no closure that is kept, pending or to be revoked
-
-    def closures(self) -> list[ClosureVerdict]:
-        """Return no closures."""
-        return []
-
-    def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
-        """Return no closures and no lines (0, 2, 3)."""
-        return [], np.empty((0, 2, 3))
-
-    def update(self) -> list[ClosureVerdict]:
-        """Return no verdicts."""
-        return []
-
-    def prepare(self, within_s: float) -> None:
-        """Do nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
-    def retune(self, settings: object) -> None:
-        """Do nothing."""
-
-    def revoke(self, match_ns: int, query_ns: int) -> list[ClosureVerdict]:
+    def revoke(self, match_stamp_ns: int, query_stamp_ns: int) -> list[ClosureVerdict]:
         """Raise a `GraphError`: there is nothing to revoke."""
         raise GraphError("localisation in a fixed map keeps no closures to reject")
 
-    def write_results(self, folder: str | Path, within_s: float = float("inf")) -> bool:
+    def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
         """Write the trajectory, `trajectory_in_map.tum`; returns true, there is nothing to settle before."""
         with writing(f"to {folder}"):
-            Path(folder).mkdir(parents=True, exist_ok=True)
-        write_tum(Path(folder) / "trajectory_in_map.tum", Trajectory(*self.trajectory()))
+            folder.mkdir(parents=True, exist_ok=True)
+        write_tum(folder / "trajectory_in_map.tum", Trajectory(*self.trajectory()))
         return True

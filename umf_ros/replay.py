@@ -16,9 +16,10 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector
+from umf_ros.durable_graph import feed
 from umf_ros.localizer import Localization, Localizer, read_poses
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.runs.run_file import NAME, RunFile, StoredOdometry
+from umf_ros.runs.run_file import NAME, RunFile
 from umf_ros.runs.writer import RunRecorder, write_summary
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
@@ -209,33 +210,6 @@ def recover_run(folder: Path) -> bool:
     recorder.close()
     graph = PoseGraph(settings.pose_graph)
     if feed(graph, inputs):
+        graph.resume({})
         graph.write_results(folder)
     return True
-
-
-def feed(graph: PoseGraph, inputs: Iterable[LoopClosure | StoredOdometry], shift_ns: int = 0) -> bool:
-    """Pass the stored odometry and closures of a run to a graph whose newest session is empty.
-
-    Args:
-        graph: to be filled.
-        inputs: in the order in which they came.
-        shift_ns: added to the stamps of the odometry.
-
-    Returns:
-        Whether there was odometry.
-    """
-    splitter, begun = OdometrySessionSplitter(graph), False
-    for item in inputs:
-        if isinstance(item, LoopClosure):
-            graph.add_closure(item)
-            continue
-        stamp_ns, pose, covariance = item.stamp_ns + shift_ns, item.odom_T_body, item.covariance
-        if covariance is None:
-            splitter.take(stamp_ns, pose)
-        else:
-            unknown = bool(np.isinf(covariance).any())
-            if unknown and begun:
-                graph.begin_session()
-            graph.add_odometry(stamp_ns, pose, None if unknown else covariance)
-        begun = True
-    return begun

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sqlite3
 import time
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,11 +18,11 @@ from std_srvs.srv import Trigger
 
 from umf_ros.core.config import load_settings
 from umf_ros.core.geometry import Array
+from umf_ros.durable_graph import JOURNAL, DurableGraph
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops
 from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, to_pose, to_time
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State
-from umf_ros.pose_graph.journal import JOURNAL, DurableGraph, GraphJournal
+from umf_ros.pose_graph.closures import ClosureReason, State
 
 Figures = dict[str, Any]
 SEED = 10005
@@ -84,13 +86,15 @@ def keep(world: GraphWorld, last: int, path: Path) -> int:
     """A journal of a drive up to a pose, with every closure accepted; returns how many these are."""
     begun = DurableGraph(SETTINGS, path, _ignore)  # as the node begins it, settings and all
     begun.close()
-    journal, closures = GraphJournal(path), [row for row, c in enumerate(world.closures) if c.second < last]
-    for k in range(last):
-        journal.add_odometry((k + 1) * PERIOD_NS, world.odometry[k])
-    for row in closures:
-        journal.add_closure(_later(world, row))
-    journal.put_verdicts([ClosureVerdict(_later(world, row), State.ACCEPTED, ClosureReason.AGREES) for row in closures])
-    journal.close()
+    closures = [_later(world, row) for row, closure in enumerate(world.closures) if closure.second < last]
+    stamps = [(one.match_stamp_ns, one.query_stamp_ns) for one in closures]
+    numbers = [np.hstack([one.match_T_query.ravel(), one.covariance.ravel(), one.probability]) for one in closures]
+    events = [("odometry", (k + 1) * PERIOD_NS, 0, world.odometry[k].tobytes()) for k in range(last)]
+    events += [("closure", *pair, data.tobytes()) for pair, data in zip(stamps, numbers, strict=True)]
+    with closing(sqlite3.connect(path)) as journal, journal:
+        journal.executemany("INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)", events)
+        verdicts = [(*pair, State.ACCEPTED.value, ClosureReason.AGREES.value) for pair in stamps]
+        journal.executemany("INSERT INTO verdict (match_ns, query_ns, state, reason) VALUES (?, ?, ?, ?)", verdicts)
     return len(closures)
 
 

@@ -7,7 +7,7 @@ import sqlite3
 import tempfile
 import threading
 from collections import Counter
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,10 @@ from std_msgs.msg import String
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import load_settings, topics_of
+from umf_ros.durable_graph import JOURNAL
 from umf_ros.lab.live.live_graph import LiveGraph
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
 from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, from_time, to_pose, to_time
-from umf_ros.pose_graph.journal import JOURNAL, GraphJournal
 
 Figures = dict[str, Any]
 ODD = [float("nan"), float("inf"), -1.0, 1e300, 1e-300, 0.0]
@@ -87,9 +87,8 @@ def kill_back_end(folder: Path, kills: int, rng: np.random.Generator) -> Figures
         shutdown_s, status = node.stop()
         ears.destroy_node()
     crashes += (status != 0) + node.tracebacks()
-    kept = GraphJournal(results / JOURNAL)
-    stored = set(kept.verdicts())
-    kept.close()
+    with closing(sqlite3.connect(results / JOURNAL)) as kept:
+        stored = set(kept.execute("SELECT match_ns, query_ns FROM verdict"))
     with (results / "graph_verdicts.csv").open(newline="") as file:
         written = {(int(row["match_stamp_ns"]), int(row["query_stamp_ns"])) for row in csv.DictReader(file)}
     return {

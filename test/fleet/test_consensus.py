@@ -23,7 +23,7 @@ def pair(metres: float, off_m: float = 0.0, session: int = -1) -> InterRobotPair
     query = replace(make_keyframe(100 + metres, metres), odom_T_body=at(metres))
     match = replace(make_keyframe(metres, metres, session=session), odom_T_body=MEETING @ at(metres))
     wrong = make_pose(np.eye(3), np.array([off_m, 0, 0]))
-    return InterRobotPair(query, match, LoopClosure(query.stamp_ns, match.stamp_ns, wrong, np.eye(6)))
+    return query, match, LoopClosure(query.stamp_ns, match.stamp_ns, wrong, np.eye(6))
 
 
 def test_the_second_closure_of_another_place_confirms_the_first() -> None:
@@ -51,6 +51,6 @@ def test_another_session_a_long_path_or_missing_odometry_confirms_nothing() -> N
     consensus = FleetConsensus(DRIFT)
     assert not consensus.agree(pair(0), pair(12, session=-2))
     assert not consensus.agree(pair(0), pair(300))
-    blind = pair(12)
-    assert not consensus.agree(pair(0), blind._replace(query=replace(blind.query, odom_T_body=None)))
+    query, match, closure = pair(12)
+    assert not consensus.agree(pair(0), (replace(query, odom_T_body=None), match, closure))
     assert consensus.agree(pair(0), pair(12)) and np.allclose(invert(MEETING) @ MEETING, np.eye(4))

@@ -64,9 +64,10 @@ def test_places_of_another_rover_are_found_with_negative_sessions(server: Postgr
     drive(ada_places, ada, [make_keyframe(500, 3.0, seed=4)])
     assert ada.drain(20)
     (answer,) = answers_of(ada)
-    candidate, match = answer.found[0]
-    assert (answer.robot, answer.keyframe.stamp_ns, candidate.stamp_ns) == ("bea", 500 * 10**9, 4 * 10**9)
-    assert match.session < 0 and match.stamp_ns == 4 * 10**9 and len(answer.found) == 3
+    keyframe, robot, found = answer
+    candidate, match = found[0]
+    assert (robot, keyframe.stamp_ns, candidate.stamp_ns) == ("bea", 500 * 10**9, 4 * 10**9)
+    assert match.session < 0 and match.stamp_ns == 4 * 10**9 and len(found) == 3
     assert match.embedding.image is not None  # all that verification needs
     assert len({one.index for one, _ in answer.found}) == 3  # verification tells candidates apart by it
     ada.close(), bea.close()
@@ -144,7 +145,7 @@ def test_unreadable_keyframes_of_another_rover_are_skipped(server: PostgresServe
     drive(ada_places, ada, [make_keyframe(500, seed=1)])
     assert ada.drain(20)
     (answer,) = answers_of(ada)
-    assert [candidate.stamp_ns for candidate, _ in answer.found] == [0]
+    assert [candidate.stamp_ns for candidate, _ in answer[2]] == [0]
     ada.close(), bea.close()
 
 

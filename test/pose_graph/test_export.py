@@ -24,10 +24,18 @@ from graph_worlds import (
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import make_pose
-from umf_ros.lab.datasets.g2o import PERIOD_NS, as_recording, drive, read_g2o
+from umf_ros.lab.datasets.g2o import (
+    PERIOD_NS,
+    as_recording,
+    drive,
+    read_g2o,
+    verdicts_by_vertex,
+    write_optimised,
+    write_plane,
+)
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS
-from umf_ros.pose_graph.g2o import verdict_table, write_g2o
+from umf_ros.pose_graph.g2o import verdict_table
 from umf_ros.pose_graph.solver import Edge
 
 WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))
@@ -91,7 +99,7 @@ def test_vertices_keep_the_ids_of_their_file(tmp_path: Path) -> None:
     (tmp_path / "in.g2o").write_text("\n".join(lines))
     recording = as_recording(read_g2o(tmp_path / "in.g2o"))
     graph = driven_file(recording)
-    graph.write_g2o(tmp_path / "out.g2o", True, recording.vertex_of)
+    write_optimised(tmp_path / "out.g2o", graph, recording, planar=True)
     written = read_g2o(tmp_path / "out.g2o")
     assert list(written.poses) == list(range(100, 160, 10))
     assert [(edge.first, edge.second) for edge in written.edges] == [
@@ -103,7 +111,7 @@ def test_vertices_keep_the_ids_of_their_file(tmp_path: Path) -> None:
         (100, 150),
     ]
     assert not (tmp_path / "out.csv").exists()
-    rows = list(csv.DictReader(io.StringIO(verdict_table(graph.closures(), recording.vertex_of))))
+    rows = list(csv.DictReader(io.StringIO(verdicts_by_vertex(graph, recording))))
     assert [(row["match"], row["query"]) for row in rows] == [("100", "150")]
 
 
@@ -140,9 +148,10 @@ def test_a_place_that_cannot_be_written_is_one_clear_error(finished: PoseGraph, 
 
 def test_a_plane_file_stays_a_plane_file(tmp_path: Path) -> None:
     flat = [Edge(k, k + 1, make_pose(np.eye(3), [1.0, 0.1, 0]), np.eye(6)) for k in range(5)]
-    write_g2o(tmp_path / "in.g2o", [np.eye(4)] * 6, flat, planar=True)
+    write_plane(tmp_path / "in.g2o", np.tile(np.eye(4), (6, 1, 1)), flat)
     content = read_g2o(tmp_path / "in.g2o")
-    driven_file(as_recording(content)).write_g2o(tmp_path / "out.g2o", planar=content.planar)
+    recording = as_recording(content)
+    write_optimised(tmp_path / "out.g2o", driven_file(recording), recording, content.planar)
     lines = (tmp_path / "out.g2o").read_text().splitlines()
     assert [line.split()[0] for line in lines] == ["VERTEX_SE2"] * 6 + ["EDGE_SE2"] * 5
     assert lines[5] == "VERTEX_SE2 5 5 0.5 0"

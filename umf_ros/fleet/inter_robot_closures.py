@@ -6,13 +6,12 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import compress
-from typing import NamedTuple
 
 import numpy as np
 
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Keyframe, LoopClosure
-from umf_ros.core.geometry import Array, invert, relative, rotation_angle
+from umf_ros.core.geometry import invert, relative, rotation_angle
 from umf_ros.fleet.link import FleetLink
 from umf_ros.places.store import KeyframeStore
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
@@ -27,14 +26,8 @@ DRIFT_RAD_PER_M = 0.003
 """Drift of the heading of odometry (*by hand*)."""
 KEPT = 200
 """Pending and confirmed closures that are kept of each rover."""
-
-
-class InterRobotPair(NamedTuple):
-    """A closure between two rovers, with both its keyframes."""
-
-    query: Keyframe
-    match: Keyframe
-    closure: LoopClosure
+InterRobotPair = tuple[Keyframe, Keyframe, LoopClosure]
+"""Query, match and the closure between them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,26 +77,19 @@ class FleetConsensus:
 
     def agree(self, one: InterRobotPair, other: InterRobotPair) -> bool:
         """Whether the loop through two closures of different places and both odometries closes."""
-        if one.query.session != other.query.session or one.match.session != other.match.session:
+        steps, path_m = [], 0.0
+        for a, b in zip(one[:2], other[:2], strict=True):
+            if a.session != b.session or a.odom_T_body is None or b.odom_T_body is None:
+                return False
+            steps.append(relative(a.odom_T_body, b.odom_T_body))
+            path_m += abs(a.path_length_m - b.path_length_m)
+        own_step, other_step = steps
+        if min(np.linalg.norm(step[:3, 3]) for step in steps) < APART_M or path_m > REACH_M:
             return False
-        own_step, other_step = _step(one.query, other.query), _step(one.match, other.match)
-        if own_step is None or other_step is None:
-            return False
-        path_m = abs(one.query.path_length_m - other.query.path_length_m)
-        path_m += abs(one.match.path_length_m - other.match.path_length_m)
-        if min(np.linalg.norm(step[:3, 3]) for step in (own_step, other_step)) < APART_M or path_m > REACH_M:
-            return False
-        predicted = invert(other_step) @ one.closure.match_T_query @ own_step
-        gap = relative(predicted, other.closure.match_T_query)
+        predicted = invert(other_step) @ one[2].match_T_query @ own_step
+        gap = relative(predicted, other[2].match_T_query)
         is_near = np.linalg.norm(gap[:3, 3]) < SLACK_M + self._drift * path_m
         return bool(is_near and rotation_angle(gap) < SLACK_RAD + DRIFT_RAD_PER_M * path_m)
-
-
-def _step(one: Keyframe, other: Keyframe) -> Array | None:
-    """The motion from one keyframe to another by their odometry."""
-    if one.odom_T_body is None or other.odom_T_body is None:
-        return None
-    return relative(one.odom_T_body, other.odom_T_body)
 
 
 class InterRobotMatcher:
@@ -128,19 +114,19 @@ class InterRobotMatcher:
         answer = self.link.answer()
         if answer is None:
             return None
-        if answer.robot not in self._verifiers:
-            self._verifiers[answer.robot] = Verifier(self._settings), FleetConsensus(self._settings.odometry_drift)
-        verifier, consensus = self._verifiers[answer.robot]
-        matches = {candidate.stamp_ns: match for candidate, match in answer.found}
-        verdicts, closures = verifier.verify(answer.keyframe, answer.found), []
+        keyframe, robot, found = answer
+        if robot not in self._verifiers:
+            self._verifiers[robot] = Verifier(self._settings), FleetConsensus(self._settings.odometry_drift)
+        verifier, consensus = self._verifiers[robot]
+        matches = {candidate.stamp_ns: match for candidate, match in found}
+        verdicts, closures = verifier.verify(keyframe, found), []
         for verdict in verdicts:
             if verdict.closure is not None:
-                pair = InterRobotPair(answer.keyframe, matches[verdict.candidate.stamp_ns], verdict.closure)
-                confirmed = consensus.confirm(pair)
-                closures += [one.closure for one in confirmed]
+                confirmed = consensus.confirm((keyframe, matches[verdict.candidate.stamp_ns], verdict.closure))
+                closures += [closure for *_, closure in confirmed]
                 if not confirmed:
                     verdict.reason = RejectReason.UNCONFIRMED
-        return InterRobotClosure(answer.keyframe, self.link.robot, answer.robot, verdicts, closures)
+        return InterRobotClosure(keyframe, self.link.robot, robot, verdicts, closures)
 
     def rest(self, timeout_s: float) -> Iterator[InterRobotClosure]:
         """Finish pushing and asking within a time limit, and verify all answers."""

@@ -7,7 +7,6 @@ import threading
 import time
 from collections import OrderedDict, deque
 from dataclasses import replace
-from typing import NamedTuple
 
 from umf_ros.core.config import Database
 from umf_ros.core.frames import Candidate, Keyframe
@@ -28,18 +27,9 @@ RETRY_S = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 """Times between attempts to reconnect."""
 
 
-class Answer(NamedTuple):
-    """Places of one session of another rover that are similar to a keyframe of this one.
-
-    Attributes:
-        keyframe: of this rover.
-        robot: the other's name.
-        found: candidates with the other's keyframes, whose sessions have negative numbers here.
-    """
-
-    keyframe: Keyframe
-    robot: str
-    found: list[tuple[Candidate, Keyframe]]
+Answer = tuple[Keyframe, str, list[tuple[Candidate, Keyframe]]]
+"""A keyframe of this rover, the name of another, and candidates of one of the other's sessions with their keyframes,
+whose sessions have negative numbers here."""
 
 
 class FleetLink:
@@ -151,7 +141,7 @@ class FleetLink:
             if match is not None:
                 found = by_session.setdefault((key.robot, match.session), [])
                 found.append((Candidate(len(found), key.stamp_ns, similarity), match))
-        self._answers.extend(Answer(keyframe, robot, found) for (robot, _), found in by_session.items())
+        self._answers.extend((keyframe, robot, found) for (robot, _), found in by_session.items())
 
     def _keyframe(self, server: FleetServer, key: FleetKey) -> Keyframe | None:
         if key not in self._cache:

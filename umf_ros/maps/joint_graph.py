@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.durable_graph import StoredOdometry, feed
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.replay import feed
-from umf_ros.runs.run_file import StoredOdometry, read_closures, read_keyframes
+from umf_ros.runs.run_file import read_closures, read_keyframes
 
 Stamps = NDArray[np.int64]
 
@@ -73,7 +73,7 @@ def solve(folder: MapFolder) -> JointMap:
     for number, session in enumerate(folder.sessions):
         if number:
             graph.begin_session()
-        feed(graph, odometry[session.name], session.shift_ns)
+        feed(graph, (one._replace(stamp_ns=one.stamp_ns + session.shift_ns) for one in odometry[session.name]))
     # after all odometry, as a closure may refer to any session
     for session in folder.sessions:
         run = folder.folder_of(session.name)

@@ -12,8 +12,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError, writing
 from umf_ros.core.io import write_atomically
@@ -106,9 +104,8 @@ class MapFolder:
 
     def odometry_of(self, name: str) -> list[StoredOdometry]:
         """Odometry of a recording, stamped by its own clock."""
-        older = self.folder_of(name) / "odometry.npz"
-        if older.is_file():
-            return _read_older(older)
+        if (self.folder_of(name) / "odometry.npz").is_file():
+            raise UmfError(f"{self.path} is of an earlier version of umf_ros; build the map again from its recordings")
         with closing(RunFile(self.folder_of(name), read_only=True)) as file:
             return list(file.odometry())
 
@@ -151,15 +148,3 @@ class MapFolder:
             self.sessions = [MapSession(**session) for session in content["sessions"]]
         except (OSError, ValueError, KeyError, TypeError):
             raise UmfError(f"{self.path / 'map.json'} is damaged") from None
-
-
-def _read_older(path: Path) -> list[StoredOdometry]:
-    """Read the odometry of a recording as earlier releases kept it, beside its run."""
-    try:
-        with np.load(path) as stored:
-            stamps, poses, covariances = stored["stamps"].tolist(), stored["poses"], stored["covariances"].copy()
-            covariances[stored["starts"]] = np.diag([np.inf] * 6)
-    except (OSError, ValueError, LookupError) as error:
-        raise UmfError(f"{path} cannot be read: {error}") from None
-    tracked = covariances if len(covariances) else [None] * len(stamps)
-    return [StoredOdometry(*one) for one in zip(stamps, poses, tracked, strict=True)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, topics_of
 from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import Array
+from umf_ros.durable_graph import JOURNAL, DurableGraph
 from umf_ros.localizer import MapFollower
 from umf_ros.nodes import conversions as messages
 from umf_ros.nodes.base_node import BaseNode
@@ -39,7 +41,6 @@ from umf_ros.nodes.conversions import (
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.pose_graph.journal import JOURNAL, DurableGraph
 from umf_ros.sensors.decode import OdometrySample, decode_odometry
 
 ODOMETRY_DEPTH = 200
@@ -66,10 +67,9 @@ class PoseGraphNode(BaseNode):
     def _open(self) -> None:
         settings = self._settings
         self._frames = settings.frames
-        journal = Path(self._results) / JOURNAL if self._results else None
-        self._durable: DurableGraph | MapFollower = (
-            MapFollower(settings) if settings.localizing else DurableGraph(settings.pose_graph, journal, self._complain)
-        )
+        journal = Path(self._results) / JOURNAL if self._results and not settings.localizing else None
+        make = partial(MapFollower, settings) if settings.localizing else None
+        self._durable = DurableGraph(settings.pose_graph, journal, self._complain, make)
         # None: in a map that is there, the rover may be anywhere
         self._map_T_odom: Array | None = None if settings.localizing else np.eye(4)
         self._covariance: Array = np.zeros((6, 6))
@@ -78,10 +78,9 @@ class PoseGraphNode(BaseNode):
         self._draws_again_s = 0.0
         self._keeps_up = False
         self._make_publishers()
-        kept = self._durable if isinstance(self._durable, DurableGraph) else None
-        if kept is not None and (kept.taken_up or kept.feed.newest_ns >= 0):
-            self.get_logger().info(_taken_up(kept))
-            self._announce(kept.graph.closures())
+        if self._durable.taken_up or self._durable.feed.newest_ns >= 0:
+            self.get_logger().info(_taken_up(self._durable))
+            self._announce(self._durable.graph.closures())
         self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._complain, QUEUE)
         if self._durable.unsettled:
             self._worker.submit(lambda: self._settle_left())
@@ -249,8 +248,8 @@ class PoseGraphNode(BaseNode):
         values |= {state.value: count for state, count in graph.verdict_counts().items()}
         trouble = self._worker.dropped or any(name.startswith("optimiser") for name in graph.counts)
         text = f"{values.get('accepted', 0)} closures accepted"
-        if isinstance(self._durable, MapFollower):
-            values["probability"] = self._durable.probability
+        if isinstance(graph, MapFollower):
+            values["probability"] = graph.probability
             text = "in the map" if self._map_T_odom is not None else "the rover is not found in the map yet"
         if values.get("pending") and self._durable.feed.newest_ns < 0:
             trouble, text = True, f"{values['pending']} closures wait for odometry, of which none has come"
@@ -279,9 +278,8 @@ class PoseGraphNode(BaseNode):
 
 def describe(verdict: ClosureVerdict) -> str:
     """One line about a verdict for a person."""
-    numbers = "" if np.isnan(verdict.residual) else f" ({verdict.residual:.1f} sigma, {verdict.residual_m:.2f} m)"
     seconds = (verdict.closure.query_stamp_ns - verdict.closure.match_stamp_ns) * 1e-9
-    return f"graph: closure {seconds:.1f} s back {verdict.state.value}: {verdict.reason}{numbers}"
+    return f"graph: closure {seconds:.1f} s back {verdict.state.value}: {verdict.reason}{verdict.figures}"
 
 
 def _numbered(results: Path) -> Path:

@@ -6,7 +6,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from itertools import takewhile
+from itertools import takewhile, zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +28,11 @@ from umf_ros.pose_graph.closures import (
     check_pose,
 )
 from umf_ros.pose_graph.consistency import NoiseScale
-from umf_ros.pose_graph.g2o import verdict_table, write_g2o, write_vertex_table
+from umf_ros.pose_graph.g2o import verdict_table, write_g2o
 from umf_ros.pose_graph.odometry import POINT, PathPoints, Stamps
 from umf_ros.pose_graph.rejection import OutlierRejection
 from umf_ros.pose_graph.sessions import Sessions
-from umf_ros.pose_graph.solver import Edge
+from umf_ros.pose_graph.solver import Graph
 
 logger = logging.getLogger(__name__)
 
@@ -132,13 +132,14 @@ class PoseGraph:
     def prepare(self, within_s: float) -> None:
         """Do a part of the work of `settle`, for so long at most: at the end of a long mission it takes minutes."""
         self._refresh()
-        order, chains = self._in_order(), self._sessions.chains
-
-        def is_complete(placed: PlacedClosure) -> bool:
-            sessions, stamps = (placed.match, placed.query), _endpoints(placed.closure)
-            return all(chains[session].stamps[-1] > stamp for session, stamp in zip(sessions, stamps, strict=True))
-
-        self._reprocess(order, len(list(takewhile(is_complete, order))), within_s)
+        last_ns = [chain.stamps[-1:] for chain in self._sessions.chains]
+        self._reprocess(
+            within_s,
+            lambda one: (
+                all(last_ns[one.match] > one.closure.match_stamp_ns)
+                and all(last_ns[one.query] > one.closure.query_stamp_ns)
+            ),
+        )
 
     def settle(self, within_s: float = float("inf")) -> list[ClosureVerdict] | None:
         """Decide finally and solve for the exact optimum, as at the end of a mission.
@@ -152,11 +153,10 @@ class PoseGraph:
         verdicts = self.update()
         if self._settled:  # nothing has come since
             return verdicts
-        before, order = self._rejection, self._in_order()
-        ordered = self._reprocess(order, len(order), within_s)
-        if ordered is None:
+        before = self._rejection
+        if not self._reprocess(within_s) or self._ordered is None:
             return None
-        (self._sessions, self._rejection), self._ordered = ordered, None
+        (_, self._sessions, self._rejection), self._ordered = self._ordered, None
         for row in np.flatnonzero(before.revoked).tolist():
             self.revoke(*_endpoints(before.placed[row].closure))
         states = {id(placed): verdict.state for placed, verdict in zip(before.placed, before.verdicts, strict=True)}
@@ -166,29 +166,21 @@ class PoseGraph:
         self._settled = True
         return verdicts
 
-    def _in_order(self) -> list[PlacedClosure]:
-        """All closures by the stamps of query and match."""
-        return sorted(self._rejection.placed, key=lambda placed: _endpoints(placed.closure)[::-1])
-
-    def _reprocess(
-        self, order: list[PlacedClosure], count: int, within_s: float
-    ) -> tuple[Sessions, OutlierRejection] | None:
-        """Decide about the first closures of `order` anew, from the odometry alone; None when the time was up first."""
+    def _reprocess(self, within_s: float, is_ready: Callable[[PlacedClosure], bool] = lambda _: True) -> bool:
+        """Decide anew, from the odometry alone, by the stamps of query and match; False when the time was up first."""
         until_s = time.monotonic() + within_s
-        if self._ordered is not None:
-            taken = self._ordered[2].placed
-            same = len(taken) <= len(order) and all(a is b for a, b in zip(taken, order, strict=False))
-            if not same or self._ordered[0] != self._sessions.begun:  # a closure came late, or a session began
-                self._ordered = None
-        if self._ordered is None:
-            anew = Sessions(self._settings, self._sessions.chains)  # the same odometry, before any closure moved it
-            self._ordered = self._sessions.begun, anew, OutlierRejection(self._settings, anew)
-        _, sessions, rejection = self._ordered
-        for placed in order[len(rejection.placed) : count]:
+        order = sorted(self._rejection.placed, key=lambda placed: _endpoints(placed.closure)[::-1])
+        begun, sessions, rejection = self._ordered or (None, self._sessions, self._rejection)
+        late = any(a is not b for a, b in zip_longest(rejection.placed, order[: len(rejection.placed)]))
+        if late or begun != self._sessions.begun:
+            sessions = Sessions(self._settings, self._sessions.chains)  # the same odometry, before any closure moved it
+            rejection = OutlierRejection(self._settings, sessions)
+            self._ordered = self._sessions.begun, sessions, rejection
+        for placed in takewhile(is_ready, order[len(rejection.placed) :]):
             if time.monotonic() > until_s:
-                return None
+                return False
             self._attempt(lambda: rejection.consider([placed]))  # noqa: B023 (called at once)
-        return sessions, rejection
+        return True
 
     def _refresh(self) -> None:
         """Take in the odometry that has come."""
@@ -244,7 +236,14 @@ class PoseGraph:
             query = self._sessions.find(closure.query_stamp_ns)
             match = self._sessions.find(closure.match_stamp_ns, before=query)
             if query is not None and match is not None:
-                arrived += self._if_new(PlacedClosure(match, query, closure))
+                # two measurements of one pair are two closures; the same again is a message of a latched topic
+                key = match, query, *_endpoints(closure), closure.match_T_query.tobytes()
+                if key in self._placed:
+                    self.counts["closure twice"] += 1
+                    continue
+                self._placed.add(key)
+                self._settled = False
+                arrived.append(PlacedClosure(match, query, closure))
             elif waited_s > self._settings.max_gap_s and oldest_ns is not None and min(_endpoints(closure)) < oldest_ns:
                 refused.append(self._refuse(closure, ClosureReason.BEFORE_ODOMETRY))
             elif waited_s > self._settings.max_pending_s:
@@ -253,20 +252,6 @@ class PoseGraph:
                 waiting.append((closure, since_ns))
         self._waiting = waiting
         return refused, arrived
-
-    def _if_new(self, placed: PlacedClosure) -> list[PlacedClosure]:
-        """The closure, unless one like it joins the same sessions: a latched topic repeats its history.
-
-        Two measurements of one pair are two closures; the same measurement again is a message sent twice.
-        """
-        match, query, closure = placed
-        key = match, query, *_endpoints(closure), closure.match_T_query.tobytes()
-        if key in self._placed:
-            self.counts["closure twice"] += 1
-            return []
-        self._placed.add(key)
-        self._settled = False
-        return [placed]
 
     def closures(self) -> list[ClosureVerdict]:
         """The latest verdict of every closure, in order of arrival."""
@@ -292,10 +277,6 @@ class PoseGraph:
         poses = [self._sessions.at(chain.at(chain.stamps)) if optimized else chain.poses for chain in chains]
         stamps = [np.empty(0, np.int64), *(chain.stamps for chain in chains)]
         return np.concatenate(stamps), np.concatenate([np.empty((0, 4, 4)), *poses])
-
-    def odometry(self) -> tuple[Stamps, Array]:
-        """Stamps (N,) in ns and `odom_T_body` (N, 4, 4) of the same keyframes as `trajectory`."""
-        return self.trajectory(optimized=False)
 
     def poses_at(self, stamps: Stamps) -> tuple[Array, NDArray[np.bool_]]:
         """(N, 4, 4) `map_T_body` at stamps, in the frame of the largest part of the map, and (N,) whether it has them.
@@ -323,7 +304,7 @@ class PoseGraph:
     def _spans(self) -> list[tuple[int, int]]:
         return [chain.span for chain in self._sessions.chains if chain.span is not None]
 
-    def map_T_odom(self) -> Array:
+    def map_T_odom(self) -> Array | None:
         """(4, 4) pose of the newest session's odometry frame in the map: where its newest pose went."""
         last, chain = self._newest(), self._sessions.chains[-1]
         return self._sessions.at(last)[0] @ invert(chain.poses_at(last["stamp"])[0]) if len(last) else np.eye(4)
@@ -354,27 +335,27 @@ class PoseGraph:
     def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
         """Verdicts of the N closures with known endpoints, and (N, 2, 3) map positions of match and query."""
         self._refresh()
-        ends = (self._rejection.closures["match"], self._rejection.closures["query"])
-        positions = [self._sessions.at(end)[:, :3, 3] for end in ends]
+        positions = [self._sessions.at(self._rejection.closures[end])[:, :3, 3] for end in ("match", "query")]
         return list(self._rejection.verdicts), np.stack(positions, axis=1)
 
-    def write_g2o(self, path: str | Path, planar: bool = False, vertex_of: Callable[[int], int] | None = None) -> None:
-        """Write keyframes, odometry and accepted closures, with the covariances that the solution used.
+    def graph(self) -> Graph:
+        """Keyframes by session and stamp, odometry and accepted closures, with the covariances of the solution."""
+        self._refresh()
+        return self._sessions.expand(self._rejection.accepted, self._rejection.closures)
 
-        Vertices get the ids that `vertex_of` gives their stamps; without it they are counted from 0, and `<name>.csv`
-        beside the file has vertex, session and stamp.
+    def write_g2o(self, path: Path) -> None:
+        """Write `graph`; `<name>.csv` beside the file has vertex, session and stamp.
 
         Raises:
             OutputError: a file cannot be written.
         """
-        self._refresh()
-        full = self._sessions.expand(self._rejection.accepted, self._rejection.closures)
-        ids = [row if vertex_of is None else vertex_of(stamp) for row, (_, stamp) in enumerate(full.vertices)]
-        write_g2o(path, full.poses, [Edge(*edge) for edge in full.edges], planar, ids)
-        if vertex_of is None:
-            write_vertex_table(Path(path).with_suffix(".csv"), full.vertices)
+        full = self.graph()
+        write_g2o(path, full.poses, full.edges)
+        lines = (f"{row},{session},{stamp}\n" for row, (session, stamp) in enumerate(full.vertices))
+        with writing(table := path.with_suffix(".csv")):
+            table.write_text("".join(("id,session,stamp_ns\n", *lines)), encoding="ascii")
 
-    def write_results(self, folder: str | Path, within_s: float = float("inf")) -> bool:
+    def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
         """Settle, and write trajectories (TUM), the graph (g2o and id-stamp table) and all verdicts (CSV).
 
         Without the time to settle all is written as it stands, and the result is False.
@@ -382,7 +363,7 @@ class PoseGraph:
         Raises:
             OutputError: the folder cannot be written.
         """
-        folder, settled = Path(folder), self.settle(within_s) is not None
+        settled = self.settle(within_s) is not None
         with writing(f"to {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "graph_verdicts.csv").write_text(verdict_table(self.closures()), encoding="utf-8")

@@ -37,7 +37,6 @@ _MOST_PER_PLACE = 4.0
 _GRID = np.exp(np.linspace(np.log(1 / 64), np.log(64), 33))
 # standard deviations of the residual of a loop with a wrong closure: of aliases close by, and of anything at all
 _ALIAS_SIGMAS = np.array([[0.5] * 3 + [5.0] * 3, [1.5] * 3 + [50.0] * 3])
-_IN_PLANE, _OUT_OF_PLANE = np.array([2, 3, 4]), np.array([0, 1, 5])
 _OUTLIERS = 0.5
 # loops share closures and odometry, so that together they say less than their sum: to trust odometry more than
 # stated takes more than to trust it less
@@ -232,8 +231,6 @@ class NoiseScaleEstimator:
 
     def add(self, loops: Loops, place: int) -> None:
         """Take in N loops of one place, to which others may have been added before."""
-        if not len(loops):
-            return
         new = _likelihoods(loops).sum(axis=0)
         self._of_place[place] = self._of_place.get(place, 0.0) + new
         self._likelihood = self._likelihood + new
@@ -244,22 +241,16 @@ class NoiseScaleEstimator:
         """The factors, exactly 1 unless the loops contradict the stated covariances clearly."""
         if self.loops < _FEWEST_LOOPS:
             return NoiseScale()
-        likelihood, one = self._likelihood, len(_GRID) // 2
-        odometry, closures = int(np.argmax(likelihood[:, one])), int(np.argmax(likelihood[one]))
-        both = np.unravel_index(np.argmax(likelihood), likelihood.shape)
+        one = len(_GRID) // 2
         # a factor has to earn its freedom, else noise in few loops would be taken for a wrong scale
-        of_odometry = [(0, one, one), (1, odometry, one)]
-        of_closures = [(1, one, closures), (2, int(both[0]), int(both[1]))]
-
-        def merit(choice: tuple[int, int, int]) -> float:
-            factors, row, column = choice
-            trusting = _NATS_TO_TRUST - _NATS_PER_FACTOR if row < one else 0.0
-            return float(likelihood[row, column]) - _NATS_PER_FACTOR * factors - trusting
-
-        best, plain = max(of_odometry + of_closures, key=merit), max(of_odometry, key=merit)
-        accepted = best[2] <= one or self._is_widely_better(best[1:], plain[1:])
+        cost = np.where(np.arange(len(_GRID)) == one, 0.0, _NATS_PER_FACTOR)
+        trusting = np.where(np.arange(len(_GRID)) < one, _NATS_TO_TRUST - _NATS_PER_FACTOR, 0.0)
+        merit = self._likelihood - (cost + trusting)[:, None] - cost
+        plain = int(np.argmax(merit[:, one])), one
+        best = int(np.argmax(merit) // len(_GRID)), int(np.argmax(merit) % len(_GRID))
+        accepted = best[1] <= one or self._is_widely_better(best, plain)
         # closures that are about as stated are taken as stated, and odometry is judged by that
-        row, column = best[1:] if accepted and _unless_small(_GRID[best[2]]) != 1 else plain[1:]
+        row, column = best if accepted and _unless_small(_GRID[best[1]]) != 1 else plain
         odometry_factor, closures_factor = float(_GRID[row]), float(_GRID[column])
         if one not in (row, column) and abs(np.log(odometry_factor / closures_factor)) < _SAME_UNITS:
             # rather other units than two mistakes: the ratio counts, and that is as stated
@@ -280,20 +271,16 @@ def _unless_small(factor: float) -> float:
 
 def _likelihoods(loops: Loops) -> Array:
     """(N, G, G) log-likelihood of each loop over the grids of odometry and closure factors."""
-    # height, roll and pitch count unless all is flat (a 2-D graph): that they fit exactly says nothing
-    flat = np.abs(loops["residual"][:, _OUT_OF_PLANE]).max() <= 1e-9
-    axes = _IN_PLANE if flat else np.arange(6)
-    residuals, square = loops["residual"][:, axes], np.ix_(np.arange(len(loops)), axes, axes)
+    residuals = loops["residual"]
     # whiten by the closures' noise, then turn the odometry's to its axes: both become diagonal
-    lower = np.linalg.cholesky(loops["closures"][square])
-    white = np.linalg.solve(lower, np.swapaxes(np.linalg.solve(lower, loops["odometry"][square]), -1, -2))
+    lower = np.linalg.cholesky(loops["closures"])
+    white = np.linalg.solve(lower, np.swapaxes(np.linalg.solve(lower, loops["odometry"]), -1, -2))
     gains, turns = np.linalg.eigh(0.5 * (white + np.swapaxes(white, -1, -2)))
     turned = np.swapaxes(turns, -1, -2) @ np.linalg.solve(lower, residuals[..., None])
     spread = _GRID[:, None, None] ** 2 * np.maximum(gains, 0)[:, None, None, :] + _GRID[None, :, None] ** 2
     determinant = 2 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
     inlier = -0.5 * ((turned[..., 0] ** 2)[:, None, None, :] / spread + np.log(spread)).sum(axis=-1)
     inlier -= 0.5 * determinant[:, None, None]
-    aliases = _ALIAS_SIGMAS[:, axes]
-    deviations = residuals[:, None, :] / aliases
-    outlier = np.logaddexp.reduce(-0.5 * (deviations**2).sum(axis=-1) - np.log(aliases).sum(axis=-1), axis=-1)
+    squares = ((residuals[:, None, :] / _ALIAS_SIGMAS) ** 2).sum(axis=-1)
+    outlier = np.logaddexp.reduce(-0.5 * squares - np.log(_ALIAS_SIGMAS).sum(axis=-1), axis=-1)
     return np.logaddexp(np.log(1 - _OUTLIERS) + inlier, np.log(_OUTLIERS / 2) + outlier[:, None, None])

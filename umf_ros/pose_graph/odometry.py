@@ -201,8 +201,6 @@ class OdometryChain:
         self._keyframes.extend(stamp=stamps, pose=poses[1:], travel=travel, noise=noise)
 
     def _has_covariance(self, stamps: Stamps) -> NDArray[np.bool_]:
-        if not self._covariances:
-            return np.zeros(len(stamps), bool)
         return np.fromiter((stamp in self._covariances for stamp in stamps.tolist()), bool, len(stamps))
 
 

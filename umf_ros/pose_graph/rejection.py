@@ -105,7 +105,8 @@ class OutlierRejection:
         before = list(self.verdicts)
         rows = [self._take(placed) for placed in arrived]
         unsolved = bool(self.placed) and self._map is None  # the solver failed when they came
-        if self._rescale() or unsolved or (rows and self._sessions.outgrown):
+        begun = set(self._sessions.begun) - set(self._sessions.vertices["session"].tolist())
+        if self._rescale() or unsolved or (rows and begun):
             self._solve()
             rows = list(range(len(self.placed)))
         self._decide({*rows, *self._brought_close})
@@ -203,24 +204,22 @@ class OutlierRejection:
         if not len(at):
             return []
         # without outlier rejection, all that is not too far
-        most = self.settings.max_chance if self.settings.reject_outliers else 1.0
+        gate, most = (
+            (self.settings.gate_chi2, self.settings.max_chance) if self.settings.reject_outliers else (np.inf, 1)
+        )
         agreed = []
         for row, distance, misfit_m, joined, ratio, false_alarm in zip(at.tolist(), *self._compare(at), strict=True):
-            state, reason = self._judge(distance, misfit_m)
+            state, reason = State.PENDING, ClosureReason.UNSURE
+            if distance > gate:
+                state, reason = State.REJECTED, ClosureReason.CONTRADICTS
+            elif misfit_m > (self.settings.max_correction_m or np.inf):
+                state, reason = State.REJECTED, ClosureReason.TOO_FAR
+            elif false_alarm <= most:
+                agreed.append(row)
             closure, sigmas = self.placed[row].closure, float(np.sqrt(distance))
             self.verdicts[row] = ClosureVerdict(closure, state, reason, sigmas, float(misfit_m))
             self._joined[row], self._ratios[row] = joined, ratio if state is State.PENDING else 1.0
-            if state is State.PENDING and false_alarm <= most:
-                agreed.append(row)
         return agreed
-
-    def _judge(self, distance: float, misfit_m: float) -> tuple[State, ClosureReason]:
-        """Decision about a closure by its squared Mahalanobis distance from the map, and its misfit."""
-        if self.settings.reject_outliers and distance > self.settings.gate_chi2:
-            return State.REJECTED, ClosureReason.CONTRADICTS
-        if self.settings.max_correction_m and misfit_m > self.settings.max_correction_m:
-            return State.REJECTED, ClosureReason.TOO_FAR
-        return State.PENDING, ClosureReason.UNSURE
 
     def _compare(self, rows: NDArray[np.int64]) -> tuple[Array, Array, NDArray[np.bool_], Array, Array]:
         """Compare N closures with the map; a closure between endpoints that nothing joins agrees with it.

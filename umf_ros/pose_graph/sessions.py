@@ -16,8 +16,6 @@ from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.odometry import POINT, CorrectedPath, OdometryChain, PathPoints, Rows, Stamps, noise_between
 from umf_ros.pose_graph.solver import EDGE, Graph, GraphSolver
 
-# a keyframe this close to a closure's endpoint would add rounding errors only
-_TOO_CLOSE_NS = 10_000_000
 # metres at which an angular error counts like a displacement when paths through the graph are compared
 _LEVER_M = 10.0
 # pairs whose shortest paths are searched together: their trees fill some tens of megabytes
@@ -40,14 +38,14 @@ class Sessions:
 
     def __init__(self, settings: PoseGraphSettings, chains: list[OdometryChain] | None = None) -> None:
         self._settings = settings
-        self._solver, self._refiner = GraphSolver(), GraphSolver()
+        self._solver = GraphSolver()
         self.scale = NoiseScale()
         self.chains = [OdometryChain(settings)] if chains is None else chains
-        self.components = list(range(len(self.chains)))
+        self.components: list[int] = []
         self.vertices: PathPoints = np.empty(0, POINT)
         self.solution: Graph | None = None
-        self._refined: dict[int, CorrectedPath] = {}
-        self._paths = {session: _uncorrected(self.chains[session]) for session in self.begun}
+        self._paths: dict[int, CorrectedPath] = {}
+        self.update()
 
     def begin(self) -> None:
         """Start a session."""
@@ -59,20 +57,18 @@ class Sessions:
         late = [session for session, chain in enumerate(self.chains) if chain.update()]
         for session in self.begun:
             if session in late or session not in self._paths:
-                self._paths[session] = _uncorrected(self.chains[session])
+                first = self.chains[session].stamps[:1].copy()
+                self._paths[session] = CorrectedPath(
+                    self.chains[session].at(first), self.chains[session].poses_at(first)
+                )
         if late:
-            self._solver, self._refined = GraphSolver(), {}
+            self._solver = GraphSolver()
         return bool(late)
 
     @property
     def begun(self) -> list[int]:
         """Sessions with odometry."""
         return [session for session, chain in enumerate(self.chains) if len(chain.stamps)]
-
-    @property
-    def outgrown(self) -> bool:
-        """Whether a session has odometry but no pose in the last solution."""
-        return not set(self.begun) <= set(self.vertices["session"].tolist())
 
     def find(self, stamp_ns: int, before: int | None = None) -> int | None:
         """The newest session (not newer than `before`) whose odometry covers the stamp, or None."""
@@ -96,7 +92,7 @@ class Sessions:
         poses = np.empty((len(points), 4, 4))
         for session in np.unique(points["session"]).tolist():
             rows = points["session"] == session
-            poses[rows] = self._path(session).at(points[rows])
+            poses[rows] = self._paths[session].at(points[rows])
         return poses
 
     def solve(self, closures: Closures, scale: NoiseScale) -> None:
@@ -107,11 +103,10 @@ class Sessions:
         """
         if scale != self.scale:
             self._solver, self.scale = GraphSolver(), scale
-        stamps = [np.union1d(chain.stamps[:1], _endpoints(closures, s)) for s, chain in enumerate(self.chains)]
         components, moves = self._join(closures)
-        vertices, graph = self._graph(stamps, closures, components, moves)
+        vertices, graph = self._graph(self._stamps(closures), closures, components, moves)
         self.solution = replace(graph, poses=self._solver.solve(graph))
-        self.vertices, self.components, self._refined = vertices, components, {}
+        self.vertices, self.components = vertices, components
         self._paths |= _paths_through(vertices, self.solution.poses)
 
     def refine(self, closures: Closures) -> None:
@@ -120,33 +115,37 @@ class Sessions:
         Raises:
             GraphError: the system cannot be solved; the paths stay as they were.
         """
-        stamps = []
-        for session, chain in enumerate(self.chains):
-            own = np.union1d(chain.stamps[:1], _endpoints(closures, session))
-            after = np.searchsorted(own, chain.stamps)
-            gaps = [np.abs(chain.stamps - own[np.clip(row, 0, len(own) - 1)]) for row in (after - 1, after)]
-            stamps.append(np.union1d(own, chain.stamps[np.min(gaps, axis=0) > _TOO_CLOSE_NS]))
-        vertices, graph = self._graph(stamps, closures, self.components)
-        refiner = GraphSolver()
-        self._refined, self._refiner = _paths_through(vertices, refiner.solve(graph)), refiner
+        vertices, graph = self._graph(self._stamps(closures, every_keyframe=True), closures, self.components)
+        self._paths |= _paths_through(vertices, self._solver.solve(graph))
 
     def expand(self, closures: Closures, extra: Closures) -> Graph:
         """Graph of every keyframe and the endpoints of `extra` closures, odometry and the given closures."""
-        stamps = [np.union1d(chain.stamps, _endpoints(extra, session)) for session, chain in enumerate(self.chains)]
-        return self._graph(stamps, closures, self.components)[1]
+        return self._graph(self._stamps(extra, every_keyframe=True), closures, self.components)[1]
+
+    def _stamps(self, closures: Closures, every_keyframe: bool = False) -> list[Stamps]:
+        """Stamps of the first or of every keyframe of each session, and of the endpoints of closures."""
+        ends = [closures["match"], closures["query"]]
+        return [
+            np.unique(
+                np.concatenate(
+                    [
+                        chain.stamps[: None if every_keyframe else 1],
+                        *(end["stamp"][end["session"] == session] for end in ends),
+                    ]
+                )
+            )
+            for session, chain in enumerate(self.chains)
+        ]
 
     def covariance(self, point: PathPoints) -> Array:
         """(6, 6) marginal covariance of the pose at a point (1,) after the last solved one, in its tangent space."""
         session = int(point["session"][0])
-        path, solver = self._path(session), self._refiner if session in self._refined else self._solver
-        last = solver.marginal((session, int(path.points["stamp"][-1])))
+        path = self._paths[session]
+        last = self._solver.marginal((session, int(path.points["stamp"][-1])))
         back = invert(path.at(point)) @ path.poses[-1:]
         walked = self.scale.odometry**2 * noise_between(path.points[-1:], point)
         known = propagate(adjoint(back), np.zeros((6, 6)) if last is None else last)
         return (known + propagate(adjoint(invert(point["pose"])), walked))[0]
-
-    def _path(self, session: int) -> CorrectedPath:
-        return self._refined.get(session) or self._paths[session]
 
     def _graph(
         self, stamps: list[Stamps], closures: Closures, components: list[int], moves: Array | None = None
@@ -196,21 +195,10 @@ class Sessions:
         return components, moves
 
 
-def _uncorrected(chain: OdometryChain) -> CorrectedPath:
-    first = chain.stamps[:1].copy()
-    return CorrectedPath(chain.at(first), chain.poses_at(first))
-
-
 def _paths_through(points: PathPoints, poses: Array) -> dict[int, CorrectedPath]:
     """The paths of sessions through solved poses."""
     rows = {session: points["session"] == session for session in np.unique(points["session"]).tolist()}
     return {session: CorrectedPath(points[own], poses[own]) for session, own in rows.items()}
-
-
-def _endpoints(closures: Closures, session: int) -> Stamps:
-    """Stamps of the endpoints of closures in a session."""
-    both = (closures["match"], closures["query"])
-    return np.concatenate([end["stamp"][end["session"] == session] for end in both])
 
 
 class RelativeCovariances:
@@ -258,27 +246,23 @@ class RelativeCovariances:
         """Replace the bounds of some pairs, which are those along the odometry, by those of shorter paths."""
         ends = []
         for point in (match, query):
-            beside = self._beside(point)
-            walked = noise_between(point[:, None], self._vertices[beside])
+            beside = self._nearest(point)
             turn = adjoint(invert(poses) @ self._sessions.at(point) @ invert(point["pose"]))
-            ends.append((beside, self._variance_scale * propagate(turn[:, None], walked)))
+            walked = propagate(turn, noise_between(point, self._vertices[beside]))
+            ends.append((beside, self._variance_scale * walked))
         # a path is the same from either end: trees grow from where there are fewer roots
         (starts, leave), (stops, enter) = sorted(ends, key=lambda one: len(np.unique(one[0])))
         sources, of_source = np.unique(starts, return_inverse=True)
-        of_source = of_source.reshape(starts.shape)
         found, before = dijkstra(
             self._paths, directed=False, indices=sources, return_predecessors=True, limit=lengths[rows].max()
         )
-        between = found[of_source[:, :, None], stops[:, None, :]]
-        totals = (_length(leave)[:, :, None] + between + _length(enter)[:, None, :]).reshape(len(starts), -1)
-        best = totals.argmin(axis=1)
-        total = totals[np.arange(len(starts)), best]
-        shorter = np.flatnonzero(total < lengths[rows])
-        out, into = best[shorter] // 2, best[shorter] % 2
-        sums = self._along(before[of_source[shorter, out]], stops[shorter, into])
-        along = propagate(adjoint(invert(poses[shorter]) @ self._poses[:1]), sums)
-        covariances[rows[shorter]] = leave[shorter, out] + enter[shorter, into] + along
-        lengths[rows[shorter]] = total[shorter]
+        totals = _length(leave) + found[of_source, stops] + _length(enter)
+        shorter = np.flatnonzero(totals < lengths[rows])
+        along = propagate(
+            adjoint(invert(poses[shorter]) @ self._poses[:1]), self._along(before[of_source[shorter]], stops[shorter])
+        )
+        covariances[rows[shorter]] = leave[shorter] + enter[shorter] + along
+        lengths[rows[shorter]] = totals[shorter]
 
     def _along(self, before: NDArray[np.int32], here: Rows) -> Array:
         """(M, 6, 6) noise along paths, from the (M, V) vertices before each and the (M,) vertices where they end."""
@@ -292,14 +276,16 @@ class RelativeCovariances:
             here = there
         return sums
 
-    def _beside(self, points: PathPoints) -> Rows:
-        """(N, 2) solved vertices before points, and at or after them; twice the same at an end of a session."""
-        beside = np.empty((len(points), 2), np.int64)
+    def _nearest(self, points: PathPoints) -> Rows:
+        """(N,) the solved vertices of the points' sessions that are nearest to them by odometry."""
+        nearest = np.empty(len(points), np.int64)
         for session in np.unique(points["session"]):
             rows, solved = points["session"] == session, np.flatnonzero(self._vertices["session"] == session)
-            after = np.searchsorted(self._vertices["stamp"][solved], points["stamp"][rows])
-            beside[rows] = solved[np.column_stack([np.maximum(after - 1, 0), np.minimum(after, len(solved) - 1)])]
-        return beside
+            travel = self._vertices["travel"][solved]
+            after = np.searchsorted(self._vertices["stamp"][solved], points["stamp"][rows]).clip(1, len(solved) - 1)
+            middle = (travel[after - 1] + travel[after]) / 2
+            nearest[rows] = solved[after - (points["travel"][rows] < middle)]
+        return nearest
 
 
 def _length(covariances: Array) -> Array:

@@ -21,7 +21,7 @@ from graph_worlds import (
 
 from umf_ros.core.errors import GraphError, OutputError
 from umf_ros.core.geometry import adjoint, expmap, heading, invert, propagate
-from umf_ros.lab.datasets.g2o import G2oGraph, as_recording, drive, read_g2o
+from umf_ros.lab.datasets.g2o import G2oGraph, as_recording, drive, read_g2o, write_plane
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.g2o import write_g2o
@@ -41,7 +41,7 @@ def edges(count: int, planar: bool) -> list[Edge]:
 
 
 def test_what_was_written_is_read(tmp_path: Path) -> None:
-    poses = [np.eye(4), *(edge.pose for edge in edges(5, False))]
+    poses = np.stack([np.eye(4), *(edge.pose for edge in edges(5, False))])
     write_g2o(tmp_path / "a.g2o", poses, edges(5, False))
     content = read_g2o(tmp_path / "a.g2o")
     assert not content.planar and not content.problems
@@ -49,12 +49,12 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
         assert (found.first, found.second) == (expected.first, expected.second)
         np.testing.assert_allclose(found.pose, expected.pose, atol=1e-10)
         np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-7)
-    np.testing.assert_allclose(np.stack(list(content.poses.values())), np.stack(poses), atol=1e-10)
+    np.testing.assert_allclose(np.stack(list(content.poses.values())), poses, atol=1e-10)
 
 
 def test_gtsam_reads_the_same_poses_and_noise(tmp_path: Path) -> None:
     path = tmp_path / "a.g2o"
-    write_g2o(path, [np.eye(4)] * 4, edges(3, False))
+    write_g2o(path, np.tile(np.eye(4), (4, 1, 1)), edges(3, False))
     graph, _ = gtsam.readG2o(str(path), True)
     for k, edge in enumerate(edges(3, False)):
         factor = graph.at(k)
@@ -64,7 +64,7 @@ def test_gtsam_reads_the_same_poses_and_noise(tmp_path: Path) -> None:
 
 def test_two_dimensions_there_and_back(tmp_path: Path) -> None:
     path = tmp_path / "plane.g2o"
-    write_g2o(path, [np.eye(4)] * 4, edges(3, True), planar=True)
+    write_plane(path, np.tile(np.eye(4), (4, 1, 1)), edges(3, True))
     content = read_g2o(path)
     assert content.planar
     plane = np.ix_([3, 4, 2], [3, 4, 2])
@@ -125,7 +125,7 @@ def test_files_that_cannot_be_used(tmp_path: Path) -> None:
     with pytest.raises(GraphError, match="no usable edge"):
         read_g2o(tmp_path / "empty.g2o")
     with pytest.raises(OutputError):
-        write_g2o(tmp_path / "no" / "folder.g2o", [], [])
+        write_g2o(tmp_path / "no" / "folder.g2o", np.empty((0, 4, 4)), [])
 
 
 def test_chains_and_backward_edges_are_sorted_out(tmp_path: Path) -> None:

@@ -39,9 +39,8 @@ def optimize(
     from rich.progress import track
 
     from umf_ros.core.config import PoseGraphSettings
-    from umf_ros.lab.datasets.g2o import as_recording, drive, read_g2o
+    from umf_ros.lab.datasets.g2o import as_recording, drive, read_g2o, verdicts_by_vertex, write_optimised
     from umf_ros.pose_graph.backend import PoseGraph
-    from umf_ros.pose_graph.g2o import verdict_table
 
     console, content = Console(), read_g2o(file)
     for problem in content.problems[:MOST_ROWS]:
@@ -54,11 +53,11 @@ def optimize(
         pass
     _report(console, graph, recording)
     if output is not None:
-        graph.write_g2o(output, planar=content.planar, vertex_of=recording.vertex_of)
+        write_optimised(output, graph, recording, content.planar)
         console.print(f"optimised graph: {output}")
     if verdicts is not None:
         with writing(verdicts):
-            verdicts.write_text(verdict_table(graph.closures(), recording.vertex_of), encoding="utf-8")
+            verdicts.write_text(verdicts_by_vertex(graph, recording), encoding="utf-8")
 
 
 @app.command()
@@ -119,7 +118,7 @@ def _compare(console: Console, graph: PoseGraph, recording: GraphRecording) -> N
     if not same.any():
         return
     told = np.stack([closure.match_T_query for closure in closures])[same]
-    for when, path in (("before", graph.odometry()[1]), ("after", after)):
+    for when, path in (("before", graph.trajectory(optimized=False)[1]), ("after", after)):
         found = np.linalg.inv(path[ends[same, 0]]) @ path[ends[same, 1]]
         gap = np.linalg.norm((found - told)[:, :3, 3], axis=1)
         off = f"off by {np.median(gap):.3g} m in the median, {gap.max():.3g} m at most"

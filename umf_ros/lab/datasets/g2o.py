@@ -8,34 +8,37 @@ as if it were live.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.config import PoseGraphSettings
-from umf_ros.core.errors import GraphError
+from umf_ros.core.errors import GraphError, writing
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import (
     Array,
     adjoint,
     from_quaternion,
     gtsam_to_ros_covariance,
+    heading,
     invert,
     make_pose,
     propagate,
 )
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import check_covariance
-from umf_ros.pose_graph.solver import Edge
+from umf_ros.pose_graph.g2o import g2o_lines, verdict_table, write_g2o
+from umf_ros.pose_graph.solver import EDGE, Edge
 
 PERIOD_NS = 1_000_000_000
 LARGEST_ID = 2**63 - 1
 _MOST_SOLUTIONS = 150
 _IGNORED = ("FIX", "PARAMS_", "VERTEX_XY", "VERTEX_TRACKXYZ", "EDGE_SE2_XY", "EDGE_SE3_TRACKXYZ")
+_IN_PLANE = np.array([3, 4, 2])
 _SWAP = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 
 
@@ -216,6 +219,34 @@ def _forward(edge: Edge, number: dict[int, int]) -> Edge:
     if first < second:
         return Edge(first, second, edge.pose, edge.covariance)
     return Edge(second, first, invert(edge.pose), propagate(adjoint(edge.pose), edge.covariance))
+
+
+def write_plane(path: Path, poses: Array, edges: ArrayLike, ids: Sequence[int] | None = None) -> None:
+    """Write a two-dimensional g2o file: position in the plane and heading; see `write_g2o`."""
+    names, measured = range(len(poses)) if ids is None else ids, np.asarray(edges, EDGE)
+    pairs = [(names[first], names[second]) for first, second in measured[["first", "second"]].tolist()]
+    upper = np.triu_indices(3)
+    information = np.linalg.inv(measured["covariance"][:, _IN_PLANE[:, None], _IN_PLANE])[:, upper[0], upper[1]]
+    places, steps = (np.column_stack([one[:, :2, 3], heading(one)]) for one in (poses, measured["pose"]))
+    lines = g2o_lines("VERTEX_SE2", [(name,) for name in names], places)
+    with writing(path):
+        path.write_text("".join(lines + g2o_lines("EDGE_SE2", pairs, np.hstack([steps, information]))))
+
+
+def write_optimised(path: Path, graph: PoseGraph, recording: GraphRecording, planar: bool) -> None:
+    """Write the optimised graph of a recording with the vertex ids of its file."""
+    full = graph.graph()
+    write, ids = write_plane if planar else write_g2o, [recording.vertex_of(stamp) for _, stamp in full.vertices]
+    write(path, full.poses, full.edges, ids)
+
+
+def verdicts_by_vertex(graph: PoseGraph, recording: GraphRecording) -> str:
+    """All verdicts as CSV, with vertex ids in place of stamps."""
+    verdicts = []
+    for verdict in graph.closures():
+        match, query = map(recording.vertex_of, (verdict.closure.match_stamp_ns, verdict.closure.query_stamp_ns))
+        verdicts.append(replace(verdict, closure=replace(verdict.closure, match_stamp_ns=match, query_stamp_ns=query)))
+    return verdict_table(verdicts).replace("match_stamp_ns,query_stamp_ns", "match,query", 1)
 
 
 def drive(graph: PoseGraph, recording: GraphRecording) -> Iterator[int]:

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from umf_ros.core.config import load_settings
 from umf_ros.core.errors import UmfError
-from umf_ros.pose_graph.journal import JOURNAL, DurableGraph, GraphJournal
+from umf_ros.durable_graph import JOURNAL, DurableGraph
 
 START_TIMEOUT_S = 180.0
 STOP_TIMEOUT_S = 60.0
@@ -198,13 +198,10 @@ def settle_left(folder: Path) -> None:
     path = folder / JOURNAL
     if not path.exists():
         return
-    kept = GraphJournal(path)
-    unsettled = kept.is_unsettled()
-    kept.close()
-    if unsettled:
-        durable = DurableGraph(load_settings(folder / "config.yaml").pose_graph, path, lambda _: None)
+    durable = DurableGraph(load_settings(folder / "config.yaml").pose_graph, path, lambda _: None)
+    if durable.unsettled:
         durable.write_results(folder)
-        durable.close()
+    durable.close()
 
 
 def _environment() -> dict[str, str]:

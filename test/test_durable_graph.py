@@ -11,9 +11,9 @@ import pytest
 from umf_ros.core.config import PoseGraphSettings, Settings, dump_settings
 from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.core.frames import LoopClosure
+from umf_ros.durable_graph import JOURNAL, DurableGraph
 from umf_ros.lab.live.live_graph import settle_left
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
-from umf_ros.pose_graph.journal import JOURNAL, DurableGraph
 
 SETTINGS = PoseGraphSettings(max_gap_s=3)
 
@@ -50,7 +50,7 @@ def test_a_graph_that_was_killed_is_taken_up_as_it_was(world: GraphWorld, tmp_pa
         graph = made(path)
         assert graph.changed == 0 and graph.taken_up == len([c for c in world.closures if c[1] < first])
         drive(graph, world, first, last)
-        graph._journal._file._lock.release()  # type: ignore[union-attr]  # as a kill does: nothing is closed
+        graph._file._lock.release()  # type: ignore[union-attr]  # as a kill does: nothing is closed
     last_one = made(path)
     assert states(last_one) == states(whole) and last_one.changed == 0
     np.testing.assert_allclose(last_one.graph.trajectory()[1], whole.graph.trajectory()[1], atol=1e-6)
@@ -150,7 +150,7 @@ def test_a_journal_that_holds_nonsense_is_refused_in_one_line(change: str, world
 def test_a_journal_that_cannot_be_written_costs_no_closure(world: GraphWorld, tmp_path: Path) -> None:
     faults: list[OutputError] = []
     graph = made(tmp_path / "graph.sqlite", faults)
-    graph._journal._file.connection.execute("PRAGMA query_only = 1")  # type: ignore[union-attr]
+    graph._file.connection.execute("PRAGMA query_only = 1")  # type: ignore[union-attr]
     drive(graph, world, 0, 60)
     assert len(graph.graph.trajectory()[0]) > 10 and faults and "cannot write" in str(faults[0])
 

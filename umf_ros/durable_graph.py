@@ -1,0 +1,251 @@
+"""Write-ahead log of the pose graph, replayed after a restart or a crash."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.errors import GraphError, OutputError, writing
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array
+from umf_ros.core.io import Schema, SqliteFile
+from umf_ros.pose_graph.backend import PoseGraph
+from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, Decision, State
+from umf_ros.runs.run_file import StoredOdometry
+from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
+
+_TABLES = (
+    "CREATE TABLE event (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, first_ns INTEGER, second_ns INTEGER, data BLOB)",
+    "CREATE TABLE verdict (match_ns INTEGER, query_ns INTEGER, state TEXT, reason TEXT, residual REAL, "
+    "residual_m REAL, PRIMARY KEY (match_ns, query_ns))",
+)
+_SCHEMA = Schema("pose graph", (_TABLES,), lambda tables: int({"event", "verdict"} <= tables))
+ODOMETRY, CLOSURE, REVOKED, STARTED, UNSETTLED = "odometry", "closure", "revoked", "started", "unsettled"
+# "decided" is of earlier versions
+_NUMBERS = {ODOMETRY: 16, CLOSURE: 53, REVOKED: 0, STARTED: 0, UNSETTLED: 0, "decided": 0}
+_EVENT = "INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)"
+_EVENTS = "SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"
+JOURNAL = "pose_graph.sqlite"
+"""Name of the file in a folder of results."""
+
+
+def feed(
+    graph: PoseGraph, inputs: Iterable[LoopClosure | StoredOdometry], splitter: OdometrySessionSplitter | None = None
+) -> bool:
+    """Pass stored odometry and closures to a graph whose newest session is empty; `resume` decides about the closures.
+
+    Args:
+        graph: to be filled.
+        inputs: in the order in which they came.
+        splitter: of the messages into the graph's sessions; None: one of its own.
+
+    Returns:
+        Whether there was odometry.
+    """
+    splitter, begun = splitter or OdometrySessionSplitter(graph), False
+    for item in inputs:
+        if isinstance(item, LoopClosure):
+            graph.hold(item)
+            continue
+        if item.covariance is None:
+            splitter.take(item.stamp_ns, item.odom_T_body)
+        else:
+            unknown = bool(np.isinf(item.covariance).any())
+            if unknown and begun:
+                graph.begin_session()
+            graph.add_odometry(item.stamp_ns, item.odom_T_body, None if unknown else item.covariance)
+        begun = True
+    return begun
+
+
+class DurableGraph:
+    """A pose graph with a write-ahead log, and its odometry split into sessions.
+
+    Every event is written when it comes: a process that is killed loses none. One process at a time writes the log.
+    After a restart the closures get their logged verdicts, and the map is solved once; with other settings they are
+    decided anew. When the disk is full, the graph goes on without its log, and `on_fault` is called with the error.
+
+    Args:
+        settings: of the graph.
+        path: of the log, opened when it exists; None: no log.
+        on_fault: takes the error when the log cannot be written.
+        make: makes an empty graph.
+
+    Attributes:
+        graph: the graph.
+        feed: splits odometry into sessions and passes it to the graph.
+        taken_up: number of closures that were found in the log.
+        changed: number of these that now have another verdict than was written.
+        unsettled: whether the process before had no time to settle the graph at its end.
+
+    Raises:
+        UmfError: the log is something else, is damaged, or another process writes it.
+        OutputError: the log cannot be written.
+    """
+
+    def __init__(
+        self,
+        settings: PoseGraphSettings,
+        path: Path | None,
+        on_fault: Callable[[OutputError], None],
+        make: Callable[[], PoseGraph] | None = None,
+    ) -> None:
+        self._settings, self._path, self._on_fault = settings, path, on_fault
+        self._make = make or partial(PoseGraph, settings)
+        self._file = SqliteFile(path, _SCHEMA) if path is not None else None
+        self.taken_up = self.changed = 0
+        self.unsettled = False
+        self._begin()
+        if self._file is not None:
+            self._resume(self._file)
+
+    def take_odometry(self, stamp_ns: int, odom_T_body: Array) -> Reset | None:
+        """Take one message; returns why a new session has begun with it."""
+        self._log(ODOMETRY, stamp_ns, 0, odom_T_body)
+        return self.feed.take(stamp_ns, odom_T_body)
+
+    def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
+        """Take one closure; returns every verdict that it brought about or changed."""
+        numbers = np.hstack([closure.match_T_query.ravel(), closure.covariance.ravel(), closure.probability])
+        self._log(CLOSURE, closure.match_stamp_ns, closure.query_stamp_ns, numbers)
+        return self._logged(self.graph.add_closure(closure))
+
+    def revoke(self, match_ns: int, query_ns: int) -> list[ClosureVerdict]:
+        """Take every closure between two keyframes out for good.
+
+        Raises:
+            GraphError: there is no such closure, or the graph cannot be solved without it.
+        """
+        verdicts = self.graph.revoke(match_ns, query_ns)
+        self._log(REVOKED, match_ns, query_ns)
+        return self._logged(verdicts)
+
+    def update(self) -> list[ClosureVerdict]:
+        """Decide about closures that waited for odometry; returns new verdicts."""
+        return self._logged(self.graph.update())
+
+    def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
+        """Settle the graph and write its results; a graph that is not settled in time is marked so in the log.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        settled = self.graph.write_results(folder, within_s)
+        if not settled:
+            self._log(UNSETTLED)
+        self.unsettled = not settled
+        return settled
+
+    def end(self) -> Path | None:
+        """End this graph and begin another; returns the new name of the old log."""
+        self._begin()
+        if self._path is None or self._file is None:
+            return None
+        old = next(name for i in count(1) if not (name := self._path.with_suffix(f".{i}.sqlite")).exists())
+        self._file.close()
+        try:
+            with writing(self._path):
+                # while another process reads it, its newest part lies in a file that belongs to its name
+                for part in (f"{self._path}-wal", str(self._path)):
+                    if Path(part).exists():
+                        Path(part).rename(part.replace(self._path.name, old.name))
+        except OutputError as error:
+            self._on_fault(error)
+            return None
+        finally:
+            self._file = SqliteFile(self._path, _SCHEMA)
+        self._write(f"PRAGMA user_version = {self._mark}")
+        return old
+
+    def close(self) -> None:
+        """Close the log."""
+        if self._file is not None:
+            self._file.close()
+
+    @property
+    def _mark(self) -> int:
+        """Mark of the settings that verdicts are decided by, 31 bits."""
+        return zlib.crc32(self._settings.model_dump_json().encode()) >> 1
+
+    def _begin(self) -> None:
+        self.graph = self._make()
+        self.feed = OdometrySessionSplitter(self.graph)
+
+    def _resume(self, file: SqliteFile) -> None:
+        with file.reading() as connection:
+            known = connection.execute("SELECT match_ns, query_ns, state, reason, residual, residual_m FROM verdict")
+            verdicts = {(match, query): _decision(*columns) for match, query, *columns in known}
+            mark = connection.execute("PRAGMA user_version").fetchone()[0]
+            last = connection.execute("SELECT kind FROM event ORDER BY id DESC LIMIT 1").fetchone()
+            revoked: list[tuple[int, int]] = []
+            feed(self.graph, self._inputs(connection.execute(_EVENTS), revoked), self.feed)
+        self.unsettled = last is not None and last[0] == UNSETTLED
+        self.graph.resume(verdicts if mark == self._mark else {})
+        for pair in revoked:
+            try:
+                self.graph.revoke(*pair)
+            except GraphError:
+                self.graph.counts["revoked closure not found"] += 1
+        if last is not None:
+            self.feed.interrupted()
+            self._log(STARTED)
+        self._write(f"PRAGMA user_version = {self._mark}")
+        found = self.graph.closures()
+        self.taken_up = len(found)
+        states = {(v.closure.match_stamp_ns, v.closure.query_stamp_ns): v.state for v in found}
+        self.changed = sum(states.get(pair) != state for pair, (state, *_) in verdicts.items())
+
+    def _inputs(
+        self, events: Iterable[tuple[Any, ...]], revoked: list[tuple[int, int]]
+    ) -> Iterator[LoopClosure | StoredOdometry]:
+        """Odometry and closures of logged events; adds pairs of keyframes whose closures were revoked."""
+        for kind, first_ns, second_ns, data in events:
+            numbers = np.frombuffer(data, np.float64)
+            if len(numbers) != _NUMBERS.get(kind, -1):
+                raise ValueError(f"an event {str(kind)[:40]!r} of {len(numbers)} numbers")
+            if not (isinstance(first_ns, int) and isinstance(second_ns, int)):
+                raise ValueError("a stamp that is no number")
+            if kind == ODOMETRY:
+                yield StoredOdometry(first_ns, numbers.reshape(4, 4))
+            elif kind == CLOSURE:
+                pose, covariance = numbers[:16].reshape(4, 4), numbers[16:52].reshape(6, 6)
+                yield LoopClosure(second_ns, first_ns, pose, covariance, float(numbers[52]))
+            elif kind == REVOKED:
+                revoked.append((first_ns, second_ns))
+            elif kind == STARTED:
+                self.feed.interrupted()
+
+    def _logged(self, verdicts: list[ClosureVerdict]) -> list[ClosureVerdict]:
+        rows = [
+            (v.closure.match_stamp_ns, v.closure.query_stamp_ns, v.state.value, v.reason, v.residual, v.residual_m)
+            for v in verdicts
+        ]
+        if rows:
+            self._write("INSERT OR REPLACE INTO verdict VALUES (?, ?, ?, ?, ?, ?)", *rows)
+        return verdicts
+
+    def _log(self, kind: str, first_ns: int = 0, second_ns: int = 0, numbers: Array | None = None) -> None:
+        data = b"" if numbers is None else np.ascontiguousarray(numbers, np.float64).tobytes()
+        self._write(_EVENT, (kind, first_ns, second_ns, data))
+
+    def _write(self, statement: str, *rows: tuple[Any, ...]) -> None:
+        if self._file is None:
+            return
+        try:
+            with self._file.writing() as connection:
+                connection.executemany(statement, rows) if rows else connection.execute(statement)
+        except OutputError as error:
+            self._on_fault(error)
+
+
+def _decision(state: str, reason: str, *numbers: float | None) -> Decision:
+    """A logged decision; SQLite has no NaN."""
+    sigmas, metres = (float("nan") if number is None else float(number) for number in numbers)
+    return State(state), ClosureReason(reason), sigmas, metres
