@@ -31,7 +31,7 @@ def turned(picture: np.ndarray, degrees: float, rows: float, columns: float) -> 
 
 def submap(picture: np.ndarray, degrees: float = 0.0, x_m: float = 0.0, y_m: float = 0.0) -> Keyframe:
     """A keyframe that sees the ground of a map all around, from a place and heading on it."""
-    places = (np.argwhere(np.isfinite(picture)) + 0.5 - SIDE / 2) * const.SUBMAP_CELL_M
+    places = (np.argwhere(np.isfinite(picture)) + 0.5 - SIDE / 2) * const.TERRAIN_CELL_M
     points: Array = np.column_stack([places, picture[np.isfinite(picture)] - 1.2])
     body = make_pose(Rotation.from_euler("z", -degrees, degrees=True).as_matrix(), [-x_m, -y_m, 0.0])
     seen = transform(body, points).astype(np.float32)

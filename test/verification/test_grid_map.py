@@ -41,7 +41,8 @@ def test_correlation_at_the_true_pose_is_high_and_falls_off() -> None:
     true = relative(world_T_match, world_T_query)
     shifted = true.copy()
     shifted[1, 3] += 2.0
-    correlation, score = terrain_fit(match, query, true)
+    correlation, score, relief_m = terrain_fit(match, query, true)
+    assert 0.02 < relief_m < 0.3
     assert correlation > 0.7 and score > 10
     assert terrain_fit(match, query, shifted)[0] < 0.4
 
@@ -50,7 +51,7 @@ def test_nothing_shared_is_no_fit() -> None:
     match, _ = map_at(-15, 0, 0)
     away = np.eye(4)
     away[0, 3] = 200.0
-    assert terrain_fit(match, match, away) == (0.0, 0.0)
+    assert terrain_fit(match, match, away) == (0.0, 0.0, 0.0)
 
 
 def test_ground_behind_counts_as_much_as_ground_ahead() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -42,19 +43,24 @@ def test_every_name_says_what_it_is() -> None:
     assert all(len(meaning.split()) >= 3 for meaning in MEASUREMENTS.values())
 
 
+NOT_HERE = {"upright_counterparts", "unexplained", "passage_rival", "prior_sigmas", "runner_up"}
+"""Where nothing stands, in no passage, without odometry, of a single hypothesis."""
+
+
 @pytest.mark.parametrize(("query", "expected"), [(QUERY, GOOD), (without_scan(QUERY), GOOD_VIEWS)])
 def test_a_hypothesis_has_every_measurement_of_its_kind_and_each_is_documented(
     query: Keyframe, expected: dict[str, float]
 ) -> None:
     found = most_probable(query, MATCH)
-    assert set(found.measurements) == set(expected) and found.kind == kind_of(expected)
-    assert set(found.measurements) <= set(MEASUREMENTS)
+    assert set(expected) - NOT_HERE <= set(found.measurements) <= set(MEASUREMENTS)
+    assert found.kind == kind_of(expected)
+    assert not any(math.isnan(value) for value in found.measurements.values())
     assert found.numbers == found.measurements | {"probability": found.probability}
 
 
 def test_a_candidate_without_a_pose_has_the_measurements_of_the_candidate_alone() -> None:
     found = Hypothesis.of(QUERY, Candidate(0, MATCH.stamp_ns, 0.7), MATCH)
-    assert set(found.numbers) == set(CANDIDATE) and found.kind == ""
+    assert found.numbers == {"similarity": 0.7} and found.kind == ""
 
 
 def test_a_pair_of_scans_is_measured_completely() -> None:
