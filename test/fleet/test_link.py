@@ -69,7 +69,7 @@ def test_places_of_another_rover_are_found_with_negative_sessions(server: Postgr
     assert (robot, keyframe.stamp_ns, candidate.stamp_ns) == ("bea", 500 * 10**9, 4 * 10**9)
     assert match.session < 0 and match.stamp_ns == 4 * 10**9 and len(found) == 3
     assert match.embedding.image is not None  # all that verification needs
-    assert len({one.index for one, _ in answer.found}) == 3  # verification tells candidates apart by it
+    assert len({one.index for one, _ in found}) == 3  # verification tells candidates apart by it
     ada.close(), bea.close()
 
 
