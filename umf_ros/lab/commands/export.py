@@ -35,7 +35,7 @@ def command(
     """
     from rich.console import Console
 
-    from umf_ros.core.errors import ConfigError
+    from umf_ros.core.errors import ConfigError, WeightsError
     from umf_ros.core.io import check_writable
     from umf_ros.embedding.embedder import FeatureRequest
     from umf_ros.embedding.runtimes import MODEL_SUFFIX, outputs_of
@@ -45,6 +45,8 @@ def command(
         raise ConfigError(f"{out}: OpenVINO's files end in .xml, those of the embedder in {MODEL_SUFFIX}")
     check_writable(out.parent)
     located = locate_weights(weights)
+    if not located.is_file():
+        raise WeightsError(f"weights {located} do not exist")
     progress = Console(stderr=True)
 
     from umf_ros.lab.fit.quantisation import export_model, save_model
