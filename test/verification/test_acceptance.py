@@ -225,3 +225,10 @@ def test_a_rival_and_surfaces_apart_refute_scans_however_probable(
 ) -> None:
     objection = refuted(measurements)
     assert (objection and objection[0]) == reason
+
+
+def test_a_submap_is_decided_by_its_terrain_or_its_scan_whichever_is_more_probable(shipped: AcceptanceModel) -> None:
+    bare = {"terrain_correlation": 0.1, "terrain_rival": 0.1, "overlap": 0.3, "support": 0.0, "prior_sigmas": 9.0}
+    by_scan, by_terrain = GOOD | NARROW | bare, GOOD | NARROW | dict.fromkeys(RIVALS, -1.0) | {"contradiction": 0.4}
+    assert shipped.probability(by_scan) == shipped.probability(without(by_scan, "terrain_rival")) > 0.9
+    assert shipped.probability(by_terrain) > 0.9 > shipped.probability(without(by_terrain, "terrain_rival"))

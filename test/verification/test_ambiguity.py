@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 from measurements import GOOD
 
+from umf_ros.core.config import Verification
+from umf_ros.core.frames import Candidate, Embedding, Keyframe
 from umf_ros.core.geometry import Array, make_pose
+from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA
+from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.ambiguity import ambiguity, passage_direction, passage_rival
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
@@ -117,3 +121,20 @@ def test_a_passage_is_found_in_its_direction_and_a_room_is_none() -> None:
     room = scan(reach, 7)
     assert passage_direction(room, room, np.eye(4)) is None
     assert math.isnan(passage_rival(room, room, np.eye(4)))
+
+
+def verdict_of(match: PreparedScan, query: PreparedScan, guess: Array) -> Hypothesis:
+    """The verdict about a pair of scans that odometry expects at a pose."""
+    ours, theirs = (
+        Keyframe(stamp_ns, Embedding(np.ones(4, np.float32)), CAMERA, BODY_T_CAMERA, scan.points.astype(np.float32))
+        for stamp_ns, scan in ((2, query), (1, match))
+    )
+    return Verifier(Verification()).verify(ours, [(Candidate(0, 1, 0.9), theirs)], {1: guess})[0]
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_a_pose_that_fits_as_well_elsewhere_along_a_passage_becomes_no_closure(name: str) -> None:
+    verdict = verdict_of(*PAIRS[name], np.eye(4))
+    assert verdict.reason is RejectReason.PASSAGE
+    assert verdict.probability is not None and verdict.probability > 0.9
+    assert verdict.measurements["passage_rival"] < 1.0
