@@ -97,6 +97,17 @@ def test_identical_door_frames_at_equal_distances_are_rivals_of_each_other() -> 
     assert passage_rival(match, query, shift(6.0)) < 1.0
 
 
+def test_next_to_the_identity_a_scan_that_fits_itself_elsewhere_cannot_tell_the_place() -> None:
+    """There the patterns coincide: bays that repeat are told from a place of its own by each scan alone."""
+    distinct = corridor(0.0, 1, CUPBOARDS), corridor(0.3, 2, CUPBOARDS)
+    assert passage_rival(*distinct, shift(0.3)) > 1.0
+    bays = tuple(np.arange(-37.5, 38.0, 3.0))
+    match, query = corridor(0.0, 1, bays, 0.4), corridor(6.3, 2, bays, 0.4)
+    pose = align_scans(match, query, shift(0.3)).pose
+    assert abs(pose[0, 3] - 0.3) < 0.2  # two bays off
+    assert passage_rival(match, query, pose) < 1.0
+
+
 @pytest.mark.parametrize(("rival", "refused"), [(0.9, True), (1.1, False), (math.nan, False)])
 def test_a_pose_with_a_rival_along_the_passage_is_refused(rival: float, refused: bool) -> None:
     assert (refuted(GOOD | {"passage_rival": rival}) is not None) == refused

@@ -72,7 +72,9 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
     """How much worse the surfaces of two scans fit at the best other pose along a passage.
 
     A place is a passage where surfaces across it outweigh those along it. Poses are shifted along the passage as far
-    as the scans overlap; the other peaks of the search at the same heading are rivals, too.
+    as the scans overlap; the other peaks of the search at the same heading are rivals, too. Next to the identity the
+    patterns of one sensor coincide, and where bays repeat, that is where a scan fits every other one best. There each
+    scan is also compared with itself, shifted likewise: where it fits itself elsewhere, it cannot tell the place.
 
     Args:
         match: the matched scan.
@@ -86,14 +88,15 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
     way = passage_direction(match, query, pose)
     if way is None:
         return float("nan")
-    needed = const.NARROW_PASSAGE_RIVAL if match.view.is_fan or query.view.is_fan else const.PASSAGE_RIVAL
-    beside = _surface_rival(match, query, [pose, *_shifted(pose, way, const.RIVAL_NEAR_M)], const.PASSAGE_SAMPLE)
-    if beside.min() < needed:
-        return float(beside.min()) / needed
-    poses = [pose, *_shifted(pose, way, const.PASSAGE_FAR_M), *_other_peaks(match, query, pose)]
-    best = np.argsort(_surface_rival(match, query, poses, const.PASSAGE_SCOUTS))[: const.PASSAGE_KEPT] + 1
-    far = _surface_rival(match, query, [poses[index] for index in (0, *best)], const.PASSAGE_SAMPLE)
-    return float(min(beside.min(), far.min())) / needed
+    shifted = _shifted(pose, way, np.concatenate([const.RIVAL_NEAR_M, const.PASSAGE_FAR_M]))
+    fits = _surface_misfit(match, query, np.stack([pose, *shifted, *_other_peaks(match, query, pose)]))
+    rival = float(fits[1:].min() - fits[0]) / const.PASSAGE_RIVAL
+    if rival < 1.0 or np.linalg.norm(pose[:3, 3]) >= const.DISTINCT_M:
+        return rival
+    for scan, axis in ((match, way), (query, pose[:3, :3].T @ way)):
+        itself = _surface_misfit(scan, scan, np.stack([np.eye(4), *_shifted(np.eye(4), axis, const.PASSAGE_FAR_M)]))
+        rival = min(rival, float(itself[1:].min() - fits[0]) / const.SELF_RIVAL)
+    return rival
 
 
 def passage_direction(match: PreparedScan, query: PreparedScan, pose: Array) -> Array | None:
@@ -101,7 +104,7 @@ def passage_direction(match: PreparedScan, query: PreparedScan, pose: Array) -> 
     turn = pose[:3, :3].T
     rough = np.concatenate([match.normals[match.picks], query.normals[query.picks] @ turn])
     weights, _ = _across(match, rough)
-    if weights[0] > const.ROUGH_PASSAGE_RATIO * weights[1]:  # most places are none: their planes are never asked for
+    if weights[0] > const.PASSAGE_RATIO * weights[1]:  # most places are none: their planes are never asked for
         return None
     normals = [planes.normals[planes.planar] for planes in match.surfaces]
     normals += [planes.normals[planes.planar] @ turn for planes in query.surfaces]
@@ -121,23 +124,21 @@ def _across(match: PreparedScan, normals: Array) -> tuple[Array, Array]:
     return weights, ways
 
 
-def _surface_rival(match: PreparedScan, query: PreparedScan, poses: list[Array], sample: int) -> Array:
-    """(K,) logarithm of the misfit at all but the first of 1 + K poses, against that at the first."""
-    stacked = np.stack(poses)
-    misfits = _surface_misfit(match, query, stacked, sample), _surface_misfit(query, match, invert(stacked), sample)
-    logarithm = np.log(sum(misfits) / 2 + const.MISFIT_FLOOR)
-    found: Array = logarithm[1:] - logarithm[0]
+def _surface_misfit(match: PreparedScan, query: PreparedScan, poses: Array) -> Array:
+    """(K,) logarithm of the mean misfit of both scans with each other at poses (K, 4, 4), the one in question first."""
+    misfits = _misfit_with(match, query, poses), _misfit_with(query, match, invert(poses))
+    found: Array = np.log(sum(misfits) / 2 + const.MISFIT_FLOOR)
     return found
 
 
-def _surface_misfit(scan: PreparedScan, other: PreparedScan, poses: Array, sample: int) -> Array:
-    """(K,) mean misfit, 0 to 1, of the other scan's points with the scan's planes; 1 where few can be compared.
+def _misfit_with(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array:
+    """(K,) mean misfit, 0 to 1, of the other scan's points with the scan's planes; 1 where far fewer can be compared.
 
     Points of every second band of elevations are compared with planes of the bands between: a ring never meets itself.
     """
     total, count = np.zeros(len(poses)), np.zeros(len(poses), int)
     for planes, others in zip(scan.surfaces, reversed(other.surfaces), strict=True):
-        picks = np.linspace(0, len(others.points) - 1, min(sample, len(others.points))).astype(np.intp)
+        picks = np.linspace(0, len(others.points) - 1, min(const.PASSAGE_SAMPLE, len(others.points))).astype(np.intp)
         points = (others.points[picks] @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
         found, squared = planes.tree.batch_nearest_neighbor_search(points, num_threads=1)
         index = np.asarray(found, np.intp)

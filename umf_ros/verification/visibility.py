@@ -30,11 +30,6 @@ class FieldOfView:
         """Of all directions seen, together, deg."""
         return float(self.seen.sum()) * 360.0 / const.SECTORS
 
-    @property
-    def is_fan(self) -> bool:
-        """Whether it looks to one side; the bearings cancel out where it looks all around."""
-        return bool(np.abs(np.fft.fft(self.seen)[1]) > const.FAN * self.seen.sum())
-
     def overlap(self, other: FieldOfView, headings: Array) -> Array:
         """Share (H,) of the narrower view that both see, were `other` turned by the headings (H,), rad."""
         spectrum = np.fft.rfft(self.seen) * np.fft.rfft(other.seen).conj()
