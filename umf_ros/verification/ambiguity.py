@@ -72,9 +72,9 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
     """How much worse the surfaces of two scans fit at the best other pose along a passage.
 
     A place is a passage where surfaces across it outweigh those along it. Poses are shifted along the passage as far
-    as the scans overlap; the other peaks of the search at the same heading are rivals, too. Next to the identity the
-    patterns of one sensor coincide, and where bays repeat, that is where a scan fits every other one best. There each
-    scan is also compared with itself, shifted likewise: where it fits itself elsewhere, it cannot tell the place.
+    as the scans overlap; the other peaks of the search at the same heading are rivals, too. Where bays repeat, a scan
+    fits every other one best at the smallest shift, at the identity even by the pattern of the sensor alone. There
+    each scan is also compared with itself, shifted likewise: where it fits itself elsewhere, it cannot tell the place.
 
     Args:
         match: the matched scan.
@@ -91,7 +91,7 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
     shifted = _shifted(pose, way, np.concatenate([const.RIVAL_NEAR_M, const.PASSAGE_FAR_M]))
     fits = _surface_misfit(match, query, np.stack([pose, *shifted, *_other_peaks(match, query, pose)]))
     rival = float(fits[1:].min() - fits[0]) / const.PASSAGE_RIVAL
-    if rival < 1.0 or np.linalg.norm(pose[:3, 3]) >= const.DISTINCT_M:
+    if rival < 1.0 or np.linalg.norm(pose[:3, 3]) >= const.HALF_BAY_M:
         return rival
     for scan, axis in ((match, way), (query, pose[:3, :3].T @ way)):
         itself = _surface_misfit(scan, scan, np.stack([np.eye(4), *_shifted(np.eye(4), axis, const.PASSAGE_FAR_M)]))
