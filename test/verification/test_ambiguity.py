@@ -87,7 +87,7 @@ def test_cupboards_tell_where_in_a_corridor_two_scans_were_taken() -> None:
     alignment = align_scans(match, query, shift(1.4))
     assert abs(alignment.pose[0, 3] - 1.5) < 0.1
     found = passage_rival(match, query, alignment.pose)
-    assert 1.0 > found > 0.0 > passage_rival(match, query, shift(0.0))  # right, but each scan alone fits itself elsewhere
+    assert 1.0 > found > 0.0 > passage_rival(match, query, shift(0.0))  # right, though each scan fits itself elsewhere
 
 
 def test_identical_door_frames_at_equal_distances_are_rivals_of_each_other() -> None:
