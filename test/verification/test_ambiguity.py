@@ -99,7 +99,8 @@ def test_identical_door_frames_at_equal_distances_are_rivals_of_each_other() -> 
 
 def test_next_to_the_identity_a_scan_that_fits_itself_elsewhere_cannot_tell_the_place() -> None:
     """There the patterns coincide: bays that repeat are told from a place of its own by each scan alone."""
-    distinct = corridor(0.0, 1, CUPBOARDS), corridor(0.3, 2, CUPBOARDS)
+    uneven = (-12.0, -6.1, -4.9, -3.5, 1.2, 3.9, 5.3, 9.8)
+    distinct = corridor(0.0, 1, uneven, 0.4), corridor(0.3, 2, uneven, 0.4)
     assert passage_rival(*distinct, shift(0.3)) > 1.0
     bays = tuple(np.arange(-37.5, 38.0, 3.0))
     match, query = corridor(0.0, 1, bays, 0.4), corridor(6.3, 2, bays, 0.4)
@@ -124,14 +125,16 @@ def test_a_scan_of_a_single_ring_has_no_planes_and_no_rival() -> None:
 
 def test_a_passage_is_found_in_its_direction_and_a_room_is_none() -> None:
     match, query = PAIRS["corridor"]
-    way = passage_direction(match, query, np.eye(4))
+    way = passage_direction(match)
     assert way is not None and abs(way[0]) > 0.99
     ways = rays()
     with np.errstate(divide="ignore"):
         reach = np.minimum(corridor_ranges(ways, 0.0, (), 0.5), 2.5 / np.abs(ways[:, 0]))
     room = scan(reach, 7)
-    assert passage_direction(room, room, np.eye(4)) is None
+    assert passage_direction(room) is None
     assert math.isnan(passage_rival(room, room, np.eye(4)))
+    turn = make_pose(np.array([[0.0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), [0.0, 0.0, 0.0])
+    assert not math.isnan(passage_rival(match, query, turn))  # a wrong heading hides no passage
 
 
 def verdict_of(match: PreparedScan, query: PreparedScan, guess: Array) -> Hypothesis:

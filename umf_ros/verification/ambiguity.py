@@ -85,9 +85,10 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
         Logarithm of the ratio of the mean misfits, as a share of that which a closure needs: 0 when another pose fits
         as well, 1 when all others fit so much worse that the pose is known. NaN where there is no passage.
     """
-    way = passage_direction(match, query, pose)
-    if way is None:
+    way, theirs = passage_direction(match), passage_direction(query)
+    if way is None and theirs is None:
         return float("nan")
+    way = pose[:3, :3] @ theirs if way is None else way
     shifted = _shifted(pose, way, np.concatenate([const.RIVAL_NEAR_M, const.PASSAGE_FAR_M]))
     fits = _surface_misfit(match, query, np.stack([pose, *shifted, *_other_peaks(match, query, pose)]))
     rival = float(fits[1:].min() - fits[0]) / const.PASSAGE_RIVAL
@@ -99,27 +100,22 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
     return rival
 
 
-def passage_direction(match: PreparedScan, query: PreparedScan, pose: Array) -> Array | None:
-    """(3,) the horizontal direction of the passage about the match that both scans show; None where there is none."""
-    turn = pose[:3, :3].T
-    rough = np.concatenate([match.normals[match.picks], query.normals[query.picks] @ turn])
-    weights, _ = _across(match, rough)
+def passage_direction(scan: PreparedScan) -> Array | None:
+    """(3,) the horizontal direction of the passage that a scan was taken in; None where it shows none."""
+    weights, _ = _across(scan, scan.normals[scan.picks])
     if weights[0] > const.PASSAGE_RATIO * weights[1]:  # most places are none: their planes are never asked for
         return None
-    normals = [planes.normals[planes.planar] for planes in match.surfaces]
-    normals += [planes.normals[planes.planar] @ turn for planes in query.surfaces]
-    flat = np.concatenate(normals)
-    weights, ways = _across(match, flat)
-    few = len(flat) < const.PASSAGE_SURFACE * (len(match.points) + len(query.points))
-    if few or weights[0] > const.PASSAGE_RATIO * weights[1]:
+    flat = np.concatenate([planes.normals[planes.planar] for planes in scan.surfaces])
+    weights, ways = _across(scan, flat)
+    if len(flat) < const.PASSAGE_SURFACE * len(scan.points) or weights[0] > const.PASSAGE_RATIO * weights[1]:
         return None
-    way: Array = match.up.T @ np.append(ways[:, 0], 0.0)
+    way: Array = scan.up.T @ np.append(ways[:, 0], 0.0)
     return way
 
 
-def _across(match: PreparedScan, normals: Array) -> tuple[Array, Array]:
-    """Weights (2,) and horizontal directions (2, 2) of normals (N, 3) about the match, the least first."""
-    level = (normals @ match.up.T)[:, :2]
+def _across(scan: PreparedScan, normals: Array) -> tuple[Array, Array]:
+    """Weights (2,) and horizontal directions (2, 2) of normals (N, 3) of a scan, the least first."""
+    level = (normals @ scan.up.T)[:, :2]
     weights, ways = np.linalg.eigh(level.T @ level)
     return weights, ways
 
