@@ -34,7 +34,7 @@ def runtime() -> list[Path]:
 
 LIGHT = [
     *(f"commands/{name}.py" for name in ("play", "graph", "compare", "why")),
-    *("datasets/g2o.py", "evaluation/graph_plot.py", "live/*.py"),
+    *("scan_files.py", "datasets/g2o.py", "evaluation/comparison.py", "evaluation/graph_plot.py", "live/*.py"),
 ]
 """Files of the lab that `pip install .` serves too: they play recordings, draw graph files, judge runs and pairs."""
 

@@ -55,7 +55,7 @@ def command(
 
 
 def _stamp(text: str, start_ns: int) -> int:
-    from umf_ros.bags.frames import parse_moment
+    from umf_ros.lab.evaluation.comparison import parse_moment
 
     try:
         moment = parse_moment(text)

@@ -1,4 +1,4 @@
-"""Compare two views of a place, each pair on its own: scans, images or frames of recordings, for `umf compare`."""
+"""Compare two views of a place, each pair on its own: scans, images or frames of recordings at given moments."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from umf_ros.bags.frames import FrameReader, Moment, nearest_frames, parse_moment, split_reference
+from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import Verification
-from umf_ros.core.errors import ConfigError, SensorFileError, UmfError
-from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
+from umf_ros.core.errors import BagError, ConfigError, SensorFileError, UmfError
+from umf_ros.core.frames import Candidate, Frame, Keyframe, LoopClosure
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
+from umf_ros.lab.scan_files import OUT_OF_REACH, UNCALIBRATED, fit_image, make_snapshot, read_image, read_scan
 from umf_ros.runs.run_file import pose_numbers
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.sensors.scan_files import OUT_OF_REACH, UNCALIBRATED, fit_image, make_snapshot, read_image, read_scan
 from umf_ros.verification import Hypothesis, Verifier
 
 NO_CALIBRATION = "no calibration: images alone give no pose without one"
@@ -30,6 +30,13 @@ CACHED_KEYFRAMES = 1000
 """Keyframes in memory, of a fifth of a megabyte each."""
 FRAMES_AT_ONCE = 100
 """Frames with their images that one pass through a recording collects."""
+REACH_NS = 10**9
+"""A frame further than this from a moment does not stand for it."""
+EPOCH_S = 10**9
+"""From so many seconds on, a moment counts since the epoch and not from the start of a recording."""
+
+Moment = int | float
+"""Nanoseconds since the epoch, or seconds from the start of the recording."""
 
 VIEW_COLUMNS = ("match_scan", "query_scan", "match_left", "match_right", "query_left", "query_right")
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -264,3 +271,60 @@ def _listed(role: str, row: dict[str, str | None], base: Path) -> PlaceView:
 def _relative(name: str, base: Path) -> str:
     path = Path(name)
     return str(path.relative_to(base)) if name and path.is_relative_to(base) else name
+
+
+def parse_moment(text: str) -> Moment:
+    """Nanoseconds since the epoch (16 digits or more), seconds since the epoch, or seconds from the start.
+
+    Raises:
+        ValueError: it is none of them.
+    """
+    if text.isdigit() and len(text) >= 16:
+        return int(text)
+    try:
+        value = float(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is neither a stamp in ns nor seconds from the start") from None
+    if not value >= 0:
+        raise ValueError(f"{text!r} is before the start")
+    if value < EPOCH_S:
+        return value
+    seconds, _, fraction = text.partition(".")
+    if not seconds.isdigit() or (fraction and not fraction.isdigit()):
+        raise ValueError(f"{text!r} is neither a stamp in ns nor seconds from the start")
+    return int(seconds) * 10**9 + int(f"{fraction:0<9}"[:9])  # a float has no room for nanoseconds
+
+
+def split_reference(text: str) -> tuple[Path, str] | None:
+    """Recording and moment of `BAG@MOMENT`; None where there is no moment, or the whole is the name of a file."""
+    name, separator, moment = text.rpartition("@")
+    if not separator or not name or "/" in moment or Path(text).exists():
+        return None
+    return Path(name), moment
+
+
+def nearest_frames(frames: Iterable[Frame], moments: list[Moment]) -> list[Frame | BagError]:
+    """The frame nearest to each moment, an error where none is within a second; reads no further than it must.
+
+    Raises:
+        BagError: the recording has no frame.
+    """
+    best: list[Frame] = []
+    wanted: list[int] = []
+    for frame in frames:
+        if not wanted:
+            wanted = [one if isinstance(one, int) else frame.stamp_ns + round(1e9 * one) for one in moments]
+            best = [frame] * len(moments)
+        for position, stamp in enumerate(wanted):
+            if abs(frame.stamp_ns - stamp) < abs(best[position].stamp_ns - stamp):
+                best[position] = frame
+        if frame.stamp_ns > max(wanted) + REACH_NS:
+            break
+    if not best:
+        raise BagError("the recording has no frame with an image or a scan")
+    return [
+        frame
+        if abs(frame.stamp_ns - stamp) <= REACH_NS
+        else BagError(f"no frame within a second of {moment}; the nearest is at {frame.stamp_ns} ns")
+        for frame, stamp, moment in zip(best, wanted, moments, strict=True)
+    ]
