@@ -33,10 +33,10 @@ def runtime() -> list[Path]:
 
 
 LIGHT = [
-    *(f"commands/{name}.py" for name in ("play", "graph", "compare", "why")),
-    *("scan_files.py", "datasets/g2o.py", "evaluation/comparison.py", "evaluation/graph_plot.py", "live/*.py"),
+    *(f"commands/{name}.py" for name in ("play", "graph", "compare", "inspect", "why")),
+    *("scan_files.py", "datasets/g2o.py", "evaluation/comparison.py", "evaluation/inspection.py", "live/*.py"),
 ]
-"""Files of the lab that `pip install .` serves too: they play recordings, draw graph files, judge runs and pairs."""
+"""Files of the lab that `pip install .` serves too: they inspect, play, judge and draw runs, recordings and graphs."""
 
 
 def light() -> list[Path]:

@@ -31,8 +31,7 @@ def command(
 
     from umf_ros.bags.frames import FrameReader
     from umf_ros.detector import make_detector_embedder, make_keyframe
-    from umf_ros.lab.evaluation.comparison import nearest_frames
-    from umf_ros.lab.evaluation.explanation import draw, explain
+    from umf_ros.lab.evaluation.comparison import draw, explain, nearest_frames
 
     console = Console()
     moments = [_moment(text) for text in (query, match)]
