@@ -292,11 +292,6 @@ MOST_NODES = 100_000
 """A file of settings has some hundreds; aliases of aliases are how a small one stands for a thousand million."""
 
 
-def is_yaml(path: Path) -> bool:
-    """Whether a path names a YAML file, and not data."""
-    return path.suffix in (".yaml", ".yml")
-
-
 def read_yaml(path: Path) -> Any:
     """Content of a YAML file; None where it is empty.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -101,13 +101,9 @@ class NetworkConfig:
         """Length of the whole descriptor."""
         return self.descriptor + self.scene
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for a JSON file."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
-
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
-        """Return the configuration from the result of `as_dict`.
+        """Return the configuration from its values as JSON holds them.
 
         Raises:
             WeightsError: a name or a value does not describe this architecture.
