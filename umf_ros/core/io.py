@@ -117,13 +117,11 @@ class Schema:
         migrations: statements; the n-th ones lead from version n to n + 1; released ones are never changed.
         unversioned: version of a file without `schema_version`, as earlier releases wrote it, by the names of its
             tables; 0 where it is another kind of file.
-        readable: oldest version that can be read without migration.
     """
 
     name: str
     migrations: tuple[tuple[str, ...], ...]
     unversioned: Callable[[set[str]], int] = lambda tables: 0
-    readable: int = 1
 
 
 class SqliteFile:
@@ -239,10 +237,6 @@ class SqliteFile:
         if not found and (tables or self._read_only):
             held = shortened(", ".join(sorted(tables))) or "nothing"
             raise UmfError(f"{self.name} is no {schema.name}: it holds {held}")
-        if self._read_only and found < schema.readable:
-            raise UmfError(
-                f"{self.name} is a {schema.name} of an earlier umf_ros: convert it by opening it for writing"
-            )
         if found and check is not None:
             check(self.connection)
         if not self._read_only:

@@ -20,10 +20,11 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from umf_ros.core.frames import Frame, ScanMotion
 from umf_ros.core.io import atomic_write
-from umf_ros.embedding.inputs import blank_input, read_frame
+from umf_ros.embedding.inputs import blank_input
 from umf_ros.embedding.local_features import network_size
 from umf_ros.embedding.runtimes import FACTS, OUTPUTS, SUPERS, XFEAT_SHAPE, import_openvino
 from umf_ros.embedding.torch_runtimes import load_flat, to_tensors
+from umf_ros.lab.datasets.views import read_frame
 from umf_ros.lab.simulation.camera import Camera
 from umf_ros.lab.simulation.survey import save, shard_plan, survey_world
 from umf_ros.lab.training.prepared_views import draw_look
