@@ -33,7 +33,7 @@ MARKED = {
     "postgres": ("fleet", "commands/test_fleet.py"),
     "browser": ("runs/test_browser.py",),
     "slow": (
-        *("lab", "benchmarks", "maps", "submaps", "commands", "comparison", "verification", "pose_graph", "embedding"),
+        *("lab", "benchmarks", "maps", "submaps", "commands", "verification", "pose_graph", "embedding"),
         *("baselines", "runs", "test_durable_graph.py", "bags/test_hostile.py"),
         *("test_packaging.py", "test_replay.py", "test_tasks.py", "test_imports.py"),
     ),

@@ -33,10 +33,10 @@ def runtime() -> list[Path]:
 
 
 LIGHT = [
-    *(f"commands/{name}.py" for name in ("play", "graph", "compare", "why")),
-    *("datasets/g2o.py", "evaluation/graph_plot.py", "live/*.py"),
+    *(f"commands/{name}.py" for name in ("play", "graph", "compare", "inspect", "report", "why")),
+    *("scan_files.py", "datasets/g2o.py", "evaluation/comparison.py", "evaluation/inspection.py", "live/*.py"),
 ]
-"""Files of the lab that `pip install .` serves too: they play recordings, draw graph files, judge runs and pairs."""
+"""Files of the lab that `pip install .` serves too: they inspect, play, judge and draw runs, recordings and graphs."""
 
 
 def light() -> list[Path]:
@@ -92,7 +92,7 @@ def test_the_runtime_imports_without_the_lab() -> None:
 
 def test_recordings_are_played_and_graph_files_read_without_the_packages_of_the_lab() -> None:
     names = modules(light())
-    assert len(names) == 10
+    assert len(names) == 14
     assert {name for path in light() for name in imports(path) if name.startswith("umf_ros.lab.")} <= set(names)
     statements = [without(lab_packages()), *(f"import {name}" for name in names)]
     assert imported_after("\n".join(statements), [*lab_packages(), *names]) == names

@@ -24,8 +24,9 @@ from umf_ros.core.config import Database, Settings, load_settings
 from umf_ros.core.errors import OutputError
 from umf_ros.core.frames import Frame
 from umf_ros.detector import Detection, LoopDetector
+from umf_ros.lab.commands.report import recover_run
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.replay import FAULTS, Replay, recover_run
+from umf_ros.replay import FAULTS, Replay
 from umf_ros.sensors.decode import OdometrySample
 
 TABLES = "candidates.csv closures.csv config.yaml inliers.csv keyframes.csv".split()

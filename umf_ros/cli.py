@@ -19,7 +19,7 @@ COMMANDS = {
     "demo": "umf_ros.lab.commands.demo",
     "simulate": "umf_ros.lab.commands.simulate",
     "import": "umf_ros.lab.commands.import_data",
-    "inspect": "umf_ros.commands.inspect",
+    "inspect": "umf_ros.lab.commands.inspect",
     "replay": "umf_ros.commands.replay",
     "map": "umf_ros.commands.map",
     "compare": "umf_ros.lab.commands.compare",

@@ -346,19 +346,18 @@ def _open_places(settings: Settings, embedder: Embedder) -> PlaceDatabase:
     return PlaceDatabase(settings.database, embedder.name, embedder.dimension)
 
 
-def make_keyframe(frame: Frame, embedder: Embedder, path_length_m: float = float("nan"), session: int = 0) -> Keyframe:
+def make_keyframe(frame: Frame, embedder: Embedder, path_length_m: float = float("nan")) -> Keyframe:
     """The keyframe that a frame becomes: embedded, its features lifted to 3-D, its scan thinned.
 
     Args:
         frame: synchronised measurements.
         embedder: the network.
         path_length_m: metres driven since the start of the session, NaN when unknown.
-        session: number of the session among all that are stored.
     """
-    return _assemble(frame, lift(frame, embedder.embed(frame)), path_length_m, session)
+    return _assemble(frame, lift(frame, embedder.embed(frame)), path_length_m)
 
 
-def _assemble(frame: Frame, embedding: Embedding, path_length_m: float, session: int) -> Keyframe:
+def _assemble(frame: Frame, embedding: Embedding, path_length_m: float, session: int = 0) -> Keyframe:
     """The keyframe of a frame whose embedding is known, its scan thinned."""
     points, motion = thin_frame(frame)
     return Keyframe(

@@ -21,9 +21,9 @@ from umf_ros.core.geometry import (
     gtsam_to_ros_covariance,
     invert,
     logmap,
+    near,
     propagate,
     relative,
-    rotation_angle,
 )
 from umf_ros.core.odometry_noise import OdometryNoise
 from umf_ros.core.trajectory import Trajectory, write_tum
@@ -215,8 +215,7 @@ class Localizer:
         return one.pose @ step, propagate(adjoint(invert(step)), one.covariance) + noise
 
     def _same(self, one: _PoseHypothesis, other: _PoseHypothesis) -> bool:
-        gap = relative(self._propagated(other, one.at)[0], one.pose)
-        return bool(np.linalg.norm(gap[:3, 3]) < _SAME_M and rotation_angle(gap) < _SAME_RAD)
+        return near(self._propagated(other, one.at)[0], one.pose, _SAME_M, _SAME_RAD)
 
     def _localization(self, one: _PoseHypothesis, at: _Sample) -> Localization:
         pose, covariance = self._propagated(one, at)

@@ -5,21 +5,18 @@ from __future__ import annotations
 import traceback
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector
-from umf_ros.durable_graph import feed
 from umf_ros.localizer import Localization, Localizer, read_poses
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.runs.run_file import NAME, RunFile
 from umf_ros.runs.writer import RunRecorder, write_summary
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
@@ -189,27 +186,3 @@ class Replay:
             poses = np.stack([one.map_T_body for one in self._found])
             write_tum(self._folder / "trajectory_in_map.tum", Trajectory(stamps, poses))
         return bool(self._found)
-
-
-def recover_run(folder: Path) -> bool:
-    """Export the files of a run whose process was killed; returns whether there was such a run in the folder.
-
-    Raises:
-        UmfError: the file of the run is damaged, or another process writes it.
-        OutputError: the folder cannot be written.
-    """
-    if not (folder / NAME).is_file() or not (folder / "config.yaml").is_file():
-        return False
-    with closing(RunFile(folder, read_only=True)) as file:
-        facts = file.facts()
-        if facts.get("exported") and (folder / "summary.json").is_file():
-            return False
-        settings, inputs = load_settings(folder / "config.yaml"), list(file.graph_inputs())
-    recorder = RunRecorder(folder, settings, str(facts.get("weights", "")))
-    write_summary(folder, recorder.summary({}) | {"interrupted": True})
-    recorder.close()
-    graph = PoseGraph(settings.pose_graph)
-    if feed(graph, inputs):
-        graph.resume({})
-        graph.write_results(folder)
-    return True

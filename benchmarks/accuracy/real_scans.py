@@ -22,12 +22,12 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from umf_ros.comparison import judge
 from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Keyframe
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding import make_embedder
-from umf_ros.sensors.scan_files import make_snapshot, read_scan
+from umf_ros.lab.evaluation.comparison import judge
+from umf_ros.lab.scan_files import make_snapshot, read_scan
 from umf_ros.verification import Verifier
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "test"))

@@ -20,12 +20,12 @@ from umf_ros.core.resources import find
 from umf_ros.durable_graph import DurableGraph
 from umf_ros.lab.datasets.g2o import as_recording, read_g2o
 from umf_ros.lab.datasets.s3li import load_data_frame, load_pickle
+from umf_ros.lab.scan_files import read_scan
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.networks.weights import load_weights
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import stored_identity, stored_sessions
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.sensors.scan_files import read_scan
 
 Rng = np.random.Generator
 Read = Callable[[Path], object]

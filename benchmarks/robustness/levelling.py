@@ -24,13 +24,13 @@ from umf_ros.core.geometry import Array, make_pose, rotation_angle
 from umf_ros.core.levelling import level
 from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
+from umf_ros.lab.scan_files import make_snapshot
 from umf_ros.lab.simulation.domains import DOMAINS, survey
 from umf_ros.lab.simulation.domains.scanners import SCANNERS, Sweep, sweep
 from umf_ros.lab.simulation.domains.solids import Scene, Solids
 from umf_ros.lab.simulation.domains.street import Facade
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.scan_files import make_snapshot
 
 SCANS = 5
 DROPPED, FLYING = 0.15, 0.02

@@ -14,10 +14,10 @@ from recordings import part_of
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
+from umf_ros.lab.scan_files import parse_pcd, parse_ply
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.runs.run_file import read_closures
 from umf_ros.runs.truth import trajectory_error
-from umf_ros.sensors.scan_files import parse_pcd, parse_ply
 
 
 @pytest.fixture(scope="module")

@@ -106,11 +106,8 @@ def test_later_versions_other_files_and_two_writers_are_refused_in_one_line(tmp_
     assert "b.sqlite" not in contents(tmp_path)
 
 
-def test_a_reader_is_told_when_a_file_has_to_be_migrated_first(tmp_path: Path) -> None:
-    path = made(tmp_path / "a.sqlite")
-    SqliteFile(path, SECOND, read_only=True).close()
-    with pytest.raises(UmfError, match=r"of an earlier umf_ros"):
-        SqliteFile(path, Schema("log", SECOND.migrations, readable=2), read_only=True)
+def test_an_earlier_version_is_read_without_migration(tmp_path: Path) -> None:
+    SqliteFile(made(tmp_path / "a.sqlite"), SECOND, read_only=True).close()
 
 
 def test_a_refusal_of_the_check_changes_nothing(tmp_path: Path) -> None:

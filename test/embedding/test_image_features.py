@@ -12,7 +12,7 @@ from umf_ros.core.config import EmbeddingSettings, Settings, Verification
 from umf_ros.core.frames import Frame, Image, LocalFeatures
 from umf_ros.detector import make_detector_embedder
 from umf_ros.embedding import make_embedder
-from umf_ros.embedding.local_features import LIMIT, WithXFeat, key_points, network_size, sample, with_xfeat
+from umf_ros.embedding.local_features import LIMIT, WithXFeat, key_points, network_size, sample
 from umf_ros.verification.rerank import mutual_neighbours, similarities
 
 
@@ -30,7 +30,7 @@ def frame(image: Image | None) -> Frame:
 
 @pytest.fixture(scope="module")
 def embedder() -> WithXFeat:
-    return with_xfeat(ThumbnailEmbedder(), EmbeddingSettings(threads=1))
+    return WithXFeat(ThumbnailEmbedder(), EmbeddingSettings(threads=1))
 
 
 def features(embedder: WithXFeat, image: Image) -> LocalFeatures:
@@ -62,7 +62,7 @@ def test_a_moved_picture_moves_its_features_by_as_much(embedder: WithXFeat, shif
 
 
 def test_runtimes_agree(embedder: WithXFeat) -> None:
-    other = with_xfeat(ThumbnailEmbedder(), EmbeddingSettings(runtime="torch"))
+    other = WithXFeat(ThumbnailEmbedder(), EmbeddingSettings(runtime="torch"))
     one, two = features(embedder, scene()), features(other, scene())
     pairs = mutual_neighbours(similarities(one.descriptors, two.descriptors))
     apart = np.linalg.norm(one.positions[pairs[:, 0]] - two.positions[pairs[:, 1]], axis=1)

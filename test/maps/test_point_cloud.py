@@ -2,9 +2,9 @@ from pathlib import Path
 
 import numpy as np
 
+from umf_ros.lab.scan_files import parse_pcd, parse_ply
 from umf_ros.maps.point_cloud import MapCloud, write_pcd, write_ply
 from umf_ros.runs.gallery import HeightMap
-from umf_ros.sensors.scan_files import parse_pcd, parse_ply
 
 
 def ground(offset_m: float, noise_m: float = 0.01) -> MapCloud:

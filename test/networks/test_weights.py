@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -25,7 +25,7 @@ def weights(network, tmp_path):
 
 def rewrite(path, tensors=None, architecture=None):
     content = load_file(path) if tensors is None else tensors
-    shape = TINY.as_dict() if architecture is None else architecture
+    shape = asdict(TINY) if architecture is None else architecture
     save_file(content, path, metadata={"architecture": json.dumps(shape)})
 
 
@@ -33,7 +33,6 @@ def test_weights_come_back(network, weights):
     batch = some_input(TINY)
     similarity = (network(batch).descriptor * load_weights(weights)(batch).descriptor).sum(-1)
     assert similarity.min() > 0.9999
-    assert read_card(weights)["architecture"] == TINY.as_dict()
     assert NetworkConfig.from_dict(read_card(weights)["architecture"]) == TINY
 
 
@@ -92,13 +91,13 @@ def test_not_a_number(weights):
 
 
 def test_another_architecture_by_name(weights):
-    rewrite(weights, architecture=TINY.as_dict() | {"vision": "transformer"})
+    rewrite(weights, architecture=asdict(TINY) | {"vision": "transformer"})
     with pytest.raises(WeightsError, match="another architecture"):
         load_weights(weights)
 
 
 def test_another_architecture_by_shape(weights):
-    rewrite(weights, architecture=TINY.as_dict() | {"tokens": 48})
+    rewrite(weights, architecture=asdict(TINY) | {"tokens": 48})
     with pytest.raises(WeightsError, match="another architecture"):
         load_weights(weights)
 
@@ -145,7 +144,7 @@ def test_a_garbled_word_about_the_architecture(weights, word):
     ids=str,
 )
 def test_an_architecture_that_cannot_be_built(weights, changes):
-    rewrite(weights, architecture=TINY.as_dict() | changes)
+    rewrite(weights, architecture=asdict(TINY) | changes)
     with pytest.raises(WeightsError, match="another architecture") as raised:
         load_weights(weights)
     assert "\n" not in str(raised.value)

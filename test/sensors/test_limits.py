@@ -9,10 +9,10 @@ import pytest
 from recordings import CALIBRATION, START_NS
 
 from umf_ros.core.config import Sync
+from umf_ros.lab.scan_files import UNCALIBRATED
 from umf_ros.sensors.assembly import ScanLimits
 from umf_ros.sensors.calibration import Calibration, load_calibration
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.scan_files import UNCALIBRATED
 from umf_ros.sensors.synchronizer import Synchronizer
 
 

@@ -1,11 +1,10 @@
-"""Frames of a recording: all in order, or those nearest to given moments."""
+"""Frames of a recording, in order."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -136,69 +135,3 @@ def _check_overlap(odometry: Trajectory, bag: Bag) -> None:
         seconds = " to ".join(f"{stamp * 1e-9:.1f}" for stamp in (odometry.stamps_ns[0], odometry.stamps_ns[-1]))
         recorded = f"{bag.start_ns * 1e-9:.1f} to {bag.end_ns * 1e-9:.1f}"
         raise BagError(f"the odometry file covers none of the recording: {seconds} s against {recorded} s")
-
-
-REACH_NS = 10**9
-"""A frame further than this from a moment does not stand for it."""
-EPOCH_S = 10**9
-"""From so many seconds on, a moment counts since the epoch and not from the start of a recording."""
-
-Moment = int | float
-"""Nanoseconds since the epoch, or seconds from the start of the recording."""
-
-
-def parse_moment(text: str) -> Moment:
-    """Nanoseconds since the epoch (16 digits or more), seconds since the epoch, or seconds from the start.
-
-    Raises:
-        ValueError: it is none of them.
-    """
-    if text.isdigit() and len(text) >= 16:
-        return int(text)
-    try:
-        value = float(text)
-    except ValueError:
-        raise ValueError(f"{text!r} is neither a stamp in ns nor seconds from the start") from None
-    if not value >= 0:
-        raise ValueError(f"{text!r} is before the start")
-    if value < EPOCH_S:
-        return value
-    seconds, _, fraction = text.partition(".")
-    if not seconds.isdigit() or (fraction and not fraction.isdigit()):
-        raise ValueError(f"{text!r} is neither a stamp in ns nor seconds from the start")
-    return int(seconds) * 10**9 + int(f"{fraction:0<9}"[:9])  # a float has no room for nanoseconds
-
-
-def split_reference(text: str) -> tuple[Path, str] | None:
-    """Recording and moment of `BAG@MOMENT`; None where there is no moment, or the whole is the name of a file."""
-    name, separator, moment = text.rpartition("@")
-    if not separator or not name or "/" in moment or Path(text).exists():
-        return None
-    return Path(name), moment
-
-
-def nearest_frames(frames: Iterable[Frame], moments: list[Moment]) -> list[Frame | BagError]:
-    """The frame nearest to each moment, an error where none is within a second; reads no further than it must.
-
-    Raises:
-        BagError: the recording has no frame.
-    """
-    best: list[Frame] = []
-    wanted: list[int] = []
-    for frame in frames:
-        if not wanted:
-            wanted = [one if isinstance(one, int) else frame.stamp_ns + round(1e9 * one) for one in moments]
-            best = [frame] * len(moments)
-        for position, stamp in enumerate(wanted):
-            if abs(frame.stamp_ns - stamp) < abs(best[position].stamp_ns - stamp):
-                best[position] = frame
-        if frame.stamp_ns > max(wanted) + REACH_NS:
-            break
-    if not best:
-        raise BagError("the recording has no frame with an image or a scan")
-    return [
-        frame
-        if abs(frame.stamp_ns - stamp) <= REACH_NS
-        else BagError(f"no frame within a second of {moment}; the nearest is at {frame.stamp_ns} ns")
-        for frame, stamp, moment in zip(best, wanted, moments, strict=True)
-    ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,7 @@ def read_tum(path: str | Path) -> Trajectory:
             continue
         try:
             stamp, row = _to_ns(fields[0]), [float(field) for field in fields[1:]]
-        except (ValueError, OverflowError):
+        except (ValueError, ArithmeticError):
             raise BagError(f"{path}, line {number}: expected numbers, found {line.strip()[:60]!r}") from None
         if len(row) != 7:
             raise BagError(f"{path}, line {number}: expected 8 numbers (stamp x y z qx qy qz qw), found {len(fields)}")
@@ -99,14 +100,9 @@ def _to_ns(seconds: str) -> int:
     """Nanoseconds of decimal seconds, without the rounding of a float.
 
     Raises:
-        OverflowError: there is no such time.
+        ArithmeticError: it is no number, or there is no such time.
     """
-    if seconds.replace(".", "", 1).isdigit():
-        whole, _, fraction = seconds.partition(".")
-        found = int(whole or 0) * 10**9 + int(fraction[:9].ljust(9, "0"))
-    else:  # as 1.6e9, or negative
-        found = round(float(seconds) * 1e9)
-    return _checked(found)
+    return _checked(int(Decimal(seconds) * 10**9))
 
 
 def _checked(nanoseconds: int) -> int:

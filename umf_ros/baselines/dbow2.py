@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
+from umf_ros.baselines import unit_descriptor
 from umf_ros.baselines.place_networks import locate_place_weights
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import OutputError, WeightsError
 from umf_ros.core.frames import Embedding, Frame, Image, Points
-from umf_ros.embedding.embedder import FeatureRequest, unit_descriptor
+from umf_ros.embedding.embedder import FeatureRequest
 
 Binary = NDArray[np.uint8]
 """(N, 32) descriptors of 256 bits."""

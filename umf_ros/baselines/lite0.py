@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from umf_ros.baselines import unit_descriptor
 from umf_ros.baselines.place_network import IMAGE_SIZE, LATE, Gem, ImageTrunk
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, WeightsError, one_line
 from umf_ros.core.frames import Embedding, Frame, Image, Points
-from umf_ros.embedding.embedder import FeatureRequest, unit_descriptor
+from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.embedding.inputs import is_blank, shrink, standardise
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.efficientnet import STAGES, EfficientNetLite0

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from umf_ros.baselines import unit_descriptor
 from umf_ros.baselines.adafusion import AdaFusion
 from umf_ros.baselines.minkloc import MinkLocFusion, MinkLocLidar, MinkLocVisual
 from umf_ros.baselines.netvlad import NetVlad
@@ -16,7 +17,7 @@ from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, UmfError, WeightsError, either
 from umf_ros.core.frames import Embedding, Frame
 from umf_ros.core.resources import find
-from umf_ros.embedding.embedder import FeatureRequest, unit_descriptor
+from umf_ros.embedding.embedder import FeatureRequest
 from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import fill, read_weights
 

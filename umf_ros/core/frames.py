@@ -33,11 +33,6 @@ class StereoCamera:
     cy: float
     baseline: float
 
-    @property
-    def width_rad(self) -> float:
-        """Angle of view from the left to the right edge, rad."""
-        return 2 * math.atan(self.width / (2 * self.fx))
-
     def project(self, points: Array, body_T_camera: Array) -> tuple[Array, Array]:
         """Left pixels (N, 2) and depths (N,) m of points (N, 3), body frame; depths <= 0 lie behind the camera."""
         optical = transform(invert(body_T_camera), points)

@@ -117,13 +117,11 @@ class Schema:
         migrations: statements; the n-th ones lead from version n to n + 1; released ones are never changed.
         unversioned: version of a file without `schema_version`, as earlier releases wrote it, by the names of its
             tables; 0 where it is another kind of file.
-        readable: oldest version that can be read without migration.
     """
 
     name: str
     migrations: tuple[tuple[str, ...], ...]
     unversioned: Callable[[set[str]], int] = lambda tables: 0
-    readable: int = 1
 
 
 class SqliteFile:
@@ -239,10 +237,6 @@ class SqliteFile:
         if not found and (tables or self._read_only):
             held = shortened(", ".join(sorted(tables))) or "nothing"
             raise UmfError(f"{self.name} is no {schema.name}: it holds {held}")
-        if self._read_only and found < schema.readable:
-            raise UmfError(
-                f"{self.name} is a {schema.name} of an earlier umf_ros: convert it by opening it for writing"
-            )
         if found and check is not None:
             check(self.connection)
         if not self._read_only:
@@ -290,11 +284,6 @@ class SqliteFile:
 LARGEST_YAML = 2**22
 MOST_NODES = 100_000
 """A file of settings has some hundreds; aliases of aliases are how a small one stands for a thousand million."""
-
-
-def is_yaml(path: Path) -> bool:
-    """Whether a path names a YAML file, and not data."""
-    return path.suffix in (".yaml", ".yml")
 
 
 def read_yaml(path: Path) -> Any:

@@ -71,6 +71,6 @@ def make_embedder(settings: EmbeddingSettings, super_features: bool = False, fea
     embedder: Embedder = make(settings, asked)
     if asked.image:
         return embedder
-    from umf_ros.embedding.local_features import with_xfeat
+    from umf_ros.embedding.local_features import WithXFeat
 
-    return with_xfeat(embedder, settings)
+    return WithXFeat(embedder, settings)

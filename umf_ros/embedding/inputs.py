@@ -10,9 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.frames import Frame, Image, Points
-from umf_ros.core.geometry import transform
-from umf_ros.core.levelling import level
+from umf_ros.core.frames import Image, Points
 from umf_ros.networks.config import CELLS, FEATURES, NetworkConfig
 
 ORIGIN_M = np.array([0.0, -20.0, -6.0], np.float32)
@@ -199,13 +197,6 @@ def prepare_scan(points: Points | None, intensity: Points | None, config: Networ
     if points is None:
         points, intensity = np.empty((0, 3), np.float32), None
     return voxelise(points, intensity, config.coarse_voxels, config.fine_voxels)
-
-
-def read_frame(frame: Frame, config: NetworkConfig) -> InputArrays:
-    """Return a batch of one frame: a blank image counts as missing, the tilt of the mount is removed from the scan."""
-    image = None if frame.left is None or is_blank(frame.left) else prepare_image(frame.left, config)
-    points = None if frame.points is None else transform(level(frame.points, keep_slope=True), frame.points)
-    return pack([image], [prepare_scan(points, frame.intensity, config)], config)
 
 
 def blank_input(config: NetworkConfig) -> InputArrays:

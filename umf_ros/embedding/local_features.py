@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,7 +16,7 @@ from umf_ros.core.resources import find
 from umf_ros.embedding.depth import lift_features
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.inputs import is_blank
-from umf_ros.embedding.runtimes import Runtime, make_runtime, name_outputs
+from umf_ros.embedding.runtimes import make_runtime, name_outputs
 from umf_ros.networks.config import XFEAT_CELL, XFEAT_OUTPUTS, XFEAT_STRIDE
 
 WEIGHTS = "models/xfeat.safetensors"
@@ -28,45 +27,20 @@ APART = 5  # pixels, side of the square in which a key point has the highest pro
 FLAT = 1e-3  # added to probabilities before their logarithm
 
 
-class XFeatExtractor:
-    """Extracts key points of an image and their descriptors.
-
-    Args:
-        weights: safetensors file.
-        runtime: runtime of XFeat.
-    """
-
-    def __init__(self, weights: Path, runtime: Runtime) -> None:
-        self.name = name_outputs(weights, runtime)
-        self._runtime = runtime
-
-    def extract(self, image: Image) -> LocalFeatures:
-        """Return the strongest features of an image (H, W), in its pixels, without depth."""
-        height, width = image.shape
-        size = network_size(width, height)
-        shrunk = image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        maps = self._runtime.run([shrunk.astype(np.float32)[None, None]])
-        pixels, score = key_points(maps["corners"][0], maps["reliability"][0])
-        found = sample(maps["descriptors"], (pixels + 0.5) / XFEAT_CELL - 0.5)
-        found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
-        positions = (pixels + 0.5) * (np.array([width, height]) / size) - 0.5
-        unknown = np.full((len(pixels), 3), np.nan, np.float32)
-        return LocalFeatures(positions.astype(np.float32), found.astype(np.float16), score, unknown)
-
-
 class WithXFeat:
-    """An embedder whose image features are replaced by those of XFeat.
+    """An embedder whose image features are replaced by those of the shipped XFeat.
 
     Args:
         embedder: computes the rest of the embedding.
-        extractor: computes the image features.
+        settings: runtime, device and threads of XFeat.
     """
 
-    def __init__(self, embedder: Embedder, extractor: XFeatExtractor) -> None:
+    def __init__(self, embedder: Embedder, settings: EmbeddingSettings) -> None:
+        weights = find(WEIGHTS)
+        self._embedder, self._runtime = embedder, make_runtime(weights, settings, XFEAT_OUTPUTS)
         # features of different networks cannot be compared: their names differ
-        self.name = f"{embedder.name}+{extractor.name}"
+        self.name = f"{embedder.name}+{name_outputs(weights, self._runtime)}"
         self.dimension = embedder.dimension
-        self._embedder, self._extractor = embedder, extractor
         # both networks release the interpreter lock while they run
         self._executor = ThreadPoolExecutor(1, "xfeat")
 
@@ -78,13 +52,18 @@ class WithXFeat:
         return replace(self._embedder.embed(frame), image=image.result())
 
     def _extract(self, frame: Frame, image: Image) -> LocalFeatures:
-        return lift_features(frame, self._extractor.extract(image))
-
-
-def with_xfeat(embedder: Embedder, settings: EmbeddingSettings) -> WithXFeat:
-    """Return the embedder with the shipped XFeat, on the runtime that the settings name."""
-    weights = find(WEIGHTS)
-    return WithXFeat(embedder, XFeatExtractor(weights, make_runtime(weights, settings, XFEAT_OUTPUTS)))
+        """Return the strongest features of the left image (H, W), in its pixels."""
+        height, width = image.shape
+        size = network_size(width, height)
+        shrunk = image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        maps = self._runtime.run([shrunk.astype(np.float32)[None, None]])
+        pixels, score = key_points(maps["corners"][0], maps["reliability"][0])
+        found = sample(maps["descriptors"], (pixels + 0.5) / XFEAT_CELL - 0.5)
+        found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
+        positions = (pixels + 0.5) * (np.array([width, height]) / size) - 0.5
+        unknown = np.full((len(pixels), 3), np.nan, np.float32)
+        features = LocalFeatures(positions.astype(np.float32), found.astype(np.float16), score, unknown)
+        return lift_features(frame, features)
 
 
 def network_size(width: int, height: int) -> tuple[int, int]:

@@ -54,15 +54,6 @@ class FlatUmf(nn.Module):
         return tuple(named[name] for name in self.outputs)
 
 
-def load_flat(weights: Path, outputs: tuple[str, ...]) -> FlatUmf:
-    """Return the UMF network of a weights file with the given outputs.
-
-    Raises:
-        WeightsError: the weights cannot be used.
-    """
-    return FlatUmf(load_weights(weights), outputs)
-
-
 class TorchRuntime:
     """Inference in torch, in single precision; a `runtimes.Runtime`.
 
@@ -81,7 +72,7 @@ class TorchRuntime:
 
     def __init__(self, weights: Path, outputs: tuple[str, ...], device: str, threads: int) -> None:
         self.file, self._outputs = weights, outputs
-        network = load_xfeat(weights) if outputs == XFEAT_OUTPUTS else load_flat(weights, outputs)
+        network = load_xfeat(weights) if outputs == XFEAT_OUTPUTS else FlatUmf(load_weights(weights), outputs)
         if device == "cpu":
             torch.set_num_threads(threads)
         try:

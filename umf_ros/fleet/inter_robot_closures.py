@@ -11,7 +11,7 @@ import numpy as np
 
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Keyframe, LoopClosure
-from umf_ros.core.geometry import invert, relative, rotation_angle
+from umf_ros.core.geometry import invert, near, relative
 from umf_ros.fleet.link import FleetLink
 from umf_ros.places.store import KeyframeStore
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
@@ -87,9 +87,8 @@ class FleetConsensus:
         if min(np.linalg.norm(step[:3, 3]) for step in steps) < APART_M or path_m > REACH_M:
             return False
         predicted = invert(other_step) @ one[2].match_T_query @ own_step
-        gap = relative(predicted, other[2].match_T_query)
-        is_near = np.linalg.norm(gap[:3, 3]) < SLACK_M + self._drift * path_m
-        return bool(is_near and rotation_angle(gap) < SLACK_RAD + DRIFT_RAD_PER_M * path_m)
+        slack = SLACK_M + self._drift * path_m, SLACK_RAD + DRIFT_RAD_PER_M * path_m
+        return near(predicted, other[2].match_T_query, *slack)
 
 
 class InterRobotMatcher:

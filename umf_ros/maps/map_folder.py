@@ -73,7 +73,13 @@ class MapFolder:
         if not (path / "map.json").is_file():
             raise UmfError(f"{path} holds no map: map.json is missing (umf map makes one)")
         folder = cls(path)
-        folder._read()
+        try:
+            content = json.loads((path / "map.json").read_text(encoding="utf-8"))
+            if content["schema"] != SCHEMA_VERSION:
+                raise UmfError(f"{path} is of another version of umf_ros; build the map again from its recordings")
+            folder.sessions = [MapSession(**session) for session in content["sessions"]]
+        except (OSError, ValueError, KeyError, TypeError):
+            raise UmfError(f"{path / 'map.json'} is damaged") from None
         return folder
 
     @classmethod
@@ -139,12 +145,3 @@ class MapFolder:
     def _write(self) -> None:
         content = {"schema": SCHEMA_VERSION, "sessions": [asdict(session) for session in self.sessions]}
         write_atomically(self.path / "map.json", json.dumps(content, indent=1) + "\n")
-
-    def _read(self) -> None:
-        try:
-            content = json.loads((self.path / "map.json").read_text(encoding="utf-8"))
-            if content["schema"] != SCHEMA_VERSION:
-                raise UmfError(f"{self.path} is of another version of umf_ros; build the map again from its recordings")
-            self.sessions = [MapSession(**session) for session in content["sessions"]]
-        except (OSError, ValueError, KeyError, TypeError):
-            raise UmfError(f"{self.path / 'map.json'} is damaged") from None

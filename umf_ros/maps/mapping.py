@@ -126,7 +126,7 @@ def _track(folder: Path, settings: Settings) -> None:
     old, new = folder / PLACES, folder / f"tracked_{PLACES}"
     with closing(open_places(old)) as places:
         odometry, tracked = track((places[row] for row in range(len(places))), settings.verification)
-    with closing(_create(new, *stored_identity(old))) as places:
+    with closing(PlaceDatabase(Database(path=str(new)), *stored_identity(old))) as places:
         for keyframe in tracked:
             places.add(keyframe)
     with writing(old):
@@ -180,7 +180,7 @@ def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
     run = target.folder_of(name)
     bag = open_bag(recording)
     _discard_unfinished(target)
-    with closing(_create(target.places, *stored_identity(run / PLACES))) as places:
+    with closing(PlaceDatabase(Database(path=str(target.places)), *stored_identity(run / PLACES))) as places:
         first_place, first_number = len(places), places.next_session
         with closing(open_places(run / PLACES)) as own:
             known = [own[row] for row in range(len(own))]
@@ -262,7 +262,3 @@ def _discard_unfinished(target: MapFolder) -> None:
 def open_places(path: Path) -> PlaceDatabase:
     """Open a place database of any embedder for reading."""
     return PlaceDatabase(Database(path=str(path)), *stored_identity(path), read_only=True)
-
-
-def _create(path: Path, embedder: str, dimension: int) -> PlaceDatabase:
-    return PlaceDatabase(Database(path=str(path)), embedder, dimension)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
+from pydantic import ConfigDict, Field, ValidationError
+from pydantic.dataclasses import dataclass
 from safetensors import safe_open
 
+from umf_ros.core.config import problems
 from umf_ros.core.errors import WeightsError, one_line, shortened
 from umf_ros.core.resources import find
 
@@ -24,14 +26,13 @@ XFEAT_STRIDE = 32
 """Stride of the deepest layer of XFeat, in pixels; sides of images are multiples of it."""
 XFEAT_OUTPUTS = ("descriptors", "corners", "reliability")
 """Names of the outputs of XFeat."""
-LARGEST = 8192
-"""Upper limit of every size in a weights file."""
-_MOST = {"voxel_blocks": 64, "layers": 64, "super_iterations": 64, "width": 1024}
-_MAY_BE_NONE = ("voxel_blocks", "scene")
+Size = Annotated[int, Field(ge=1, le=8192)]
+Depth = Annotated[int, Field(ge=1, le=64)]
+"""Limits of what a weights file may state: a damaged one must not fill the memory."""
 Backbone = Literal["resnet18", "resnet34", "resnet50", "efficientnet_lite0"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=ConfigDict(strict=True, extra="forbid"))
 class NetworkConfig:
     """Architecture of the network.
 
@@ -54,69 +55,49 @@ class NetworkConfig:
     """
 
     backbone: Backbone = "resnet18"
-    width: int = 32
-    image_size: tuple[int, int] = (96, 128)
-    pyramid: int = 96
-    voxel_channels: tuple[int, int, int] = (24, 64, 128)
-    voxel_blocks: int = 0
-    tokens: int = 128
-    heads: int = 4
-    layers: int = 1
-    feedforward: int = 256
-    descriptor: int = 256
-    coarse_voxels: int = 160
-    fine_voxels: int = 512
-    local: int = 64
-    image_local: int = 64
-    cloud_local: int = 32
-    super_iterations: int = 3
-    image_supers: tuple[int, int] = (64, 64)
-    cloud_supers: tuple[int, int] = (64, 32)
-    scene: int = 0
+    width: Annotated[int, Field(ge=1, le=1024)] = 32
+    image_size: tuple[Size, Size] = (96, 128)
+    pyramid: Size = 96
+    voxel_channels: tuple[Size, Size, Size] = (24, 64, 128)
+    voxel_blocks: Annotated[int, Field(ge=0, le=64)] = 0
+    tokens: Size = 128
+    heads: Size = 4
+    layers: Depth = 1
+    feedforward: Size = 256
+    descriptor: Size = 256
+    coarse_voxels: Size = 160
+    fine_voxels: Size = 512
+    local: Size = 64
+    image_local: Size = 64
+    cloud_local: Size = 32
+    super_iterations: Depth = 3
+    image_supers: tuple[Size, Size] = (64, 64)
+    cloud_supers: tuple[Size, Size] = (64, 32)
+    scene: Annotated[int, Field(ge=0, le=8192)] = 0
 
     def __post_init__(self) -> None:
-        self._check_sizes()
-        if self.backbone not in get_args(Backbone):
-            raise ValueError(f"backbone must be one of {', '.join(get_args(Backbone))}, not {self.backbone}")
-        if any(side % 32 or side <= 0 for side in self.image_size):
+        if any(side % 32 for side in self.image_size):
             raise ValueError(f"image_size must be multiples of 32, not {self.image_size}")
         if self.tokens % self.heads or self.local % 4:
             raise ValueError("the width of a transformer must be a multiple of its heads")
-
-    def _check_sizes(self) -> None:
-        """Raise ValueError unless every size is a whole number (or a tuple of them) within its limits."""
-        for field in fields(self):
-            value, usual = getattr(self, field.name), field.default
-            if isinstance(usual, str):
-                continue
-            numbers = value if isinstance(usual, tuple) else (value,)
-            if not isinstance(numbers, tuple) or len(numbers) != (len(usual) if isinstance(usual, tuple) else 1):
-                raise ValueError(f"{field.name} must be {usual!r} or alike, not {value!r}")
-            least, most = 0 if field.name in _MAY_BE_NONE else 1, _MOST.get(field.name, LARGEST)
-            if not all(type(number) is int and least <= number <= most for number in numbers):
-                raise ValueError(f"{field.name} must be whole and from {least} to {most}, not {value!r}")
 
     @property
     def length(self) -> int:
         """Length of the whole descriptor."""
         return self.descriptor + self.scene
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for a JSON file."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
-
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
-        """Return the configuration from the result of `as_dict`.
+        """Return the configuration from its values as JSON holds them.
 
         Raises:
             WeightsError: a name or a value does not describe this architecture.
         """
+        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         try:
-            fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
             return cls(**fields)
-        except (TypeError, ValueError, ArithmeticError) as error:
-            raise WeightsError(f"weights of another architecture: {one_line(error)}") from None
+        except ValidationError as error:
+            raise WeightsError(f"weights of another architecture: {shortened(problems(error))}") from None
 
 
 SHIPPED = ("umf_scene",)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from umf_ros.bags.trajectories import read_tum
-from umf_ros.core.errors import ConfigError, OutputError
+from umf_ros.core.errors import ConfigError, writing
 from umf_ros.core.frames import Frame, Keyframe
 from umf_ros.core.geometry import Array
 
@@ -39,10 +39,8 @@ class RerunLog:
             import rerun
         except ImportError:
             raise ConfigError("--rerun needs another package: pip install 'umf_ros[rerun]'") from None
-        try:
+        with writing(path):
             path.open("wb").close()
-        except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror}") from None
         self._rerun = rerun
         self._log = rerun.RecordingStream("umf_ros")
         self._log.save(path)

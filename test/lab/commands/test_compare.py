@@ -13,7 +13,7 @@ from command_line import only_line, umf
 from recordings import CALIBRATION
 from sources import ROOT
 
-from umf_ros.comparison import RESULT_COLUMNS, VIEW_COLUMNS, Comparer
+from umf_ros.lab.evaluation.comparison import RESULT_COLUMNS, VIEW_COLUMNS, Comparer
 
 NUMBERS = RESULT_COLUMNS[: RESULT_COLUMNS.index("reason")]
 
@@ -69,7 +69,7 @@ def test_a_defect_costs_one_pair_only(here: Path, monkeypatch: pytest.MonkeyPatc
     def fail(self: Comparer, match: object, query: object) -> None:
         raise np.linalg.LinAlgError("singular\nmatrix")
 
-    monkeypatch.setattr("umf_ros.comparison.Comparer.compare", fail)
+    monkeypatch.setattr("umf_ros.lab.evaluation.comparison.Comparer.compare", fail)
     Path("pairs.csv").write_text("match_scan,query_scan\none.npy,other.npy\none.npy,one.npy\n")
     ended = umf("compare", "--list", "pairs.csv", "--out", "verdicts.csv")
     assert ended.status == 1 and ended.err.splitlines() == [

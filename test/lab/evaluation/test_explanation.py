@@ -10,7 +10,7 @@ from command_line import umf
 
 from umf_ros.core.config import Verification
 from umf_ros.core.errors import OutputError
-from umf_ros.lab.evaluation.explanation import Explanation, draw, explain
+from umf_ros.lab.evaluation.comparison import Explanation, draw, explain
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 
 GROUND = landscape(20)

@@ -10,9 +10,8 @@ import pytest
 
 from umf_ros.lab.simulation.camera import Sun
 from umf_ros.lab.simulation.families import FAMILIES, Traits, draw_traits
-from umf_ros.lab.simulation.noise import detail_texture, smooth_step, spectral_noise
 from umf_ros.lab.simulation.presets import THESIS_SAMPLES, thesis_surveys
-from umf_ros.lab.simulation.relief import CELLS
+from umf_ros.lab.simulation.relief import CELLS, detail_texture, smooth_step, spectral_noise
 from umf_ros.lab.simulation.world import ground
 
 

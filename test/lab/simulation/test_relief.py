@@ -7,8 +7,7 @@ import pytest
 
 from umf_ros.core.errors import ConfigError
 from umf_ros.lab.simulation.families import FAMILIES, draw_traits
-from umf_ros.lab.simulation.noise import detail_texture, spectral_noise
-from umf_ros.lab.simulation.relief import CELL_M, SIZE_M, Pan
+from umf_ros.lab.simulation.relief import CELL_M, SIZE_M, Pan, detail_texture, spectral_noise
 from umf_ros.lab.simulation.world import TEST, TRAINING, VALIDATION, check_seed, ground
 
 

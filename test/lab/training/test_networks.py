@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import pytest
 import torch
@@ -59,7 +60,7 @@ def test_the_thesis_network_has_about_39_million_parameters():
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_survives_its_own_card(name):
-    assert NetworkConfig.from_dict(json.loads(json.dumps(PRESETS[name].as_dict()))) == PRESETS[name]
+    assert NetworkConfig.from_dict(json.loads(json.dumps(asdict(PRESETS[name])))) == PRESETS[name]
 
 
 def test_the_default_network_fits_a_rover():

@@ -15,7 +15,7 @@ from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, wr
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.comparison import Comparer, Pair, PlaceView, Row
+    from umf_ros.lab.evaluation.comparison import Comparer, Pair, PlaceView, Row
 
 Image = Annotated[Path | None, typer.Option(help="Image file; needs --calibration.", show_default=False)]
 ViewName = Annotated[
@@ -57,9 +57,9 @@ def command(
     from rich.console import Console
 
     from umf_ros.commands.console import WARNING
-    from umf_ros.comparison import Comparer, read_pairs
     from umf_ros.core.config import load_settings
     from umf_ros.detector import make_detector_embedder
+    from umf_ros.lab.evaluation.comparison import Comparer, read_pairs
 
     if pairs is not None:
         asked = read_pairs(pairs)
@@ -94,8 +94,8 @@ def _check_named(match: str | Path | None, query: str | Path | None, out: Path |
 
 
 def _view(name: str | None, left: Path | None, right: Path | None) -> PlaceView:
-    from umf_ros.comparison import PlaceView
-    from umf_ros.sensors.scan_files import IMAGE_SUFFIXES
+    from umf_ros.lab.evaluation.comparison import PlaceView
+    from umf_ros.lab.scan_files import IMAGE_SUFFIXES
 
     scan, images = name or "", [str(path) if path else "" for path in (left, right)]
     if Path(scan).suffix.lower() in IMAGE_SUFFIXES:
@@ -109,7 +109,7 @@ def _compare_list(comparer: Comparer, asked: list[Pair], base: Path, out: Path, 
     """Write one row per pair; a pair that cannot be compared is reported and does not stop the others."""
     from rich.progress import track
 
-    from umf_ros.comparison import RESULT_COLUMNS, VIEW_COLUMNS, view_row
+    from umf_ros.lab.evaluation.comparison import RESULT_COLUMNS, VIEW_COLUMNS, view_row
 
     accepted, failures = 0, []
     with writing(out), out.open("x", newline="", encoding="utf-8") as file:
@@ -131,7 +131,7 @@ def _compare_list(comparer: Comparer, asked: list[Pair], base: Path, out: Path, 
 
 def _result(comparer: Comparer, pair: Pair) -> tuple[Row, str]:
     """Return the row of a pair, and the reason where it could not be compared."""
-    from umf_ros.comparison import result_row
+    from umf_ros.lab.evaluation.comparison import result_row
 
     try:
         return comparer.compare(*pair), ""
@@ -143,7 +143,7 @@ def _result(comparer: Comparer, pair: Pair) -> tuple[Row, str]:
 
 
 def _show(row: Row, as_json: bool) -> None:
-    from umf_ros.comparison import POSE, SIGMA
+    from umf_ros.lab.evaluation.comparison import POSE, SIGMA
 
     if as_json:
         typer.echo(json.dumps(row, indent=2))

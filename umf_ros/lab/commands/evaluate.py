@@ -22,7 +22,6 @@ from umf_ros.commands.recordings import (
     open_recording,
 )
 from umf_ros.core.errors import ConfigError
-from umf_ros.core.io import is_yaml
 from umf_ros.embedding import choices
 
 if TYPE_CHECKING:
@@ -262,7 +261,8 @@ def command(
     test worlds are never trained or tuned on.
     """
     _check(data, worlds, methods, trained)
-    if data is not None and not is_yaml(data):
+    listed = data is not None and data.suffix in (".yaml", ".yml")
+    if data is not None and not listed:
         check_files(data, config, odometry, ground_truth)
 
     from umf_ros.lab.evaluation.places import lists_place_sets
@@ -276,12 +276,12 @@ def command(
         _refuse("simulated worlds", of_lists | of_recordings)
         chosen = str(worlds), seed, count
         figures = every.worlds(*chosen) if every else _on_worlds(*chosen, quick, weights, out)
-    elif is_yaml(data) and lists_place_sets(data):
+    elif listed and lists_place_sets(data):
         allowed = () if every else ("--embedder", "--config")
         others = {name: value for name, value in of_recordings.items() if name not in allowed}
         _refuse("a list of place sets", of_worlds | of_lists | others)
         figures = every.places(data) if every else _on_places(data, config, embedder, weights, out)
-    elif is_yaml(data):
+    elif listed:
         _refuse("a list of sequences", of_worlds | of_recordings)
         figures = every.sequences(data, rule) if every else _on_sequences(data, rule, weights, out)
     else:

@@ -11,7 +11,7 @@ from umf_ros.commands.recordings import BagPath, ConfigPath, DatasetName, Embedd
 from umf_ros.core.errors import BagError
 
 if TYPE_CHECKING:
-    from umf_ros.bags.frames import Moment
+    from umf_ros.lab.evaluation.comparison import Moment
 
 Optional = typer.Option
 
@@ -29,9 +29,9 @@ def command(
     """Show both images with their matching features, both scans aligned, and the decision's numbers."""
     from rich.console import Console
 
-    from umf_ros.bags.frames import FrameReader, nearest_frames
+    from umf_ros.bags.frames import FrameReader
     from umf_ros.detector import make_detector_embedder, make_keyframe
-    from umf_ros.lab.evaluation.explanation import draw, explain
+    from umf_ros.lab.evaluation.comparison import draw, explain, nearest_frames
 
     console = Console()
     moments = [_moment(text) for text in (query, match)]
@@ -55,7 +55,7 @@ def command(
 
 
 def _moment(text: str) -> Moment:
-    from umf_ros.bags.frames import parse_moment
+    from umf_ros.lab.evaluation.comparison import parse_moment
 
     try:
         return parse_moment(text)

@@ -66,8 +66,7 @@ def plot(
     output: Annotated[Path, typer.Option("--output", "-o", help="Picture to write.")] = Path("graph.png"),
 ) -> None:
     """Draw a graph file: odometry dark, closures green, from above and from the side."""
-    from umf_ros.lab.datasets.g2o import as_recording, read_g2o
-    from umf_ros.lab.evaluation.graph_plot import plot_graph
+    from umf_ros.lab.datasets.g2o import as_recording, plot_graph, read_g2o
 
     content = read_g2o(file)
     plot_graph(as_recording(content), content.poses, output)

@@ -36,7 +36,7 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
-    from umf_ros.replay import recover_run
+    from umf_ros.lab.commands.report import recover_run
     from umf_ros.runs.diagnosis import explain
     from umf_ros.runs.reader import read_run
     from umf_ros.runs.report import judge
@@ -55,7 +55,7 @@ def command(
 
 
 def _stamp(text: str, start_ns: int) -> int:
-    from umf_ros.bags.frames import parse_moment
+    from umf_ros.lab.evaluation.comparison import parse_moment
 
     try:
         moment = parse_moment(text)

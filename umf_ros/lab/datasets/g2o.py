@@ -3,14 +3,15 @@
 An information matrix is read as GTSAM reads it: tangent space of the second vertex, translation
 first, rotation in radians. A plane graph is lifted into space; what it does not say about height,
 roll and pitch is given the weight of what it does say. A graph can be driven through the back-end
-as if it were live.
+as if it were live, and drawn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +34,9 @@ from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import check_covariance
 from umf_ros.pose_graph.g2o import g2o_lines, verdict_table, write_g2o
 from umf_ros.pose_graph.solver import EDGE, Edge
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 PERIOD_NS = 1_000_000_000
 LARGEST_ID = 2**63 - 1
@@ -268,3 +272,47 @@ def _advance(graph: PoseGraph, recording: GraphRecording, start: int, end: int) 
             graph.begin_session()
         graph.add_odometry(vertex * PERIOD_NS, recording.odometry[vertex], recording.step_covariance(vertex))
     return max(start, end)
+
+
+def plot_graph(recording: GraphRecording, given: Mapping[int, Array], path: str | Path) -> None:
+    """Draw odometry (dark) and closures (green) from above, and from the side where height varies.
+
+    Args:
+        recording: the graph.
+        given: (4, 4) poses by vertex id; others are composed from the odometry.
+        path: the picture.
+
+    Raises:
+        OutputError: the picture cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    composed = zip(recording.ids.tolist(), recording.odometry, strict=True)
+    at = np.array([given.get(vertex, pose)[:3, 3] for vertex, pose in composed])
+    closures = np.array([[edge.first, edge.second] for edge in recording.closures], int).reshape(-1, 2)
+    views = [("x [m]", "y [m]", at[:, :2])]
+    if np.ptp(at[:, 2]) > 0.01 * np.ptp(at[:, :2]):
+        views.append(("x [m]", "z [m]", at[:, [0, 2]]))
+    figure = Figure(figsize=(7 * len(views), 6.5), layout="constrained")
+    for column, (across, up, points) in enumerate(views, start=1):
+        axes = figure.add_subplot(1, len(views), column, xlabel=across, ylabel=up, aspect="equal")
+        _draw_graph(axes, points, recording.chains, closures)
+    figure.suptitle(f"{len(at)} poses, {len(closures)} closures")
+    with writing(path, ValueError):
+        figure.savefig(path, dpi=120)
+
+
+def _draw_graph(axes: Axes, points: Array, chains: list[int], closures: Array) -> None:
+    from matplotlib.collections import LineCollection
+
+    for start, end in zip(chains, [*chains[1:], len(points)], strict=True):
+        axes.plot(*points[start:end].T, color="0.2", linewidth=0.8, zorder=3, label="odometry" if start == 0 else None)
+    if len(closures):
+        # thousands of closures would bury the path
+        alpha = float(np.clip(500 / len(closures), 0.05, 0.8))
+        lines = LineCollection(list(points[closures]), colors="tab:green", linewidths=0.6, alpha=alpha)
+        axes.add_collection(lines)
+        axes.plot([], [], color="tab:green", label="closures")
+    axes.plot(*points[:1].T, "o", color="tab:blue", markersize=5, zorder=4, label="start")
+    axes.legend(loc="best", fontsize="small")
+    axes.grid(alpha=0.3)

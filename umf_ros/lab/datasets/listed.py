@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 
 from umf_ros.core.config import Dataset, Group, problems
 from umf_ros.core.errors import ConfigError
-from umf_ros.core.io import is_yaml, read_yaml
+from umf_ros.core.io import read_yaml
 from umf_ros.lab.datasets.robotcar import read_evaluation, read_training
 from umf_ros.lab.datasets.s3li import ETNA_TEST, ETNA_TRAINING, read_bag, read_toolkit
 from umf_ros.lab.datasets.sample import SampleSequence
@@ -149,7 +149,7 @@ def open_source(path: Path) -> Source:
         ConfigError: the file is no such list.
         UmfError: there is no folder, or a sequence is missing or damaged.
     """
-    return SequenceList(path) if is_yaml(path) else WorldFolder(path)
+    return SequenceList(path) if path.suffix in (".yaml", ".yml") else WorldFolder(path)
 
 
 def _entries(path: Path) -> list[ListEntry]:

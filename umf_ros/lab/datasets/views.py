@@ -11,12 +11,28 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.frames import Image, Points
+from umf_ros.core.frames import Frame, Image, Points
 from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.core.levelling import level
-from umf_ros.embedding.inputs import VoxelScan, is_blank, prepare_scan, shrink, standardise
+from umf_ros.embedding.inputs import (
+    InputArrays,
+    VoxelScan,
+    is_blank,
+    pack,
+    prepare_image,
+    prepare_scan,
+    shrink,
+    standardise,
+)
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.networks.config import NetworkConfig
+
+
+def read_frame(frame: Frame, config: NetworkConfig) -> InputArrays:
+    """Return a batch of one frame: a blank image counts as missing, the tilt of the mount is removed from the scan."""
+    image = None if frame.left is None or is_blank(frame.left) else prepare_image(frame.left, config)
+    points = None if frame.points is None else transform(level(frame.points, keep_slope=True), frame.points)
+    return pack([image], [prepare_scan(points, frame.intensity, config)], config)
 
 
 @dataclass(frozen=True, slots=True)

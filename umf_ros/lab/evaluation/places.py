@@ -20,8 +20,8 @@ from umf_ros.embedding import make_embedder
 from umf_ros.embedding.embedder import Embedder
 from umf_ros.lab.evaluation.results import EvaluationReport, Figures, Scores, TextTable, percent, rounded, score
 from umf_ros.lab.evaluation.retrieval import Mask, PlaceCollection, RetrievalTask, rank, rerank_all
+from umf_ros.lab.scan_files import SUFFIXES, read_scan
 from umf_ros.sensors.calibration import Calibration, load_calibration
-from umf_ros.sensors.scan_files import SUFFIXES, read_scan
 
 IMAGES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 RERANKER = "ransac both"

@@ -25,9 +25,9 @@ from umf_ros.core.geometry import Array
 from umf_ros.core.io import atomic_write
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
-from umf_ros.embedding.inputs import read_frame
 from umf_ros.embedding.torch_runtimes import to_tensors
 from umf_ros.lab.datasets.sample import distances, places_of
+from umf_ros.lab.datasets.views import read_frame
 from umf_ros.lab.training.losses import neighbourhood_components
 from umf_ros.networks.fusion import Fused
 from umf_ros.networks.umf import UMF

@@ -20,14 +20,16 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from umf_ros.core.frames import Frame, ScanMotion
 from umf_ros.core.io import atomic_write
-from umf_ros.embedding.inputs import blank_input, read_frame
+from umf_ros.embedding.inputs import blank_input
 from umf_ros.embedding.local_features import network_size
 from umf_ros.embedding.runtimes import FACTS, OUTPUTS, SUPERS, XFEAT_SHAPE, import_openvino
-from umf_ros.embedding.torch_runtimes import load_flat, to_tensors
+from umf_ros.embedding.torch_runtimes import FlatUmf, to_tensors
+from umf_ros.lab.datasets.views import read_frame
 from umf_ros.lab.simulation.camera import Camera
 from umf_ros.lab.simulation.survey import save, shard_plan, survey_world
 from umf_ros.lab.training.prepared_views import draw_look
 from umf_ros.networks.config import XFEAT_OUTPUTS, read_config
+from umf_ros.networks.weights import load_weights
 from umf_ros.networks.xfeat import load_xfeat
 from umf_ros.sensors.calibration import load_calibration
 
@@ -236,7 +238,7 @@ def convert(network: nn.Module, example: dict[str, Any], outputs: tuple[str, ...
 
 
 def _convert_umf(weights: Path, outputs: tuple[str, ...]) -> Any:
-    flat = load_flat(weights, outputs)
+    flat = FlatUmf(load_weights(weights), outputs)
     fold_normalisation(flat)
     stem = flat.network.voxel_encoder.get_submodule("stem.1")
     assert isinstance(stem, nn.Sequential) and isinstance(stem[0], nn.Conv3d)

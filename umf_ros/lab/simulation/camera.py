@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.frames import Image, StereoCamera
 from umf_ros.core.geometry import Array
-from umf_ros.lab.simulation.noise import Field
-from umf_ros.lab.simulation.relief import CELL_M, SIZE_M
+from umf_ros.lab.simulation.relief import CELL_M, SIZE_M, Field
 from umf_ros.lab.simulation.world import HORIZON, ROCK, TEXTURE_PERIODS_M, World
 
 Task = TypeVar("Task")

@@ -14,7 +14,7 @@ from umf_ros.core.frames import Image, StereoCamera
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose
 from umf_ros.core.resources import find
 from umf_ros.lab.simulation.camera import Camera, cast
-from umf_ros.lab.simulation.noise import Field
+from umf_ros.lab.simulation.relief import Field
 from umf_ros.lab.simulation.world import ROCK, World
 from umf_ros.sensors.calibration import Calibration, load_calibration
 

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.camera import Sun
-from umf_ros.lab.simulation.noise import smooth_step
-from umf_ros.lab.simulation.relief import Relief
+from umf_ros.lab.simulation.relief import Relief, smooth_step
 
 WHEELBASE_M, TRACK_M = 1.2, 0.9
 

@@ -29,7 +29,7 @@ from umf_ros.core.io import atomic_write
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, Camera, Rendering, ahead, resized
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.lidar import FIELD_OF_VIEW_DEG, RANGE_M, Lidar
-from umf_ros.lab.simulation.noise import Field
+from umf_ros.lab.simulation.relief import Field
 from umf_ros.lab.simulation.route import SETTINGS, Pass, plan_passes, stand, thinned
 from umf_ros.lab.simulation.world import World, ground
 from umf_ros.sensors.calibration import Calibration, load_calibration

@@ -13,8 +13,17 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.families import FAMILIES, Traits, draw_traits
-from umf_ros.lab.simulation.noise import Field, detail_texture, smooth_step, spectral_noise
-from umf_ros.lab.simulation.relief import CELL_M, CELLS, SIZE_M, Pan, Relief
+from umf_ros.lab.simulation.relief import (
+    CELL_M,
+    CELLS,
+    SIZE_M,
+    Field,
+    Pan,
+    Relief,
+    detail_texture,
+    smooth_step,
+    spectral_noise,
+)
 
 SMALLEST_M = 0.12
 _SHAPES = 10

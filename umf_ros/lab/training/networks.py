@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
@@ -274,7 +274,7 @@ def save_weights(network: UMF, path: Path, card: dict[str, Any], precision: Prec
     Raises:
         OutputError: the files cannot be written.
     """
-    save_tensors(network, path, card, network.config.as_dict(), precision)
+    save_tensors(network, path, card, asdict(network.config), precision)
 
 
 def save_tensors(

@@ -16,12 +16,12 @@ from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.core.io import atomic_write
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
+from umf_ros.lab.scan_files import UNCALIBRATED, make_snapshot
 from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
 from umf_ros.lab.simulation.domains.passages import Passage
 from umf_ros.lab.simulation.domains.passages import drive as drive_passage
 from umf_ros.lab.simulation.domains.survey import FIRST, MOUNTS, OTHER_WAY, SAME_WAY
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.scan_files import UNCALIBRATED, make_snapshot
 from umf_ros.submaps.merging import DriftMeter, needed_scans, submap_of
 from umf_ros.verification import Verifier
 from umf_ros.verification import constants as const

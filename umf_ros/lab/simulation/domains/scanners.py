@@ -14,7 +14,7 @@ import numpy as np
 from umf_ros.core.geometry import Array, relative
 from umf_ros.lab.simulation.domains.solids import Scene, cast_into
 from umf_ros.lab.simulation.lidar import PERIOD_NS, pulse_directions, pulse_times
-from umf_ros.lab.simulation.noise import Field
+from umf_ros.lab.simulation.relief import Field
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.comparison import (
+from umf_ros.core.errors import ConfigError
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import from_quaternion, make_pose
+from umf_ros.lab.evaluation.comparison import (
     POSE,
     RESULT_COLUMNS,
     SIGMA,
@@ -17,9 +20,6 @@ from umf_ros.comparison import (
     result_row,
     view_row,
 )
-from umf_ros.core.errors import ConfigError
-from umf_ros.core.frames import LoopClosure
-from umf_ros.core.geometry import from_quaternion, make_pose
 
 
 def listed(folder: Path, text: str) -> Path:

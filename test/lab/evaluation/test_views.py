@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from recordings import CALIBRATION, traverse, write_mcap
 
-from umf_ros import comparison as views
 from umf_ros.baselines.handcrafted import ThumbnailEmbedder
-from umf_ros.comparison import Comparer, PlaceView
 from umf_ros.core.config import Verification
 from umf_ros.core.errors import CalibrationError, SensorFileError, UmfError
 from umf_ros.core.frames import Embedding, Frame
+from umf_ros.lab.evaluation import comparison as views
+from umf_ros.lab.evaluation.comparison import Comparer, PlaceView
 
 
 class CountingEmbedder(ThumbnailEmbedder):

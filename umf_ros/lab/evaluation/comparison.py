@@ -1,4 +1,4 @@
-"""Compare two views of a place, each pair on its own: scans, images or frames of recordings, for `umf compare`."""
+"""Two views of a place, each pair on its own: scans, images or frames of recordings, compared and drawn."""
 
 from __future__ import annotations
 
@@ -11,18 +11,22 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from umf_ros.bags.frames import FrameReader, Moment, nearest_frames, parse_moment, split_reference
+import numpy as np
+
+from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import Verification
-from umf_ros.core.errors import ConfigError, SensorFileError, UmfError
-from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
+from umf_ros.core.errors import BagError, ConfigError, SensorFileError, UmfError, writing
+from umf_ros.core.frames import Candidate, Frame, Image, Keyframe, LoopClosure, Points
+from umf_ros.core.geometry import transform
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding.embedder import Embedder
+from umf_ros.lab.scan_files import OUT_OF_REACH, UNCALIBRATED, fit_image, make_snapshot, read_image, read_scan
 from umf_ros.runs.run_file import pose_numbers
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.sensors.scan_files import OUT_OF_REACH, UNCALIBRATED, fit_image, make_snapshot, read_image, read_scan
 from umf_ros.verification import Hypothesis, Verifier
+from umf_ros.verification.acceptance import load_acceptance
 
 NO_CALIBRATION = "no calibration: images alone give no pose without one"
 NO_DEPTH = "no depth: images without a scan or a right image give no metric pose"
@@ -30,6 +34,13 @@ CACHED_KEYFRAMES = 1000
 """Keyframes in memory, of a fifth of a megabyte each."""
 FRAMES_AT_ONCE = 100
 """Frames with their images that one pass through a recording collects."""
+REACH_NS = 10**9
+"""A frame further than this from a moment does not stand for it."""
+EPOCH_S = 10**9
+"""From so many seconds on, a moment counts since the epoch and not from the start of a recording."""
+
+Moment = int | float
+"""Nanoseconds since the epoch, or seconds from the start of the recording."""
 
 VIEW_COLUMNS = ("match_scan", "query_scan", "match_left", "match_right", "query_left", "query_right")
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -264,3 +275,160 @@ def _listed(role: str, row: dict[str, str | None], base: Path) -> PlaceView:
 def _relative(name: str, base: Path) -> str:
     path = Path(name)
     return str(path.relative_to(base)) if name and path.is_relative_to(base) else name
+
+
+def parse_moment(text: str) -> Moment:
+    """Nanoseconds since the epoch (16 digits or more), seconds since the epoch, or seconds from the start.
+
+    Raises:
+        ValueError: it is none of them.
+    """
+    if text.isdigit() and len(text) >= 16:
+        return int(text)
+    try:
+        value = float(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is neither a stamp in ns nor seconds from the start") from None
+    if not value >= 0:
+        raise ValueError(f"{text!r} is before the start")
+    if value < EPOCH_S:
+        return value
+    seconds, _, fraction = text.partition(".")
+    if not seconds.isdigit() or (fraction and not fraction.isdigit()):
+        raise ValueError(f"{text!r} is neither a stamp in ns nor seconds from the start")
+    return int(seconds) * 10**9 + int(f"{fraction:0<9}"[:9])  # a float has no room for nanoseconds
+
+
+def split_reference(text: str) -> tuple[Path, str] | None:
+    """Recording and moment of `BAG@MOMENT`; None where there is no moment, or the whole is the name of a file."""
+    name, separator, moment = text.rpartition("@")
+    if not separator or not name or "/" in moment or Path(text).exists():
+        return None
+    return Path(name), moment
+
+
+def nearest_frames(frames: Iterable[Frame], moments: list[Moment]) -> list[Frame | BagError]:
+    """The frame nearest to each moment, an error where none is within a second; reads no further than it must.
+
+    Raises:
+        BagError: the recording has no frame.
+    """
+    best: list[Frame] = []
+    wanted: list[int] = []
+    for frame in frames:
+        if not wanted:
+            wanted = [one if isinstance(one, int) else frame.stamp_ns + round(1e9 * one) for one in moments]
+            best = [frame] * len(moments)
+        for position, stamp in enumerate(wanted):
+            if abs(frame.stamp_ns - stamp) < abs(best[position].stamp_ns - stamp):
+                best[position] = frame
+        if frame.stamp_ns > max(wanted) + REACH_NS:
+            break
+    if not best:
+        raise BagError("the recording has no frame with an image or a scan")
+    return [
+        frame
+        if abs(frame.stamp_ns - stamp) <= REACH_NS
+        else BagError(f"no frame within a second of {moment}; the nearest is at {frame.stamp_ns} ns")
+        for frame, stamp, moment in zip(best, wanted, moments, strict=True)
+    ]
+
+
+MOST_LINES = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """The best pose for a pair and what speaks for it.
+
+    Attributes:
+        query: the later keyframe.
+        match: the earlier one.
+        best: the most probable hypothesis, or None when no pose fits.
+        threshold: probability from which a closure is published.
+        contributions: log-odds that each criterion adds, by name; "bias" is what has to be overcome.
+        pixels: (K, 4) feature pairs that obey the pose.
+    """
+
+    query: Keyframe
+    match: Keyframe
+    best: Hypothesis | None
+    threshold: float
+    contributions: dict[str, float]
+    pixels: Points
+
+    @property
+    def verdict(self) -> str:
+        """One line for a person."""
+        if self.best is None:
+            return "rejected: no pose fits"
+        probability = self.best.probability or 0.0
+        word = "accepted" if probability >= self.threshold else "rejected"
+        return f"{word}: probability {probability:.3f}, {self.threshold:g} is needed"
+
+
+def explain(query: Keyframe, match: Keyframe, settings: Verification) -> Explanation:
+    """Examine one pair on its own, without the support of neighbouring keyframes."""
+    candidate = Candidate(0, match.stamp_ns, similarity_of(match, query))
+    examined = Verifier(settings).examine(query, [(candidate, match)])
+    if not examined:
+        return Explanation(query, match, None, settings.min_probability, {}, np.empty((0, 4), np.float32))
+    best = max(examined, key=lambda one: one.probability or 0.0)
+    contributions = load_acceptance(settings.calibration).contributions(best.measurements)
+    pixels = best.views.consistent_pixels(best.pose) if best.views else np.empty((0, 4), np.float32)
+    return Explanation(query, match, best, settings.min_probability, contributions, pixels)
+
+
+def draw(explanation: Explanation, query_image: Image | None, match_image: Image | None, path: Path) -> None:
+    """Write the picture: images with inlier lines, aligned scans from above and from the side, contributions.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 11), layout="constrained")
+    grid = figure.add_gridspec(2, 3, height_ratios=[1.0, 1.05], width_ratios=[1.1, 1, 0.9])
+    _draw_images(figure.add_subplot(grid[0, :]), explanation, query_image, match_image)
+    _draw_scans(figure.add_subplot(grid[1, 0]), explanation, 1, "left [m]", "from above")
+    _draw_scans(figure.add_subplot(grid[1, 1]), explanation, 2, "up [m]", "from the side")
+    _draw_contributions(figure.add_subplot(grid[1, 2]), explanation)
+    stamps = f"query {explanation.query.stamp_ns}   match {explanation.match.stamp_ns}"
+    figure.suptitle(f"{explanation.verdict}\n{stamps}", fontsize=14)
+    with writing(path, ValueError):
+        figure.savefig(path, dpi=100)
+
+
+def _draw_images(axes: Any, explanation: Explanation, query: Image | None, match: Image | None) -> None:
+    camera = explanation.query.camera
+    blank = np.zeros((camera.height, camera.width), np.uint8)
+    left, right = (blank if image is None else image for image in (query, match))
+    axes.imshow(np.hstack([left, right]), cmap="gray", vmin=0, vmax=255)
+    shown = explanation.pixels[:: max(1, len(explanation.pixels) // MOST_LINES)]
+    for u, v, match_u, match_v in shown:
+        axes.plot([u, match_u + left.shape[1]], [v, match_v], color="limegreen", linewidth=0.7, alpha=0.8)
+    axes.set_title(f"query | match: {len(explanation.pixels)} feature pairs obey the pose")
+    axes.set_axis_off()
+
+
+def _draw_scans(axes: Any, explanation: Explanation, height_axis: int, label: str, title: str) -> None:
+    match, query = explanation.match.points, explanation.query.points
+    if explanation.best is not None:
+        query = transform(explanation.best.pose, query)
+        title += ", aligned"
+    for points, colour, name in ((match, "tab:blue", "match"), (query, "tab:orange", "query")):
+        axes.scatter(points[:, 0], points[:, height_axis], s=1.2, c=colour, label=name, linewidths=0)
+    axes.set(xlabel="ahead of the match [m]", ylabel=label, title=f"scans {title}", xlim=(-2, 30))
+    axes.set_aspect("equal" if height_axis == 1 else "auto")
+    axes.legend(loc="upper left", markerscale=6)
+
+
+def _draw_contributions(axes: Any, explanation: Explanation) -> None:
+    names = sorted(explanation.contributions, key=lambda name: explanation.contributions[name])
+    values = [explanation.contributions[name] for name in names]
+    colours = ["tab:red" if value < 0 else "tab:green" for value in values]
+    axes.barh([name.replace("_", " ") for name in names], values, color=colours)
+    axes.axvline(0, color="black", linewidth=0.8)
+    axes.set(
+        xlabel="log-odds", title=f"what speaks for it: {sum(values):+.1f} in all" if values else "nothing to judge"
+    )

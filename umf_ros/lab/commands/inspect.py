@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from umf_ros.bags.reader import Bag
-    from umf_ros.commands.inspection import Inspected
+    from umf_ros.lab.evaluation.inspection import Inspected
 
 PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
 
@@ -36,7 +36,7 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
-    from umf_ros.commands.inspection import inspect
+    from umf_ros.lab.evaluation.inspection import inspect
     from umf_ros.runs.findings import USELESS
 
     console, recording = Console(), open_bag(bag)
@@ -80,9 +80,9 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
 
 def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> None:
     from umf_ros.bags.frames import read_transforms
-    from umf_ros.commands.inspection import GUESS, write_calibration, write_settings
     from umf_ros.core.errors import writing
     from umf_ros.core.io import write_atomically
+    from umf_ros.lab.evaluation.inspection import GUESS, write_calibration, write_settings
 
     settings, calibration = folder / "my_rover.yaml", folder / "my_calibration.yaml"
     for path in (settings, calibration):

@@ -11,9 +11,9 @@ from recordings import CALIBRATION
 
 from umf_ros.core.errors import SensorFileError
 from umf_ros.core.geometry import transform
+from umf_ros.lab.scan_files import UNCALIBRATED, fit_image, make_snapshot, read_image
 from umf_ros.sensors.calibration import Calibration, load_calibration
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.scan_files import UNCALIBRATED, fit_image, make_snapshot, read_image
 
 POINTS = np.array([[5, 1, 0.5], [8, -2, 1], [3, 0, 9]], np.float32)
 
