@@ -33,7 +33,7 @@ def runtime() -> list[Path]:
 
 
 LIGHT = [
-    *(f"commands/{name}.py" for name in ("play", "graph", "compare", "why")),
+    *(f"commands/{name}.py" for name in ("demo", "graph", "compare", "report")),
     *("datasets/g2o.py", "evaluation/graph_plot.py", "live/*.py"),
 ]
 """Files of the lab that `pip install .` serves too: they play recordings, draw graph files, judge runs and pairs."""
