@@ -31,6 +31,7 @@ class Layout:
         rendered: width and height at which pictures are rendered before they are enlarged; None: those published.
         scan_behind_ns: by which the stamps of the scans are too early.
         right_lost: share of the right images that do not arrive.
+        dummies: whether a pulse without a return is sent as a point at 1 m.
     """
 
     calibration: str
@@ -40,6 +41,7 @@ class Layout:
     rendered: tuple[int, int] | None = None
     scan_behind_ns: int = 0
     right_lost: float = 0.02
+    dummies: bool = True
 
     def load(self) -> Calibration:
         """Calibration of the sensors."""
@@ -128,6 +130,11 @@ class Scan:
     intensity: NDArray[np.uint32]
     ambient: NDArray[np.uint32]
     offset_ns: NDArray[np.uint32]
+
+    def returns(self) -> Scan:
+        """The pulses that came back."""
+        kept = self.intensity > 0
+        return Scan(self.points[kept], self.intensity[kept], self.ambient[kept], self.offset_ns[kept])
 
     def usable(self, min_intensity: float, max_height_m: float) -> NDArray[np.bool_]:
         """(POINTS,) which pulses are returns worth using."""

@@ -269,7 +269,9 @@ def record(
     bag.note("simulation", describe(simulator))
     with ThreadPoolExecutor(workers) as pool:
         done = 0
-        for log_ns, _, topic, message in heapq.merge(*_streams(simulator, pool, truth, sensors_only), key=lambda event: event[:2]):
+        for log_ns, _, topic, message in heapq.merge(
+            *_streams(simulator, pool, truth, sensors_only), key=lambda event: event[:2]
+        ):
             bag.write(topic, message, log_ns)
             if topic == CLOUD_TOPIC:
                 done += 1
@@ -314,9 +316,7 @@ def describe(simulator: Simulator) -> dict[str, str]:
     }
 
 
-def _streams(
-    simulator: Simulator, pool: ThreadPoolExecutor, truth: bool, sensors_only: bool
-) -> list[Iterator[Event]]:
+def _streams(simulator: Simulator, pool: ThreadPoolExecutor, truth: bool, sensors_only: bool) -> list[Iterator[Event]]:
     sensors = [_images(simulator, pool, truth), _clouds(simulator, pool), _imu(simulator)]
     return sensors if sensors_only else [*sensors, _odometry(simulator), _ground_truth(simulator), _fixes(simulator)]
 
@@ -348,10 +348,11 @@ def _maps(picture: Rendering, stamp: int, log_ns: int) -> Iterator[Event]:
 
 
 def _clouds(simulator: Simulator, pool: ThreadPoolExecutor) -> Iterator[Event]:
+    layout = simulator.preset.layout
     scans = ahead(pool, simulator.scan, range(len(simulator.scan_stamps_ns)))
     for stamp, scan in zip(simulator.scan_stamps_ns, scans, strict=True):
-        arrives = int(stamp) + PERIOD_NS + _CLOUD_DELAY_NS
-        yield arrives, 1, CLOUD_TOPIC, cloud_message(scan, int(stamp) - simulator.preset.layout.scan_behind_ns)
+        sent, stated = scan if layout.dummies else scan.returns(), int(stamp) - layout.scan_behind_ns
+        yield int(stamp) + PERIOD_NS + _CLOUD_DELAY_NS, 1, CLOUD_TOPIC, cloud_message(sent, stated)
 
 
 def _imu(simulator: Simulator) -> Iterator[Event]:
