@@ -148,11 +148,12 @@ class Simulator:
 
     def published(self, picture: Rendering) -> Image:
         """The image as the camera's driver sends it."""
-        image, size, raw = picture.image, self.calibration.image_size, self.preset.layout.encoding.startswith("bayer")
+        size, raw = self.calibration.image_size, self.preset.layout.encoding.startswith("bayer")
+        image: Any = picture.image
         if image.shape[::-1] != size:
             # equal neighbours pack well, and binning takes them together again
             image = cv2.resize(image, size, interpolation=cv2.INTER_NEAREST if raw else cv2.INTER_LINEAR)
-        return mosaic(image) if raw else image.astype(np.uint8, copy=False)
+        return mosaic(image) if raw else image
 
     def frames(self) -> Iterator[Frame]:
         """Synchronised frames, one per scan, without a file in between; needs one exposure per scan."""

@@ -186,7 +186,7 @@ class SideFiles:
             row += [*track.geodetic[nearest].tolist(), yaw, [w, x, y, z], slam[0, :3, 3].tolist()]
             for column, value in zip(COLUMNS, row, strict=True):
                 columns[column].append(value)
-            self._rows.append((stamp + shift_ns, row[2], pose[:2, 3], yaw))
+            self._rows.append((stamp + shift_ns, str(row[2]), pose[:2, 3], yaw))
         write_data_frame(self.area / "dataset" / name / f"{name}.pkl", columns)
 
     def finish(self) -> None:
@@ -296,7 +296,7 @@ class SideFiles:
         distortion, size = np.array(one["distortion"]), (one["width"], one["height"])
         wider, _ = cv2.getOptimalNewCameraMatrix(matrix, distortion, size, 1, size)
         self._fov_deg = 2 * np.degrees(np.arctan(size[0] / 2 / wider[0, 0]))
-        wider[:2] *= IMAGE_SCALE
+        wider = wider * np.array([[IMAGE_SCALE], [IMAGE_SCALE], [1.0]])
         small = (int(size[0] * IMAGE_SCALE), int(size[1] * IMAGE_SCALE))
         maps = cv2.initUndistortRectifyMap(matrix, distortion, np.eye(3), wider, small, cv2.CV_32FC1)
         return lambda raw: cv2.remap(cv2.cvtColor(raw, cv2.COLOR_BayerRG2RGB), *maps, cv2.INTER_LINEAR)
@@ -393,7 +393,7 @@ class _Made:
 class _FramePickler(pickle._Pickler):
     """Writes names of pandas as they are."""
 
-    dispatch: ClassVar[dict[Any, Any]] = dict(pickle._Pickler.dispatch)  # type: ignore[attr-defined]
+    dispatch: ClassVar[dict[Any, Any]] = dict(pickle._Pickler.dispatch)
 
     def _save_name(self, name: _Name) -> None:
         self.write(pickle.GLOBAL + f"{name.module}\n{name.name}\n".encode())  # type: ignore[attr-defined]
