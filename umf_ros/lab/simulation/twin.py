@@ -117,7 +117,7 @@ class TwinSequence:
         return max(scale * self.length_m, min(SHORTEST_M, self.length_m))
 
 
-STRONG = Drift(scale=0.02, turn_deg_m=0.14, walk_deg_sqrt_m=0.3)
+STRONG = Drift(scale=0.02, turn_deg_m=0.16, walk_deg_sqrt_m=0.3)
 """What makes 94 m of error over the crater's kilometre."""
 
 
