@@ -193,7 +193,7 @@ def replay_sequence(task: SequenceTask) -> Record:
     if found and odometry is not None and (lag := clock_lag_s(odometry, found[1])):
         late = f"the odometry fits the satellites' positions {-lag:+.1f} s later than their stamps say"
         notes.append(f"{late}: is {found[0].name} in GPS time? its figures are not to be trusted")
-    notes += [one.line for one in look_first(about) if one.severity != "note"]
+    notes += [one.line for one in look_first(replace(about, missed=[])) if one.severity != "note"]
     record = judged_record(about, odometry)
     record |= {"warnings": notes, "minutes": round((time.monotonic() - started) / 60, 2)}
     record["stereo_scale"] = _number(about.sensors.stereo_scale)
