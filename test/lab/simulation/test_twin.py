@@ -22,7 +22,7 @@ from umf_ros.lab.simulation import twin
 from umf_ros.lab.simulation.lidar import ETNA as ETNA_LAYOUT
 from umf_ros.lab.simulation.motion_sensors import Motion, drifting
 from umf_ros.lab.simulation.relief import Relief
-from umf_ros.lab.simulation.twin import TWINS, Disorders, preset_of, twin_of, write_twin
+from umf_ros.lab.simulation.twin import TWINS, Disorders, twin_of, write_twin
 from umf_ros.lab.simulation.world import ground
 from umf_ros.runs.truth import absolute_trajectory_error, find_revisits
 from umf_ros.sensors.calibration import load_calibration
@@ -163,7 +163,7 @@ def test_all_fourteen_by_name_and_length() -> None:
 @pytest.mark.parametrize("scale", [0.1, 1.0])
 def test_the_crater_comes_back_once_at_its_end(relief: Relief, scale: float) -> None:
     one = twin_of("s3li_crater")
-    preset = preset_of(one, scale, ETNA_LAYOUT, Disorders(), SEED)
+    preset = one.preset(SEED, scale, ETNA_LAYOUT)
     route = preset.route(relief, SEED)
     motion = Motion(relief, route, preset.speed_m_s, preset.tilt_deg, SEED)
     times = np.arange(0, motion.duration_s, 0.5)
@@ -180,7 +180,7 @@ def test_the_crater_comes_back_once_at_its_end(relief: Relief, scale: float) -> 
 def test_a_disorder_can_be_left_out_by_its_name() -> None:
     names = {field.name for field in fields(Disorders)}
     assert {"late_scans", "dummies", "gps_time", "missing_fixes", "imu_frame", "gaps", "drift", "baseline"} <= names
-    calm = preset_of(twin_of("s3li_crater"), 1.0, ETNA_LAYOUT, Disorders(drift=False), SEED)
+    calm = twin_of("s3li_crater").preset(SEED, 1.0, ETNA_LAYOUT, drifts=False)
     assert calm.drift.turn_deg_m < 0.01
 
 

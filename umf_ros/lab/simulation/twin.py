@@ -25,79 +25,40 @@ from umf_ros.lab.simulation.world import World, check_seed, ground
 SHORTEST_M = 60.0
 """Of a scaled drive: one more lap has to lie the gap of a loop closure behind the first."""
 SHORTEST_LOOP_M = 36.0
-LAST_REVISIT = 0.01
-"""Share of the crater's way that is driven twice, at its end."""
-SHORTEST_REVISIT_M = 6.0
+LAST_REVISIT, SHORTEST_REVISIT_M = 0.01, 6.0
+"""Share of the crater's way that is driven twice, at its end, and the least of it."""
+ASIDE_M = 1.5
+"""Of the trail, where it is driven again."""
 
-Way = Callable[[Relief, np.random.Generator, np.random.Generator, float, float], Walker]
-"""Lays a drive on a relief: draws of the place and of the drive, its length, and that of the drive whose trail it is."""
-
-
-def _laps(share: float) -> Way:
-    """A loop of a share of the way, driven again until the way is over."""
-
-    def way(
-        relief: Relief, place: np.random.Generator, rng: np.random.Generator, length_m: float, trail_m: float
-    ) -> Walker:
-        loop_m = max(share * trail_m, SHORTEST_LOOP_M)
-        return Walker(gentle_loop(relief, loop_m, place), rng).forward(loop_m).forward(length_m, lateral_m=1.5)
-
-    return way
+Trail = Callable[[Relief, np.random.Generator, float], Array]
+"""Draws a closed (N, 2) curve on a relief, for a drive of a length."""
 
 
-def _out_and_back(*shares: float) -> Way:
-    """Along a trail, back, out again, ...: a share of the way each."""
-
-    def way(
-        relief: Relief, place: np.random.Generator, rng: np.random.Generator, length_m: float, trail_m: float
-    ) -> Walker:
-        walker = Walker(gentle_loop(relief, max(0.6 * trail_m, SHORTEST_LOOP_M), place), rng)
-        walker.forward(shares[0] * length_m)
-        for share in shares[1:]:
-            walker.turn_back().forward(share * length_m, lateral_m=1.5)
-        return walker.forward(10.0)
-
-    return way
+def _loop(share: float) -> Trail:
+    """A loop of a share of the drive's length."""
+    return lambda relief, rng, length_m: gentle_loop(relief, max(share * length_m, SHORTEST_LOOP_M), rng)
 
 
-def _eights(
-    relief: Relief, place: np.random.Generator, rng: np.random.Generator, length_m: float, trail_m: float
-) -> Walker:
-    """Figures of eight, more than one."""
-    t = np.linspace(0, 2 * np.pi, 1500, endpoint=False)
+def _eight(_: Relief, rng: np.random.Generator, length_m: float) -> Array:
+    """A figure of eight of a good half of the length."""
+    t, turn = np.linspace(0, 2 * np.pi, 1500, endpoint=False), rng.uniform(0, 2 * np.pi)
     eight = np.stack([np.sin(t), 0.6 * np.sin(2 * t)], 1)
-    eight *= max(0.7 * trail_m, SHORTEST_LOOP_M) / metres_along(eight)[-1]
-    turn = place.uniform(0, 2 * np.pi)
-    trail = eight @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    return Walker(trail, rng).forward(length_m + 10.0, lateral_m=1.0)
+    eight *= max(0.6 * length_m, SHORTEST_LOOP_M) / metres_along(eight)[-1]
+    return eight @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
 
 
-def _around_the_crater(
-    relief: Relief, place: np.random.Generator, rng: np.random.Generator, length_m: float, trail_m: float
-) -> Walker:
-    """One long way around that meets its start at its very end, and nothing before."""
-    loop_m = length_m - max(LAST_REVISIT * length_m, SHORTEST_REVISIT_M)
-    reach_m, lobes = 86.0, 6
+def _crater(relief: Relief, rng: np.random.Generator, length_m: float) -> Array:
+    """A long way around that meets its start at the very end of the drive, and nothing before."""
+    loop_m, reach_m, lobes = length_m - max(LAST_REVISIT * length_m, SHORTEST_REVISIT_M), 86.0, 6
     if loop_m < 2 * np.pi * reach_m:
-        trail = gentle_loop(relief, loop_m, place)
-    else:
-        angle = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
-        phase = place.uniform(0, 2 * np.pi)
+        return gentle_loop(relief, loop_m, rng)
+    angle, phase = np.linspace(0, 2 * np.pi, 4000, endpoint=False), rng.uniform(0, 2 * np.pi)
 
-        def ring(depth: float) -> Array:
-            radius = reach_m * (1 + depth * np.cos(lobes * angle + phase))
-            return np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
+    def ring(depth: float) -> Array:
+        radius = reach_m * (1 + depth * np.cos(lobes * angle + phase))
+        return np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
 
-        trail = ring(brentq(lambda depth: metres_along(ring(depth))[-1] - loop_m, 0.0, 0.6))
-    start = int(place.integers(len(trail)))
-    closed = metres_along(np.vstack([trail, trail[:1]]))[-1]
-    return Walker(np.roll(trail, -start, axis=0), rng).forward(closed).forward(length_m)
-
-
-def _never_back(
-    relief: Relief, place: np.random.Generator, rng: np.random.Generator, length_m: float, trail_m: float
-) -> Walker:
-    return Walker(gentle_loop(relief, 1.6 * trail_m, place), rng).forward(length_m + 5.0)
+    return ring(brentq(lambda depth: metres_along(ring(depth))[-1] - loop_m, 0.0, 0.6))
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,18 +68,20 @@ class TwinSequence:
     Attributes:
         name: of the published recording.
         length_m: as published; of Vulcano nobody says it.
-        way: what is driven.
         start: when, UTC.
+        trail: what is driven along.
+        legs: shares of the length, driven one after the other; before a negative one the rover turns back.
         drift: of the odometry that comes with it.
-        trail: name of the sequence whose trail it takes; empty: its own.
+        place: name of the sequence whose trail it takes; empty: its own.
     """
 
     name: str
     length_m: float
-    way: Way
     start: datetime
+    trail: Trail
+    legs: tuple[float, ...]
     drift: Drift = field(default_factory=Drift)
-    trail: str = ""
+    place: str = ""
 
     @property
     def etna(self) -> bool:
@@ -129,9 +92,24 @@ class TwinSequence:
         """Metres of a shortened drive."""
         return max(scale * self.length_m, min(SHORTEST_M, self.length_m))
 
+    def preset(self, seed: int, scale: float, layout: Layout, drifts: bool = True) -> Preset:
+        """The drive through the world of a seed."""
+        length_m, place = self.scaled(scale), twin_of(self.place or self.name)
+
+        def plan(relief: Relief, rng: np.random.Generator) -> Walker:
+            drawn = np.random.default_rng([seed, 25, TWINS.index(place)])
+            walker = Walker(self.trail(relief, drawn, place.scaled(scale)), rng)
+            for number, share in enumerate(self.legs):
+                walker = walker.turn_back() if share < 0 else walker
+                walker.forward(abs(share) * length_m, lateral_m=ASIDE_M if number else 0.0)
+            return walker.forward(10.0)
+
+        drift = self.drift if drifts else Drift(0.002, 0.002, 0.02, 0.002)
+        return Preset(self.name, plan, length_m, 0, drift=drift, layout=layout)
+
 
 STRONG = Drift(scale=0.02, turn_deg_m=0.16, walk_deg_sqrt_m=0.3)
-"""What makes 94 m of error over the crater's kilometre."""
+"""Odometry that is off by more than 60 m after the crater's kilometre."""
 
 
 def _day(month: int, day: int, hour: int, year: int = 2021) -> datetime:
@@ -139,20 +117,20 @@ def _day(month: int, day: int, hour: int, year: int = 2021) -> datetime:
 
 
 TWINS = (
-    TwinSequence("s3li_traverse_1", 371, _out_and_back(0.45, 0.35, 0.2), _day(7, 7, 8)),
-    TwinSequence("s3li_traverse_2", 300, _out_and_back(0.5, 0.25, 0.25), _day(7, 7, 9), trail="s3li_traverse_1"),
-    TwinSequence("s3li_crater", 1010, _around_the_crater, _day(7, 7, 11), STRONG),
-    TwinSequence("s3li_loops", 587, _laps(0.33), _day(7, 7, 14)),
-    TwinSequence("s3li_crater_inout", 1338, _out_and_back(0.4, 0.3, 0.3), _day(7, 8, 8)),
-    TwinSequence("s3li_mapping", 242, _laps(0.33), _day(7, 8, 11), trail="s3li_loops"),
-    TwinSequence("s3li_landmarks", 482, _eights, _day(7, 8, 13)),
-    TwinSequence("capo_grillo", 640, _laps(0.6), _day(7, 4, 8, 2023)),
-    TwinSequence("capo_grillo_2", 520, _laps(0.6), _day(7, 4, 10, 2023), trail="capo_grillo"),
-    TwinSequence("vegetation", 380, _laps(0.6), _day(7, 5, 8, 2023)),
-    TwinSequence("waterfront", 450, _laps(0.6), _day(7, 5, 10, 2023), trail="vegetation"),
-    TwinSequence("straight_path", 300, _never_back, _day(7, 6, 8, 2023)),
-    TwinSequence("moon_lake", 420, _laps(0.5), _day(7, 6, 10, 2023)),
-    TwinSequence("lava_tunnel", 260, _laps(0.5), _day(7, 6, 13, 2023), trail="moon_lake"),
+    TwinSequence("s3li_traverse_1", 371, _day(7, 7, 8), _loop(0.6), (0.45, -0.35, -0.2)),
+    TwinSequence("s3li_traverse_2", 300, _day(7, 7, 9), _loop(0.6), (0.5, -0.25, -0.25), place="s3li_traverse_1"),
+    TwinSequence("s3li_crater", 1010, _day(7, 7, 11), _crater, (0.9, 0.2), STRONG),
+    TwinSequence("s3li_loops", 587, _day(7, 7, 14), _loop(0.33), (0.33, 0.8)),
+    TwinSequence("s3li_crater_inout", 1338, _day(7, 8, 8), _loop(0.6), (0.4, -0.3, -0.3)),
+    TwinSequence("s3li_mapping", 242, _day(7, 8, 11), _loop(0.33), (0.5, 0.6), place="s3li_loops"),
+    TwinSequence("s3li_landmarks", 482, _day(7, 8, 13), _eight, (0.6, 0.5)),
+    TwinSequence("capo_grillo", 640, _day(7, 4, 8, 2023), _loop(0.6), (0.6, 0.5)),
+    TwinSequence("capo_grillo_2", 520, _day(7, 4, 10, 2023), _loop(0.6), (0.6, 0.5), place="capo_grillo"),
+    TwinSequence("vegetation", 380, _day(7, 5, 8, 2023), _loop(0.6), (0.6, 0.5)),
+    TwinSequence("waterfront", 450, _day(7, 5, 10, 2023), _loop(0.6), (0.6, 0.5), place="vegetation"),
+    TwinSequence("straight_path", 300, _day(7, 6, 8, 2023), _loop(1.6), (1.0,)),
+    TwinSequence("moon_lake", 420, _day(7, 6, 10, 2023), _loop(0.5), (0.5, 0.6)),
+    TwinSequence("lava_tunnel", 260, _day(7, 6, 13, 2023), _loop(0.5), (0.5, 0.6), place="moon_lake"),
 )
 """Etna's seven with their published lengths, Vulcano's seven by their days."""
 
@@ -165,18 +143,6 @@ ETNA_FAMILY, VULCANO_FAMILY = "etna", "mounds"
 def twin_of(name: str) -> TwinSequence:
     """The sequence of a name."""
     return next(one for one in TWINS if one.name == name)
-
-
-def preset_of(one: TwinSequence, scale: float, layout: Layout, disorders: Disorders, seed: int) -> Preset:
-    """The drive of a sequence through the world of a seed."""
-    length_m, trail = one.scaled(scale), twin_of(one.trail or one.name)
-    trail_m, number = trail.scaled(scale), TWINS.index(trail)
-    drift = one.drift if disorders.drift else Drift(0.002, 0.002, 0.02, 0.002)
-
-    def plan(relief: Relief, rng: np.random.Generator) -> Walker:
-        return one.way(relief, np.random.default_rng([seed, 25, number]), rng, length_m, trail_m)
-
-    return Preset(one.name, plan, length_m, 0, drift=drift, layout=layout)
 
 
 def write_twin(
@@ -215,7 +181,7 @@ def write_twin(
         layout = _layout(area, etna, seed, disorders, COARSE[etna] if not fine else FULL[etna])
         family = ETNA_FAMILY if etna else VULCANO_FAMILY
         relief = ground(check_seed(seed), family, 0.3)
-        presets = {one.name: preset_of(one, scale, layout, disorders, seed) for one in group}
+        presets = {one.name: one.preset(seed, scale, layout, disorders.drift) for one in group}
         seeds = {one.name: seed + 97 * TWINS.index(one) for one in group}
         routes = {name: preset.route(relief, seeds[name]) for name, preset in presets.items()}
         world = World(seed, family, 0.3, np.concatenate([route.path for route in routes.values()]), relief)

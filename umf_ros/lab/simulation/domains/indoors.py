@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
 from umf_ros.core.geometry import Array
-from umf_ros.lab.simulation.domains.solids import Scene, Solids
-from umf_ros.lab.simulation.domains.trails import closed, distance_to, rounded_rectangle, wobbly_ring
+from umf_ros.lab.simulation.domains.solids import Scene, Solids, closed, distance_to, rounded_rectangle, wobbly_ring
 
 MODULE_M = 3.2
 DOOR_M = 1.3

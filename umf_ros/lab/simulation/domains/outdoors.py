@@ -8,8 +8,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array
-from umf_ros.lab.simulation.domains.solids import Scene, Solids
-from umf_ros.lab.simulation.domains.trails import distance_to, rounded_rectangle, wobbly_ring
+from umf_ros.lab.simulation.domains.solids import Scene, Solids, distance_to, rounded_rectangle, wobbly_ring
 from umf_ros.lab.simulation.noise import Field, smooth_step, spectral_noise
 from umf_ros.lab.simulation.world import GROUND, HORIZON, ROCK, World
 

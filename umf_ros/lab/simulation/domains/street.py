@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from umf_ros.core.geometry import Array
-from umf_ros.lab.simulation.domains.solids import Scene, Solids
-from umf_ros.lab.simulation.domains.trails import rounded_rectangle
+from umf_ros.lab.simulation.domains.solids import Scene, Solids, rounded_rectangle
 
 HALF_ROAD_M, PAVEMENT_M = 4.0, 2.2
 OCCUPIED = 0.55
