@@ -49,7 +49,7 @@ def command(
     tables = {"S3LI by protocol": protocol_table(run.records), "S3LI by sequence": sequence_table(run.records)}
     for title, table in tables.items():
         print_table(console, title, table)
-    notes += [f"{name}: {text}" for name, one in run.records.items() for text in _told(one)]
+    notes += _told(run.records)
     for note in notes:
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
     total = pooled(list(run.records.values()))
@@ -74,17 +74,22 @@ def _chosen(download: S3liFolder, sequences: str) -> S3liFolder:
     return replace(download, sequences=[known[name] for name in names]) if names else download
 
 
-def _told(record: Record) -> list[str]:
-    failed = [record["status"]] if record["status"].startswith("failed") else []
-    return failed + list(dict.fromkeys(record.get("warnings", [])))
+def _told(records: dict[str, Record]) -> list[str]:
+    """Faults and warnings, each with the sequences it is about."""
+    about: dict[str, list[str]] = {}
+    for name, one in records.items():
+        failed = [one["status"]] if one["status"].startswith("failed") else []
+        for text in dict.fromkeys(failed + one["warnings"]):
+            about.setdefault(text, []).append(name)
+    return [f"{', '.join(names)}: {text}" for text, names in about.items()]
 
 
 def _run(run: S3liRun, download: S3liFolder, console: Console) -> list[str]:
     """Replay and retrieve with a bar over all sequences; returns lines about what was left out."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    left_out = []
+    left_out: list[str] = []
     with Progress(*columns, console=console, transient=True) as progress:
         bar = progress.add_task("replaying", total=len(download.sequences))
         for number, one in enumerate(download.sequences):
@@ -96,10 +101,9 @@ def _run(run: S3liRun, download: S3liFolder, console: Console) -> list[str]:
                 console.print(f"{number + 1} of {len(download.sequences)}: {one.name}: {status}", markup=False)
         for dataset in dict.fromkeys(one.dataset for one in download.sequences):
             task = progress.add_task(f"retrieving {dataset}", total=1.0)
-            left_out.append(
-                run.retrieve(
-                    dataset,
-                    lambda name, done, task=task: progress.update(task, description=name, completed=done),  # type: ignore[misc]
-                )
-            )
-    return [line for line in left_out if line]
+
+            def show(name: str, done: float, task: TaskID = task) -> None:
+                progress.update(task, description=name, completed=done)
+
+            left_out += run.retrieve(dataset, show)
+    return left_out

@@ -197,7 +197,7 @@ def contradictions(files: Sequence[StereoFile], names: Sequence[str], launch_bas
             percent = 100 * (value / launch_baseline_m - 1)
             told.append(
                 f"the stereo baseline is {launch_baseline_m:.5f} m by the launch file and {value:.5f} m by {name} "
-                f"({percent:+.1f} %): {name} is used, and held against the LiDAR"
+                f"({percent:+.1f} %)"
             )
     for (name, one), (another, other) in pairwise(zip(names, files, strict=True)):
         share = other.left["fx"] / one.left["fx"] - 1

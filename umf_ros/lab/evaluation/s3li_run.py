@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -167,32 +169,31 @@ def clock_lag_s(odometry: Trajectory, truth: Trajectory) -> float:
     return float(lags[best]) if clear and abs(lags[best]) > LAG_STEP_S else 0.0
 
 
-@dataclass(frozen=True)
-class SequenceTask:
-    """A sequence to replay into a folder."""
-
-    sequence: S3liSequence
-    folder: Path
-
-
-def replay_sequence(task: SequenceTask) -> Record:
+def replay_sequence(one: S3liSequence, folder: Path) -> Record:
     """Replay a sequence with the odometry that is there and judge it by the satellites.
 
     Raises:
         UmfError: a file of it is damaged.
     """
-    one, folder = task.sequence, task.folder
     started = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     notes: list[str] = []
     recording, settings, odometry = _open(one, folder, notes)
     run, check = _replayed(folder, recording, settings, odometry, notes)
-    found = truth_of(one, recording.start_ns, recording.end_ns)
-    truth = _best_fixed(*found, run) if found else None
+    found, truth = truth_of(one, recording.start_ns, recording.end_ns), None
+    if found:
+        truth = found[1]
+        with suppress(UmfError):  # none of them is fixed
+            fixed = read_rtklib(found[0], FIXED)
+            truth = fixed if fixed.at(run.stamps)[1].mean() >= ENOUGH_FIXED else truth
     about = replace(judge_run(replace(run, truth=truth), recording), sensors=check.report(run.odometry))
     if found and odometry is not None and (lag := clock_lag_s(odometry, found[1])):
         late = f"the odometry fits the satellites' positions {-lag:+.1f} s later than their stamps say"
         notes.append(f"{late}: is {found[0].name} in GPS time? its figures are not to be trusted")
+    if one.calibrations and math.isfinite(about.sensors.stereo_scale):
+        notes.append(
+            f"stereo sees {about.sensors.stereo_scale:.3f} times as far as the LiDAR with {one.calibrations[0].name}"
+        )
     notes += [one.line for one in look_first(replace(about, missed=[])) if one.severity != "note"]
     record = judged_record(about, odometry)
     record |= {"warnings": notes, "minutes": round((time.monotonic() - started) / 60, 2)}
@@ -254,48 +255,27 @@ def _replayed(
     return read_run(folder), check
 
 
-def _best_fixed(path: Path, track: Trajectory, run: FinishedRun) -> Trajectory:
-    """Positions of fixed solutions alone, where they cover half of the keyframes."""
-    try:
-        fixed = read_rtklib(path, FIXED)
-    except UmfError:
-        return track
-    known = fixed.at(run.stamps)[1]
-    return fixed if len(known) and known.mean() >= ENOUGH_FIXED else track
-
-
 def judged_record(about: JudgedRun, odometry: Trajectory | None) -> Record:
     """The figures of one run."""
-    run, truth = about.run, about.run.truth
+    run, truth, closures = about.run, about.run.truth, about.closures
     record: Record = {"keyframes": len(run.stamps), "closures": len(run.closures)}
-    names = (
-        "recall1",
-        "recall1_queries",
-        "closures_true",
-        "closures_false",
-        "closures_judged",
-        "closures_overlapping",
-        *("revisits", "revisits_closed"),
-    )
-    record |= dict.fromkeys((*names, *LENGTHS))
+    record |= dict.fromkeys(("recall1", "precision1", "closures_true", "closures_false", "revisits", *LENGTHS))
     if truth is None or not about.covered[0]:
         return record
     poses, known = headed(truth, run.stamps, odometry if odometry is not None else run.odometry)
-    path_length = run.keyframes["path_length_m"]
+    stamps, path_length = run.stamps[known], run.keyframes["path_length_m"][known]
     if run.descriptors is not None:
-        hits = recall_of_places(
-            run.stamps[known], poses[known], path_length[known], run.descriptors[known], run.settings.loop
-        )
+        hits = recall_of_places(stamps, poses[known], path_length, run.descriptors[known], run.settings.loop)
         record |= {"recall1_hits": hits[0], "recall1_queries": hits[1], "recall1": _share(*hits)}
-    true = int(about.closures.is_true.sum())
-    again = find_revisits(run.stamps[known], poses[known], path_length[known], run.settings.loop)
-    closed = again & np.isin(run.stamps[known], about.closures.query_stamp_ns[about.closures.is_true])
-    overlapping = [_overlap(about, poses, one) > LEAST_OVERLAP for one in about.closures]
-    record |= {"closures_true": true, "closures_false": len(about.closures) - true}
-    record |= {"closures_judged": len(about.closures), "closures_overlapping": int(sum(overlapping))}
-    record |= {"revisits": int(again.sum()), "revisits_closed": int(closed.sum())}
-    record["pose_error_m"] = _number(np.median(about.closures.translation_error_m)) if len(about.closures) else None
-    return record | {"ate_odometry_m": about.ate_odometry_m, "ate_optimized_m": about.ate_optimized_m}
+    true = int(closures.is_true.sum())
+    again = find_revisits(stamps, poses[known], path_length, run.settings.loop)
+    closed = again & np.isin(stamps, closures.query_stamp_ns[closures.is_true])
+    overlapping = sum(_overlap(about, poses, one) > LEAST_OVERLAP for one in closures)
+    record |= {"closures_true": true, "closures_false": len(closures) - true, "closures_judged": len(closures)}
+    record |= {"closures_overlapping": overlapping, "revisits": int(again.sum()), "revisits_closed": int(closed.sum())}
+    record["pose_error_m"] = _number(np.median(closures.translation_error_m)) if len(closures) else None
+    ates = about.ate_odometry_m, about.ate_optimized_m
+    return record | dict(zip(LENGTHS[1:], (None if one is None else _number(one) for one in ates), strict=True))
 
 
 def _overlap(about: JudgedRun, poses: Array, closure: Any) -> float:
@@ -308,30 +288,20 @@ def _overlap(about: JudgedRun, poses: Array, closure: Any) -> float:
     return view_overlap(query[:2, 3], float(heading(query)), match[:2, 3], float(heading(match)), fov_deg)
 
 
-def embed_samples(task: SequenceTask) -> tuple[list[str], Array, Array]:
-    """Names, stamps (N,) in s and descriptors (N, D) of the toolkit's samples of a sequence.
+def embed_samples(one: S3liSequence, path: Path) -> tuple[list[str], Array, Array]:
+    """Names, stamps (N,) in s and descriptors (N, D) of the toolkit's samples of a sequence, in its pickle at `path`.
 
     Raises:
         UmfError: the pickle or an image is missing or damaged.
     """
-    one = task.sequence
-    assert one.pickle is not None
-    kept = task.folder / "samples.npz"
-    table = load_data_frame(one.pickle)
-    keys, stamps = [image_key(str(path)) for path in table["img_path"]], table["time_stamp"].astype(float)
-    if kept.is_file():
-        with np.load(kept) as content:
-            if content["keys"].tolist() == keys:
-                return keys, stamps, content["descriptors"]
-    sequence = read_toolkit([one.pickle], one.pickle.parent.parent, one.dataset)
+    table = load_data_frame(path)
+    sequence = read_toolkit([path], path.parent.parent, one.dataset)
     embedder = make_embedder(Settings().embedding)
     found = []
     for number, frame in enumerate(sequence_set(sequence, THESIS_RULE).frames, 1):
         found.append(embedder.embed(frame).descriptor)
-        _progress(number / len(keys))
-    task.folder.mkdir(parents=True, exist_ok=True)
-    np.savez(kept, keys=np.array(keys), descriptors=np.stack(found))
-    return keys, stamps, np.stack(found)
+        _progress(number / len(sequence))
+    return [image_key(str(name)) for name in table["img_path"]], table["time_stamp"].astype(float), np.stack(found)
 
 
 _shared: Any = None
@@ -379,51 +349,43 @@ class S3liRun:
 
     def replay(self, one: S3liSequence, report: Callable[[float], None]) -> None:
         """Replay one sequence, or take its figures from an earlier run; a fault is its own."""
-        task = SequenceTask(one, self._out / one.name)
-        kept = task.folder / "figures.json"
+        folder = self._out / one.name
+        kept = folder / "figures.json"
+        record: Record = {"dataset": one.dataset, "status": "not replayed", "warnings": []}
         if self._resume and kept.is_file():
-            self.records[one.name] = json.loads(kept.read_text(encoding="utf-8"))
-            return
-        record: Record = {"dataset": one.dataset, "status": "done", "warnings": []}
-        if one.recording is None and one.export is None:
-            record["status"] = "not replayed"
-        else:
+            record = json.loads(kept.read_text(encoding="utf-8"))
+        elif one.recording is not None or one.export is not None:
+            shutil.rmtree(folder, ignore_errors=True)  # what an earlier run has left
             try:
-                record |= in_own_process(replay_sequence, _fresh(task), report=report)
+                record |= {"status": "done"} | in_own_process(replay_sequence, one, folder, report=report)
+                write_atomically(kept, json.dumps(record, indent=2) + "\n")
             except UmfError as error:
                 record["status"] = f"failed: {error}"
         self.records[one.name] = record
-        if record["status"] == "done":
-            write_atomically(kept, json.dumps(record, indent=2) + "\n")
 
-    def retrieve(self, dataset: str, report: Callable[[str, float], None]) -> str:
-        """MPRF's protocol over all samples of one data set; returns a line where it has to be left out."""
+    def retrieve(self, dataset: str, report: Callable[[str, float], None]) -> list[str]:
+        """MPRF's protocol over all samples of one data set; returns lines about what had to be left out."""
         path = self._download.pairs.get(dataset)
         chosen = [one for one in self._download.sequences if one.dataset == dataset and one.pickle is not None]
         if path is None or not chosen:
-            return f"{dataset}: no list of overlapping pairs, or no pickles: MPRF's protocol is left out"
-        told, keys, stamps, descriptors, names = [], list[str](), [], [], list[str]()
-        pairs = read_pairs(path)
+            return [f"{dataset}: no list of overlapping pairs, or no pickles: MPRF's protocol is left out"]
+        told, found = [], {}
         for one in chosen:
-            task = SequenceTask(one, self._out / one.name)
             try:
-                found = in_own_process(embed_samples, task, report=partial(report, one.name))
+                found[one.name] = in_own_process(embed_samples, one, one.pickle, report=partial(report, one.name))
             except UmfError as error:
                 told.append(f"{one.name}: {error}")
-                continue
-            keys += found[0]
-            stamps.append(found[1])
-            descriptors.append(found[2])
-            names += [one.name] * len(found[0])
-        if keys:
-            right, answerable = precision_of_pairs(keys, np.concatenate(stamps), np.concatenate(descriptors), pairs)
-            for one in chosen:
-                of_it = np.array(names) == one.name
-                hits, count = int((right & answerable & of_it).sum()), int((answerable & of_it).sum())
-                record = self.records.setdefault(one.name, {"dataset": dataset, "status": "not replayed"})
-                record |= {"precision1": _share(hits, count), "precision1_hits": hits, "precision1_queries": count}
-                record |= {"samples": int(of_it.sum())}
-        return "; ".join(told)
+        if not found:
+            return told
+        keys = [key for part in found.values() for key in part[0]]
+        stamps, descriptors = (np.concatenate([part[place] for part in found.values()]) for place in (1, 2))
+        right, answerable = precision_of_pairs(keys, stamps, descriptors, read_pairs(path))
+        names = np.repeat(list(found), [len(part[0]) for part in found.values()])
+        for name in found:
+            hits, count = int((right & answerable & (names == name)).sum()), int((answerable & (names == name)).sum())
+            self.records[name] |= {"precision1": _share(hits, count), "precision1_hits": hits}
+            self.records[name] |= {"precision1_queries": count, "samples": int((names == name).sum())}
+        return told
 
 
 PUBLISHED = {
@@ -522,14 +484,6 @@ def latex(table: TextTable) -> str:
 
 def _escaped(text: str) -> str:
     return "".join(f"\\{one}" if one in "%_&#" else one for one in text)
-
-
-def _fresh(task: SequenceTask) -> SequenceTask:
-    """The task, its folder without the files of a run that was begun before."""
-    for path in task.folder.glob("*") if task.folder.is_dir() else ():
-        if path.is_file() and path.name != "samples.npz":
-            path.unlink()
-    return task
 
 
 def _share(hits: int, count: int) -> float | None:
