@@ -345,10 +345,8 @@ def _poses(frames: list[Frame], positions: Array, truth: Trajectory) -> Array:
     return poses_of(aligned_rotations(np.stack(odometry), positions), positions)
 
 
-def aligned_rotations(estimate: Array | None, positions: Array) -> Array:
+def aligned_rotations(estimate: Array, positions: Array) -> Array:
     """(N, 3, 3) rotations of estimated (N, 4, 4) poses in the frame of (N, 3) positions; the course if they differ."""
-    if estimate is None:
-        return course(positions)
     truth_T_estimate = align(estimate[:, :3, 3], positions)[0]
     misfit = np.linalg.norm(transform(truth_T_estimate, estimate[:, :3, 3]) - positions, axis=1)
     if np.sqrt(np.mean(misfit**2)) > MAX_MISFIT * path_length(positions)[-1]:

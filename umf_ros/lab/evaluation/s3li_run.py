@@ -45,7 +45,7 @@ from umf_ros.lab.datasets.s3li_folder import (
     read_stereo,
     truth_of,
 )
-from umf_ros.lab.datasets.simulated import poses_of
+from umf_ros.lab.datasets.simulated import course, poses_of
 from umf_ros.lab.evaluation.bag_run import sequence_set
 from umf_ros.lab.evaluation.results import TextTable
 from umf_ros.lab.evaluation.retrieval import THESIS_RULE, Mask, loop_closure, rank
@@ -142,13 +142,16 @@ def headed(truth: Trajectory, stamps: NDArray[np.int64], odometry: Trajectory | 
     estimate, heard = odometry.at(stamps) if odometry is not None else (poses, np.zeros(len(stamps), bool))
     for part in np.array_split(rows, SPLITS):
         if len(part):
-            positions, used = poses[part, :3, 3], heard[part].all() and len(part) >= SPLITS
-            poses[part] = poses_of(aligned_rotations(estimate[part] if used else None, positions), positions)
+            positions, used = poses[part, :3, 3], heard[part]
+            rotations = course(positions)
+            if used.sum() >= SPLITS:
+                rotations[used] = aligned_rotations(estimate[part[used]], positions[used])
+            poses[part] = poses_of(rotations, positions)
     return poses, known
 
 
 def clock_lag_s(odometry: Trajectory, truth: Trajectory) -> float:
-    """Seconds to be added to the stamps of the positions so that the odometry fits them; 0 unless that is clear."""
+    """Seconds to be added to the stamps of the positions so that they fit the odometry; 0 unless that is clear."""
     lags = np.arange(-LARGEST_LAG_S, LARGEST_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
     first, last = odometry.stamps_ns[0], odometry.stamps_ns[-1]
     wanted = np.arange(first, last, 10**9)
@@ -186,18 +189,17 @@ def replay_sequence(one: S3liSequence, folder: Path) -> Record:
         with suppress(UmfError):  # none of them is fixed
             fixed = read_rtklib(found[0], FIXED)
             truth = fixed if fixed.at(run.stamps)[1].mean() >= ENOUGH_FIXED else truth
-    about = replace(judge_run(replace(run, truth=truth), recording), sensors=check.report(run.odometry))
+    about = replace(judge_run(replace(run, truth=truth), recording), sensors=check.report(odometry or run.odometry))
     if found and odometry is not None and (lag := clock_lag_s(odometry, found[1])):
         late = f"the odometry fits the satellites' positions {-lag:+.1f} s later than their stamps say"
         notes.append(f"{late}: is {found[0].name} in GPS time? its figures are not to be trusted")
-    if one.calibrations and math.isfinite(about.sensors.stereo_scale):
-        notes.append(
-            f"stereo sees {about.sensors.stereo_scale:.3f} times as far as the LiDAR with {one.calibrations[0].name}"
-        )
+    scale = about.sensors.stereo_scale
+    if one.calibrations and math.isfinite(scale):
+        notes.append(f"with {one.calibrations[0].name}, stereo sees {scale:.2f} times as far as the LiDAR")
     notes += [one.line for one in look_first(replace(about, missed=[])) if one.severity != "note"]
     record = judged_record(about, odometry)
     record |= {"warnings": notes, "minutes": round((time.monotonic() - started) / 60, 2)}
-    record["stereo_scale"] = _number(about.sensors.stereo_scale)
+    record["stereo_scale"] = _number(scale)
     return record
 
 
