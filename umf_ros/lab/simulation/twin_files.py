@@ -110,9 +110,9 @@ class Samples:
 
     def __init__(self, simulator: Simulator, name: str, files: SideFiles) -> None:
         self._simulator, self._folder = simulator, files.area / "dataset" / name / "images"
-        self._layout, self._develop, self._shift_ns = files.layout, files.develop, 0
+        self._layout, self._develop = files.layout, files.develop
         self._next_m = 0.0
-        self.images: list[tuple[int, str, Any]] = []
+        self.images: list[tuple[int, Any]] = []
         self.points: dict[int, Array] = {}
 
     def watch(self, topic: str, message: Any) -> None:
@@ -123,7 +123,7 @@ class Samples:
             if driven >= self._next_m:
                 self._next_m = driven + SAMPLE_M
                 picture = np.asarray(message.data).reshape(message.height, message.width)
-                self.images.append((stamp, "", self._develop(picture)))
+                self.images.append((stamp, self._develop(picture)))
         elif topic == CLOUD_TOPIC and self.images:
             taken = stamp + self._layout.scan_behind_ns
             if abs(taken - self.images[-1][0]) < 50_000_000:
@@ -136,7 +136,7 @@ class Samples:
         """Write the images with a scan; returns their stamps, their names and the points (N, 3) in the camera."""
         found = []
         self._folder.mkdir(parents=True, exist_ok=True)
-        for stamp, _, picture in self.images:
+        for stamp, picture in self.images:
             if stamp in self.points:
                 name = f"img{(stamp + shift_ns) * 1e-9:.6f}.png"
                 cv2.imwrite(str(self._folder / name), picture)
@@ -256,12 +256,10 @@ class SideFiles:
         camera = self._calibration.camera
         for number, side in enumerate(("left", "right")):
             numbers = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+            none = dict.fromkeys(("k1", "k2", "p1", "p2"), 0)
             content = {"model_type": "PINHOLE", "camera_name": f"camera_{side}", "image_width": camera.width}
-            content |= {
-                "image_height": camera.height,
-                "distortion_parameters": dict.fromkeys(("k1", "k2", "p1", "p2"), 0),
-            }
-            text = yaml.safe_dump(content | {"projection_parameters": numbers}, sort_keys=False)
+            content |= {"image_height": camera.height, "distortion_parameters": none, "projection_parameters": numbers}
+            text = yaml.safe_dump(content, sort_keys=False)
             _write_text(self.area / "Cfgs" / f"cam{number}_pinhole.yaml", f"%YAML:1.0\n---\n{text}")
         imu_T_camera = invert(self._calibration.body_T_imu) @ self._calibration.body_T_camera
         rate = 100 if self._disorders.imu_rate else 400
