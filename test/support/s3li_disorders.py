@@ -1,10 +1,10 @@
-"""What is wrong with S3LI's files, taken out one by one: is it noticed by name, or harmless?
+"""Take the disorders of S3LI's files out one by one: each has to be noticed by name, or harmless.
 
 python test/support/s3li_disorders.py OUT [--seed 20001] [--only NAME,NAME]
 
 Simulates one short sequence of the twin for every disorder, without that disorder, and runs it as `umf s3li` does.
-What is missing then is what the readers expect: positions in UTC where they are read as GPS time, scans that are on
-time where 0.1 s are added. A row says what was said of it, and what it did to the figures.
+The readers expect each disorder: without it, positions in UTC are read as GPS time, and 0.1 s are added to scans that
+are on time. A row holds the first lines that were printed about it, and the figures.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def at(x_m: list[float], yaw_deg: list[float]) -> np.ndarray:
 
 
 def test_recall_of_the_thesis_on_ten_frames() -> None:
-    """Frames 5, 6 and 7 are back at 0, 1 and 2; 8 is turned by 40 deg, 9 is where nobody was: 2 of 3 are found."""
+    """Frames 5, 6 and 7 are back at 0, 1 and 2; 8 is turned by 40 deg, 9 is at a new place: 2 of 3 are found."""
     poses = at([0, 30, 60, 90, 120, 5, 35, 65, 95, 150], [0, 0, 0, 0, 0, 10, 0, -20, 40, 0])
     stamps = np.arange(10) * 10 * SECOND
     assert recall_of_places(stamps, poses, 30.0 * np.arange(10), DESCRIPTORS, Loop()) == (2, 3)

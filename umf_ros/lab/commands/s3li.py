@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def command(
-    folder: Annotated[Path, typer.Argument(help="What was downloaded of S3LI: Etna, Vulcano, or both.")],
+    folder: Annotated[Path, typer.Argument(help="Download of S3LI: Etna, Vulcano, or both.")],
     out: Annotated[Path, typer.Option(help="Folder of runs, tables and report.")] = Path("results/s3li"),
     figures: Annotated[Path | None, typer.Option("--json", help="Also write the figures to this file.")] = None,
     sequences: Annotated[str, typer.Option(help="Names with commas between; default: all that are there.")] = "",

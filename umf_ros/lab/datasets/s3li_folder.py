@@ -231,7 +231,7 @@ def read_pairs(path: Path) -> list[Pair]:
 
 
 def image_key(path: str) -> str:
-    """What an image is called on any machine: sequence and name, of `.../SEQUENCE/images/NAME`."""
+    """Sequence and name of an image at `.../SEQUENCE/images/NAME`, which are the same on any machine."""
     parts = Path(path).parts
     return "/".join((parts[-3], parts[-1])) if len(parts) >= 3 else path
 

@@ -181,7 +181,7 @@ def fix_message(geodetic: Array, deviation_m: float, stamp_ns: int, frame: str =
 
 
 class Recorder(Protocol):
-    """What simulated messages are written to."""
+    """A recording in the making."""
 
     def write(self, topic: str, message: Any, stamp_ns: int) -> None:
         """Append a message that is recorded at `stamp_ns`."""

@@ -67,7 +67,7 @@ class TwinSequence:
 
     Attributes:
         name: of the published recording.
-        length_m: as published; of Vulcano nobody says it.
+        length_m: as published; assumed for Vulcano.
         start: when, UTC.
         trail: what is driven along.
         legs: shares of the length, driven one after the other; before a negative one the rover turns back.

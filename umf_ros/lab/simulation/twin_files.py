@@ -42,7 +42,7 @@ VISIBLE_M, WIDEST_TURN_DEG, APART_S, LEAST_OVERLAP = (3.0, 20.0), 45.0, 30.0, 0.
 
 @dataclass(frozen=True, slots=True)
 class Disorders:
-    """What is wrong with the originals; each can be left out.
+    """Faults of the originals; each can be left out.
 
     Attributes:
         late_scans: Etna's scans are stamped 0.1 s too early.
