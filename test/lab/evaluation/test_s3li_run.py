@@ -1,18 +1,23 @@
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from spread_tasks import die, refuse, square
+from typer.testing import CliRunner
 
+from umf_ros.cli import umf
 from umf_ros.core.config import Loop
 from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import heading
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.lab.datasets.s3li_folder import S3liFolder, S3liSequence
 from umf_ros.lab.datasets.simulated import poses_of
 from umf_ros.lab.evaluation.s3li_run import (
+    S3liRun,
     clock_lag_s,
     headed,
     in_own_process,
@@ -151,6 +156,29 @@ def test_a_table_for_latex() -> None:
     text = latex((["a_b", "%"], [["x & y", "1"]]))
     assert text.splitlines()[0] == r"\begin{tabular}{lr}"
     assert r"a\_b & \% \\" in text and r"x \& y & 1 \\" in text
+
+
+def test_damaged_pairs_cost_their_protocol_alone(tmp_path: Path) -> None:
+    (tmp_path / "etna_pairs.pkl").write_bytes(b"cut")
+    loops = S3liSequence("s3li_loops", pickle=tmp_path / "s3li_loops.pkl")
+    run = S3liRun(S3liFolder(tmp_path, [loops], {"s3li-etna": tmp_path / "etna_pairs.pkl"}, []), tmp_path)
+    run.replay(loops, lambda done: None)
+    assert run.retrieve("s3li-etna", lambda name, done: None) == []
+    assert len(run.faults) == 1 and "etna_pairs.pkl" in run.faults[0]
+    assert run.records["s3li_loops"]["status"] == "not replayed"
+    assert "left out" in run.retrieve("s3li-vulcano", lambda name, done: None)[0] and len(run.faults) == 1
+
+
+@pytest.mark.slow
+def test_a_cut_bag_fails_in_one_line_and_the_table_is_printed(tmp_path: Path) -> None:
+    (tmp_path / "Bagfiles").mkdir()
+    (tmp_path / "Bagfiles/s3li_loops.bag").write_bytes(b"#ROSBAG V2.0\ncut")
+    figures = tmp_path / "figures.json"
+    result = CliRunner().invoke(umf(), ["s3li", str(tmp_path), "--out", str(tmp_path / "out"), "--json", str(figures)])
+    assert result.exit_code == 1 and "s3li_loops: no trajectory below Eval" in result.output
+    record = json.loads(figures.read_text())["sequences"]["s3li_loops"]
+    assert record["status"].startswith("failed: ") and "s3li_loops.bag" in record["status"]
+    assert r"\toprule" in (tmp_path / "out/s3li.tex").read_text()
 
 
 @pytest.mark.slow

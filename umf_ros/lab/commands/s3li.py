@@ -49,7 +49,7 @@ def command(
     tables = {"S3LI by protocol": protocol_table(run.records), "S3LI by sequence": sequence_table(run.records)}
     for title, table in tables.items():
         print_table(console, title, table)
-    notes += _told(run.records)
+    notes += run.faults + _told(run.records)
     for note in notes:
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
     total = pooled(list(run.records.values()))
@@ -59,7 +59,7 @@ def command(
     for path in filter(None, (out / "s3li.json", figures)):
         write_atomically(path, json.dumps(found, indent=2) + "\n")
     console.print(f"{out}: evaluation.md, s3li.tex, s3li.json", markup=False, highlight=False, soft_wrap=True)
-    if any(one["status"].startswith("failed") for one in run.records.values()):
+    if run.faults or any(one["status"].startswith("failed") for one in run.records.values()):
         raise typer.Exit(1)
 
 

@@ -343,11 +343,13 @@ class S3liRun:
 
     Attributes:
         records: figures by sequence.
+        faults: lines about files that are damaged and belong to no replay.
     """
 
     def __init__(self, download: S3liFolder, out: Path, resume: bool = False) -> None:
         self._download, self._out, self._resume = download, out, resume
         self.records: dict[str, Record] = {}
+        self.faults: list[str] = []
 
     def replay(self, one: S3liSequence, report: Callable[[float], None]) -> None:
         """Replay one sequence, or take its figures from an earlier run; a fault is its own."""
@@ -366,28 +368,33 @@ class S3liRun:
         self.records[one.name] = record
 
     def retrieve(self, dataset: str, report: Callable[[str, float], None]) -> list[str]:
-        """MPRF's protocol over all samples of one data set; returns lines about what had to be left out."""
+        """MPRF's protocol over all samples of one data set; returns a line where there is nothing for it."""
         path = self._download.pairs.get(dataset)
         chosen = [one for one in self._download.sequences if one.dataset == dataset and one.pickle is not None]
         if path is None or not chosen:
             return [f"{dataset}: no list of overlapping pairs, or no pickles: MPRF's protocol is left out"]
-        told, found = [], {}
+        try:
+            pairs = read_pairs(path)
+        except UmfError as error:
+            self.faults.append(str(error))
+            return []
+        found = {}
         for one in chosen:
             try:
                 found[one.name] = in_own_process(embed_samples, one, one.pickle, report=partial(report, one.name))
             except UmfError as error:
-                told.append(f"{one.name}: {error}")
+                self.faults.append(f"{one.name}: {error}")
         if not found:
-            return told
+            return []
         keys = [key for part in found.values() for key in part[0]]
         stamps, descriptors = (np.concatenate([part[place] for part in found.values()]) for place in (1, 2))
-        right, answerable = precision_of_pairs(keys, stamps, descriptors, read_pairs(path))
+        right, answerable = precision_of_pairs(keys, stamps, descriptors, pairs)
         names = np.repeat(list(found), [len(part[0]) for part in found.values()])
         for name in found:
             hits, count = int((right & answerable & (names == name)).sum()), int((answerable & (names == name)).sum())
             self.records[name] |= {"precision1": _share(hits, count), "precision1_hits": hits}
             self.records[name] |= {"precision1_queries": count, "samples": int((names == name).sum())}
-        return told
+        return []
 
 
 PUBLISHED = {
