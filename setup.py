@@ -37,7 +37,7 @@ setup(
             "umf = umf_ros.cli:main",
             "loop_closure_node = umf_ros.nodes.start:loop_closure_node",
             "pose_graph_node = umf_ros.nodes.start:pose_graph_node",
-            "bag_player_node = umf_ros.lab.live.start:bag_player_node",
+            "bag_player_node = umf_ros.lab.live:bag_player_node",
         ],
     },
     data_files=[

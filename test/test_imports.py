@@ -33,7 +33,7 @@ def runtime() -> list[Path]:
 
 
 LIGHT = [
-    *(f"commands/{name}.py" for name in ("play", "graph", "compare", "inspect", "report", "why")),
+    *(f"commands/{name}.py" for name in ("demo", "graph", "compare", "inspect", "report")),
     *("scan_files.py", "datasets/g2o.py", "evaluation/comparison.py", "evaluation/inspection.py", "live/*.py"),
 ]
 """Files of the lab that `pip install .` serves too: they inspect, play, judge and draw runs, recordings and graphs."""

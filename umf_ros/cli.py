@@ -17,6 +17,7 @@ from umf_ros.core.resources import FLEET_PACKAGES, LAB_PACKAGES
 
 COMMANDS = {
     "demo": "umf_ros.lab.commands.demo",
+    "s3li": "umf_ros.lab.commands.s3li",
     "simulate": "umf_ros.lab.commands.simulate",
     "import": "umf_ros.lab.commands.import_data",
     "inspect": "umf_ros.lab.commands.inspect",
@@ -24,22 +25,22 @@ COMMANDS = {
     "map": "umf_ros.commands.map",
     "compare": "umf_ros.lab.commands.compare",
     "sensors": "umf_ros.lab.commands.sensors",
-    "play": "umf_ros.lab.commands.play",
+    "play": "umf_ros.lab.commands.demo:play",
     "report": "umf_ros.lab.commands.report",
     "evaluate": "umf_ros.lab.commands.evaluate",
-    "why": "umf_ros.lab.commands.why",
+    "why": "umf_ros.lab.commands.report:why",
     "explain": "umf_ros.lab.commands.explain",
     "train": "umf_ros.lab.commands.train",
     "adapt": "umf_ros.lab.commands.adapt",
     "export": "umf_ros.lab.commands.export",
     "bench": "umf_ros.lab.commands.bench:app",
     "doctor": "umf_ros.commands.doctor",
-    "pretrain": "umf_ros.lab.commands.pretrain:app",
+    "pretrain": "umf_ros.lab.commands.train:app",
     "graph": "umf_ros.lab.commands.graph:app",
     "places": "umf_ros.commands.stores:places",
     "fleet": "umf_ros.commands.stores:fleet",
 }
-"""The module of every subcommand, and the group in it where there is one; those of the lab by their names alone."""
+"""The module of every subcommand, and its function or group there; those of the lab by their names alone."""
 
 
 def _print_version(wanted: bool) -> None:
@@ -64,11 +65,12 @@ def umf() -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     for name, place in COMMANDS.items():
-        module, _, group = place.partition(":")
-        if group:
-            app.add_typer(getattr(import_module(module), group), name=name)
+        module, _, member = place.partition(":")
+        command = getattr(import_module(module), member or "command")
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name)
         else:
-            app.command(name)(import_module(module).command)
+            app.command(name)(command)
     app.callback()(_options)
     return app
 

@@ -111,10 +111,11 @@ def _checked(nanoseconds: int) -> int:
     return nanoseconds
 
 
-def read_rtklib(path: str | Path) -> Trajectory:
+def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> Trajectory:
     """Positions east, north and up of the first one, in metres, without orientation, and their stamps in UTC.
 
     Lines are `date time lat lon height Q ...` or `week seconds lat lon height Q ...`, in GPS time, degrees and metres.
+    Positions of a worse quality Q than asked for are left out.
 
     Raises:
         BagError: the file cannot be read or holds no position of that quality; names the line that is wrong.
@@ -129,11 +130,11 @@ def read_rtklib(path: str | Path) -> Trajectory:
         except (ValueError, IndexError, OverflowError):
             expected = "expected date time lat lon height Q"
             raise BagError(f"{path}, line {number}: {expected}, found {line.strip()[:60]!r}") from None
-        if quality <= WORST_QUALITY and (not stamps or stamp > stamps[-1]):
+        if quality <= worst_quality and (not stamps or stamp > stamps[-1]):
             stamps.append(stamp)
             geodetic.append((latitude, longitude, height))
     if not stamps:
-        raise BagError(f"{path} holds no position of quality {WORST_QUALITY} or better")
+        raise BagError(f"{path} holds no position of quality {worst_quality} or better")
     poses = RigidTransform.from_translation(east_north_up(np.array(geodetic))).as_matrix()
     return Trajectory(np.array(stamps, np.int64), poses, has_orientation=False)
 

@@ -392,12 +392,57 @@ def folder(source: Path) -> Imported:
     return found
 
 
+def vslam_lab(source: Path) -> Imported:
+    """An export of S3LI Vulcano by VSLAM-LAB: rgb.csv without a header, groundtruth.csv, calibration.yaml; no scans.
+
+    The satellites' positions come with a placeholder for the orientation, which is no truth.
+    """
+    matrix, baseline = _export_calibration(source / "calibration.yaml")
+    found = Imported({})
+    for line in lines_of(source / "rgb.csv"):
+        row = [word.strip() for word in line.split(",")]
+        try:
+            left, right = (round(float(row[place]) * 1e9) for place in (0, 2))
+        except (ValueError, IndexError):
+            raise SensorFileError(
+                f"{source / 'rgb.csv'}: expected SECONDS,FILE,SECONDS,FILE, found {line[:60]!r}"
+            ) from None
+        found.left.append((left, source / row[1]))
+        found.right.append((right, source / row[3]))
+    found.check(source)
+    found.camera = {"camera": pinhole(*size_of(found.left[0][1]), matrix, baseline=baseline)}
+    return found
+
+
+def _export_calibration(path: Path) -> tuple[Array, float]:
+    """(3, 3) intrinsics and the baseline in metres from `calibration.yaml` of VSLAM-LAB's export.
+
+    Its `Stereo.bf` holds metres, unlike ORB-SLAM's.
+
+    Raises:
+        SensorFileError: the file is missing, cut or of other content.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        fx, fy, cx, cy, baseline = (
+            storage.getNode(name).real()
+            for name in ("Camera0.fx", "Camera0.fy", "Camera0.cx", "Camera0.cy", "Stereo.bf")
+        )
+    except (OSError, UnicodeDecodeError, cv2.error, SystemError):
+        raise SensorFileError(f"{path} is no calibration of an export: it cannot be read") from None
+    if fx <= 0 or fy <= 0 or not 0.02 <= baseline <= 1:
+        raise SensorFileError(f"{path}: fx {fx:.4g} px and a baseline of {baseline:.4g} m: expected pixels and metres")
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), float(baseline)
+
+
 FORMATS: dict[str, Callable[[Path], Imported]] = {
     "kitti-odometry": kitti_odometry,
     "kitti-raw": kitti_raw,
     "euroc": euroc,
     "tum-rgbd": tum_rgbd,
     "nuscenes": nuscenes,
+    "vslam-lab": vslam_lab,
     "folder": folder,
 }
 

@@ -13,13 +13,13 @@ from typer.testing import CliRunner
 
 from umf_ros.core.config import dump_settings
 from umf_ros.core.errors import ConfigError, UmfError
-from umf_ros.lab.commands import evaluate, pretrain
+from umf_ros.lab.commands import evaluate, train
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
 
 app = typer.Typer()
 app.command("evaluate")(evaluate.command)
-app.add_typer(pretrain.app, name="pretrain")
+app.add_typer(train.app, name="pretrain")
 
 
 def run(*arguments: str) -> str:

@@ -19,7 +19,6 @@ from tiny_worlds import TINY, pose_at, some_input, write_world
 from typer.testing import CliRunner
 
 from umf_ros.core.errors import ConfigError, OutputError, UmfError, WeightsError
-from umf_ros.lab.commands import pretrain as pretrain_command
 from umf_ros.lab.commands import train as train_command
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.lab.training.metric_objective import MetricObjective, describe, figures, mean_of, validate
@@ -286,7 +285,7 @@ def test_every_modality_is_lost_now_and_then_and_never_both(folder, tmp_path, mo
 
 app = typer.Typer()
 app.command("train")(train_command.command)
-app.add_typer(pretrain_command.app, name="pretrain")
+app.add_typer(train_command.app, name="pretrain")
 
 
 def umf(*arguments: object) -> str:

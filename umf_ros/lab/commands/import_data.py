@@ -9,7 +9,7 @@ import typer
 
 from umf_ros.core.errors import BagError, ConfigError, OutputError, either
 
-KINDS = ("kitti-odometry", "kitti-raw", "euroc", "tum-rgbd", "nuscenes", "folder")
+KINDS = ("kitti-odometry", "kitti-raw", "euroc", "tum-rgbd", "nuscenes", "vslam-lab", "folder")
 
 
 def command(
@@ -17,7 +17,7 @@ def command(
     source: Annotated[Path, typer.Argument(help="Folder of the sequence.")],
     out: Annotated[Path, typer.Argument(help="The .mcap to write; its .yaml and .calibration.yaml go beside it.")],
 ) -> None:
-    """Make a recording of a data set: KITTI, EuRoC (ASL), TUM RGB-D, nuScenes, or images and scans with a times.txt.
+    """Make a recording of KITTI, EuRoC (ASL), TUM RGB-D, nuScenes, VSLAM-LAB, or images and scans with a times.txt.
 
     Odometry is not part of them: run one, and give its poses with --odometry.
     """

@@ -1,13 +1,24 @@
-"""`umf report`: evaluate and draw a finished run."""
+"""`umf report` and `umf why`: a finished run in pictures, and why one of its moments closed no loop."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from umf_ros.commands.recordings import TruthPath, check_files
+from umf_ros.core.errors import UmfError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from umf_ros.bags.reader import Bag
+    from umf_ros.runs.diagnosis import ClosureDiagnosis
+    from umf_ros.runs.truth import JudgedRun
+
+SHOWN = 8
+"""Candidates and criteria in the terminal."""
 
 
 def command(
@@ -31,6 +42,84 @@ def command(
     recover_run(folder)
     read_summary(folder)
     finish_run(folder, open_bag(bag), Console(), ground_truth)
+
+
+def why(
+    folder: Annotated[Path, typer.Argument(help="A run folder, such as results/latest.")],
+    moment: Annotated[str, typer.Argument(metavar="STAMP", help="Stamp in ns, or seconds from the first keyframe.")],
+    bag: Annotated[
+        Path | None, typer.Argument(help="The recording, for its truth; default: where the run found it.")
+    ] = None,
+    ground_truth: TruthPath = None,
+) -> None:
+    """Say why a keyframe closed no loop: what the database returned, which gate stopped it, and by how much.
+
+    Also which parameter would have let it through, and what that costs. Reads the run folder alone.
+    """
+    from rich.console import Console
+
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.runs.diagnosis import explain
+    from umf_ros.runs.reader import read_run
+    from umf_ros.runs.report import judge
+    from umf_ros.runs.writer import read_summary
+
+    recover_run(folder)
+    summary = read_summary(folder)
+    known = bag or Path(summary.get("recording", {}).get("path", ""))
+    recording: Bag | None = open_bag(known) if bag or known.is_file() or (known.is_dir() and known.name) else None
+    about = judge(read_run(folder, recording, ground_truth), recording, keep=False)
+    if not len(about.run.keyframes):
+        raise UmfError(f"{folder} holds no keyframe")
+    asked_ns = _stamp(moment, int(about.run.stamps[0]))
+    row = min(range(len(about.run.stamps)), key=lambda row: abs(int(about.run.stamps[row]) - asked_ns))
+    _tell(Console(), about, row, explain(about, row))
+
+
+def _stamp(text: str, start_ns: int) -> int:
+    from umf_ros.lab.evaluation.comparison import parse_moment
+
+    try:
+        moment = parse_moment(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+    return moment if isinstance(moment, int) else start_ns + round(moment * 1e9)
+
+
+def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    start = int(about.run.stamps[0])
+
+    def at(stamp_ns: int) -> str:
+        return f"{(stamp_ns - start) * 1e-9:.1f} s"
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True)
+
+    say(f"keyframe {row + 1} of {len(about.run.keyframes)}, {at(why.stamp_ns)}, {why.stamp_ns} ns")
+    say(f"[bold]{escape(why.gate)}[/]: {escape(why.what)}")
+    if why.match_stamp_ns is not None:
+        apart = f", {why.distance_m:.1f} m away by the truth" if why.distance_m < float("inf") else ""
+        say(f"the place is that of {at(why.match_stamp_ns)}, {why.match_stamp_ns} ns{apart}")
+    if why.gate != "found":
+        through = why.parameter or "no parameter: the measurements do not speak for it"
+        say(f"would let it through: {escape(through)}")
+    if tested := about.tested[why.stamp_ns]:
+        table = Table("returned", "similarity", "probability", "m by the truth", "reason", box=None, pad_edge=False)
+        for one in tested[:SHOWN]:
+            apart_m = about.distance(*one.endpoints)
+            probability = "" if one.probability is None else f"{one.probability:.3f}"
+            known = f"{apart_m:.1f}" if apart_m < float("inf") else ""
+            table.add_row(
+                at(one.match_stamp_ns), f"{one.candidate.similarity:.3f}", probability, known, escape(one.outcome)
+            )
+        console.print(table)
+    for name, value in sorted(why.contributions.items(), key=lambda one: -abs(one[1]))[:SHOWN]:
+        say(f"  {name.replace('_', ' '):24} {value:+.1f}")
+    if why.match_stamp_ns is not None:
+        say(f"a picture of it: umf explain BAG {why.stamp_ns} {why.match_stamp_ns}")
 
 
 def recover_run(folder: Path) -> bool:

@@ -15,9 +15,13 @@ if TYPE_CHECKING:
 
     from umf_ros.lab.simulation.survey import Survey
 
+TWIN = "s3li-twin"
+
 
 def command(
-    out: Annotated[Path | None, typer.Argument(help="The .mcap to write.", show_default=False)] = None,
+    out: Annotated[
+        Path | None, typer.Argument(help="The .mcap to write; or s3li-twin, with --out.", show_default=False)
+    ] = None,
     preset: Annotated[
         str,
         typer.Option(
@@ -44,7 +48,17 @@ def command(
     ] = None,
     worlds: Annotated[str, typer.Option(help="Seeds of the shards, as first:last+1.")] = "0:8",
     every: Annotated[int, typer.Option(min=1, help="Every n-th sample of the shards' passes: a smaller set.")] = 1,
-    sequences: Annotated[str, typer.Option(help="Shards of named sequences instead: etna (7) or thesis (13).")] = "",
+    sequences: Annotated[
+        str,
+        typer.Option(
+            help="Shards of named sequences instead: etna (7) or thesis (13); of s3li-twin: names with commas between."
+        ),
+    ] = "",
+    folder: Annotated[Path | None, typer.Option("--out", help="Folder of s3li-twin.", show_default=False)] = None,
+    scale: Annotated[
+        float, typer.Option(min=0.01, max=1, help="Of the lengths of s3li-twin's drives; none falls below 60 m.")
+    ] = 1.0,
+    fine: Annotated[bool, typer.Option("--fine", help="Render s3li-twin's pictures pixel by pixel.")] = False,
     contact_sheet: Annotated[Path | None, typer.Option(help="Write a PNG of 24 frames and 6 scans instead.")] = None,
     workers: Annotated[int, typer.Option(min=1, max=64, help="Threads that render.")] = 2,
     ray: Annotated[
@@ -54,11 +68,14 @@ def command(
     """Simulate a rover with S3LI's sensors: stereo, LiDAR, IMU, odometry, GNSS and ground truth.
 
     Beside OUT.mcap come OUT.odometry.tum and OUT.pos, as beside S3LI's bags. The same seed gives the same bytes.
+    `umf simulate s3li-twin --out DIR` writes all fourteen sequences of S3LI as the files that are published.
     """
     from rich.console import Console
 
     console = Console()
-    if contact_sheet is not None:
+    if str(out) == TWIN:
+        _write_twin(folder, seed, scale, sequences, fine, workers, console)
+    elif contact_sheet is not None:
         _write_contact_sheet(contact_sheet, seed, family or "etna", console)
     elif shards is not None:
         if ray is None:
@@ -69,6 +86,35 @@ def command(
         _write_bag(out, preset, (seed, world), duration, family, aliasing, image_rate, truth, workers, console)
     else:
         raise ConfigError("say where to write: OUT.mcap, --shards DIR or --contact-sheet OUT.png")
+
+
+def _write_twin(
+    folder: Path | None, seed: int, scale: float, sequences: str, fine: bool, workers: int, console: Console
+) -> None:
+    import time
+
+    from umf_ros.lab.simulation.twin import TWINS, write_twin
+
+    names = tuple(name for name in sequences.split(",") if name)
+    unknown = sorted(set(names) - {one.name for one in TWINS})
+    if folder is None:
+        raise ConfigError("say where the twin goes: --out DIR")
+    if unknown:
+        raise ConfigError(f"S3LI has no sequence {unknown[0]!r}; expected {', '.join(one.name for one in TWINS)}")
+    started = time.monotonic()
+    with _progress(console) as progress:
+        task = progress.add_task("building the world", total=len(names) or len(TWINS))
+        finished: list[str] = []
+
+        def report(name: str, done: float) -> None:
+            progress.update(task, description=name, completed=len(finished) + done)
+
+        for name in write_twin(folder, seed, scale, names, fine=fine, workers=workers, progress=report):
+            finished.append(name)
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) * 1e-9
+    minutes = (time.monotonic() - started) / 60
+    told = f"{folder}: {len(finished)} sequences, {size:.1f} GB, {minutes:.1f} min"
+    console.print(told, markup=False, highlight=False, soft_wrap=True)
 
 
 def _write_bag(

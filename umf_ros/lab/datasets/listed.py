@@ -10,10 +10,11 @@ from typing import Any, Literal, Protocol
 from pydantic import Field, ValidationError
 
 from umf_ros.core.config import Dataset, Group, problems
-from umf_ros.core.errors import ConfigError
-from umf_ros.core.io import read_yaml
+from umf_ros.core.errors import BagError, ConfigError
+from umf_ros.core.io import is_yaml, read_yaml
 from umf_ros.lab.datasets.robotcar import read_evaluation, read_training
 from umf_ros.lab.datasets.s3li import ETNA_TEST, ETNA_TRAINING, read_bag, read_toolkit
+from umf_ros.lab.datasets.s3li_folder import S3liSequence, find_s3li
 from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.datasets.simulated import WorldFolder
 
@@ -57,7 +58,7 @@ class BagEntry(ListEntry):
 
 
 class S3liEntry(ListEntry):
-    """The recordings of Etna as they are published."""
+    """The recordings of Etna as they are published, wherever they lie in the folder."""
 
     s3li: Path = Field(description="folder of the bags, GT and Eval")
     split: Literal["training", "test"] = Field(description="part of the split of [UMF 5.1.2]")
@@ -65,17 +66,16 @@ class S3liEntry(ListEntry):
 
     def read(self, base: Path) -> Sequence[SampleSequence]:
         """Every recording of the split, with BASALT's headings."""
-        found: list[SampleSequence] = []
-        for name in ETNA_TRAINING if self.split == "training" else ETNA_TEST:
-            bag = BagEntry(
-                bag=self.s3li / f"{name}.bag",
-                ground_truth=self.s3li / "GT" / name / "global_lle.pos",
-                odometry=self.s3li / "Eval" / "BASALT" / name / "trajectory.txt",
-                odometry_frame="imu",
-                spacing_m=self.spacing_m,
-            )
-            found += bag.read(base)
-        return found
+        wanted = ETNA_TRAINING if self.split == "training" else ETNA_TEST
+        there = {one.name: one for one in find_s3li(base / self.s3li).sequences if one.recording and one.truth}
+        missing = [name for name in wanted if name not in there]
+        if missing:
+            raise BagError(f"{base / self.s3li} lacks recording or positions of {', '.join(missing)}")
+        return [self._read(there[name]) for name in wanted]
+
+    def _read(self, one: S3liSequence) -> SampleSequence:
+        assert one.recording is not None
+        return read_bag(one.recording, one.truth[0], one.odometry, spacing_m=self.spacing_m, odometry_frame="imu")
 
 
 class ToolkitEntry(ListEntry):

@@ -342,10 +342,10 @@ def _poses(frames: list[Frame], positions: Array, truth: Trajectory) -> Array:
     odometry = [frame.odom_T_body for frame in frames if frame.odom_T_body is not None]
     if len(odometry) < len(frames):
         return poses_of(course(positions), positions)
-    return poses_of(_aligned(np.stack(odometry), positions), positions)
+    return poses_of(aligned_rotations(np.stack(odometry), positions), positions)
 
 
-def _aligned(estimate: Array, positions: Array) -> Array:
+def aligned_rotations(estimate: Array, positions: Array) -> Array:
     """(N, 3, 3) rotations of estimated (N, 4, 4) poses in the frame of (N, 3) positions; the course if they differ."""
     truth_T_estimate = align(estimate[:, :3, 3], positions)[0]
     misfit = np.linalg.norm(transform(truth_T_estimate, estimate[:, :3, 3]) - positions, axis=1)
@@ -376,7 +376,7 @@ def _toolkit_poses(table: dict[str, NDArray[Any]], positions: Array, calibration
         Rotation.from_quat(wxyz, scalar_first=True).as_matrix(),
         np.stack([np.asarray(value, float) for value in table["slam_position"]]),
     )
-    return poses_of(_aligned(slam @ np.linalg.inv(calibration.body_T_imu), positions), positions)
+    return poses_of(aligned_rotations(slam @ np.linalg.inv(calibration.body_T_imu), positions), positions)
 
 
 def _read_image(written: Path, folder: Path | None) -> Image:

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import os
+import struct
+from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, Any, Protocol
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.typesys import Stores, get_typestore
 
 from umf_ros.bags.storages import message_types
 from umf_ros.core.errors import OutputError, writing
@@ -173,6 +178,70 @@ def fix_message(geodetic: Array, deviation_m: float, stamp_ns: int, frame: str =
         position_covariance=np.diag([1.0, 1.0, 4.0]).ravel() * deviation_m**2,
         position_covariance_type=2,
     )
+
+
+class Recorder(Protocol):
+    """A recording in the making."""
+
+    def write(self, topic: str, message: Any, stamp_ns: int) -> None:
+        """Append a message that is recorded at `stamp_ns`."""
+
+    def note(self, name: str, facts: dict[str, str]) -> None:
+        """Keep facts about the recording, where there is room for them."""
+
+
+class Ros1Writer:
+    """Writes a ROS 1 bag with LZ4 chunks, as S3LI's are; the drive's clock is shifted to the day of the recording.
+
+    `header.seq` counts the messages of each topic. When the context ends in an error, no file is left.
+    """
+
+    def __init__(self, path: Path, shift_ns: int = 0, watch: Callable[[str, Any], None] = lambda *_: None) -> None:
+        """Write to `path`, which must not exist; `watch` sees every topic and message.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        self.path, self._shift_ns, self._watch = path, shift_ns, watch
+        self._unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+        self._noetic = get_typestore(Stores.ROS1_NOETIC)
+        self._connections: dict[str, tuple[Any, Iterator[int]]] = {}
+        self._writer = Writer1(self._unfinished)
+        self._writer.set_compression(Writer1.CompressionFormat.LZ4)
+
+    def write(self, topic: str, message: Any, stamp_ns: int) -> None:
+        """Append a message with a header; raises an `OutputError` when the disk is full."""
+        self._watch(topic, message)
+        store, kind = message_types(), message.__msgtype__
+        if topic not in self._connections:
+            connection = self._writer.add_connection(topic, kind, typestore=self._noetic)
+            self._connections[topic] = connection, count()
+        connection, numbers = self._connections[topic]
+        data = bytearray(store.cdr_to_ros1(store.serialize_cdr(message, kind), kind))
+        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec + self._shift_ns
+        struct.pack_into("<III", data, 0, next(numbers), *divmod(stamp, 10**9))
+        with writing(self.path):
+            self._writer.write(connection, stamp_ns + self._shift_ns, bytes(data))
+
+    def note(self, name: str, facts: dict[str, str]) -> None:
+        """Do nothing: these bags hold no facts."""
+
+    def __enter__(self) -> Ros1Writer:
+        with writing(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            with writing(self.path):
+                self._writer.close()
+                if kind is None:
+                    self._unfinished.replace(self.path)
+        finally:
+            self._unfinished.unlink(missing_ok=True)
 
 
 class BagWriter:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.frames import Image, StereoCamera
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose
 from umf_ros.core.resources import find
-from umf_ros.lab.simulation.camera import Camera, cast
+from umf_ros.lab.simulation.camera import Camera, cast, resized
 from umf_ros.lab.simulation.relief import Field
 from umf_ros.lab.simulation.world import ROCK, World
 from umf_ros.sensors.calibration import Calibration, load_calibration
@@ -28,12 +28,20 @@ class Layout:
         images: topics of the left and the right image.
         infos: topics of their camera_info; empty where there is none.
         encoding: of the images.
+        rendered: width and height at which pictures are rendered before they are enlarged; None: those published.
+        scan_behind_ns: by which the stamps of the scans are too early.
+        right_lost: share of the right images that do not arrive.
+        dummies: whether a pulse without a return is sent as a point at 1 m.
     """
 
     calibration: str
     images: tuple[str, str]
     infos: tuple[str, str] | None
     encoding: str
+    rendered: tuple[int, int] | None = None
+    scan_behind_ns: int = 0
+    right_lost: float = 0.02
+    dummies: bool = True
 
     def load(self) -> Calibration:
         """Calibration of the sensors."""
@@ -68,13 +76,13 @@ class Eye:
 def eyes(world: World, layout: Layout, calibration: Calibration) -> tuple[Eye, Eye]:
     """The left and the right camera of a layout in a world."""
     if calibration.rectifier is None:
-        camera = Camera(world, calibration.camera)
+        camera = Camera(world, _coarse(calibration.camera, layout))
         shift = make_pose(np.eye(3), [calibration.camera.baseline, 0, 0])
         mounting = calibration.body_T_camera
         return Eye(camera, mounting), Eye(camera, mounting @ shift)
     content = yaml.safe_load(find(layout.calibration).read_text(encoding="utf-8"))
     pair, mounting = content["raw_camera"], _pose(content["body_T_camera"])
-    left, right = (_raw_camera(world, pair[side]) for side in ("left", "right"))
+    left, right = (_raw_camera(world, pair[side], layout) for side in ("left", "right"))
     return Eye(left, mounting), Eye(right, mounting @ _pose(pair["left_T_right"]))
 
 
@@ -85,9 +93,13 @@ def mosaic(image: Image) -> Image:
     return np.clip(image * gains, 0, 255).astype(np.uint8)
 
 
-def _raw_camera(world: World, values: dict[str, Any]) -> Camera:
+def _raw_camera(world: World, values: dict[str, Any], layout: Layout) -> Camera:
     pinhole = {name: value for name, value in values.items() if name != "distortion"}
-    return Camera(world, StereoCamera(**pinhole, baseline=0.0), values["distortion"])
+    return Camera(world, _coarse(StereoCamera(**pinhole, baseline=0.0), layout), values["distortion"])
+
+
+def _coarse(camera: StereoCamera, layout: Layout) -> StereoCamera:
+    return resized(camera, *layout.rendered) if layout.rendered else camera
 
 
 def _pose(values: dict[str, list[float]]) -> Array:
@@ -118,6 +130,11 @@ class Scan:
     intensity: NDArray[np.uint32]
     ambient: NDArray[np.uint32]
     offset_ns: NDArray[np.uint32]
+
+    def returns(self) -> Scan:
+        """The pulses that came back."""
+        kept = self.intensity > 0
+        return Scan(self.points[kept], self.intensity[kept], self.ambient[kept], self.offset_ns[kept])
 
     def usable(self, min_intensity: float, max_height_m: float) -> NDArray[np.bool_]:
         """(POINTS,) which pulses are returns worth using."""

@@ -141,18 +141,19 @@ ORIGIN = (37.7437, 15.0165, 2600.0)
 """Latitude and longitude (deg) and height (m, WGS-84) of the world's origin, by the Cisternazza crater."""
 GNSS_RATE_HZ = 5.0
 GPS_MINUS_UTC_S = 18
+GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 _SEMI_MAJOR_M, _ECCENTRICITY2 = 6378137.0, 6.69437999014e-3
 
 
 @dataclass(frozen=True, slots=True)
 class GnssTrack:
-    """Positions of the antenna, which is taken to sit above base_link.
+    """Positions of the antenna.
 
     Attributes:
         times_s: (N,) s.
         geodetic: (N, 3) latitude, longitude (deg) and height (m).
         deviation_m: (N,) standard deviation, m.
-        quality: (N,) 1 for a fixed, 2 for a float solution.
+        quality: (N,) 1 for a fixed, 2 for a float, 5 for a single solution.
     """
 
     times_s: Array
@@ -161,13 +162,18 @@ class GnssTrack:
     quality: Array
 
 
-def measure_gnss(motion: Motion, duration_s: float, seed: int) -> GnssTrack:
-    """Positions at 5 Hz; now and then the fix is lost for some seconds."""
+def measure_gnss(motion: Motion, duration_s: float, seed: int, antenna: ArrayLike = (0.0, 0.0, 0.0)) -> GnssTrack:
+    """Positions at 5 Hz of an antenna (3,), m, body frame; now and then the fix is lost for some seconds."""
     rng = np.random.default_rng([seed, 9])
     times = np.arange(0, duration_s, 1 / GNSS_RATE_HZ)
     floating = np.convolve(rng.random(len(times)) < 0.004, np.ones(15))[: len(times)] > 0
     deviation = np.where(floating, 0.15, 0.012)
-    world = motion.poses(times)[:, :3, 3] + deviation[:, None] * rng.standard_normal((len(times), 3))
+    poses = motion.poses(times)
+    world = (
+        poses[:, :3, 3]
+        + poses[:, :3, :3] @ np.asarray(antenna, float)
+        + deviation[:, None] * rng.standard_normal((len(times), 3))
+    )
     return GnssTrack(times, to_geodetic(world), deviation, np.where(floating, 2, 1))
 
 
@@ -183,9 +189,9 @@ def to_geodetic(world: Array) -> Array:
     )
 
 
-def rtklib_text(track: GnssTrack, start_ns: int) -> str:
-    """The track as an RTKLIB `.pos` file, in GPS time."""
-    start = datetime.fromtimestamp(start_ns // 10**9, UTC) + timedelta(seconds=GPS_MINUS_UTC_S)
+def rtklib_text(track: GnssTrack, start_ns: int, weeks: bool = False, ahead_s: int = GPS_MINUS_UTC_S) -> str:
+    """The track as an RTKLIB `.pos` file: in GPS time, `ahead_s` of UTC, as a date or as week and seconds."""
+    start = datetime.fromtimestamp(start_ns // 10**9, UTC) + timedelta(seconds=ahead_s)
     fraction = start_ns % 10**9 * 1e-9
     lines = [
         "% program   : umf simulate",
@@ -195,8 +201,12 @@ def rtklib_text(track: GnssTrack, start_ns: int) -> str:
     rows = zip(track.times_s, track.geodetic, track.quality, track.deviation_m, strict=True)
     for time_s, (latitude, longitude, height), quality, deviation in rows:
         stamp = start + timedelta(milliseconds=round((time_s + fraction) * 1000))
+        clock = f"{stamp:%Y/%m/%d %H:%M:%S}.{stamp.microsecond // 1000:03d}"
+        if weeks:
+            week, since = divmod(stamp - GPS_EPOCH, timedelta(weeks=1))
+            clock = f"{week:4d} {since.total_seconds():10.3f}"
         lines.append(
-            f"{stamp:%Y/%m/%d %H:%M:%S}.{stamp.microsecond // 1000:03d} {latitude:14.9f} {longitude:14.9f} "
+            f"{clock} {latitude:14.9f} {longitude:14.9f} "
             f"{height:10.4f} {quality:3d} {12:3d} {deviation:8.4f} {deviation:8.4f} {2 * deviation:8.4f}"
         )
     return "\n".join(lines) + "\n"

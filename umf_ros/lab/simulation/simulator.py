@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from umf_ros.core.errors import ConfigError, writing
@@ -18,7 +19,7 @@ from umf_ros.core.geometry import Array, relative, transform
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.lab.simulation import motion_sensors
 from umf_ros.lab.simulation.bag_writer import (
-    BagWriter,
+    Recorder,
     camera_info_message,
     cloud_message,
     fix_message,
@@ -41,7 +42,6 @@ SHORTEST_S = 2.0
 FASTEST_HZ = 30.0
 _EXPOSURE_S = 0.006
 _JITTER_S = 0.003
-_DROPPED_RIGHT = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +81,7 @@ class Simulator:
         family: str | None = None,
         aliasing: float | None = None,
         world_seed: int | None = None,
+        world: World | None = None,
     ) -> None:
         """Build the world and plan the drive.
 
@@ -92,6 +93,7 @@ class Simulator:
             family: kind of world; None takes the preset's.
             aliasing: 0 to 1; None takes the preset's.
             world_seed: of the world, where several drives go through one; None takes `seed`.
+            world: the world itself, where it is at hand and clear of rocks on the route; goes before the above.
 
         Raises:
             ConfigError: negative seed, unknown family, or a duration or image rate that cannot be.
@@ -101,11 +103,11 @@ class Simulator:
         family, aliasing = family or preset.family, preset.aliasing if aliasing is None else aliasing
         self.preset, self.seed = preset, seed
         world_seed = seed if world_seed is None else world_seed
-        relief = ground(world_seed, family, aliasing, preset.pan)
+        relief = world.relief if world else ground(world_seed, family, aliasing, preset.pan)
         self.route: Route = preset.route(relief, seed)
         self.motion = Motion(relief, self.route, preset.speed_m_s, preset.tilt_deg, seed)
         self.duration_s = self._checked(duration_s)
-        self.world = World(world_seed, family, aliasing, preset.clearing(relief, seed), relief)
+        self.world = world or World(world_seed, family, aliasing, preset.clearing(relief, seed), relief)
         self.calibration = preset.layout.load()
         self._eyes, self._lidar = eyes(self.world, preset.layout, self.calibration), Lidar(self.world)
         self._sun = self._morning()
@@ -146,7 +148,12 @@ class Simulator:
 
     def published(self, picture: Rendering) -> Image:
         """The image as the camera's driver sends it."""
-        return mosaic(picture.image) if self.preset.layout.encoding.startswith("bayer") else picture.image
+        size, raw = self.calibration.image_size, self.preset.layout.encoding.startswith("bayer")
+        image: Any = picture.image
+        if image.shape[::-1] != size:
+            # equal neighbours pack well, and binning takes them together again
+            image = cv2.resize(image, size, interpolation=cv2.INTER_NEAREST if raw else cv2.INTER_LINEAR)
+        return mosaic(image) if raw else image
 
     def frames(self) -> Iterator[Frame]:
         """Synchronised frames, one per scan, without a file in between; needs one exposure per scan."""
@@ -206,7 +213,7 @@ class Simulator:
             stamps = np.maximum(self.scan_stamps_ns + (jitter * 1e9).astype(np.int64), START_NS)
         else:
             stamps = START_NS + (np.arange(0, self.duration_s - 0.3, 1 / rate_hz) * 1e9).astype(np.int64)
-        arrived = rng.random(len(stamps)) >= _DROPPED_RIGHT
+        arrived = rng.random(len(stamps)) >= self.preset.layout.right_lost
         return [
             Exposure(int(stamp), i, bool(right)) for i, (stamp, right) in enumerate(zip(stamps, arrived, strict=True))
         ]
@@ -241,10 +248,11 @@ _IMAGE_DELAY_NS, _CLOUD_DELAY_NS, _ODOMETRY_DELAY_NS = 9_000_000, 4_000_000, 2_0
 
 def record(
     simulator: Simulator,
-    bag: BagWriter,
+    bag: Recorder,
     workers: int = 2,
     truth: bool = False,
     progress: Callable[[int], None] = lambda done: None,
+    sensors_only: bool = False,
 ) -> None:
     """Simulate a drive into a bag; the bytes do not depend on the number of workers.
 
@@ -254,6 +262,7 @@ def record(
         workers: threads that render.
         truth: add depth (32FC1, m), semantic (mono8) and instance (32SC1) maps of the left image.
         progress: called with the number of scans done.
+        sensors_only: leave out odometry, ground truth and positions by satellites.
 
     Raises:
         OutputError: the bag cannot be written; nothing is left of it.
@@ -261,7 +270,9 @@ def record(
     bag.note("simulation", describe(simulator))
     with ThreadPoolExecutor(workers) as pool:
         done = 0
-        for log_ns, _, topic, message in heapq.merge(*_streams(simulator, pool, truth), key=lambda event: event[:2]):
+        for log_ns, _, topic, message in heapq.merge(
+            *_streams(simulator, pool, truth, sensors_only), key=lambda event: event[:2]
+        ):
             bag.write(topic, message, log_ns)
             if topic == CLOUD_TOPIC:
                 done += 1
@@ -306,15 +317,9 @@ def describe(simulator: Simulator) -> dict[str, str]:
     }
 
 
-def _streams(simulator: Simulator, pool: ThreadPoolExecutor, truth: bool) -> list[Iterator[Event]]:
-    return [
-        _images(simulator, pool, truth),
-        _clouds(simulator, pool),
-        _imu(simulator),
-        _odometry(simulator),
-        _ground_truth(simulator),
-        _fixes(simulator),
-    ]
+def _streams(simulator: Simulator, pool: ThreadPoolExecutor, truth: bool, sensors_only: bool) -> list[Iterator[Event]]:
+    sensors = [_images(simulator, pool, truth), _clouds(simulator, pool), _imu(simulator)]
+    return sensors if sensors_only else [*sensors, _odometry(simulator), _ground_truth(simulator), _fixes(simulator)]
 
 
 def _images(simulator: Simulator, pool: ThreadPoolExecutor, truth: bool) -> Iterator[Event]:
@@ -344,10 +349,11 @@ def _maps(picture: Rendering, stamp: int, log_ns: int) -> Iterator[Event]:
 
 
 def _clouds(simulator: Simulator, pool: ThreadPoolExecutor) -> Iterator[Event]:
+    layout = simulator.preset.layout
     scans = ahead(pool, simulator.scan, range(len(simulator.scan_stamps_ns)))
     for stamp, scan in zip(simulator.scan_stamps_ns, scans, strict=True):
-        arrives = int(stamp) + PERIOD_NS + _CLOUD_DELAY_NS
-        yield arrives, 1, CLOUD_TOPIC, cloud_message(scan, int(stamp))
+        sent, stated = scan if layout.dummies else scan.returns(), int(stamp) - layout.scan_behind_ns
+        yield int(stamp) + PERIOD_NS + _CLOUD_DELAY_NS, 1, CLOUD_TOPIC, cloud_message(sent, stated)
 
 
 def _imu(simulator: Simulator) -> Iterator[Event]:
