@@ -195,20 +195,23 @@ def _fit_similarity(examples: Sequence[Examples]) -> float:
 def _fit_counts(examples: Sequence[Examples], name: str, known: Fitted) -> dict[str, float]:
     given = [one.score(known, ()) for one in examples]
     values = np.concatenate([np.log1p(one.counts[name][np.isfinite(one.counts[name])]) for one in examples])
-    spread = values.std()
+    spread = max(float(values.std()), 1e-6)
 
-    def said(slope: float, onset: float, floor: float = 0.0) -> list[Array]:
-        numbers = {"floor": floor, "onset": float(np.expm1(max(onset, 0.0))), "slope": slope / spread}
-        return [one.ratio(name, numbers) for one in examples]
+    def numbers(at: Array, floor: float = 0.0) -> dict[str, float]:
+        onset = float(np.expm1(np.clip(at[1], 0.0, values.max())))
+        return {"floor": floor, "onset": onset, "slope": float(at[0] / spread)}
+
+    def said(at: Array, floor: float = 0.0) -> list[Array]:
+        return [one.ratio(name, numbers(at, floor)) for one in examples]
 
     def loss(at: Array) -> float:
-        return _surprise(examples, [a + b for a, b in zip(given, said(*at), strict=True)]) + RIDGE * at[0] ** 2
+        return _surprise(examples, [a + b for a, b in zip(given, said(at), strict=True)]) + RIDGE * at[0] ** 2
 
     starts = [np.array([1.0, np.quantile(values, 0.2)]), np.array([3.0, np.quantile(values, 0.6)])]
     best = min((minimize(loss, start, method="Nelder-Mead") for start in starts), key=lambda one: float(one.fun)).x
     # the floor orders nothing among candidates that were all seen; it says what being seen is worth
-    floor = minimize(lambda at: _imbalance(examples, name, said(*best, floor=at[0])), [0.0], method="Nelder-Mead").x[0]
-    return {"floor": float(floor), "onset": float(np.expm1(max(best[1], 0.0))), "slope": float(best[0] / spread)}
+    floor = minimize(lambda at: _imbalance(examples, name, said(best, at[0])), [0.0], method="Nelder-Mead").x[0]
+    return numbers(best, float(floor))
 
 
 def _shares(examples: Sequence[Examples]) -> list[float]:
@@ -241,7 +244,7 @@ def right_share(one: Examples, scores: Array) -> Array:
     odds = np.where(one.right | one.wrong, scores, -np.inf)
     best = odds.max(axis=1, keepdims=True)
     weights = np.exp(odds - np.where(np.isfinite(best), best, 0.0))
-    return np.asarray((weights * one.right).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-300))
+    return np.asarray(np.where(one.right, weights, 0.0).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-300))
 
 
 def left_out(examples: Sequence[Examples]) -> list[Fitted]:
