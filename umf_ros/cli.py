@@ -31,7 +31,6 @@ COMMANDS = {
     "why": "umf_ros.lab.commands.report:why",
     "explain": "umf_ros.lab.commands.explain",
     "train": "umf_ros.lab.commands.train",
-    "adapt": "umf_ros.lab.commands.adapt",
     "export": "umf_ros.lab.commands.export",
     "bench": "umf_ros.lab.commands.bench:app",
     "doctor": "umf_ros.commands.doctor",

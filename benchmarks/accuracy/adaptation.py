@@ -1,4 +1,4 @@
-"""Gain of `umf adapt` on rovers of kinds the network has never seen, in another world.
+"""Gain of heads that are fitted to a rover's own drive (an experiment), on rovers of kinds the network has never seen.
 
     python benchmarks/accuracy/adaptation.py --json adaptation.json  # three rovers, about an hour on one core
     python benchmarks/accuracy/adaptation.py --quick --seed 10101 --json F        # one rover, shorter drives
@@ -9,9 +9,12 @@ drifts. Then it drives two passes through a world of another seed and family, in
 (offset to 4.5 m, yaw to 16 degrees, sun moved by 70, aliasing), and the second asks the first.
 Pooled features of the frames stay in `--work` and are used again.
 
+On validation seeds (`--seed 10400`, three rovers, 353 queries) it gained -.000 of `fused`, -.009 of `image` and -.003
+of `lidar`: the command `umf adapt` that did this was removed.
+
 Prints and writes, per rover and as means: recall@1 of the second pass before and after of `fused`, `image` and
 `lidar`, and their `_gain`; `kept`: whether the revisits held out of the drive found that anything was gained (where
-not, `umf adapt` writes nothing and the gain is 0); `labels` and `wrong_labels`: pairs that the first drive called one
+not, the fitted heads are dropped and the gain is 0); `labels` and `wrong_labels`: pairs that the first drive called one
 place, and how many of them the truth puts more than 12 m or 30 degrees apart; `minutes`, without simulating.
 """
 

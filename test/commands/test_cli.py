@@ -112,7 +112,6 @@ NO_BAG = "there is no recording nowhere.mcap"
         (["simulate"], "say where to write: OUT.mcap, --shards DIR or --contact-sheet OUT.png"),
         (["simulate", "drive.bag"], "cannot write drive.bag: the name must end in .mcap"),
         (["simulate", "drive.mcap", "--preset", "olympus"], "unknown preset 'olympus'"),
-        (["adapt", "nowhere.mcap", "--out", "mine.safetensors"], NO_BAG),
         (["sensors", "nowhere.mcap"], NO_BAG),
         (["places", "delete", "nowhere.sqlite", "--session", "1"], "there is no place database nowhere.sqlite"),
         (["evaluate", "--worlds", "test", "--methods", "some"], "--methods: expected umf or all, not 'some'"),

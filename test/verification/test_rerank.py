@@ -5,14 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from umf_ros.core.config import Verification
+from umf_ros.core.config import Verification, load_settings
+from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import Candidate, Keyframe, SuperFeatures
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan
 from umf_ros.verification.rerank import (
     Offered,
     eligible_superfeatures,
+    likelihoods,
+    log_ratio,
     mutual_neighbours,
     rerank,
+    score,
     similarities,
 )
 
@@ -48,10 +52,23 @@ def test_the_same_place_comes_before_some_that_only_look_more_alike() -> None:
     assert sorted(stamps(ranked)) == sorted(candidate.stamp_ns for candidate, _ in candidates)
 
 
-def test_how_much_inliers_weigh_is_a_setting() -> None:
-    candidates = offered(*map(elsewhere, range(5)), similarity=0.9) + offered(SAME, similarity=0.1)
-    thesis, none = (rerank(QUERY, candidates, Verification(rerank_weight=weight)) for weight in (1000, 0))
-    assert thesis[0][1] is SAME and none[-1][1] is SAME
+@pytest.mark.parametrize("name", ["xfeat", "umf", "cloud", "super_image", "super_cloud"])
+def test_more_matches_are_likelier_and_a_few_say_no_more_than_none(name: str) -> None:
+    fitted = likelihoods()[name]
+    ratios = log_ratio(np.array([0, 1, 2, 10, 20, 40, 80]), **fitted)
+    assert (np.diff(ratios) >= 0).all() and ratios[0] < 0 < ratios[-1]
+    assert ratios[-1] - ratios[-2] == pytest.approx(fitted["slope"] * np.log(81 / 41), rel=0.05)
+
+
+def test_features_that_were_not_seen_say_nothing() -> None:
+    nothing = score(0.4, {"xfeat": None, "cloud": None})
+    assert nothing == pytest.approx(0.4 * likelihoods()["similarity"]["slope"])
+    assert score(0.4, {"xfeat": 0, "cloud": None}) < nothing < score(0.4, {"xfeat": 60, "cloud": None})
+
+
+def test_a_weight_of_the_inliers_is_no_setting_any_more() -> None:
+    with pytest.raises(ConfigError, match=r"unknown parameter verification\.rerank_weight"):
+        load_settings(None, verification__rerank_weight=0.05)
 
 
 def test_equals_are_ordered_by_similarity_then_by_age() -> None:
@@ -66,9 +83,8 @@ def test_equals_are_ordered_by_similarity_then_by_age() -> None:
 def test_score_grows_with_the_inliers_of_both_modalities() -> None:
     found, _ = rerank(QUERY, offered(SAME), RANSAC)[0]
     assert found.inliers_image > 30 and found.inliers_cloud > 20
-    weight = RANSAC.rerank_weight
-    expected = 0.5 + weight * (np.log1p(found.inliers_image) + np.log1p(found.inliers_cloud))
-    assert found.score == pytest.approx(expected)
+    expected = score(0.5, {"xfeat": int(found.inliers_image), "cloud": int(found.inliers_cloud)})
+    assert found.score == pytest.approx(expected) and expected > score(0.5, {"xfeat": None, "cloud": None}) + 3
 
 
 @pytest.mark.parametrize("modalities", ["image", "cloud"])
@@ -76,7 +92,7 @@ def test_one_modality_is_blind_for_the_other(modalities: str) -> None:
     settings = Verification(modalities=modalities)
     found, _ = rerank(QUERY, offered(SAME), settings)[0]
     stripped = without_scan(SAME) if modalities == "image" else without_image(SAME)
-    assert found.score == rerank(QUERY, offered(stripped), settings)[0][0].score > 0.5
+    assert found.score == rerank(QUERY, offered(stripped), settings)[0][0].score > score(0.5, {})
     assert (found.inliers_image == 0) == (modalities == "cloud")
     assert (found.inliers_cloud == 0) == (modalities == "image")
 

@@ -123,12 +123,6 @@ class Verification(Group):
     rerank: Literal["ransac", "superfeatures"] = Field(
         "ransac", description="how local features reorder the candidates"
     )
-    rerank_weight: float = Field(
-        0.05,
-        ge=0,
-        le=1000,
-        description="what e times as many inliers weigh against cosine similarity; 1000: inliers alone [UMF 4.5]",
-    )
     features: Literal["umf", "xfeat"] = Field(
         "xfeat", description="local features of images: xfeat's, or those of the network that embeds"
     )

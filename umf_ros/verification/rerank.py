@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Any
 
 import cv2
@@ -13,17 +15,13 @@ from numpy.typing import NDArray
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, LocalFeatures, SuperFeatures
 from umf_ros.core.geometry import Array, align, relative, transform
+from umf_ros.core.resources import find
 from umf_ros.verification import constants as const
 
 
 @dataclass(frozen=True, slots=True)
 class Consensus:
-    """A model and the pairs that agree with it.
-
-    Attributes:
-        model: (3, 3) homography or (4, 4) pose that takes the first set to the second.
-        inliers: (N,) mask over the pairs.
-    """
+    """A homography (3, 3) or a pose (4, 4) that takes one set to another, and the mask (N,) of pairs that agree."""
 
     model: Array
     inliers: NDArray[np.bool_]
@@ -94,8 +92,6 @@ WITHOUT: dict[str, Any] = {
     "cloud": {"image": None, "super_image": None},
 }
 """Features that a choice of modalities takes out of an embedding."""
-
-
 Offered = tuple[Candidate, Keyframe]
 """A candidate with its keyframe."""
 
@@ -108,9 +104,25 @@ def rerank(query: Keyframe, candidates: Sequence[Offered], settings: Verificatio
     return sorted(ranked, key=lambda item: (-item[0].score, -item[0].similarity, item[0].stamp_ns))
 
 
-def weigh(similarity: float, counts: Iterable[float], settings: Verification) -> float:
-    """Score of a candidate: the global similarity and the number of inliers of each modality."""
-    return similarity + settings.rerank_weight * float(np.log1p(list(counts)).sum())
+@cache
+def likelihoods() -> dict[str, dict[str, float]]:
+    """Fitted numbers of each feature type and of the similarity (`umf_ros.lab.fit.reranking`)."""
+    return dict(json.loads(find("config/verification/reranking.json").read_text(encoding="utf-8"))["likelihoods"])
+
+
+def log_ratio(count: Any, floor: float, onset: float, slope: float) -> Any:
+    """How much more likely so many matches are at the right place than at a wrong one, nats; numbers or arrays.
+
+    Below `onset` wrong places match as much by chance, which says `floor`; beyond, e times as many say `slope` more.
+    """
+    return floor + np.logaddexp(0.0, slope * (np.log1p(count) - np.log1p(onset)))
+
+
+def score(similarity: float, counts: dict[str, int | None]) -> float:
+    """Log-likelihood ratio of a candidate: of its similarity and of each feature type; None, not seen, says nothing."""
+    fitted = likelihoods()
+    seen = (log_ratio(count, **fitted[name]) for name, count in counts.items() if count is not None)
+    return float(fitted["similarity"]["slope"] * similarity + sum(seen))
 
 
 def select(ranked: list[Offered], count: int) -> list[Offered]:
@@ -129,8 +141,6 @@ def select(ranked: list[Offered], count: int) -> list[Offered]:
 
 def strongest(features: LocalFeatures, count: int) -> LocalFeatures:
     """The first `count` features: a bound on what their comparison costs."""
-    if len(features.positions) <= count:
-        return features
     return LocalFeatures(*(getattr(features, one.name)[:count] for one in fields(features)))
 
 
@@ -145,11 +155,7 @@ def similarities(query: NDArray[Any], match: NDArray[Any]) -> NDArray[np.float32
 
 
 def mutual_neighbours(similarity: NDArray[Any]) -> Indices:
-    """Pairs (P, 2) of row and column that are each other's most similar.
-
-    Args:
-        similarity: (Q, M); may be empty.
-    """
+    """Pairs (P, 2) of row and column of a matrix (Q, M), which may be empty, that are each other's most similar."""
     if 0 in similarity.shape:
         return NO_PAIRS
     best_column = similarity.argmax(axis=1)
@@ -161,11 +167,7 @@ def mutual_neighbours(similarity: NDArray[Any]) -> Indices:
 def eligible_superfeatures(
     query: SuperFeatures, match: SuperFeatures, ratio: float = const.SUPERFEATURE_RATIO
 ) -> Indices:
-    """IDs of the super-features that match [UMF eq. 4.1].
-
-    A pair is eligible when both are each other's nearest neighbour, carry the same ID, and the
-    nearest neighbour is closer than `ratio` times the second nearest.
-    """
+    """IDs whose super-features are each other's nearest, and nearer than `ratio` times the second [UMF eq. 4.1]."""
     count = min(len(query.descriptors), len(match.descriptors))
     if count < 2:
         return np.empty(0, np.intp)
@@ -178,11 +180,13 @@ def eligible_superfeatures(
 
 
 def _by_superfeatures(query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification) -> Candidate:
-    ours, theirs = query.embedding, match.embedding
-    pairs = (ours.super_image, theirs.super_image), (ours.super_cloud, theirs.super_cloud)
-    counts = [len(eligible_superfeatures(mine, other)) for mine, other in pairs if mine and other]
-    score = weigh(candidate.similarity, counts, settings)
-    return replace(candidate, inliers_image=0.0, inliers_cloud=0.0, superfeatures=float(sum(counts)), score=score)
+    counts: dict[str, int | None] = {}
+    for name in ("super_image", "super_cloud"):
+        ours, theirs = getattr(query.embedding, name), getattr(match.embedding, name)
+        counts[name] = len(eligible_superfeatures(ours, theirs)) if ours and theirs else None
+    eligible = float(sum(filter(None, counts.values())))
+    ratio = score(candidate.similarity, counts)
+    return replace(candidate, inliers_image=0.0, inliers_cloud=0.0, superfeatures=eligible, score=ratio)
 
 
 def _by_ransac(query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification) -> Candidate:
@@ -190,28 +194,22 @@ def _by_ransac(query: Keyframe, candidate: Candidate, match: Keyframe, settings:
     reach = const.IMAGE_THRESHOLD * query.camera.width
     image_pairs, image = _explain(ours.image, theirs.image, fit_homography, reach, settings)
     cloud_pairs, cloud = _explain(ours.cloud, theirs.cloud, fit_rigid, const.POINT_THRESHOLD_M, settings)
-    counts = [consensus.count if consensus else 0 for consensus in (image, cloud)]
-    return replace(
-        candidate,
-        inliers_image=float(counts[0]),
-        inliers_cloud=float(counts[1]),
-        superfeatures=0.0,
-        image_pairs=image_pairs,
-        cloud_pairs=cloud_pairs,
-        score=weigh(candidate.similarity, counts, settings),
-    )
+    ratio = score(candidate.similarity, {settings.features: image, "cloud": cloud})
+    counts = {"inliers_image": float(image or 0), "inliers_cloud": float(cloud or 0), "superfeatures": 0.0}
+    return replace(candidate, **counts, image_pairs=image_pairs, cloud_pairs=cloud_pairs, score=ratio)
 
 
 def _explain(
     query: LocalFeatures | None, match: LocalFeatures | None, fit: Fit, threshold: float, settings: Verification
-) -> tuple[Indices, Consensus | None]:
-    """Mutual neighbours among the strongest features of both, and the model that explains most of them."""
-    if query is None or match is None:
+) -> tuple[Indices, int | None]:
+    """Mutual neighbours among the strongest features, and how many one model explains; None if a side has none."""
+    if query is None or match is None or 0 in (len(query.positions), len(match.positions)):
         return NO_PAIRS, None
     query, match = strongest(query, settings.rerank_features), strongest(match, settings.rerank_features)
     pairs = mutual_neighbours(similarities(query.descriptors, match.descriptors))
     here, there = query.positions[pairs[:, 0]].astype(float), match.positions[pairs[:, 1]].astype(float)
-    return pairs, fit(here, there, threshold, settings.ransac_iterations, settings.seed)
+    found = fit(here, there, threshold, settings.ransac_iterations, settings.seed)
+    return pairs, int(found.inliers.sum()) if found else 0
 
 
 def _same_place(a: Keyframe, b: Keyframe) -> bool:

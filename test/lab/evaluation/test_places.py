@@ -84,7 +84,7 @@ def test_the_command_reranks_with_the_network_and_writes_the_figures(folder: Pat
     app.command()(evaluate.command)
     (folder / "results").mkdir()
     (folder / "results" / "latest").symlink_to("a run")
-    (folder / "settings.yaml").write_text("verification: {rerank_weight: 0.1}\n")
+    (folder / "settings.yaml").write_text("verification: {rerank_features: 100}\n")
     arguments = [
         str(folder / "places.yaml"),
         "--config",

@@ -22,6 +22,7 @@ from umf_ros.lab.evaluation.retrieval import (
     rank,
     rerank_all,
 )
+from umf_ros.verification.rerank import likelihoods, log_ratio
 
 SIMILARITY = np.array([[0.9, 0.5, 0.7], [0.2, 0.2, 0.1]])
 
@@ -87,15 +88,15 @@ def test_counts_of_both_modalities_stand_beside_the_similarity(gathered) -> None
     similarity, reranking, _ = gathered
     ranking = reranking.before
     before = np.take_along_axis(similarity, ranking.order, axis=1)
-    gained = {method: (scores - before) / Verification().rerank_weight for method, scores in reranking.scores.items()}
+    slope = likelihoods()["similarity"]["slope"]
+    gained = {method: scores - slope * before for method, scores in reranking.scores.items()}
     for name in ("superfeatures", "ransac"):
         both, image, cloud = (gained[f"{name} {part}"] for part in ("both", "image", "lidar"))
-        np.testing.assert_allclose(both, image + cloud, atol=1e-9)
-        for counts in (np.expm1(image), np.expm1(cloud)):
-            np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
+        np.testing.assert_allclose(both, image + cloud, atol=1e-5)
     # all twelve super-features of a place are its own
     right = [list(row).index(place) for row, place in zip(ranking.order, ASKED, strict=True)]
-    np.testing.assert_allclose(np.expm1(gained["superfeatures image"][[0, 1, 2], right]), 12)
+    twelve = log_ratio(12, **likelihoods()["super_image"])
+    np.testing.assert_allclose(gained["superfeatures image"][[0, 1, 2], right], twelve, atol=1e-5)
 
 
 def test_only_the_first_candidates_are_reordered(gathered) -> None:

@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-import typer
-from recordings import small_settings, traverse, write_mcap
-from rich.console import Console
 from tiny_worlds import TINY, pose_at
-from typer.testing import CliRunner
 
-from umf_ros.core.config import dump_settings
-from umf_ros.core.errors import ConfigError, UmfError
-from umf_ros.lab.commands import adapt as command
 from umf_ros.lab.fit.adaptation import Adaptation, Drive, Lesson, Recall, adapt, measure
 from umf_ros.lab.fit.scene import with_scene
-from umf_ros.lab.training.networks import read_card, save_weights
 from umf_ros.networks.efficientnet import DEPTH, EfficientNetLite0
 from umf_ros.networks.umf import UMF
-from umf_ros.networks.weights import load_weights
 
 PLACES = 60
 STEP_M = 5.0
@@ -113,65 +101,3 @@ def test_a_gain_that_may_be_chance_is_none() -> None:
     assert after.gain_over(before) == pytest.approx(0.0133, abs=1e-3)  # four won, none lost
     lost = after._replace(hits=np.roll(after.hits, 6))  # ten won, six lost
     assert lost.gain_over(before) == 0
-
-
-@pytest.fixture
-def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Weights, and a command whose recordings have been read before."""
-    save_weights(network(), tmp_path / "tiny.safetensors", {})
-    monkeypatch.chdir(tmp_path)
-    for name in ("0.alike", *(f"{seed}.mcap" for seed in range(12))):
-        Path(name).touch()
-    monkeypatch.setattr(
-        command, "_drive", lambda bag, *_: drive(int(bag.stem), 0.0 if bag.suffix == ".alike" else 0.7, blind=True)
-    )
-    return tmp_path
-
-
-def run(folder: Path, bags: list[str], out: str = "mine.safetensors") -> str:
-    app = typer.Typer()
-    app.command()(command.command)
-    arguments = [*bags, "--out", str(folder / out), "--weights", str(folder / "tiny.safetensors")]
-    found = CliRunner().invoke(app, arguments, catch_exceptions=False)
-    assert found.exit_code == 0, found.output
-    return " ".join(found.output.split())
-
-
-def test_what_was_gained_is_written_and_said(given: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("umf_ros.lab.fit.adaptation.Adaptation", lambda: EAGER)
-    bags = [f"{seed}.mcap" for seed in range(12)]
-    said = run(given, bags)
-    assert said.startswith("Gained: held out: ") and "mine.safetensors" in said
-    fitted = load_weights(given / "mine.safetensors")
-    assert not torch.equal(fitted.fusion.image_head.weight, network().fusion.image_head.weight)
-    assert read_card(given / "mine.safetensors")["drives"] == bags
-
-
-def test_when_nothing_is_gained_nothing_is_written(given: Path) -> None:
-    assert run(given, ["0.alike"]).startswith("Nothing was gained, and nothing is written")
-    assert not (given / "mine.safetensors").exists()
-
-
-def test_what_cannot_be_adapted_is_one_clear_line(given: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigError, match=r"expected a \.safetensors file"):
-        run(given, ["0.mcap"], "mine.onnx")
-    monkeypatch.setattr(command, "_drive", lambda *_: replace(drive(), closures=np.empty((0, 2), np.int64)))
-    with pytest.raises(UmfError, match="too few places were seen twice"):
-        run(given, ["0.mcap"])
-    save_weights(UMF(TINY), given / "tiny.safetensors", {})
-    with pytest.raises(ConfigError, match="only networks with a scene"):
-        run(given, ["0.mcap"])
-
-
-def test_a_recording_is_read_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    weights = tmp_path / "tiny.safetensors"
-    save_weights(network(), weights, {})
-    config = tmp_path / "rover.yaml"
-    config.write_text(dump_settings(small_settings(tmp_path, database={"path": str(tmp_path / "map.sqlite")})))
-    bag = write_mcap(tmp_path / "a.mcap", traverse(4))
-    for _ in range(2):
-        found = command._drive(bag, load_weights(weights), weights, config, "auto", tmp_path / "kept", Console())
-        assert len(found.session) > 1 and found.closures.shape == (0, 2)
-    told = capsys.readouterr().out
-    assert f"{len(found.session)} keyframes, 0 closures" in told and "read before" in told
-    assert not (tmp_path / "map.sqlite").exists()  # the rover's map is not touched
