@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 
 from umf_ros.core.config import Dataset, Group, problems
 from umf_ros.core.errors import BagError, ConfigError
-from umf_ros.core.io import is_yaml, read_yaml
+from umf_ros.core.io import read_yaml
 from umf_ros.lab.datasets.robotcar import read_evaluation, read_training
 from umf_ros.lab.datasets.s3li import ETNA_TEST, ETNA_TRAINING, read_bag, read_toolkit
 from umf_ros.lab.datasets.s3li_folder import S3liSequence, find_s3li
