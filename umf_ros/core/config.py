@@ -178,6 +178,14 @@ class PoseGraphSettings(Group):
         60.0, ge=0, description="an uncertain closure nothing speaks against is believed after this way, m"
     )
     max_pending_s: float = Field(30.0, gt=0, description="a closure waits this long for its odometry, stream time, s")
+    origin: str = Field(
+        "", description="latitude, longitude (deg) and height (m) of the world frame; empty: the first good GNSS fixes"
+    )
+    elevation_model: str = Field("", description="heights of the ground: a GeoTIFF, an .asc or an .npz; empty: none")
+    elevation_sigma_m: float = Field(0.5, gt=0, description="standard deviation of its heights, m")
+    elevation_start: str = Field(
+        "", description="x and y (m) and heading (deg) of the first pose in the elevation model; empty: by GNSS"
+    )
     reject_outliers: bool = Field(
         True, description="find out which closures are wrong and which stated noise is; false: believe all of it"
     )

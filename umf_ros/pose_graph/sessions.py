@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, adjoint, invert, propagate
 from umf_ros.pose_graph.closures import Closures
@@ -32,12 +33,18 @@ class Sessions:
         chains: the odometry of each session.
         components: for each session the earliest one that shares its map.
         vertices: (N,) of `POINT`, the vertices that were solved last.
+        reference: absolute measurements that hold the map in the world.
         solution: the graph that was solved last; None before.
         scale: of the stated noise, in that solution.
     """
 
-    def __init__(self, settings: PoseGraphSettings, chains: list[OdometryChain] | None = None) -> None:
-        self._settings = settings
+    def __init__(
+        self,
+        settings: PoseGraphSettings,
+        chains: list[OdometryChain] | None = None,
+        reference: AbsoluteReference | None = None,
+    ) -> None:
+        self._settings, self.reference = settings, reference or AbsoluteReference(settings)
         self._solver = GraphSolver()
         self.scale = NoiseScale()
         self.chains = [OdometryChain(settings)] if chains is None else chains
@@ -105,7 +112,7 @@ class Sessions:
             self._solver, self.scale = GraphSolver(), scale
         components, moves = self._join(closures)
         vertices, graph = self._graph(self._stamps(closures), closures, components, moves)
-        self.solution = replace(graph, poses=self._solver.solve(graph))
+        self.solution = replace(graph, poses=self.reference.solve(self._solver, vertices, graph, components))
         self.vertices, self.components = vertices, components
         self._paths |= _paths_through(vertices, self.solution.poses)
 
@@ -116,7 +123,21 @@ class Sessions:
             GraphError: the system cannot be solved; the paths stay as they were.
         """
         vertices, graph = self._graph(self._stamps(closures, every_keyframe=True), closures, self.components)
-        self._paths |= _paths_through(vertices, self._solver.solve(graph))
+        poses = self.reference.solve(self._solver, vertices, graph, self.components)
+        self._paths |= _paths_through(vertices, poses)
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of squared, normalised errors of the last solution."""
+        return self._solver.cost
+
+    def snapshot(self) -> tuple[dict[int, CorrectedPath], list[int]]:
+        """What `restore` takes, to undo a trial."""
+        return dict(self._paths), list(self.components)
+
+    def restore(self, snapshot: tuple[dict[int, CorrectedPath], list[int]]) -> None:
+        """Put every path back to where it was."""
+        self._paths, self.components = dict(snapshot[0]), list(snapshot[1])
 
     def expand(self, closures: Closures, extra: Closures) -> Graph:
         """Graph of every keyframe and the endpoints of `extra` closures, odometry and the given closures."""
@@ -131,6 +152,7 @@ class Sessions:
                     [
                         chain.stamps[: None if every_keyframe else 1],
                         *(end["stamp"][end["session"] == session] for end in ends),
+                        self.reference.stamps(session),
                     ]
                 )
             )
