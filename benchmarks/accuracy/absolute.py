@@ -68,7 +68,7 @@ class Drive:
     ) -> tuple[float, int, dict[str, object], Counter[str]]:
         """Error in metres, wrong measurements believed, counts, and reasons of what was not accepted."""
         if Source.ELEVATION in sources:
-            settings = {"elevation_model": self.model, "elevation_start": self.start(), **settings}
+            settings = {"elevation_model": self.model, "elevation_start": self.start(), "elevation_sigma_m": 0.3, **settings}
         if Source.GNSS in sources:
             settings = {"origin": " ".join(map(str, self._world.origin)), **settings}
         world, graph = self._world.graph, PoseGraph(PoseGraphSettings(max_gap_s=1.5, keyframe_spacing_m=0.5, **settings))

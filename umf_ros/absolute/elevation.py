@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,12 @@ class ElevationModel:
     pixel_T_world: Array
     cell_m: float
     sigma_m: float
+
+    def shifted(self, shift: Array) -> ElevationModel:
+        """The same ground (2,) metres further."""
+        moved = self.pixel_T_world.copy()
+        moved[:, 2] -= moved[:, :2] @ shift
+        return replace(self, pixel_T_world=moved)
 
     def at(self, positions: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Heights (N,) m and slopes (N, 2) of the ground at positions (N, 2), interpolated, and (N,) whether known."""

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -64,7 +64,12 @@ _FREE, _FIXED = 1e3, 1e-6
 _START_M, _START_RAD = 5.0, np.deg2rad(5.0)
 # by hand: largest cost per height that a right elevation model adds, its own noise and the odometry's strain together;
 # least share of the heights within three sigmas
-_MOST_COST, _LEAST_FITTING = 3.0, 0.8
+_MOST_COST, _LEAST_FITTING = 1.0, 0.8
+# by hand: nats that the model fits better than it does anywhere else
+_EVIDENCE = 12.0
+# by hand: where else a model is tried, m; by which factor the path grows until the next test
+_ELSEWHERE_M = 50.0 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0.7, 0.7], [-0.7, -0.7]])
+_RETEST = 1.3
 _HEIGHT_GATE, _HUBER = 3.5, 1.345
 _TANGENT_M = 100.0
 _ROUNDS, _TRIAL_ROUNDS = 1, 5
@@ -170,17 +175,16 @@ class AbsoluteReference:
         """
         if self.is_empty:
             return
-        self._place(sessions)
-        ends = tuple(int(sessions.chains[session].travel[-1] // STRETCH_M) for session in sessions.begun)
-        seen = ends, sum(len(track.measurements) for track in self._tracks.values()), tuple(sessions.components)
-        if seen == self._seen and not at_last:
+        late = self._place(sessions)
+        seen = tuple(self._finished(sessions, session)[0] for session in sessions.begun), tuple(sessions.components)
+        if seen == self._seen and not late and not at_last:
             return
         self._seen = seen
         if self._judge_all(sessions, at_last) or at_last:
             solve()
         for component in sorted(set(sessions.components)):
             if self._model is not None:
-                self._judge_heights(self._model, component, sessions, solve)
+                self._judge_heights(self._model, component, sessions, solve, at_last)
 
     def verdicts(self) -> list[AbsoluteVerdict]:
         """The latest verdict of every measurement."""
@@ -265,9 +269,16 @@ class AbsoluteReference:
             poses[of == component] = orthonormal(invert(self.worlds[component]) @ poses[of == component])
         return poses
 
-    def _place(self, sessions: Sessions) -> None:
-        """Give every measurement whose odometry has arrived to its session."""
-        waiting, changed = [], set()
+    @staticmethod
+    def _finished(sessions: Sessions, session: int) -> tuple[int, int]:
+        """Number of the finished stretches of a session, and the stamp at the end of the last."""
+        chain = sessions.chains[session]
+        cell = int(chain.travel[-1] // STRETCH_M)
+        return cell, int(chain.stamps[np.searchsorted(chain.travel, cell * STRETCH_M)])
+
+    def _place(self, sessions: Sessions) -> bool:
+        """Give every measurement whose odometry has arrived to its session; True where one is of a finished stretch."""
+        waiting, changed, late = [], set(), False
         for one in self._waiting:
             session = sessions.find(one.stamp_ns)
             if session is None:
@@ -276,9 +287,11 @@ class AbsoluteReference:
             track = self._tracks.setdefault((session, one.source), _Track())
             track.measurements.append(one)
             changed.add((session, one.source))
+            late = late or one.stamp_ns < self._finished(sessions, session)[1]
         self._waiting = waiting
         for key in changed:
             self._tracks[key].measurements.sort(key=lambda one: one.stamp_ns)
+        return late
 
     def _judge_all(self, sessions: Sessions, at_last: bool) -> bool:
         """Decide about the tracks; returns whether other measurements than before are accepted, or others averages."""
@@ -495,7 +508,7 @@ class AbsoluteReference:
         return gtsam.noiseModel.Gaussian.Covariance(axes @ covariance @ axes.T)
 
     def _judge_heights(
-        self, model: ElevationModel, component: int, sessions: Sessions, solve: Callable[[], None]
+        self, model: ElevationModel, component: int, sessions: Sessions, solve: Callable[[], None], at_last: bool
     ) -> None:
         """Test whether an elevation model fits the path, solve with it where it does, and judge its heights."""
         if component not in self.worlds or (self._start is not None and not self._has_gnss(component, sessions)):
@@ -511,36 +524,55 @@ class AbsoluteReference:
             for cell in range(int(chain.travel[-1] // STRETCH_M)):
                 stamp = int(chain.stamps[_reference(chain.travel, cell)])
                 heights.residuals.setdefault((session, stamp), (np.nan, np.nan))
-        if heights.fits:
-            if len(heights.residuals) > known:
+        count = len(heights.residuals)
+        due = count > heights.tested if at_last else count >= _RETEST * heights.tested
+        if count < _FEW_STRETCHES or not due:
+            if heights.fits and count > known:
                 solve()
-            if self._fitting(model, component, sessions, newest=_FEW_STRETCHES) >= 0.5:
-                return
-            heights.tested = 0
-        if len(heights.residuals) < max(_FEW_STRETCHES, 1.3 * heights.tested):
             return
-        self._try(model, component, sessions, solve)
+        self._test(model, component, sessions, solve)
 
-    def _try(self, model: ElevationModel, component: int, sessions: Sessions, solve: Callable[[], None]) -> None:
-        """Solve with the heights, and take that back where they do not fit."""
+    def _test(self, model: ElevationModel, component: int, sessions: Sessions, solve: Callable[[], None]) -> None:
+        """Solve with the heights, and take that back where they do not fit, or fit elsewhere as well.
+
+        The first time, the model is tried at other places too: heights that fit there say nothing.
+        """
         heights = self._heights[component]
-        heights.tested, heights.fits = len(heights.residuals), False
+        known, count = heights.fits, len(heights.residuals)
+        heights.tested, heights.fits = count, False
         solve()
-        before, world, cost = sessions.snapshot(), self.worlds[component].copy(), sessions.cost
-        heights.fits, self._rounds = True, _TRIAL_ROUNDS
+        before = sessions.snapshot(), self.worlds[component].copy(), sessions.cost
+        elsewhere = np.inf
+        for shift in _ELSEWHERE_M if not known else ():
+            added, inside = self._cost_of(model.shifted(shift), component, sessions, solve, before[2])
+            elsewhere = min(elsewhere, added if inside else np.inf)
+            self._take_back(component, sessions, before)
+        added, inside = self._cost_of(model, component, sessions, solve, before[2])
+        evidence = 0.5 * count * (elsewhere - added)
+        right = inside and added <= _MOST_COST and self._fitting(model, component, sessions) >= _LEAST_FITTING
+        heights.fits = True if right and (known or evidence >= _EVIDENCE) else None if right else False
+        if not heights.fits:
+            self._take_back(component, sessions, before)
+            solve()
+
+    def _cost_of(
+        self, model: ElevationModel, component: int, sessions: Sessions, solve: Callable[[], None], cost: float
+    ) -> tuple[float, bool]:
+        """Cost per height that a model adds to a cost without, and whether it covers the path."""
+        heights, given = self._heights[component], self._model
+        heights.fits, self._rounds, self._model = True, _TRIAL_ROUNDS, model
         try:
             solve()
-            added = 2 * (sessions.cost - cost) / len(heights.residuals)
-            fits = added <= _MOST_COST and self._fitting(model, component, sessions) >= _LEAST_FITTING
+            inside = self._fitting(model, component, sessions) > 0
+            return 2 * (sessions.cost - cost) / len(heights.residuals), inside
         except GraphError:
-            fits = False
+            return np.inf, False
         finally:
-            self._rounds = _ROUNDS
-        heights.fits = fits
-        if not fits:
-            sessions.restore(before)
-            self.worlds[component] = world
-            solve()
+            heights.fits, self._rounds, self._model = False, _ROUNDS, given
+
+    def _take_back(self, component: int, sessions: Sessions, before: tuple[Any, Array, float]) -> None:
+        sessions.restore(before[0])
+        self.worlds[component] = before[1].copy()
 
     def _begin_at_start(self, model: ElevationModel, component: int, sessions: Sessions) -> None:
         """Say how a component lies in the world by the start pose of the parameters."""
@@ -638,7 +670,8 @@ def _scatter(values: Array, variances: Array, middles: Array, groups: list[NDArr
         for number, rows in enumerate(groups)
         if len(rows) > 2
     ]
-    return max(1.0, 1.4826 * float(np.median(np.concatenate(ratios)))) if ratios else 1.0
+    scale = max(1.0, 1.4826 * float(np.median(np.concatenate(ratios)))) if ratios else 1.0
+    return float(1.2 ** np.ceil(np.log(scale) / np.log(1.2)))  # in steps, so that averages stay as they are
 
 
 def _assign(track: _Track, rows: NDArray[np.int64], state: State, reason: AbsoluteReason) -> None:
