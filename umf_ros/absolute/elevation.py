@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.absolute.measurement import from_enu
 from umf_ros.core.errors import ConfigError, one_line
 from umf_ros.core.geometry import Array
+
+_HUBER = 1.345
+# by hand: along the ground a height says nothing; between the middles of cells a slope is known to a quarter of one
+_TANGENT_M, _CELL_SHARE = 100.0, 0.25
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,41 @@ class ElevationModel:
         heights = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
         by_pixel = np.stack([(1 - v) * (b - a) + v * (d - c), (1 - u) * (c - a) + u * (d - b)], axis=1)
         return heights, by_pixel @ self.pixel_T_world[:, :2], known & np.isfinite(heights)
+
+    def misfits(self, poses: Array, is_free: bool) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """(N,) m by which world poses (N, 4, 4) are above the ground, their sigmas, and whether the ground is known.
+
+        With `is_free` heights count from elsewhere: GNSS counts from the ellipsoid, models mostly from the geoid.
+        """
+        ground, slopes, known = self.at(poses[:, :2, 3])
+        missed = np.where(known, poses[:, 2, 3] - ground, 0.0)
+        if is_free and known.any():
+            missed = missed - np.median(missed[known])
+        steepness = np.where(known, np.linalg.norm(slopes, axis=1), 0.0)
+        return missed, np.hypot(self.sigma_m, _CELL_SHARE * self.cell_m * steepness), known
+
+    def planes(self, poses: Array, is_free: bool, gate: float) -> list[Callable[[int], gtsam.NonlinearFactor] | None]:
+        """N makers of factors that hold a vertex on the plane of the ground under a pose.
+
+        None where the ground is unknown, or more than `gate` sigmas away.
+        """
+        missed, sigmas, known = self.misfits(poses, is_free)
+        slopes = self.at(poses[:, :2, 3])[1]
+        normals = np.column_stack([-slopes, np.ones(len(poses))])
+        return [
+            _plane(pose[:3, 3] - [0.0, 0.0, miss], normal, sigma) if inside and abs(miss) <= gate * sigma else None
+            for pose, miss, normal, sigma, inside in zip(poses, missed, normals, sigmas, known, strict=True)
+        ]
+
+
+def _plane(point: Array, normal: Array, sigma_m: float) -> Callable[[int], gtsam.NonlinearFactor]:
+    """Maker of a factor of a plane through a point, `sigma_m` is vertical."""
+    size = float(np.linalg.norm(normal))
+    across = np.outer(normal, normal) / size**2
+    spread = (sigma_m / size) ** 2 * across + _TANGENT_M**2 * (np.eye(3) - across)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
+    noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(spread))
+    return lambda vertex: gtsam.GPSFactorArm(vertex, point, np.zeros(3), noise)
 
 
 def load_elevation(path: Path, sigma_m: float, origin: Array | None) -> ElevationModel:

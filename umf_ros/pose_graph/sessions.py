@@ -112,7 +112,7 @@ class Sessions:
             self._solver, self.scale = GraphSolver(), scale
         components, moves = self._join(closures)
         vertices, graph = self._graph(self._stamps(closures), closures, components, moves)
-        self.solution = replace(graph, poses=self.reference.solve(self._solver, vertices, graph, components))
+        self.solution = replace(graph, poses=self._optimum(vertices, graph, components))
         self.vertices, self.components = vertices, components
         self._paths |= _paths_through(vertices, self.solution.poses)
 
@@ -123,8 +123,17 @@ class Sessions:
             GraphError: the system cannot be solved; the paths stay as they were.
         """
         vertices, graph = self._graph(self._stamps(closures, every_keyframe=True), closures, self.components)
-        poses = self.reference.solve(self._solver, vertices, graph, self.components)
-        self._paths |= _paths_through(vertices, poses)
+        self._paths |= _paths_through(vertices, self._optimum(vertices, graph, self.components))
+
+    def _optimum(self, points: PathPoints, graph: Graph, components: list[int]) -> Array:
+        """(N, 4, 4) poses at the minimum, absolute measurements included."""
+        return self.reference.solve(
+            points,
+            graph.anchors,
+            graph.poses,
+            components,
+            lambda held: self._solver.solve(replace(graph, **held._asdict())),
+        )
 
     @property
     def cost(self) -> float:
