@@ -33,7 +33,7 @@ _REACH = 60
 # by hand: the least jump that multipath makes, m; a chain across a longer tolerance proves nothing
 _LEAST_JUMP_M = 5.0
 # by hand: attitude of the solved map, rad, and systematic error of odometry per metre
-_ATTITUDE, _SYSTEMATIC = np.deg2rad(1.0), 0.02
+_ATTITUDE, _SYSTEMATIC, _SYSTEMATIC_RAD = np.deg2rad(1.0), 0.02, np.deg2rad(0.03)
 _HEADINGS = np.deg2rad(np.arange(0, 360, 5.0))
 _PAIRS = 5
 # by hand: errors of measurements beside each other are alike, so that a stretch counts as so many at most
@@ -42,7 +42,7 @@ _MOST_DRIFT_M = 2000
 _ALIGNED_STRETCHES = 40
 _FEW_STRETCHES = 15
 # by hand: mounting errors that matter, and how well they must be known: m for an antenna, rad for an IMU
-_MOUNTING = {Source.GNSS: (0.5, 0.25), Source.GRAVITY: (np.deg2rad(1.5), np.deg2rad(1.0))}
+_MOUNTING = {Source.GNSS: (0.5, 1.0), Source.GRAVITY: (np.deg2rad(2.5), np.deg2rad(1.0))}
 _LEAST_SIGMA_M = 0.05
 _STEP = np.log(1.2)
 
@@ -62,7 +62,7 @@ def position_drift(noise: OdometryNoise, path_m: Array) -> Array:
 
 def attitude_drift(noise: OdometryNoise, path_m: Array) -> Array:
     """Variance per axis (rad^2) of the odometry's attitude over path lengths."""
-    return (noise.scale * noise.sigma_rad) ** 2 * path_m
+    return (noise.scale * noise.sigma_rad) ** 2 * path_m + (_SYSTEMATIC_RAD * path_m) ** 2
 
 
 def longest_chain(values: Array, variances: Array, path_m: Array, drift: Array) -> NDArray[np.bool_]:
@@ -133,28 +133,28 @@ def turned(points: Array, heading: float) -> Array:
     return points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1.0]])
 
 
-def body_offset(values: Array, rotations: Array, path_m: Array) -> tuple[Array, Array]:
-    """An error (3,) that turns with the body, of values along the path, and its covariance (3, 3).
+def body_offset(
+    values: Array, variances: Array, rotations: Array, path_m: Array, drift: Array
+) -> tuple[Array, Array]:
+    """An error (3,) that turns with the body, and its covariance (3, 3).
 
     Args:
-        values: (N, 3) in the world, or in the frame of the odometry.
+        values: (N, 3) in the world, or in the frame of the odometry, with `variances`, `path_m` and `drift` as for
+            `longest_chain`.
         rotations: (N, 3, 3) of the body there.
-        path_m: (N,) along the path.
     """
     pairs = [(row, row + step) for step in range(1, _PAIRS + 1) for row in range(len(values) - step)]
     first, second = np.array(pairs).reshape(-1, 2).T
-    # far apart, drift hides it
-    weights = 1 / np.maximum(path_m[second] - path_m[first], 1.0)
-    design, missed = rotations[second] - rotations[first], values[second] - values[first]
+    apart = drift[np.minimum((path_m[second] - path_m[first]).astype(int), len(drift) - 1)]
+    stated = (variances[first] + variances[second]).mean(axis=1) + apart
+    design, missed, weights = rotations[second] - rotations[first], values[second] - values[first], 1 / stated
     for _ in range(3):  # reweighted: the chain is right, some of its links are not
         information = np.einsum("n,nji,njk->ik", weights, design, design) + 1e-9 * np.eye(3)
         offset = np.linalg.solve(information, np.einsum("n,nji,nj->i", weights, design, missed))
-        left = np.square(missed - design @ offset).sum(axis=1)
-        scale = float(np.median(left)) + 1e-12
-        weights = 1 / np.maximum(path_m[second] - path_m[first], 1.0) / (1 + left / (4 * scale))
-    variance = float((weights * left).sum() / max(3 * len(values) - 3, 1)) / _PAIRS
+        left = np.square(missed - design @ offset).sum(axis=1) / stated
+        weights = 1 / (stated * (1 + left / 4))
     # every value is in several pairs
-    return offset, _PAIRS * variance * np.linalg.inv(information)
+    return offset, _PAIRS * max(1.0, float(np.median(left)) / 3) * np.linalg.inv(information)
 
 
 class Factor(NamedTuple):
@@ -344,7 +344,8 @@ class Track:
         if members.sum() < _FEW_STRETCHES:
             return unknown
         turns = np.array([rotations[rows[len(rows) // 2]] for rows in stretches.rows])
-        offset, covariance = body_offset(stretches.middles[members], turns[members], stretches.travel[members])
+        chosen = (part[members] for part in (stretches.middles, stretches.spreads, turns, stretches.travel))
+        offset, covariance = body_offset(*chosen, self._drift)
         offset, covariance = offset[:2], covariance[:2, :2]  # along the vertical, the rover does not turn
         if np.sqrt(np.linalg.eigvalsh(covariance).max()) > well_known:
             return unknown

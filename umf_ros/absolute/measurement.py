@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -34,6 +34,10 @@ class Source(StrEnum):
     GNSS = "gnss"
     GRAVITY = "gravity"
     ELEVATION = "elevation"
+
+
+ABSOLUTE_TYPES = {Source.GNSS: "sensor_msgs/msg/NavSatFix", Source.GRAVITY: "sensor_msgs/msg/Imu"}
+"""Types of message of measurements."""
 
 
 class AbsoluteReason(StrEnum):
@@ -153,22 +157,19 @@ class GravityFilter:
     """Makes upward directions of sensor_msgs/Imu messages, two per second at most.
 
     From the orientation where the driver gives one, else from the mean acceleration over a second at rest.
-
-    Args:
-        body_T_imu: (4, 4), of which the rotation counts.
     """
 
-    def __init__(self, body_T_imu: Array) -> None:
-        self._body_R_imu = body_T_imu[:3, :3]
+    def __init__(self) -> None:
         self._window: deque[tuple[int, Array, Array]] = deque()
         self._last_ns = -(10**18)
 
-    def take(self, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
-        """Take one message; returns a measurement now and then.
+    def take(self, message: Any, stamp_ns: int, body_R_imu: Array) -> AbsoluteMeasurement | None:
+        """Take one message of an IMU that is turned so (3, 3) on the body; returns a measurement now and then.
 
         Raises:
             MessageError: of kind "imu": its orientation is none.
         """
+        self._body_R_imu = body_R_imu
         if message.orientation_covariance[0] < 0:
             return self._at_rest(message, stamp_ns)
         if 0 <= stamp_ns - self._last_ns < 500_000_000:
@@ -205,6 +206,32 @@ class GravityFilter:
         self._last_ns = stamp_ns
         up = self._body_R_imu @ up_imu
         return AbsoluteMeasurement(Source.GRAVITY, stamp_ns, up / np.linalg.norm(up), sigma**2 * np.eye(3), np.zeros(3))
+
+
+class AbsoluteDecoder:
+    """Decodes the messages of GNSS and IMU, the same live and offline.
+
+    Args:
+        antenna: (3,) m, body frame.
+        body_T_imu: (4, 4).
+        find: pose (4, 4) of a frame on the body by `/tf_static`, which goes before those; None where it is unknown.
+    """
+
+    def __init__(self, antenna: Array, body_T_imu: Array, find: Callable[[str], Array | None]) -> None:
+        self._antenna, self._body_T_imu, self._find = antenna, body_T_imu, find
+        self._gravity = GravityFilter()
+
+    def decode(self, source: Source, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
+        """The measurement in a message; None where an IMU has nothing to say yet.
+
+        Raises:
+            MessageError: the message cannot be used.
+        """
+        mounted = self._find(message.header.frame_id)
+        if source is Source.GNSS:
+            return decode_fix(message, stamp_ns, self._antenna if mounted is None else mounted[:3, 3])
+        pose = self._body_T_imu if mounted is None else mounted
+        return self._gravity.take(message, stamp_ns, pose[:3, :3])
 
 
 def parse_numbers(text: str, count: int, what: str) -> Array | None:

@@ -53,6 +53,13 @@ class Topics(Group):
     odometry: str = Field("/odom", description="odometry, nav_msgs/Odometry; empty: none")
 
 
+class AbsoluteTopics(Group):
+    """Topics of measurements that say where the rover is on the planet."""
+
+    gnss: str = Field("", description="GNSS, sensor_msgs/NavSatFix; empty: none")
+    imu: str = Field("", description="IMU for the direction of gravity, sensor_msgs/Imu; empty: none")
+
+
 class DatasetPreset(Group):
     """Calibration and topics of a data set, by its name: a file in `config/datasets`."""
 
@@ -240,6 +247,7 @@ class Settings(Group):
     )
     map: str = Field("", description="folder of a map that `umf map` made, for mode localization; it stays as it is")
     topics: Topics = Topics()
+    absolute: AbsoluteTopics = AbsoluteTopics()
     qos: Qos = Qos()
     sync: Sync = Sync()
     keyframe: KeyframePolicy = KeyframePolicy()

@@ -135,6 +135,7 @@ class PoseGraph:
             self._attempt(lambda: self._rejection.resume(decided))
         for placed in new:
             self._attempt(lambda: self._rejection.consider([placed]))  # noqa: B023 (called at once)
+        self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
 
     def update(self) -> list[ClosureVerdict]:
         """Decide about closures whose odometry has arrived; returns new verdicts."""

@@ -333,10 +333,11 @@ def _upon(ground: Callable[[Array], Array], plan: Array) -> Array:
 
 
 def _drift_by(truth: Array, rng: np.random.Generator, share: float) -> GraphWorld:
-    """Odometry that random and systematic errors of one proportion bring off by a share of the way at its end."""
+    """Odometry that random errors, and others that change with the ground, bring off by a share of the way."""
     steps = invert(truth[:-1]) @ truth[1:]
     lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
-    bias = np.array([*np.deg2rad([0.01, 0.01, 0.03]), 0.01, 0.003, 0.003]) * rng.choice([-1, 1], 6) * rng.uniform(0.5, 1, 6)
+    bias = gaussian_filter1d(rng.normal(size=(len(steps), 6)), 60, axis=0)
+    bias *= np.array([*np.deg2rad([0.02, 0.02, 0.06]), 0.02, 0.006, 0.006]) / bias.std(axis=0)
     noise = lengths[:, None] * bias + np.sqrt(lengths)[:, None] * rng.normal(size=(len(steps), 6)) * _ODOMETRY_SIGMAS
 
     def drifted(factor: float) -> Array:
