@@ -31,17 +31,16 @@ _SCHEMA = Schema("pose graph", (_TABLES,), lambda tables: int({"event", "verdict
 ODOMETRY, CLOSURE, REVOKED, STARTED, UNSETTLED = "odometry", "closure", "revoked", "started", "unsettled"
 _ABSOLUTE = (Source.GNSS.value, Source.GRAVITY.value)
 # "decided" is of earlier versions
-_NUMBERS = {ODOMETRY: 16, CLOSURE: 53, REVOKED: 0, STARTED: 0, UNSETTLED: 0, "decided": 0, **dict.fromkeys(_ABSOLUTE, 15)}
+_NUMBERS = {ODOMETRY: 16, CLOSURE: 53, REVOKED: 0, STARTED: 0, UNSETTLED: 0, "decided": 0}
+_NUMBERS |= dict.fromkeys(_ABSOLUTE, 15)
 _EVENT = "INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)"
 _EVENTS = "SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"
 JOURNAL = "pose_graph.sqlite"
 """Name of the file in a folder of results."""
 
 
-def feed(
-    graph: PoseGraph, inputs: Iterable[GraphInput], splitter: OdometrySessionSplitter | None = None
-) -> bool:
-    """Pass stored odometry, closures and absolute measurements to a graph whose newest session is empty; `resume` decides about the closures.
+def feed(graph: PoseGraph, inputs: Iterable[GraphInput], splitter: OdometrySessionSplitter | None = None) -> bool:
+    """Pass stored inputs to a graph whose newest session is empty; `resume` decides about the closures.
 
     Args:
         graph: to be filled.
@@ -212,10 +211,8 @@ class DurableGraph:
         states = {(v.closure.match_stamp_ns, v.closure.query_stamp_ns): v.state for v in found}
         self.changed = sum(states.get(pair) != state for pair, (state, *_) in verdicts.items())
 
-    def _inputs(
-        self, events: Iterable[tuple[Any, ...]], revoked: list[tuple[int, int]]
-    ) -> Iterator[GraphInput]:
-        """Odometry, closures and absolute measurements of logged events; adds pairs of keyframes whose closures were revoked."""
+    def _inputs(self, events: Iterable[tuple[Any, ...]], revoked: list[tuple[int, int]]) -> Iterator[GraphInput]:
+        """Inputs of logged events; adds pairs of keyframes whose closures were revoked."""
         for kind, first_ns, second_ns, data in events:
             numbers = np.frombuffer(data, np.float64)
             if len(numbers) != _NUMBERS.get(kind, -1):

@@ -79,7 +79,9 @@ class Replay:
         Raises:
             OutputError: the disk is full.
         """
-        for item in self._detector.prefetch(stream, lambda: self._done <= WARM_UP):
+        items: Iterator[Frame | OdometrySample | AbsoluteMeasurement]
+        items = self._detector.prefetch(stream, lambda: self._done <= WARM_UP)
+        for item in items:
             if isinstance(item, OdometrySample):
                 self._has_odometry = True
                 self._recorder.record_odometry(item.stamp_ns, item.odom_T_body)

@@ -1,4 +1,4 @@
-"""What absolute measurements do to a map, right ones and wrong ones.
+"""Accuracy of a map with absolute measurements, right ones and wrong ones.
 
 `python benchmarks/accuracy/absolute.py [--seed N] [--quick] [--json FILE]`
 
@@ -58,6 +58,7 @@ class Drive:
         return self._write("wrong", tiled[: shape[0], : shape[1]])
 
     def start(self) -> str:
+        """Start pose as a person would state it, a little wrong."""
         first = self._world.graph.truth[0]
         return f"{first[0, 3] + 1.5:.2f} {first[1, 3] - 1.5:.2f} {np.degrees(heading(first)) + 1.5:.2f}"
 
@@ -70,7 +71,12 @@ class Drive:
     ) -> tuple[float, int, dict[str, object], Counter[str]]:
         """Error in metres, wrong measurements believed, counts, and reasons of what was not accepted."""
         if Source.ELEVATION in sources:
-            settings = {"elevation_model": self.model, "elevation_start": self.start(), "elevation_sigma_m": 0.3, **settings}
+            settings = {
+                "elevation_model": self.model,
+                "elevation_start": self.start(),
+                "elevation_sigma_m": 0.3,
+                **settings,
+            }
         if Source.GNSS in sources:
             settings = {"origin": " ".join(map(str, self._world.origin)), **settings}
         world, graph = self._world.graph, PoseGraph(PoseGraphSettings(**ODOMETRY | settings))
@@ -93,7 +99,9 @@ class Drive:
             for one, lie in zip(self._world.measurements, self._world.lies, strict=True)
             if lie and one.source in sources
         ]
-        reasons = Counter(f"{v.source.value}: {v.reason}" for v in graph.reference.verdicts() if v.state is not State.ACCEPTED)
+        reasons = Counter(
+            f"{v.source.value}: {v.reason}" for v in graph.reference.verdicts() if v.state is not State.ACCEPTED
+        )
         error = float(np.sqrt(np.square(moved - truth).sum(axis=1).mean()))
         return error, sum(lie in believed for lie in lies), graph.reference.report(), reasons
 
@@ -120,9 +128,14 @@ def measure(seed: int, quick: bool) -> dict[str, Any]:
             figures[f"ate_{name}_m"] = round(error, 3)
             figures["wrong_believed"] += wrong
             told = "; ".join(f"{key} {value}" for key, value in counts.items())
-            print(f"{name:28s} {error:8.3f} m  {time.process_time() - began:5.1f} s  {wrong} wrong believed  {told}", flush=True)
+            print(
+                f"{name:28s} {error:8.3f} m  {time.process_time() - began:5.1f} s  {wrong} wrong believed  {told}",
+                flush=True,
+            )
             if reasons:
-                print(" " * 30 + "; ".join(f"{reason} {number}" for reason, number in reasons.most_common(4)), flush=True)
+                print(
+                    " " * 30 + "; ".join(f"{reason} {number}" for reason, number in reasons.most_common(4)), flush=True
+                )
             return error
 
         def pair(name: str, without: float, *arguments: Any, **options: Any) -> None:
@@ -132,14 +145,14 @@ def measure(seed: int, quick: bool) -> dict[str, Any]:
         row("closures", ())
         gravity = row("gravity", (Source.GRAVITY,))
         elevation = row("elevation", (Source.GRAVITY, Source.ELEVATION))
-        gnss = row("gnss", ALL)
+        row("gnss", ALL)
         row("elevation_alone", (Source.ELEVATION,), closures=False)
         gnss_alone = row("gnss_alone", (Source.GNSS,), closures=False)
         first = world.graph.truth[0]
         far = f"{first[0, 3] + 60:.2f} {first[1, 3] + 40:.2f} {np.degrees(heading(first)) + 40:.2f}"
         pair("model", gravity, (Source.GRAVITY, Source.ELEVATION), elevation_model=drive.wrong_model(seed))
         pair("start", gravity, (Source.GRAVITY, Source.ELEVATION), elevation_start=far)
-        off = world.origin + [0.002, 0.002, 0.0]
+        off = world.origin + np.array([0.002, 0.002, 0.0])
         gravity_gnss = row("gravity_gnss", (Source.GRAVITY, Source.GNSS))
         pair("origin", gravity_gnss, ALL, origin=" ".join(map(str, off)), elevation_start="")
         lever = altered(world, Source.GNSS, lever=np.array([1.7, -1.75, 1.1]))
@@ -147,7 +160,6 @@ def measure(seed: int, quick: bool) -> dict[str, Any]:
         pair("lever_arm_alone", figures["ate_closures_m"], (Source.GNSS,), measurements=lever)
         pair("gravity", figures["ate_closures_m"], (Source.GRAVITY,), measurements=tilted(world, 5.0))
         pair("gravity_gnss", gnss_alone, (Source.GRAVITY, Source.GNSS), measurements=tilted(world, 5.0))
-    print(f"{gnss=:.3f}")
     return figures
 
 

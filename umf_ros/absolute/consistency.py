@@ -1,6 +1,6 @@
 """Consistency of absolute measurements over time.
 
-What a source measures, less what odometry says of the same, changes slowly along the path where the source is right:
+The measurement of a source, less the odometry's of the same, changes slowly along the path where the source is right:
 by the drift of the odometry. Multipath jumps. The longest chain of measurements, each of which agrees with the one
 before over the odometry between, is found by dynamic programming; what is not on it contradicts what is.
 An error of the mounting turns with the rover, which tells it from drift.
@@ -106,9 +106,7 @@ def find_heading(measured: Array, mapped: Array, variances: Array, path_m: Array
 
     Every heading is tried; the right one lets the longest chain agree.
 
-    Args:
-        measured: (N, 3) positions in the world, with `variances`, `path_m` and `drift` as for `longest_chain`.
-        mapped: (N, 3) the same in the map.
+    `measured` (N, 3) are positions in the world, `mapped` the same in the map; the others as for `longest_chain`.
     """
     best: tuple[int, float, float] | None = None
     for heading in _HEADINGS:
@@ -133,15 +131,10 @@ def turned(points: Array, heading: float) -> Array:
     return points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1.0]])
 
 
-def body_offset(
-    values: Array, variances: Array, rotations: Array, path_m: Array, drift: Array
-) -> tuple[Array, Array]:
+def body_offset(values: Array, variances: Array, rotations: Array, path_m: Array, drift: Array) -> tuple[Array, Array]:
     """An error (3,) that turns with the body, and its covariance (3, 3).
 
-    Args:
-        values: (N, 3) in the world, or in the frame of the odometry, with `variances`, `path_m` and `drift` as for
-            `longest_chain`.
-        rotations: (N, 3, 3) of the body there.
+    `values` (N, 3) are in the frame in which `rotations` (N, 3, 3) are those of the body; as for `longest_chain`.
     """
     pairs = [(row, row + step) for step in range(1, _PAIRS + 1) for row in range(len(values) - step)]
     first, second = np.array(pairs).reshape(-1, 2).T
@@ -158,11 +151,11 @@ def body_offset(
 
 
 class Factor(NamedTuple):
-    """What the measurements of a stretch say together.
+    """The average of the measurements of a stretch.
 
     Attributes:
-        stamp_ns: of the pose that it is about.
-        numbers: change when it does.
+        stamp_ns: of its pose.
+        numbers: those that determine it.
         make: makes the factor of a vertex with a number.
     """
 
@@ -192,7 +185,7 @@ class Path:
 
 @dataclass(frozen=True)
 class _Stretches:
-    """Averages over K stretches: their numbers, rows of the measurements, medians and their variances (K, 3), travel."""
+    """Averages over K stretches: numbers, rows of the measurements, medians and their variances (K, 3), travel (K,)."""
 
     cells: Rows
     rows: list[Rows]
@@ -259,7 +252,9 @@ class Track:
         world, here = (_Stretches.of(points, self._variances, path) for points in (measured, mapped))
         newest = slice(-_ALIGNED_STRETCHES, None)
         ends = world.middles[newest], here.middles[newest]
-        direction = find_heading(*ends, world.spreads[newest], world.travel[newest], self._drift) if len(ends[0]) else None
+        direction = (
+            find_heading(*ends, world.spreads[newest], world.travel[newest], self._drift) if len(ends[0]) else None
+        )
         if direction is None:
             self._decide_all((State.PENDING, AbsoluteReason.NOT_ALIGNED))
             return None
@@ -344,8 +339,9 @@ class Track:
         if members.sum() < _FEW_STRETCHES:
             return unknown
         turns = np.array([rotations[rows[len(rows) // 2]] for rows in stretches.rows])
-        chosen = (part[members] for part in (stretches.middles, stretches.spreads, turns, stretches.travel))
-        offset, covariance = body_offset(*chosen, self._drift)
+        parts = stretches.middles, stretches.spreads, turns, stretches.travel
+        values, spreads, turns, travel = (part[members] for part in parts)
+        offset, covariance = body_offset(values, spreads, turns, travel, self._drift)
         offset, covariance = offset[:2], covariance[:2, :2]  # along the vertical, the rover does not turn
         if np.sqrt(np.linalg.eigvalsh(covariance).max()) > well_known:
             return unknown
@@ -364,8 +360,8 @@ class Track:
         """Make the factor of a stretch: on a rigid path, the mean of positions is that of the mean of their levers."""
         stamp_ns, middle = path.at_middle(cell)
         there = invert(middle) @ path.odometry[rows]
-        counted = min(len(rows), _MOST_COUNTED)
-        covariance = np.mean([self._measurements[row].covariance for row in rows], axis=0) * scale**2 / counted
+        # as of one measurement: errors of GNSS last for longer than a stretch
+        covariance = np.mean([self._measurements[row].covariance for row in rows], axis=0) * scale**2
         if self._source is Source.GNSS:
             mean = measured[rows].mean(axis=0)
             lever = (there[:, :3, 3] + apply(there, self._levers[rows])).mean(axis=0)

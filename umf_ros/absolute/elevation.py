@@ -108,9 +108,7 @@ def load_elevation(path: Path, sigma_m: float, origin: Array | None) -> Elevatio
     """
     try:
         if path.suffix == ".npz":
-            with np.load(path) as stored:
-                heights, cell, x0, y0 = (np.asarray(stored[name], float) for name in ("heights", "cell_m", "x0_m", "y0_m"))
-            to_pixel = np.array([[1, 0, -x0], [0, 1, -y0]], float) / float(cell)
+            heights, to_pixel = _read_arrays(path)
         elif path.suffix == ".asc":
             heights, to_pixel = _read_ascii(path)
         else:
@@ -123,6 +121,13 @@ def load_elevation(path: Path, sigma_m: float, origin: Array | None) -> Elevatio
         raise ConfigError(f"elevation model {path} is no grid of heights")
     cell_m = float(1 / np.sqrt(abs(np.linalg.det(to_pixel[:, :2]))))
     return ElevationModel(heights, to_pixel, cell_m, sigma_m)
+
+
+def _read_arrays(path: Path) -> tuple[Array, Array]:
+    """Heights, and the columns and rows of points; as the other readers."""
+    with np.load(path) as stored:
+        heights, cell, x0, y0 = (np.asarray(stored[name], float) for name in ("heights", "cell_m", "x0_m", "y0_m"))
+    return heights, np.array([[1, 0, -x0], [0, 1, -y0]], float) / float(cell)
 
 
 def _read_ascii(path: Path) -> tuple[Array, Array]:
@@ -144,7 +149,7 @@ def _read_geotiff(path: Path, origin: Array | None) -> tuple[Array, Array]:
         from rasterio.warp import transform
     except ImportError:
         raise ConfigError(
-            f"elevation model {path}: rasterio is not installed (pip install umf_ros[elevation]); .asc and .npz need none"
+            f"elevation model {path}: rasterio is not installed (pip install umf_ros[elevation]); .asc needs none"
         ) from None
     with rasterio.open(path) as file:
         heights = file.read(1, masked=True).astype(float).filled(np.nan)

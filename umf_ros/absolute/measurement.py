@@ -186,7 +186,9 @@ class GravityFilter:
 
     def _at_rest(self, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
         """The mean acceleration of the last second, if the IMU stood still meanwhile."""
-        force, rate = ([vector.x, vector.y, vector.z] for vector in (message.linear_acceleration, message.angular_velocity))
+        force, rate = (
+            [vector.x, vector.y, vector.z] for vector in (message.linear_acceleration, message.angular_velocity)
+        )
         if self._window and not 0 < stamp_ns - self._window[-1][0] < 10**9:
             self._window.clear()
         self._window.append((stamp_ns, np.array(force, float), np.array(rate, float)))

@@ -20,7 +20,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.absolute.consistency import STRETCH_M, Factor, Path, Rows, Track, apply, turned
+from umf_ros.absolute.consistency import STRETCH_M, Path, Rows, Track, apply, turned
 from umf_ros.absolute.elevation import ElevationModel, load_elevation
 from umf_ros.absolute.measurement import (
     AbsoluteMeasurement,
@@ -52,7 +52,7 @@ Factors = Sequence[tuple[int, Callable[[int], gtsam.NonlinearFactor]]]
 
 
 class Held(NamedTuple):
-    """What holds a graph in the world: poses (N, 4, 4) there, factors of vertices, noise of anchors that may move."""
+    """A graph held in the world: poses (N, 4, 4) there, factors of vertices, noise of anchors that may move."""
 
     poses: Array
     absolute: Factors
@@ -78,6 +78,7 @@ class Paths(Protocol):
     """The sessions of a pose graph; see `pose_graph.sessions.Sessions`."""
 
     components: list[int]
+    solved: Any
 
     @property
     def chains(self) -> Sequence[Any]:
@@ -100,12 +101,6 @@ class Paths(Protocol):
     def members(self, component: int) -> list[int]:
         """Sessions of a component."""
 
-    def snapshot(self) -> Any:
-        """What `restore` takes."""
-
-    def restore(self, snapshot: Any) -> None:
-        """Undo a trial."""
-
 
 @dataclass
 class _Heights:
@@ -124,7 +119,9 @@ class _Heights:
     def verdict(self, stamp_ns: int, sigmas: float, misfit_m: float) -> AbsoluteVerdict:
         """Decision about one height."""
         if not self.fits:
-            known = (State.PENDING, AbsoluteReason.UNSURE) if self.fits is None else (State.REJECTED, AbsoluteReason.MISFIT)
+            known = (
+                (State.PENDING, AbsoluteReason.UNSURE) if self.fits is None else (State.REJECTED, AbsoluteReason.MISFIT)
+            )
         elif np.isnan(sigmas):
             known = State.REJECTED, AbsoluteReason.OUTSIDE
         elif sigmas > _HEIGHT_GATE:
@@ -219,8 +216,16 @@ class AbsoluteReference:
 
     def stamps(self, session: int) -> Rows:
         """(K,) stamps of the poses of a session that accepted measurements are about."""
-        stamps = [one.stamp_ns for (own, _), track in self._tracks.items() if own == session for one in track.factors.values()]
-        stamps += [stamp for heights in self._heights.values() if heights.fits for own, stamp in heights.misfits if own == session]
+        stamps = [
+            one.stamp_ns for (own, _), track in self._tracks.items() if own == session for one in track.factors.values()
+        ]
+        stamps += [
+            stamp
+            for heights in self._heights.values()
+            if heights.fits
+            for own, stamp in heights.misfits
+            if own == session
+        ]
         return np.unique(np.array(stamps, np.int64))
 
     def solve(
@@ -244,7 +249,9 @@ class AbsoluteReference:
             GraphError: it cannot be solved.
         """
         of = np.array(components, np.int64)[points["session"]]
-        rows = dict(zip(zip(points["session"].tolist(), points["stamp"].tolist(), strict=True), range(len(points)), strict=True))
+        rows = dict(
+            zip(zip(points["session"].tolist(), points["stamp"].tolist(), strict=True), range(len(points)), strict=True)
+        )
         firsts = {int(of[row]): row for row in anchors if int(of[row]) in self.worlds}
         held, factors, planes, loose = poses.copy(), list[Any](), list[tuple[list[int], bool]](), dict[int, Any]()
         for component, first in firsts.items():
@@ -293,7 +300,9 @@ class AbsoluteReference:
         """Decide about the tracks; returns whether what is accepted has changed."""
         changed = False
         # gravity before GNSS: both say how the map lies in the world, and GNSS says more
-        for (session, source), track in sorted(self._tracks.items(), key=lambda one: (one[0][1] is Source.GNSS, one[0][0])):
+        for (session, source), track in sorted(
+            self._tracks.items(), key=lambda one: (one[0][1] is Source.GNSS, one[0][0])
+        ):
             before = {cell: factor.numbers for cell, factor in track.factors.items()}
             component, measured = paths.components[session], self._measured(source, track)
             path = self._path(track, session, paths, at_last)
@@ -304,7 +313,9 @@ class AbsoluteReference:
                 self.worlds[component] = world
             known = component in self.worlds
             if known:
-                path = Path(path.odometry, self.worlds[component] @ path.poses, path.travel, path.finished, path.at_middle)
+                path = Path(
+                    path.odometry, self.worlds[component] @ path.poses, path.travel, path.finished, path.at_middle
+                )
             track.judge(measured, path, known)
             if track.factors and not known:
                 self.worlds[component] = _upright(apply(path.poses, measured).mean(axis=0))
@@ -370,19 +381,17 @@ class AbsoluteReference:
         heights = self._heights[component]
         believed, heights.fits, heights.tested = heights.fits, False, len(heights.misfits)
         solve()
-        before, cost, elsewhere = (paths.snapshot(), self.worlds[component]), paths.cost, np.inf
+        before, cost, elsewhere = (dict(paths.solved), self.worlds[component]), paths.cost, np.inf
         for shift in _ELSEWHERE_M if not believed else ():
             added, fitting = self._try(model.shifted(shift), component, paths, solve, cost)
             elsewhere = min(elsewhere, added if fitting > 0 else np.inf)
-            paths.restore(before[0])
-            self.worlds[component] = before[1]
+            paths.solved, self.worlds[component] = dict(before[0]), before[1]
         added, fitting = self._try(model, component, paths, solve, cost)
         is_right = added <= _MOST_COST and fitting >= _LEAST_FITTING
         is_sure = believed or 0.5 * heights.tested * (elsewhere - added) >= _EVIDENCE
         heights.fits = is_sure or None if is_right else False
         if not heights.fits:
-            paths.restore(before[0])
-            self.worlds[component] = before[1]
+            paths.solved, self.worlds[component] = dict(before[0]), before[1]
             solve()
 
     def _try(

@@ -133,15 +133,16 @@ def read_transforms(bag: Bag) -> StaticTransforms:
 
 
 def _absolute_topics(settings: Settings, bag: Bag) -> dict[str, Source]:
-    """Topics of absolute measurements; a `BagError` where the recording lacks one that is named, or has another type."""
+    """Topics of absolute measurements; a `BagError` where one that is named is missing, or of another type."""
     found = {}
     for source, topic in ((Source.GNSS, settings.absolute.gnss), (Source.GRAVITY, settings.absolute.imu)):
         if not topic:
             continue
         info = bag.topics.get(topic)
         if info is None or info.type != ABSOLUTE_TYPES[source]:
-            others = ", ".join(name for name, one in bag.topics.items() if one.type == ABSOLUTE_TYPES[source]) or "none"
-            raise BagError(f"{bag.path}: no {ABSOLUTE_TYPES[source]} on {topic} (topics of that type: {others})")
+            others = ", ".join(name for name, one in bag.topics.items() if one.type == ABSOLUTE_TYPES[source])
+            text = f"{bag.path}: no {ABSOLUTE_TYPES[source]} on {topic}"
+            raise BagError(f"{text} (topics of that type: {others or 'none'})")
         found[topic] = source
     return found
 

@@ -37,23 +37,18 @@ from umf_ros.pose_graph.sessions import Sessions
 from umf_ros.pose_graph.solver import Graph
 
 logger = logging.getLogger(__name__)
-_LAST_ROUNDS = 3
 
 
 class PoseGraph:
     """Keep the optimal trajectory from odometry and loop closures that arrive in any order.
 
-    Unusable messages are refused with a reason and counted.
-
-    Attributes:
-        reference: absolute measurements, and the decisions about them.
-        counts: messages by what became of them.
+    Unusable messages are refused with a reason and counted. `reference` decides about absolute measurements.
     """
 
     def __init__(self, settings: PoseGraphSettings | None = None) -> None:
         self._settings = settings or PoseGraphSettings()
         self.reference = AbsoluteReference(self._settings)
-        self._sessions = Sessions(self._settings, reference=self.reference)
+        self._sessions = Sessions(self._settings, self.reference)
         self._rejection = OutlierRejection(self._settings, self._sessions)
         # decisions in order of stamps as far as they have come, and the sessions with odometry that they know
         self._ordered: tuple[list[int], Sessions, OutlierRejection] | None = None
@@ -179,9 +174,10 @@ class PoseGraph:
         after = zip(self._rejection.placed, self._rejection.verdicts, strict=True)
         verdicts += [verdict for placed, verdict in after if verdict.state is not states[id(placed)]]
         verdicts += self._attempt(self._rejection.settle)
-        for _ in range(_LAST_ROUNDS):  # the map that measurements move may contradict others
+        for _ in range(3):  # the map that measurements move may contradict others
             self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve, at_last=True))
-        self._attempt(self._rejection.refine)
+        if self._sessions.solution is not None:
+            self._attempt(lambda: self._sessions.refine(self._rejection.accepted))
         self._settled = True
         return verdicts
 
@@ -193,7 +189,7 @@ class PoseGraph:
         late = any(a is not b for a, b in zip_longest(rejection.placed, order[: len(rejection.placed)]))
         if late or begun != self._sessions.begun:
             # the same odometry, before any closure moved it
-            sessions = Sessions(self._settings, self._sessions.chains, self.reference)
+            sessions = Sessions(self._settings, self.reference, self._sessions.chains)
             rejection = OutlierRejection(self._settings, sessions)
             self._ordered = self._sessions.begun, sessions, rejection
         for placed in takewhile(is_ready, order[len(rejection.placed) :]):

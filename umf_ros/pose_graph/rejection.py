@@ -138,11 +138,6 @@ class OutlierRejection:
         self.solve()
         return self._changed_since(before)
 
-    def refine(self) -> None:
-        """Bring the solved map to the exact optimum over all keyframes."""
-        if self._map is not None:
-            self._sessions.refine(self.accepted)
-
     def renew(self) -> None:
         """Solve again after the odometry's past changed; no verdict changes by that."""
         for end in (self.closures["match"], self.closures["query"]):

@@ -85,7 +85,7 @@ class StoredOdometry(NamedTuple):
 
 
 GraphInput = LoopClosure | StoredOdometry | AbsoluteMeasurement
-"""What a pose graph is fed with."""
+"""Input of a pose graph."""
 
 
 class RunFile:

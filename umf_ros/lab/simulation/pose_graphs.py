@@ -320,7 +320,7 @@ def _round_trip(rng: np.random.Generator, length_m: float) -> Array:
 
 def _upon(ground: Callable[[Array], Array], plan: Array) -> Array:
     """(N, 4, 4) poses along the way, upright on the slope."""
-    slope = np.stack([ground(plan + [0.5, 0]) - ground(plan - [0.5, 0]), ground(plan + [0, 0.5]) - ground(plan - [0, 0.5])])
+    slope = np.stack([ground(plan + axis) - ground(plan - axis) for axis in 0.5 * np.eye(2)])
     normal = np.column_stack([-slope.T, np.ones(len(plan))])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     ahead = np.column_stack([np.gradient(plan, axis=0), np.zeros(len(plan))])
