@@ -54,6 +54,7 @@ FILES = {
     "requirements-ros.txt": Pinned("ros", "ROS 2 Jazzy from PyPI, where Jazzy itself is not installed"),
     "requirements-lab.txt": Pinned("lab", "simulation, training and evaluation"),
     "requirements-fleet.txt": Pinned("fleet", "a fleet's PostgreSQL, and many machines; a single rover needs neither"),
+    "requirements-elevation.txt": Pinned("elevation", "elevation models as GeoTIFF"),
     "requirements-rerun.txt": Pinned("rerun", "umf replay --rerun; asks for NumPy 2"),
     "requirements-peers.txt": Pinned(
         "peers", "other systems of benchmarks/accuracy/systems.py, in an environment of their own"

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement, Source
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError, OutputError, writing
 from umf_ros.core.frames import LoopClosure
@@ -18,7 +19,7 @@ from umf_ros.core.geometry import Array
 from umf_ros.core.io import Schema, SqliteFile
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, Decision, State
-from umf_ros.runs.run_file import StoredOdometry
+from umf_ros.runs.run_file import GraphInput, StoredOdometry
 from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
 
 _TABLES = (
@@ -28,18 +29,18 @@ _TABLES = (
 )
 _SCHEMA = Schema("pose graph", (_TABLES,), lambda tables: int({"event", "verdict"} <= tables))
 ODOMETRY, CLOSURE, REVOKED, STARTED, UNSETTLED = "odometry", "closure", "revoked", "started", "unsettled"
+_ABSOLUTE = (Source.GNSS.value, Source.GRAVITY.value)
 # "decided" is of earlier versions
 _NUMBERS = {ODOMETRY: 16, CLOSURE: 53, REVOKED: 0, STARTED: 0, UNSETTLED: 0, "decided": 0}
+_NUMBERS |= dict.fromkeys(_ABSOLUTE, 15)
 _EVENT = "INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)"
 _EVENTS = "SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"
 JOURNAL = "pose_graph.sqlite"
 """Name of the file in a folder of results."""
 
 
-def feed(
-    graph: PoseGraph, inputs: Iterable[LoopClosure | StoredOdometry], splitter: OdometrySessionSplitter | None = None
-) -> bool:
-    """Pass stored odometry and closures to a graph whose newest session is empty; `resume` decides about the closures.
+def feed(graph: PoseGraph, inputs: Iterable[GraphInput], splitter: OdometrySessionSplitter | None = None) -> bool:
+    """Pass stored inputs to a graph whose newest session is empty; `resume` decides about the closures.
 
     Args:
         graph: to be filled.
@@ -53,6 +54,9 @@ def feed(
     for item in inputs:
         if isinstance(item, LoopClosure):
             graph.hold(item)
+            continue
+        if isinstance(item, AbsoluteMeasurement):
+            graph.add_absolute(item)
             continue
         if item.covariance is None:
             splitter.take(item.stamp_ns, item.odom_T_body)
@@ -110,6 +114,11 @@ class DurableGraph:
         """Take one message; returns why a new session has begun with it."""
         self._log(ODOMETRY, stamp_ns, 0, odom_T_body)
         return self.feed.take(stamp_ns, odom_T_body)
+
+    def take_absolute(self, measurement: AbsoluteMeasurement) -> None:
+        """Take one absolute measurement; `update` decides about it."""
+        self._log(measurement.source.value, measurement.stamp_ns, 0, measurement.numbers)
+        self.graph.add_absolute(measurement)
 
     def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
         """Take one closure; returns every verdict that it brought about or changed."""
@@ -202,10 +211,8 @@ class DurableGraph:
         states = {(v.closure.match_stamp_ns, v.closure.query_stamp_ns): v.state for v in found}
         self.changed = sum(states.get(pair) != state for pair, (state, *_) in verdicts.items())
 
-    def _inputs(
-        self, events: Iterable[tuple[Any, ...]], revoked: list[tuple[int, int]]
-    ) -> Iterator[LoopClosure | StoredOdometry]:
-        """Odometry and closures of logged events; adds pairs of keyframes whose closures were revoked."""
+    def _inputs(self, events: Iterable[tuple[Any, ...]], revoked: list[tuple[int, int]]) -> Iterator[GraphInput]:
+        """Inputs of logged events; adds pairs of keyframes whose closures were revoked."""
         for kind, first_ns, second_ns, data in events:
             numbers = np.frombuffer(data, np.float64)
             if len(numbers) != _NUMBERS.get(kind, -1):
@@ -217,6 +224,8 @@ class DurableGraph:
             elif kind == CLOSURE:
                 pose, covariance = numbers[:16].reshape(4, 4), numbers[16:52].reshape(6, 6)
                 yield LoopClosure(second_ns, first_ns, pose, covariance, float(numbers[52]))
+            elif kind in _ABSOLUTE:
+                yield AbsoluteMeasurement.stored(kind, first_ns, numbers)
             elif kind == REVOKED:
                 revoked.append((first_ns, second_ns))
             elif kind == STARTED:

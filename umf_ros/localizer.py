@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import PoseGraphSettings, Settings
 from umf_ros.core.errors import GraphError, UmfError, writing
 from umf_ros.core.frames import LoopClosure
@@ -285,6 +286,10 @@ class MapFollower(PoseGraph):
             if np.linalg.norm(found.map_T_body[:3, 3] - last) >= _SPACING_M:
                 self._poses.append(found)
         return usable
+
+    def add_absolute(self, measurement: AbsoluteMeasurement) -> None:
+        """Count a measurement: the map stays as it is, and tells the pose."""
+        self.counts["absolute measurements unused"] += 1
 
     def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
         """Take a closure with the map; returns its verdict."""

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
@@ -69,17 +70,24 @@ class Replay:
         for closure in self._recorder.earlier_closures if resume else ():
             self._earlier[closure.query_stamp_ns].append(closure)
 
-    def run(self, stream: Iterable[Frame | OdometrySample]) -> Iterator[Detection]:
+    def run(self, stream: Iterable[Frame | OdometrySample | AbsoluteMeasurement]) -> Iterator[Detection]:
         """Process a recording's stream and yield the result of each frame; stop iterating to stop the run.
 
         Raises:
             OutputError: the disk is full.
         """
-        for item in self._detector.prefetch(stream, lambda: self._done <= WARM_UP):
+        items: Iterator[Frame | OdometrySample | AbsoluteMeasurement]
+        items = self._detector.prefetch(stream, lambda: self._done <= WARM_UP)
+        for item in items:
             if isinstance(item, OdometrySample):
                 self._has_odometry = True
                 self._recorder.record_odometry(item.stamp_ns, item.odom_T_body)
                 self._feed.take(item.stamp_ns, item.odom_T_body)
+                continue
+            if isinstance(item, AbsoluteMeasurement):
+                self._recorder.record_absolute(item)
+                self._graph.add_absolute(item)
+                self._graph.update()
                 continue
             if self._done > WARM_UP:
                 yield self._skip_known(item)

@@ -20,13 +20,15 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import NavSatFix
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from umf_ros.absolute.measurement import Source
 from umf_ros.core.geometry import Array
 from umf_ros.lab.datasets.g2o import read_g2o
-from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, open_ground, rover_loops, with_wrong_closures
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, closure_to_message, from_time, to_pose, to_time
 from umf_ros.sensors.decode import decode_pose
 
@@ -355,3 +357,35 @@ def test_a_wrong_parameter_is_one_line(tmp_path: Path) -> None:
     assert "unknown parameter pose_graph.gate" in process.output
     assert len(process.output.strip().splitlines()) == 1
     process.kill()
+
+
+def test_fixes_over_dds_are_decided_about_and_told(ros_context: None, tmp_path: Path) -> None:
+    world = open_ground(10_004, 300.0)
+    rig = Rig(world.graph)
+    fixes, results = rig.create_publisher(NavSatFix, "/gnss/fix", 50), tmp_path / "results"
+    arguments = ("absolute.gnss:=/gnss/fix", "pose_graph.max_gap_s:=3", "pose_graph.odometry_sigma_deg:=0.1")
+    process = Process(MODULE, tmp_path / "node.log", f"results_dir:={results}", *arguments)
+    try:
+        process.wait_for("ready")
+        rig.until(lambda: rig.odometry.get_subscription_count() and fixes.get_subscription_count())
+        given = {one.stamp_ns // PERIOD_NS: one for one in world.measurements if one.source is Source.GNSS}
+        for k in range(len(world.graph.truth)):
+            rig.drive(k, k + 1)
+            if k in given:
+                message = NavSatFix(position_covariance_type=2)
+                message.header.stamp, message.status.status = to_time(k * PERIOD_NS), 0
+                message.latitude, message.longitude, message.altitude = given[k].value.tolist()
+                message.position_covariance = given[k].covariance.ravel()
+                fixes.publish(message)
+        fixes.publish(NavSatFix())  # without a stamp
+        rig.until(lambda: int(rig.values.get("gnss accepted", 0)) > 100)
+        rig.until(lambda: "stamp" in rig.values)
+        assert "pose_graph_node: input gnss" in rig.inputs
+        assert process.interrupt() == 0
+    finally:
+        process.kill()
+        rig.destroy_node()
+    rows = list(csv.DictReader((results / "absolute_verdicts.csv").open()))
+    lies = {one.stamp_ns for one, lie in zip(world.measurements, world.lies, strict=True) if lie}
+    accepted = {int(row["stamp_ns"]) for row in rows if row["verdict"] == "accepted"}
+    assert len(accepted) > 100 and not accepted & lies

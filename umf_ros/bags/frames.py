@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from umf_ros.absolute.measurement import ABSOLUTE_TYPES, AbsoluteDecoder, AbsoluteMeasurement, Source
 from umf_ros.bags.reader import Bag, decode
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics, topics_of
@@ -60,6 +61,10 @@ class FrameReader:
         transforms = read_transforms(bag) if settings.uses_transforms else StaticTransforms()
         frames = BodyFrames(settings.frames, transforms, warn, 0.0, calibration) if transforms.version else None
         self._router = MessageRouter(self._synchronizer, topics, warn, self._samples.append, frames)
+        self._absolute = _absolute_topics(settings, bag)
+        find = frames.pose_of if frames is not None else lambda _: None
+        self._decoder = AbsoluteDecoder(calibration.antenna, calibration.body_T_imu, find)
+        self._warn, self._warned = warn, set[tuple[str, str]]()
         if bag.warning:
             warn(bag.warning)
 
@@ -72,14 +77,20 @@ class FrameReader:
         """Frames in the order of their stamps."""
         return (item for item in self.stream() if isinstance(item, Frame))
 
-    def stream(self) -> Iterator[Frame | OdometrySample]:
-        """Every message of the odometry as it comes, and the frames as they are complete."""
-        for raw in self._bag.raw_messages(self._router.topics):
+    def stream(self) -> Iterator[Frame | OdometrySample | AbsoluteMeasurement]:
+        """Every message of the odometry and absolute measurement as it comes, and the frames as they are complete."""
+        for raw in self._bag.raw_messages([*self._router.topics, *self._absolute]):
             watchdog.feed()
             try:
                 message = decode(raw)
+                if raw.topic in self._absolute:
+                    yield from self._decode_absolute(raw.topic, message)
+                    continue
             except MessageError as error:
-                self._router.refuse(raw.topic, error)
+                if raw.topic in self._absolute:
+                    self._warn_once(raw.topic, error)
+                else:
+                    self._router.refuse(raw.topic, error)
             else:
                 self._add_odometry(message)
                 self._router.take(raw.topic, message)
@@ -88,6 +99,16 @@ class FrameReader:
             self._samples.clear()
             yield from self._synchronizer.pop()
         yield from self._synchronizer.flush()
+
+    def _decode_absolute(self, topic: str, message: Any) -> list[AbsoluteMeasurement]:
+        measurement = self._decoder.decode(self._absolute[topic], message, stamp_ns(message))
+        return [] if measurement is None else [measurement]
+
+    def _warn_once(self, topic: str, error: MessageError) -> None:
+        """Warn of the first message of each kind that cannot be used."""
+        if (topic, error.kind) not in self._warned:
+            self._warned.add((topic, error.kind))
+            self._warn(f"{topic}: {error}; such messages are skipped")
 
     def _add_odometry(self, message: Any) -> None:
         """Add the poses of the trajectory up to the message's stamp that were not added before."""
@@ -108,6 +129,21 @@ def read_transforms(bag: Bag) -> StaticTransforms:
         for _, _, message in bag.messages([TOPIC]):
             transforms.add(message)
     return transforms
+
+
+def _absolute_topics(settings: Settings, bag: Bag) -> dict[str, Source]:
+    """Topics of absolute measurements; a `BagError` where one that is named is missing, or of another type."""
+    found = {}
+    for source, topic in ((Source.GNSS, settings.absolute.gnss), (Source.GRAVITY, settings.absolute.imu)):
+        if not topic:
+            continue
+        info = bag.topics.get(topic)
+        if info is None or info.type != ABSOLUTE_TYPES[source]:
+            others = ", ".join(name for name, one in bag.topics.items() if one.type == ABSOLUTE_TYPES[source])
+            text = f"{bag.path}: no {ABSOLUTE_TYPES[source]} on {topic}"
+            raise BagError(f"{text} (topics of that type: {others or 'none'})")
+        found[topic] = source
+    return found
 
 
 def _present(topics: Topics, bag: Bag) -> Topics:

@@ -53,6 +53,13 @@ class Topics(Group):
     odometry: str = Field("/odom", description="odometry, nav_msgs/Odometry; empty: none")
 
 
+class AbsoluteTopics(Group):
+    """Topics of measurements that say where the rover is on the planet."""
+
+    gnss: str = Field("", description="GNSS, sensor_msgs/NavSatFix; empty: none")
+    imu: str = Field("", description="IMU for the direction of gravity, sensor_msgs/Imu; empty: none")
+
+
 class DatasetPreset(Group):
     """Calibration and topics of a data set, by its name: a file in `config/datasets`."""
 
@@ -172,6 +179,14 @@ class PoseGraphSettings(Group):
         60.0, ge=0, description="an uncertain closure nothing speaks against is believed after this way, m"
     )
     max_pending_s: float = Field(30.0, gt=0, description="a closure waits this long for its odometry, stream time, s")
+    origin: str = Field(
+        "", description="latitude, longitude (deg) and height (m) of the world frame; empty: the first good GNSS fixes"
+    )
+    elevation_model: str = Field("", description="heights of the ground: a GeoTIFF, an .asc or an .npz; empty: none")
+    elevation_sigma_m: float = Field(0.5, gt=0, description="standard deviation of its heights, m")
+    elevation_start: str = Field(
+        "", description="x and y (m) and heading (deg) of the first pose in the elevation model; empty: by GNSS"
+    )
     reject_outliers: bool = Field(
         True, description="find out which closures are wrong and which stated noise is; false: believe all of it"
     )
@@ -226,6 +241,7 @@ class Settings(Group):
     )
     map: str = Field("", description="folder of a map that `umf map` made, for mode localization; it stays as it is")
     topics: Topics = Topics()
+    absolute: AbsoluteTopics = AbsoluteTopics()
     qos: Qos = Qos()
     sync: Sync = Sync()
     keyframe: KeyframePolicy = KeyframePolicy()

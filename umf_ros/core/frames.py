@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,19 @@ from umf_ros.core.geometry import Array, invert, transform
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float32]
+
+
+class State(StrEnum):
+    """State of a closure or of an absolute measurement in the pose graph."""
+
+    ACCEPTED = "accepted"
+    PENDING = "pending"
+    REJECTED = "rejected"
+    REFUSED = "refused"
+
+    @classmethod
+    def _missing_(cls, value: object) -> State | None:
+        return cls.PENDING if value in ("undecided", "waiting") else None  # names of earlier versions
 
 
 @dataclass(frozen=True, slots=True)

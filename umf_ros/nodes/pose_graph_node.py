@@ -18,10 +18,12 @@ from nav_msgs.msg import Path as PathMessage
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
+from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from umf_ros.absolute.measurement import AbsoluteDecoder, Source
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, topics_of
 from umf_ros.core.errors import UmfError
@@ -41,7 +43,8 @@ from umf_ros.nodes.conversions import (
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.sensors.decode import OdometrySample, decode_odometry
+from umf_ros.sensors.calibration import calibration_of
+from umf_ros.sensors.decode import OdometrySample, decode_odometry, stamp_ns
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works
@@ -77,6 +80,7 @@ class PoseGraphNode(BaseNode):
         self._drawn_ns: int | None = None
         self._draws_again_s = 0.0
         self._keeps_up = False
+        self._absolute: dict[str, object] = {}
         self._make_publishers()
         if self._durable.taken_up or self._durable.feed.newest_ns >= 0:
             self.get_logger().info(_taken_up(self._durable))
@@ -90,6 +94,7 @@ class PoseGraphNode(BaseNode):
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
             self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
         self._subscribe("closures", Odometry, "loop_closures", self._on_closure, CLOSURES_QOS, rare=True)
+        self._hear_absolute()
         self.create_subscription(String, "~/reject_edge", self._guarded("reject_edge", self._on_reject), 10)
         hear = self._guarded("front-end", self._on_front_end)
         self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", hear, 10)
@@ -147,6 +152,23 @@ class PoseGraphNode(BaseNode):
 
     def _on_front_end(self, event: TransitionEvent) -> None:
         self._front_end_busy = event.goal_state.label == "shuttingdown"
+
+    def _hear_absolute(self) -> None:
+        """Hear GNSS and IMU where their topics are named."""
+        topics, qos = self._settings.absolute, sensor_qos(self._settings.qos, ODOMETRY_DEPTH)
+        if not topics.gnss and not topics.imu:
+            return
+        calibration = calibration_of(self._settings)
+        self._decoder = AbsoluteDecoder(calibration.antenna, calibration.body_T_imu, self._odometry_frames.pose_of)
+        if topics.gnss:
+            self._subscribe("gnss", NavSatFix, topics.gnss, partial(self._on_absolute, Source.GNSS), qos)
+        if topics.imu:
+            self._subscribe("imu", Imu, topics.imu, partial(self._on_absolute, Source.GRAVITY), qos)
+
+    def _on_absolute(self, source: Source, message: Any) -> None:
+        measurement = self._decoder.decode(source, message, stamp_ns(message))
+        if measurement is not None:
+            self._worker.submit(lambda: self._durable.take_absolute(measurement))
 
     def _make_publishers(self) -> None:
         self._path_publisher = self.create_publisher(PathMessage, "~/path", LATCHED_QOS)
@@ -234,6 +256,7 @@ class PoseGraphNode(BaseNode):
         """Decide about closures that waited for odometry, and publish the new path."""
         self._keeps_up = False
         self._announce(self._durable.update())
+        self._absolute = self._durable.graph.reference.report()
         self._durable.graph.prepare(PREPARE_S)
         self._correct()
         self._show()
@@ -246,7 +269,9 @@ class PoseGraphNode(BaseNode):
         values["queue_waiting"] = self._worker.waiting
         values["executor_stall_max_ms"] = self._stall_ms
         values |= {state.value: count for state, count in graph.verdict_counts().items()}
+        values |= self._absolute
         trouble = self._worker.dropped or any(name.startswith("optimiser") for name in graph.counts)
+        trouble = trouble or any("as a whole" in name for name in self._absolute)
         text = f"{values.get('accepted', 0)} closures accepted"
         if isinstance(graph, MapFollower):
             values["probability"] = graph.probability

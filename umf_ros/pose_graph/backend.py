@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement, write_verdicts
+from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError, writing
 from umf_ros.core.frames import LoopClosure
@@ -40,12 +42,13 @@ logger = logging.getLogger(__name__)
 class PoseGraph:
     """Keep the optimal trajectory from odometry and loop closures that arrive in any order.
 
-    Unusable messages are refused with a reason and counted.
+    Unusable messages are refused with a reason and counted. `reference` decides about absolute measurements.
     """
 
     def __init__(self, settings: PoseGraphSettings | None = None) -> None:
         self._settings = settings or PoseGraphSettings()
-        self._sessions = Sessions(self._settings)
+        self.reference = AbsoluteReference(self._settings)
+        self._sessions = Sessions(self._settings, self.reference)
         self._rejection = OutlierRejection(self._settings, self._sessions)
         # decisions in order of stamps as far as they have come, and the sessions with odometry that they know
         self._ordered: tuple[list[int], Sessions, OutlierRejection] | None = None
@@ -86,6 +89,11 @@ class PoseGraph:
         self._sessions.chains[-1].add(int(stamp_ns), np.asarray(odom_T_body, float), covariance)
         return True
 
+    def add_absolute(self, measurement: AbsoluteMeasurement) -> None:
+        """Take one absolute measurement, in any order; `update` decides about it."""
+        self._settled = False
+        self.reference.add(measurement)
+
     def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
         """Take one closure; returns every verdict that it brought about or changed."""
         return self.add_closures([closure])
@@ -122,12 +130,15 @@ class PoseGraph:
             self._attempt(lambda: self._rejection.resume(decided))
         for placed in new:
             self._attempt(lambda: self._rejection.consider([placed]))  # noqa: B023 (called at once)
+        self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
 
     def update(self) -> list[ClosureVerdict]:
         """Decide about closures whose odometry has arrived; returns new verdicts."""
         self._refresh()
         refused, arrived = self._take_waiting()
-        return refused + self._attempt(lambda: self._rejection.consider(arrived))
+        verdicts = refused + self._attempt(lambda: self._rejection.consider(arrived))
+        self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
+        return verdicts
 
     def prepare(self, within_s: float) -> None:
         """Do a part of the work of `settle`, for so long at most: at the end of a long mission it takes minutes."""
@@ -163,6 +174,10 @@ class PoseGraph:
         after = zip(self._rejection.placed, self._rejection.verdicts, strict=True)
         verdicts += [verdict for placed, verdict in after if verdict.state is not states[id(placed)]]
         verdicts += self._attempt(self._rejection.settle)
+        for _ in range(3):  # the map that measurements move may contradict others
+            self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve, at_last=True))
+        if self._sessions.solution is not None:
+            self._attempt(lambda: self._sessions.refine(self._rejection.accepted))
         self._settled = True
         return verdicts
 
@@ -173,7 +188,8 @@ class PoseGraph:
         begun, sessions, rejection = self._ordered or (None, self._sessions, self._rejection)
         late = any(a is not b for a, b in zip_longest(rejection.placed, order[: len(rejection.placed)]))
         if late or begun != self._sessions.begun:
-            sessions = Sessions(self._settings, self._sessions.chains)  # the same odometry, before any closure moved it
+            # the same odometry, before any closure moved it
+            sessions = Sessions(self._settings, self.reference, self._sessions.chains)
             rejection = OutlierRejection(self._settings, sessions)
             self._ordered = self._sessions.begun, sessions, rejection
         for placed in takewhile(is_ready, order[len(rejection.placed) :]):
@@ -367,6 +383,8 @@ class PoseGraph:
         with writing(f"to {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "graph_verdicts.csv").write_text(verdict_table(self.closures()), encoding="utf-8")
+        if absolute := self.reference.verdicts():
+            write_verdicts(folder / "absolute_verdicts.csv", absolute)
         self.write_tum(folder / "trajectory_odometry.tum", optimized=False)
         self.write_tum(folder / "trajectory_optimized.tum")
         self.write_g2o(folder / "graph.g2o")

@@ -11,26 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.errors import GraphError
-from umf_ros.core.frames import LoopClosure
+from umf_ros.core.frames import LoopClosure, State
 from umf_ros.core.geometry import Array, ros_to_gtsam_covariance
 from umf_ros.pose_graph.odometry import POINT, OdometryChain
 
 VERDICT_COLUMNS = ("match_stamp_ns", "query_stamp_ns", "verdict", "reason", "mahalanobis", "misfit_m")
 """Columns of a table of verdicts."""
 _LARGEST_SKEW = 1e-3
-
-
-class State(StrEnum):
-    """State of a closure in the pose graph."""
-
-    ACCEPTED = "accepted"
-    PENDING = "pending"
-    REJECTED = "rejected"
-    REFUSED = "refused"
-
-    @classmethod
-    def _missing_(cls, value: object) -> State | None:
-        return cls.PENDING if value in ("undecided", "waiting") else None  # names of earlier versions
 
 
 class ClosureReason(StrEnum):

@@ -100,6 +100,11 @@ class OdometryChain:
         return self._keyframes["pose"]
 
     @property
+    def travel(self) -> Array:
+        """(N,) path length up to each keyframe, m."""
+        return self._keyframes["travel"]
+
+    @property
     def span(self) -> tuple[int, int] | None:
         """Stamps of the first and the last message; None without any."""
         stamps = self._messages["stamp"]

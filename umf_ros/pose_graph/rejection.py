@@ -107,7 +107,7 @@ class OutlierRejection:
         unsolved = bool(self.placed) and self._map is None  # the solver failed when they came
         begun = set(self._sessions.begun) - set(self._sessions.vertices["session"].tolist())
         if self._rescale() or unsolved or (rows and begun):
-            self._solve()
+            self.solve()
             rows = list(range(len(self.placed)))
         self._decide({*rows, *self._brought_close})
         return self._changed_since(before)
@@ -117,14 +117,14 @@ class OutlierRejection:
         for placed, decision in decided:
             self.verdicts[self._take(placed)] = ClosureVerdict(placed.closure, *decision)
         self._rescale()
-        self._solve()
+        self.solve()
         rows = np.flatnonzero(~self._of(State.ACCEPTED))
         for row, joined, ratio in zip(rows.tolist(), *self._compare(rows)[2:4], strict=True):
             is_pending = self.verdicts[row].state is State.PENDING
             self._joined[row], self._ratios[row] = joined, ratio if is_pending else 1.0
 
     def settle(self) -> list[ClosureVerdict]:
-        """Decide about pending closures and bring the map to its exact optimum; returns changed verdicts."""
+        """Decide about pending closures; returns changed verdicts."""
         if self._map is None:
             return []
         before = list(self.verdicts)
@@ -135,8 +135,7 @@ class OutlierRejection:
             self._decide_all()
         if self._revoke_outvoted():
             self._decide_all()
-        self._solve()
-        self._sessions.refine(self.accepted)
+        self.solve()
         return self._changed_since(before)
 
     def renew(self) -> None:
@@ -146,14 +145,14 @@ class OutlierRejection:
                 rows = end["session"] == session
                 end[rows] = self._sessions.chains[session].at(end["stamp"][rows])
         if self._map is not None:
-            self._solve()
+            self.solve()
 
     def revoke(self, row: int) -> list[ClosureVerdict]:
         """Take a closure out for good."""
         before = list(self.verdicts)
         self._reject(row, ClosureReason.BY_HAND)
         if before[row].state is State.ACCEPTED:
-            self._solve()
+            self.solve()
         return self._changed_since(before)
 
     def _decide_all(self) -> None:
@@ -283,13 +282,13 @@ class OutlierRejection:
                 self._reject(row, ClosureReason.OUTVOTED)
         if not outvoted:
             return False
-        self._solve()
+        self.solve()
         distances = self._compare(np.array(list(outvoted)))[0]
         right = [row for row, near in zip(outvoted, distances <= self.settings.gate_chi2, strict=True) if near]
         for row in right:
             self.verdicts[row] = outvoted[row]
         if right:
-            self._solve()
+            self.solve()
         return len(right) < len(outvoted)
 
     def _unopposed(self, at_last: bool = False) -> list[int]:
@@ -341,10 +340,11 @@ class OutlierRejection:
         for row, reason in reasons.items():
             self.verdicts[row] = replace(self.verdicts[row], state=State.ACCEPTED, reason=reason)
         if reasons:
-            self._solve()
+            self.solve()
         return bool(reasons)
 
-    def _solve(self) -> None:
+    def solve(self) -> None:
+        """Solve the map with the accepted closures."""
         self._sessions.solve(self.accepted, self.scale)
         self._map = RelativeCovariances(self._sessions)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, adjoint, invert, propagate
 from umf_ros.pose_graph.closures import Closures
@@ -32,19 +33,24 @@ class Sessions:
         chains: the odometry of each session.
         components: for each session the earliest one that shares its map.
         vertices: (N,) of `POINT`, the vertices that were solved last.
+        solved: the corrected paths.
+        reference: absolute measurements that hold the map in the world.
+        cost: half the sum of squared, normalised errors of the last solution.
         solution: the graph that was solved last; None before.
         scale: of the stated noise, in that solution.
     """
 
-    def __init__(self, settings: PoseGraphSettings, chains: list[OdometryChain] | None = None) -> None:
-        self._settings = settings
+    def __init__(
+        self, settings: PoseGraphSettings, reference: AbsoluteReference, chains: list[OdometryChain] | None = None
+    ) -> None:
+        self._settings, self.reference, self.cost = settings, reference, 0.0
         self._solver = GraphSolver()
         self.scale = NoiseScale()
         self.chains = [OdometryChain(settings)] if chains is None else chains
         self.components: list[int] = []
         self.vertices: PathPoints = np.empty(0, POINT)
         self.solution: Graph | None = None
-        self._paths: dict[int, CorrectedPath] = {}
+        self.solved: dict[int, CorrectedPath] = {}
         self.update()
 
     def begin(self) -> None:
@@ -56,9 +62,9 @@ class Sessions:
         self.components += range(len(self.components), len(self.chains))
         late = [session for session, chain in enumerate(self.chains) if chain.update()]
         for session in self.begun:
-            if session in late or session not in self._paths:
+            if session in late or session not in self.solved:
                 first = self.chains[session].stamps[:1].copy()
-                self._paths[session] = CorrectedPath(
+                self.solved[session] = CorrectedPath(
                     self.chains[session].at(first), self.chains[session].poses_at(first)
                 )
         if late:
@@ -92,7 +98,7 @@ class Sessions:
         poses = np.empty((len(points), 4, 4))
         for session in np.unique(points["session"]).tolist():
             rows = points["session"] == session
-            poses[rows] = self._paths[session].at(points[rows])
+            poses[rows] = self.solved[session].at(points[rows])
         return poses
 
     def solve(self, closures: Closures, scale: NoiseScale) -> None:
@@ -105,9 +111,9 @@ class Sessions:
             self._solver, self.scale = GraphSolver(), scale
         components, moves = self._join(closures)
         vertices, graph = self._graph(self._stamps(closures), closures, components, moves)
-        self.solution = replace(graph, poses=self._solver.solve(graph))
+        self.solution = replace(graph, poses=self._optimum(vertices, graph, components))
         self.vertices, self.components = vertices, components
-        self._paths |= _paths_through(vertices, self.solution.poses)
+        self.solved |= _paths_through(vertices, self.solution.poses)
 
     def refine(self, closures: Closures) -> None:
         """Move every path to the exact optimum over all keyframes, after `solve` with the same closures.
@@ -116,7 +122,14 @@ class Sessions:
             GraphError: the system cannot be solved; the paths stay as they were.
         """
         vertices, graph = self._graph(self._stamps(closures, every_keyframe=True), closures, self.components)
-        self._paths |= _paths_through(vertices, self._solver.solve(graph))
+        self.solved |= _paths_through(vertices, self._optimum(vertices, graph, self.components))
+
+    def _optimum(self, points: PathPoints, graph: Graph, components: list[int]) -> Array:
+        """(N, 4, 4) poses at the minimum, absolute measurements included."""
+        solve, given = self._solver.solve, (points, graph.anchors, graph.poses, components)
+        poses = self.reference.solve(*given, lambda held: solve(replace(graph, **held._asdict())))
+        self.cost = self._solver.cost
+        return poses
 
     def expand(self, closures: Closures, extra: Closures) -> Graph:
         """Graph of every keyframe and the endpoints of `extra` closures, odometry and the given closures."""
@@ -131,6 +144,7 @@ class Sessions:
                     [
                         chain.stamps[: None if every_keyframe else 1],
                         *(end["stamp"][end["session"] == session] for end in ends),
+                        self.reference.stamps(session),
                     ]
                 )
             )
@@ -140,7 +154,7 @@ class Sessions:
     def covariance(self, point: PathPoints) -> Array:
         """(6, 6) marginal covariance of the pose at a point (1,) after the last solved one, in its tangent space."""
         session = int(point["session"][0])
-        path = self._paths[session]
+        path = self.solved[session]
         last = self._solver.marginal((session, int(path.points["stamp"][-1])))
         back = invert(path.at(point)) @ path.poses[-1:]
         walked = self.scale.odometry**2 * noise_between(path.points[-1:], point)
@@ -220,7 +234,7 @@ class RelativeCovariances:
         order = np.argsort(lengths, kind="stable")
         self._keys, best = np.unique((low * size + high)[order], return_index=True)
         rows = order[best]
-        self._paths = csr_matrix((lengths[rows], (low[rows], high[rows])), shape=(size, size))
+        self.solved = csr_matrix((lengths[rows], (low[rows], high[rows])), shape=(size, size))
         # at the first vertex, so that covariances along a path add up
         carry = adjoint(invert(self._poses[:1]) @ self._poses[edges["second"][rows]])
         self._noise = propagate(carry, edges["covariance"][rows])
@@ -254,7 +268,7 @@ class RelativeCovariances:
         (starts, leave), (stops, enter) = sorted(ends, key=lambda one: len(np.unique(one[0])))
         sources, of_source = np.unique(starts, return_inverse=True)
         found, before = dijkstra(
-            self._paths, directed=False, indices=sources, return_predecessors=True, limit=lengths[rows].max()
+            self.solved, directed=False, indices=sources, return_predecessors=True, limit=lengths[rows].max()
         )
         totals = _length(leave) + found[of_source, stops] + _length(enter)
         shorter = np.flatnonzero(totals < lengths[rows])

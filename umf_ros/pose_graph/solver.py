@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -56,6 +56,8 @@ class Graph:
         anchors: the vertices 0..N-1 that stay where they are, one per connected part.
         keys: M lasting keys of the edges.
         edges: (M,) of `EDGE`, between vertices 0..N-1.
+        absolute: measurements of single vertices, each with what makes its factor.
+        loose: noise of anchors that such measurements move.
     """
 
     vertices: Sequence[Any]
@@ -63,18 +65,22 @@ class Graph:
     anchors: Sequence[int]
     keys: Sequence[Hashable]
     edges: NDArray[np.void]
+    absolute: Sequence[tuple[int, Callable[[int], gtsam.NonlinearFactor]]] = ()
+    loose: Mapping[int, gtsam.noiseModel.Base] = field(default_factory=dict)
 
 
 class GraphSolver:
     """Solve graphs, most of whose edges are those of the graph before; keeps the last solution for its marginals.
 
-    An edge whose measurement or covariance changes needs another key, or another solver.
+    An edge whose measurement or covariance changes needs another key, or another solver. `cost` is half the sum of
+    squared, normalised errors of the last solution.
     """
 
     def __init__(self) -> None:
         self._numbers: dict[Hashable, int] = {}
         self._factors: dict[Hashable, gtsam.NonlinearFactor] = {}
         self._tree: gtsam.GaussianBayesTree | None = None
+        self.cost = 0.0
 
     def solve(self, graph: Graph) -> Array:
         """(N, 4, 4) poses of the vertices at the minimum near the initial poses.
@@ -89,7 +95,11 @@ class GraphSolver:
         for number, pose in zip(numbers, graph.poses, strict=True):
             values.insert(number, gtsam.Pose3(pose))
         for row in graph.anchors:
-            factors.add(gtsam.PriorFactorPose3(numbers[row], gtsam.Pose3(graph.poses[row]), _ANCHOR))
+            factors.add(
+                gtsam.PriorFactorPose3(numbers[row], gtsam.Pose3(graph.poses[row]), graph.loose.get(row, _ANCHOR))
+            )
+        for row, make in graph.absolute:
+            factors.add(make(numbers[row]))
         self._factors = {key: self._factor(key, row, graph, numbers) for row, key in enumerate(graph.keys)}
         for factor in self._factors.values():
             factors.add(factor)
@@ -99,6 +109,7 @@ class GraphSolver:
         except (RuntimeError, IndexError, ValueError) as error:
             self._factors = {}
             raise GraphError(f"the pose graph cannot be solved: {one_line(error)}") from None
+        self.cost = factors.error(values)
         poses, order = np.tile(np.eye(4), (len(numbers), 1, 1)), np.argsort(numbers)
         found = gtsam.utilities.extractPose3(values)  # in the order of their keys
         poses[order, :3, :3], poses[order, :3, 3] = found[:, :9].reshape(-1, 3, 3), found[:, 9:]

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from umf_ros.absolute.measurement import read_verdict_counts
 from umf_ros.bags.inputs import SEVERITIES, Advice, Severity, absent_inputs, useless_inputs
 from umf_ros.bags.sensor_check import about_sensors
 from umf_ros.core.config import Settings
@@ -131,6 +132,20 @@ def _graph(about: JudgedRun) -> Iterator[Advice]:
         yield Advice("warning", what, f"odometry worse than {settings} say, or wrong closures: click some")
 
 
+def _absolute(about: JudgedRun) -> Iterator[Advice]:
+    counts = read_verdict_counts(about.run.folder / "absolute_verdicts.csv")
+    for source in sorted({source for source, _, _ in counts}):
+        own = Counter({(state, reason): number for (name, state, reason), number in counts.items() if name == source})
+        accepted = sum(number for (state, _), number in own.items() if state == State.ACCEPTED)
+        left = Counter({reason: number for (state, reason), number in own.items() if state != State.ACCEPTED})
+        why = f" ({left.most_common(1)[0][0]})" if left else ""
+        what = f"{source}: {accepted} of {own.total()} measurements accepted{why}"
+        if accepted:
+            yield Advice("note", what)
+        else:
+            yield Advice("warning", what, "docs/absolute.md says what each reason means")
+
+
 def _closures(about: JudgedRun) -> Iterator[Advice]:
     judged = about.closures
     if len(wrong := judged[~judged.is_true]):
@@ -205,7 +220,7 @@ def _end(about: JudgedRun) -> Iterator[Advice]:
 
 
 _CAUSES = (_truth, _gaps, lambda about: about_sensors(about.sensors), _disparity, _pairs, _inputs)
-_EFFECTS = (_graph, _closures, _unjudged, _map, _stated_errors, _speed, _end)
+_EFFECTS = (_graph, _absolute, _closures, _unjudged, _map, _stated_errors, _speed, _end)
 
 
 def look_first(about: JudgedRun) -> list[Advice]:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.errors import UmfError, writing
 from umf_ros.core.frames import Candidate, LoopClosure, Points
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
@@ -56,6 +57,10 @@ SCHEMA = Schema(
             "CREATE TABLE about (name TEXT PRIMARY KEY, value)",
         ),
         ("ALTER TABLE odometry ADD COLUMN covariance BLOB",),
+        (
+            "CREATE TABLE absolute (source TEXT, stamp_ns INTEGER, odometry_before INTEGER, data BLOB NOT NULL, "
+            "PRIMARY KEY (source, stamp_ns))",
+        ),
     ),
 )
 Row = TypeVar("Row")
@@ -79,6 +84,10 @@ class StoredOdometry(NamedTuple):
     covariance: Array | None = None
 
 
+GraphInput = LoopClosure | StoredOdometry | AbsoluteMeasurement
+"""Input of a pose graph."""
+
+
 class RunFile:
     """The file of a run. Rows of a transaction are kept together or not at all, also when the process is killed.
 
@@ -98,14 +107,17 @@ class RunFile:
             _set_aside(folder)
         self._file = SqliteFile(self._path, SCHEMA, read_only=read_only)
         self._odometry: deque[tuple[int, int, bytes, bytes | None]] = deque()
+        self._absolute: list[tuple[str, int, int, bytes]] = []
 
     @contextmanager
     def writing(self) -> Iterator[None]:
         """One transaction; the odometry that came since the last one is written with it."""
         with self._file.writing() as connection:
             connection.executemany("INSERT OR IGNORE INTO odometry VALUES (?, ?, ?, ?)", self._odometry)
+            connection.executemany("INSERT OR IGNORE INTO absolute VALUES (?, ?, ?, ?)", self._absolute)
             yield
         self._odometry.clear()
+        self._absolute.clear()
 
     def append(self, table: str, rows: Iterable[Sequence[Any]], **more: Any) -> None:
         """Add rows to a table, within a transaction; `more` are values of columns that are not exported."""
@@ -123,6 +135,11 @@ class RunFile:
         stamp_ns, pose, covariance = odometry
         spread = None if covariance is None else np.ascontiguousarray(covariance, np.float64).tobytes()
         self._odometry.append((number, stamp_ns, np.ascontiguousarray(pose[:3], np.float64).tobytes(), spread))
+
+    def append_absolute(self, odometry_before: int, measurement: AbsoluteMeasurement) -> None:
+        """Add a measurement, after so many odometry messages, with the next transaction; a known one stays."""
+        numbers = np.ascontiguousarray(measurement.numbers, np.float64).tobytes()
+        self._absolute.append((measurement.source.value, measurement.stamp_ns, odometry_before, numbers))
 
     def note(self, **values: Any) -> None:
         """Write facts about the run by name, within a transaction."""
@@ -155,16 +172,22 @@ class RunFile:
                 found.append(StoredOdometry(int(stamp_ns), pose, covariance))
         return found
 
-    def graph_inputs(self) -> Iterator[LoopClosure | StoredOdometry]:
-        """Odometry and closures in the order in which the graph got them."""
+    def graph_inputs(self) -> Iterator[GraphInput]:
+        """Odometry, closures and absolute measurements in the order in which the graph got them."""
+        inputs: list[tuple[int, GraphInput]] = []
         with self._file.reading() as connection:
             before = connection.execute("SELECT odometry_before FROM closures ORDER BY rowid").fetchall()
-        waiting = deque(zip((number for (number,) in before), self.closures(), strict=True))
+            if connection.execute("SELECT name FROM sqlite_master WHERE name = 'absolute'").fetchone():
+                for source, stamp_ns, number, data in connection.execute("SELECT * FROM absolute ORDER BY rowid"):
+                    numbers = np.frombuffer(data, np.float64)
+                    inputs.append((number, AbsoluteMeasurement.stored(source, stamp_ns, numbers)))
+        inputs += zip((number for (number,) in before), self.closures(), strict=True)
+        waiting = deque(sorted(inputs, key=lambda one: one[0]))
         for number, odometry in enumerate(self.odometry()):
             while waiting and waiting[0][0] <= number:
                 yield waiting.popleft()[1]
             yield odometry
-        yield from (closure for _, closure in waiting)
+        yield from (item for _, item in waiting)
 
     def descriptors(self) -> dict[int, Points]:
         """Descriptors (D,) float32 of the keyframes by their stamps, in order."""
@@ -181,7 +204,7 @@ class RunFile:
 
     def close(self) -> None:
         """Write the odometry in hand, and close the file."""
-        if self._odometry:
+        if self._odometry or self._absolute:
             with self.writing():
                 pass
         if not self._read_only:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from umf_ros import __version__
+from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame
@@ -163,6 +164,10 @@ class RunRecorder:
         """Write the next odometry message of the recording, with the next keyframe."""
         self._file.append_odometry(self._odometry, StoredOdometry(stamp_ns, odom_T_body))
         self._odometry += 1
+
+    def record_absolute(self, measurement: AbsoluteMeasurement) -> None:
+        """Write the next absolute measurement of the recording, with the next keyframe."""
+        self._file.append_absolute(self._odometry, measurement)
 
     def record_encounter(self, inter_closure: InterRobotClosure) -> None:
         """Write the closures with another rover of a fleet."""

@@ -98,6 +98,7 @@ class Calibration:
         min_intensity: returns up to this intensity, in the sensor's unit, are dropped; 0: none.
         max_height_m: returns further than this from the LiDAR's horizontal plane are dropped; infinite: none.
         guesses: entries of the file that are marked as guesses.
+        antenna: (3,) m, the GNSS antenna.
         rectifier: makes the pair of `camera` from raw images; None where they arrive rectified.
     """
 
@@ -110,6 +111,7 @@ class Calibration:
     max_height_m: float = math.inf
     rectifier: StereoRectifier | None = None
     guesses: tuple[str, ...] = ()
+    antenna: Array = field(default_factory=lambda: np.zeros(3))
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -199,6 +201,7 @@ class _File(Group):
     lidar_time_offset_s: float = Field(ge=-3600, le=3600)
     min_intensity: float = Field(0.0, ge=0)
     max_height_m: float = Field(0.0, ge=0)
+    antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
     def _one_camera(self) -> _File:
@@ -224,4 +227,5 @@ class _File(Group):
             self.min_intensity,
             self.max_height_m or math.inf,
             rectifier,
+            antenna=np.array(self.antenna),
         )

@@ -86,6 +86,10 @@ class BodyFrames:
         self._first_ns = 0
         self.odom = frames.odom
 
+    def pose_of(self, frame_id: str) -> Array | None:
+        """(4, 4) pose of a frame on the body; None where the transforms do not say it."""
+        return self._transforms.find(self._base, frame_id) if frame_id else None
+
     def mounting(self, sensor: str, frame_id: str) -> dict[str, Any]:
         """Return the new pose of a "camera" or a "lidar", as `body_T_camera` or `body_T_lidar`; empty: as before.
 

@@ -8,11 +8,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement, Source, from_enu
 from umf_ros.core.frames import LoopClosure
-from umf_ros.core.geometry import Array, expmap, gtsam_to_ros_covariance, invert, relative
+from umf_ros.core.geometry import Array, expmap, gtsam_to_ros_covariance, invert, orthonormal, relative
 
 Kind = Literal["random", "groups", "near"]
 PERIOD_NS = 1_000_000_000
@@ -233,3 +235,159 @@ def _true_closures(world: GraphWorld, rng: np.random.Generator, spacing: int, re
             pose = relative(world.truth[i], world.truth[j]) @ noise
             closures.append(WorldClosure(i, int(j), pose, covariance, True))
     return closures
+
+
+@dataclass(frozen=True)
+class AbsoluteWorld:
+    """A drive over open ground with everything that says where it is on the planet.
+
+    Attributes:
+        graph: truth, odometry and closures; the true poses are in metres east, north and up of `origin`.
+        origin: (3,) latitude, longitude, height.
+        measurements: GNSS fixes and upward directions, in order of their stamps.
+        lies: (K,) which of them are wrong by far more than they state.
+        heights: (H, W) m, the elevation model: of cells of `cell_m`, the first one at `corner` (x, y), with errors.
+    """
+
+    graph: GraphWorld
+    origin: Array
+    measurements: list[AbsoluteMeasurement]
+    lies: NDArray[np.bool_]
+    heights: Array
+    corner: tuple[float, float]
+    cell_m: float
+
+
+ANTENNA = np.array([-0.3, 0.25, 1.1])
+_ORIGIN = np.array([37.72, 15.0, 2550.0])
+_FIX_SIGMAS = np.array([0.8, 0.8, 1.6])
+_UP_SIGMA = np.deg2rad(0.5)
+
+
+def open_ground(seed: int, length_m: float = 1500.0, lying: float = 0.2, cell_m: float = 5.0) -> AbsoluteWorld:
+    """One round over hills, a pose per metre and second, that ends where it began.
+
+    Odometry is off by 1 to 2 % of the way at the end. GNSS has two outages of a minute, and `lying` of its fixes are
+    off by 5 to 50 m for 5 to 30 s, at once or over some seconds, with a covariance that does not say so. Upward
+    directions come twice per 3 m; one of ten is of an accelerating rover. The model's heights are wrong by 0.3 m.
+    """
+    rng = np.random.default_rng(seed)
+    ground = _hills(rng)
+    plan = _round_trip(rng, length_m)
+    truth = _upon(ground, plan)
+    graph = replace(_drift_by(truth, rng, rng.uniform(0.01, 0.02)), closures=[])
+    ends = [closure for closure in _true_closures(graph, rng, 8, 2.5) if closure.first < 40]
+    graph = replace(graph, closures=ends)
+    fixes, lies = _fixes(truth, rng, lying)
+    ups = _upward(truth, rng)
+    both = sorted([*zip(fixes, lies, strict=True), *((up, False) for up in ups)], key=lambda one: one[0].stamp_ns)
+    x, y = (np.arange(plan[:, axis].min() - 150, plan[:, axis].max() + 150, cell_m) for axis in (0, 1))
+    heights = ground(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x))
+    error = gaussian_filter(rng.normal(size=heights.shape), 15 / cell_m)
+    heights = heights + 0.25 * error / error.std() + rng.normal(0, 0.15, heights.shape)
+    measurements, wrong = [one for one, _ in both], np.array([lie for _, lie in both])
+    return AbsoluteWorld(graph, _ORIGIN, measurements, wrong, heights, (float(x[0]), float(y[0])), cell_m)
+
+
+def _hills(rng: np.random.Generator) -> Callable[[Array], Array]:
+    """Heights (N,) of the ground at (N, 2): waves of 40 to 300 m with slopes of some per cent each, and craters."""
+    lengths = np.geomspace(40, 300, 14)
+    angles, phases = rng.uniform(0, 2 * np.pi, (2, 14))
+    waves = 2 * np.pi / lengths[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    tall = 0.055 * lengths / (2 * np.pi) * rng.uniform(0.6, 1.4, 14)
+    craters, radii = rng.uniform(-350, 350, (12, 2)), rng.uniform(15, 60, 12)
+
+    def ground(points: Array) -> Array:
+        heights = (tall * np.sin(points @ waves.T + phases)).sum(axis=1)
+        for centre, radius in zip(craters, radii, strict=True):
+            away = np.square(points - centre).sum(axis=1) / radius**2
+            heights = heights - 0.12 * radius * (1 - away) * np.exp(-away)
+        return heights
+
+    return ground
+
+
+def _round_trip(rng: np.random.Generator, length_m: float) -> Array:
+    """(N, 2) points a metre apart: a bent round with detours, and 30 m of it again."""
+    angles = np.linspace(0, 2 * np.pi, 4000)
+    radius = 1 + sum(rng.uniform(-0.2, 0.2) * np.cos(k * angles + rng.uniform(0, 6.3)) for k in (2, 3, 4))
+    radius += sum(rng.uniform(0.2, 0.6) / k * np.cos(k * angles + rng.uniform(0, 6.3)) / 3 for k in (9, 13, 21))
+    loop = np.stack([radius * np.cos(angles), radius * np.sin(angles)], axis=1)
+    loop *= (length_m - 30) / np.linalg.norm(np.diff(loop, axis=0), axis=1).sum()
+    points = _resample(loop, 1.0)
+    return np.concatenate([points, points[:30] + rng.normal(0, 0.5, 2)])
+
+
+def _upon(ground: Callable[[Array], Array], plan: Array) -> Array:
+    """(N, 4, 4) poses along the way, upright on the slope."""
+    slope = np.stack([ground(plan + axis) - ground(plan - axis) for axis in 0.5 * np.eye(2)])
+    normal = np.column_stack([-slope.T, np.ones(len(plan))])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    ahead = np.column_stack([np.gradient(plan, axis=0), np.zeros(len(plan))])
+    left = np.cross(normal, ahead)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (len(plan), 1, 1))
+    poses[:, :3, :3] = np.stack([np.cross(left, normal), left, normal], axis=2)
+    poses[:, :3, 3] = np.column_stack([plan, ground(plan)])
+    return poses
+
+
+def _drift_by(truth: Array, rng: np.random.Generator, share: float) -> GraphWorld:
+    """Odometry that random errors, and others that change with the ground, bring off by a share of the way."""
+    steps = invert(truth[:-1]) @ truth[1:]
+    lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
+    bias = gaussian_filter1d(rng.normal(size=(len(steps), 6)), 60, axis=0)
+    bias *= np.array([*np.deg2rad([0.02, 0.02, 0.06]), 0.02, 0.006, 0.006]) / bias.std(axis=0)
+    noise = lengths[:, None] * bias + np.sqrt(lengths)[:, None] * rng.normal(size=(len(steps), 6)) * _ODOMETRY_SIGMAS
+
+    def drifted(factor: float) -> Array:
+        poses = [np.eye(4)]  # a map begins where the rover is
+        for step in steps @ expmap(factor * noise):
+            poses.append(poses[-1] @ step)
+        return orthonormal(np.array(poses))
+
+    begun = invert(truth[0])
+
+    def error(factor: float) -> float:
+        return float(np.linalg.norm(drifted(factor)[-1, :3, 3] - (begun @ truth[-1])[:3, 3]))
+
+    low, high = 0.0, 0.25
+    while error(high) < share * lengths.sum():
+        low, high = high, 2 * high
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if error(middle) < share * lengths.sum() else (low, middle)
+    return GraphWorld(truth, drifted(high), np.zeros((len(truth), 6, 6)), [])
+
+
+def _fixes(truth: Array, rng: np.random.Generator, lying: float) -> tuple[list[AbsoluteMeasurement], NDArray[np.bool_]]:
+    """GNSS fixes, and which of them lie."""
+    count = len(truth)
+    offsets, heard = np.zeros((count, 3)), np.ones(count, bool)
+    for start in rng.integers(200, count - 100, 2):
+        heard[start : start + 60] = False
+    while (np.abs(offsets).max(axis=1) > 0).mean() < lying:
+        start, length = int(rng.integers(0, count)), int(rng.integers(5, 31))
+        way = rng.normal(size=3) * [1, 1, 0.7]
+        jump = way / np.linalg.norm(way) * rng.uniform(5, 50)
+        ramp = np.clip(np.arange(length) / rng.choice([1, 3]), 0, 1)[: count - start, None]
+        offsets[start : start + length] = (np.maximum(ramp, 0.4) * jump)[: count - start]
+    slow = gaussian_filter1d(rng.normal(size=(count, 3)), 15, axis=0)
+    slow *= 0.5 / slow.std(axis=0)
+    errors = _FIX_SIGMAS * (slow + np.sqrt(1 - 0.25) * rng.normal(size=(count, 3))) + offsets
+    antennas = (truth @ np.append(ANTENNA, 1.0))[:, :3]
+    geodetic = from_enu(antennas + errors, _ORIGIN)
+    found = [
+        AbsoluteMeasurement(Source.GNSS, k * PERIOD_NS, geodetic[k], np.diag(_FIX_SIGMAS**2), ANTENNA)
+        for k in np.flatnonzero(heard).tolist()
+    ]
+    return found, (np.linalg.norm(errors / _FIX_SIGMAS, axis=1) > 5)[heard]
+
+
+def _upward(truth: Array, rng: np.random.Generator) -> list[AbsoluteMeasurement]:
+    found = []
+    for k in np.flatnonzero(np.arange(len(truth)) % 3 < 2).tolist():
+        up = truth[k, 2, :3] + rng.normal(0, _UP_SIGMA, 3) + (rng.random() < 0.1) * rng.normal(0, 0.12, 3)
+        spread = _UP_SIGMA**2 * np.eye(3)
+        found.append(AbsoluteMeasurement(Source.GRAVITY, k * PERIOD_NS, up / np.linalg.norm(up), spread, np.zeros(3)))
+    return found

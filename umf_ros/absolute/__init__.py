@@ -1,0 +1,1 @@
+"""Absolute measurements of the pose graph: GNSS, gravity and elevation models, and the decisions about them."""

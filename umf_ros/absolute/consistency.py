@@ -1,0 +1,397 @@
+"""Consistency of absolute measurements over time.
+
+The measurement of a source, less the odometry's of the same, changes slowly along the path where the source is right:
+by the drift of the odometry. Multipath jumps. The longest chain of measurements, each of which agrees with the one
+before over the odometry between, is found by dynamic programming; what is not on it contradicts what is.
+An error of the mounting turns with the rover, which tells it from drift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteReason, AbsoluteVerdict, Source
+from umf_ros.core.frames import State
+from umf_ros.core.geometry import Array, invert, make_pose
+from umf_ros.core.odometry_noise import OdometryNoise
+
+STRETCH_M = 10.0
+"""Measurements are averaged over so much of the path (*by hand*: multipath jumps further than odometry drifts)."""
+GATE = float(chi2.ppf(0.999, 3))
+"""Largest squared Mahalanobis distance of a right measurement."""
+SUPPORT = 4
+"""Stretches of the path in a row that agree: by hand, longer than a rover drives through one reflection."""
+# by hand: stretches that a chain may leave out in a row
+_REACH = 60
+# by hand: the least jump that multipath makes, m; a chain across a longer tolerance proves nothing
+_LEAST_JUMP_M = 5.0
+# by hand: attitude of the solved map, rad, and systematic error of odometry per metre
+_ATTITUDE, _SYSTEMATIC, _SYSTEMATIC_RAD = np.deg2rad(1.0), 0.02, np.deg2rad(0.03)
+_HEADINGS = np.deg2rad(np.arange(0, 360, 5.0))
+_PAIRS = 5
+# by hand: errors of measurements beside each other are alike, so that a stretch counts as so many at most
+_MOST_COUNTED = 4
+_MOST_DRIFT_M = 2000
+_ALIGNED_STRETCHES = 40
+_FEW_STRETCHES = 15
+# by hand: mounting errors that matter, and how well they must be known: m for an antenna, rad for an IMU
+_MOUNTING = {Source.GNSS: (0.5, 1.0), Source.GRAVITY: (np.deg2rad(2.5), np.deg2rad(1.0))}
+_LEAST_SIGMA_M = 0.05
+_STEP = np.log(1.2)
+
+Rows = NDArray[np.int64]
+Decision = tuple[State, AbsoluteReason]
+_AGREES = State.ACCEPTED, AbsoluteReason.AGREES
+_JUMPED = State.REJECTED, AbsoluteReason.JUMPED
+_CONTRADICTS = State.REJECTED, AbsoluteReason.CONTRADICTS
+_MOUNTED_WRONG = State.REJECTED, AbsoluteReason.MOUNTING
+
+
+def position_drift(noise: OdometryNoise, path_m: Array) -> Array:
+    """Variance per axis (m^2) of the odometry's translation over path lengths, attitude being known at the start."""
+    random = noise.sigma_m**2 * path_m + noise.sigma_rad**2 * path_m**3 / 3
+    return noise.scale**2 * random + (_ATTITUDE**2 + _SYSTEMATIC**2) * path_m**2
+
+
+def attitude_drift(noise: OdometryNoise, path_m: Array) -> Array:
+    """Variance per axis (rad^2) of the odometry's attitude over path lengths."""
+    return (noise.scale * noise.sigma_rad) ** 2 * path_m + (_SYSTEMATIC_RAD * path_m) ** 2
+
+
+def longest_chain(values: Array, variances: Array, path_m: Array, drift: Array) -> NDArray[np.bool_]:
+    """(N,) members of the longest chain of measurements along the path.
+
+    Args:
+        values: (N, 3) what drifts slowly.
+        variances: (N, 3) of the values.
+        path_m: (N,) where they are along the path, rising.
+        drift: (K,) variance of the drift over 0, 1, 2, ... metres; beyond, the last.
+    """
+    best, before = np.ones(len(values)), np.full(len(values), -1)
+    for row in range(1, len(values)):
+        start = max(0, row - _REACH)
+        apart = drift[np.minimum((path_m[row] - path_m[start:row]).astype(int), len(drift) - 1)]
+        spread = variances[start:row] + variances[row] + apart[:, None]
+        fits = ((values[start:row] - values[row]) ** 2 / spread).sum(axis=1) <= GATE
+        if fits.any():
+            chosen = int(np.argmax(np.where(fits, best[start:row], 0.0)[::-1]))  # of equals the nearest
+            before[row] = row - 1 - chosen
+            best[row] += best[before[row]]
+    members, row = np.zeros(len(values), bool), int(np.argmax(best)) if len(values) else -1
+    while row >= 0:
+        members[row], row = True, int(before[row])
+    return members
+
+
+def supported(members: NDArray[np.bool_], variances: Array, path_m: Array, drift: Array) -> NDArray[np.bool_]:
+    """(N,) members of a chain with enough others in a row whose links leave no room for a jump."""
+    rows = np.flatnonzero(members)
+    gaps = np.minimum(np.diff(path_m[rows]).astype(int), len(drift) - 1)
+    room = np.sqrt(GATE * (variances[rows[1:]] + variances[rows[:-1]]).mean(axis=1) + GATE * drift[gaps])
+    part = np.concatenate([[0], np.cumsum(room > _LEAST_JUMP_M)]) if len(rows) else np.empty(0, int)
+    found = np.zeros(len(members), bool)
+    found[rows] = np.bincount(part)[part] >= SUPPORT if len(rows) else False
+    return found
+
+
+def find_heading(measured: Array, mapped: Array, variances: Array, path_m: Array, drift: Array) -> float | None:
+    """Heading (rad) of an upright map in the world; None where too little of the path agrees on one.
+
+    Every heading is tried; the right one lets the longest chain agree.
+
+    `measured` (N, 3) are positions in the world, `mapped` the same in the map; the others as for `longest_chain`.
+    """
+    best: tuple[int, float, float] | None = None
+    for heading in _HEADINGS:
+        values = measured - turned(mapped, heading)
+        members = longest_chain(values, variances, path_m, drift)
+        scatter = float(np.square(values[members] - np.median(values[members], axis=0)).sum(axis=1).mean())
+        if best is None or (int(members.sum()), -scatter) > best[:2]:
+            best, chain = (int(members.sum()), -scatter, float(heading)), members
+    if best is None or best[0] < max(SUPPORT, 0.6 * len(measured)):
+        return None
+    world, here = (points[chain, :2] - points[chain, :2].mean(axis=0) for points in (measured, mapped))
+    reach = np.linalg.norm(here - here[0], axis=1).max()
+    if np.sqrt(variances[chain].mean()) > 0.07 * reach:  # by hand: 4 degrees
+        return None
+    cross = (here[:, 0] * world[:, 1] - here[:, 1] * world[:, 0]).sum()
+    return float(np.arctan2(cross, (here * world).sum()))
+
+
+def turned(points: Array, heading: float) -> Array:
+    """(N, 3) points turned about z."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    return points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1.0]])
+
+
+def body_offset(values: Array, variances: Array, rotations: Array, path_m: Array, drift: Array) -> tuple[Array, Array]:
+    """An error (3,) that turns with the body, and its covariance (3, 3).
+
+    `values` (N, 3) are in the frame in which `rotations` (N, 3, 3) are those of the body; as for `longest_chain`.
+    """
+    pairs = [(row, row + step) for step in range(1, _PAIRS + 1) for row in range(len(values) - step)]
+    first, second = np.array(pairs).reshape(-1, 2).T
+    apart = drift[np.minimum((path_m[second] - path_m[first]).astype(int), len(drift) - 1)]
+    stated = (variances[first] + variances[second]).mean(axis=1) + apart
+    design, missed, weights = rotations[second] - rotations[first], values[second] - values[first], 1 / stated
+    for _ in range(3):  # reweighted: the chain is right, some of its links are not
+        information = np.einsum("n,nji,njk->ik", weights, design, design) + 1e-9 * np.eye(3)
+        offset = np.linalg.solve(information, np.einsum("n,nji,nj->i", weights, design, missed))
+        left = np.square(missed - design @ offset).sum(axis=1) / stated
+        weights = 1 / (stated * (1 + left / 4))
+    # every value is in several pairs
+    return offset, _PAIRS * max(1.0, float(np.median(left)) / 3) * np.linalg.inv(information)
+
+
+class Factor(NamedTuple):
+    """The average of the measurements of a stretch.
+
+    Attributes:
+        stamp_ns: of its pose.
+        numbers: those that determine it.
+        make: makes the factor of a vertex with a number.
+    """
+
+    stamp_ns: int
+    numbers: tuple[float, ...]
+    make: Callable[[int], gtsam.NonlinearFactor]
+
+
+@dataclass(frozen=True)
+class Path:
+    """The path at N measurements, and where its stretches are.
+
+    Attributes:
+        odometry: (N, 4, 4) poses by odometry alone.
+        poses: (N, 4, 4) in the world, or in the map while it is not known how that lies in the world.
+        travel: (N,) m.
+        finished: stretches that are finished.
+        at_middle: stamp and odometry (4, 4) in the middle of a stretch.
+    """
+
+    odometry: Array
+    poses: Array
+    travel: Array
+    finished: int
+    at_middle: Callable[[int], tuple[int, Array]]
+
+
+@dataclass(frozen=True)
+class _Stretches:
+    """Averages over K stretches: numbers, rows of the measurements, medians and their variances (K, 3), travel (K,)."""
+
+    cells: Rows
+    rows: list[Rows]
+    middles: Array
+    spreads: Array
+    travel: Array
+
+    @classmethod
+    def of(cls, values: Array, variances: Array, path: Path) -> _Stretches:
+        """Averages of (N, 3) values over the finished stretches."""
+        cells = (path.travel // STRETCH_M).astype(int)
+        names, first, counts = np.unique(cells, return_index=True, return_counts=True)
+        done = names < path.finished
+        rows = [np.arange(start, start + count) for start, count in zip(first[done], counts[done], strict=True)]
+        middles = np.array([np.median(values[own], axis=0) for own in rows]).reshape(-1, 3)
+        spreads = np.array([variances[own].mean(axis=0) / min(len(own), _MOST_COUNTED) for own in rows]).reshape(-1, 3)
+        return cls(names[done], rows, middles, spreads, np.array([path.travel[own].mean() for own in rows]))
+
+
+class Track:
+    """Measurements of one source in one session, and the decisions about them.
+
+    Attributes:
+        mounting: error (2,) of the mounting ahead and to the left, m, or of the upward direction, rad, for which the
+            source is rejected; None: none was found.
+        factors: what is accepted, by the number of the stretch.
+    """
+
+    def __init__(self, source: Source, noise: OdometryNoise) -> None:
+        metres = np.arange(_MOST_DRIFT_M, dtype=float)
+        self._source = source
+        self._drift = (position_drift if source is Source.GNSS else attitude_drift)(noise, metres)
+        self._measurements: list[AbsoluteMeasurement] = []
+        self._decisions: list[Decision] = []
+        self._misfits = self._distances = np.empty(0)
+        self._solved: set[int] = set()
+        self.mounting: Array | None = None
+        self.factors: dict[int, Factor] = {}
+
+    def add(self, measurements: list[AbsoluteMeasurement]) -> None:
+        """Take measurements; their verdicts are open until `judge`."""
+        self._measurements = sorted([*self._measurements, *measurements], key=lambda one: one.stamp_ns)
+        self._decide_all((State.PENDING, AbsoluteReason.INCOMPLETE))
+
+    @property
+    def stamps(self) -> Rows:
+        """(N,) stamps of the measurements."""
+        return np.array([one.stamp_ns for one in self._measurements], np.int64)
+
+    @property
+    def values(self) -> Array:
+        """(N, 3) what was measured."""
+        return np.array([one.value for one in self._measurements])
+
+    def verdicts(self) -> list[AbsoluteVerdict]:
+        """The latest verdicts, in order of the stamps."""
+        figures = zip(np.sqrt(self._distances).tolist(), self._misfits.tolist(), strict=True)
+        rows = zip(self._measurements, self._decisions, figures, strict=True)
+        return [AbsoluteVerdict(one.source, one.stamp_ns, *decision, *figure) for one, decision, figure in rows]
+
+    def align(self, measured: Array, path: Path) -> Array | None:
+        """`world_T_map` by the newest stretches of (N, 3) positions; None where they do not tell."""
+        mapped = path.poses[:, :3, 3] + apply(path.poses, self._levers)
+        world, here = (_Stretches.of(points, self._variances, path) for points in (measured, mapped))
+        newest = slice(-_ALIGNED_STRETCHES, None)
+        ends = world.middles[newest], here.middles[newest]
+        direction = (
+            find_heading(*ends, world.spreads[newest], world.travel[newest], self._drift) if len(ends[0]) else None
+        )
+        if direction is None:
+            self._decide_all((State.PENDING, AbsoluteReason.NOT_ALIGNED))
+            return None
+        return make_pose(turned(np.eye(3), direction).T, np.median(ends[0] - turned(ends[1], direction), axis=0))
+
+    def judge(self, measured: Array, path: Path, in_world: bool) -> None:
+        """Decide about all measurements; `measured` (N, 3) are positions in the world, or upward directions."""
+        self.factors = {}
+        if self.mounting is not None:
+            self._decide_all(_MOUNTED_WRONG)
+            return
+        self._decide_all((State.PENDING, AbsoluteReason.INCOMPLETE))
+        values, rotations = self._drifting(measured, path)
+        scale = _scatter(values, self._variances, _Stretches.of(values, self._variances, path))
+        variances = scale**2 * self._variances
+        stretches = _Stretches.of(values, variances, path)
+        members = longest_chain(stretches.middles, stretches.spreads, stretches.travel, self._drift)
+        firm = supported(members, stretches.spreads, stretches.travel, self._drift)
+        source = self._judge_mounting(stretches, members, rotations)
+        if in_world:
+            missed = self._missed(measured, path)
+            self._misfits, self._distances = np.linalg.norm(missed, axis=1), (missed**2 / variances).sum(axis=1)
+        for number, rows in enumerate(stretches.rows):
+            if not firm[number] or source != _AGREES:
+                unsure = State.PENDING, AbsoluteReason.UNSURE
+                self._decide(rows, _JUMPED if not members[number] else unsure if not firm[number] else source)
+                continue
+            near = ((values[rows] - stretches.middles[number]) ** 2 / variances[rows]).sum(axis=1) <= GATE
+            kept = self._judge_stretch(int(stretches.cells[number]), rows, near)
+            if len(kept):
+                self._average(int(stretches.cells[number]), kept, measured, path, scale)
+
+    def _judge_stretch(self, cell: int, rows: Rows, near: NDArray[np.bool_]) -> Rows:
+        """Decide about the measurements of a stretch that is consistent with others; returns those that are accepted.
+
+        Where it was in the map before, its measurements have to agree with that too. Of a stretch whose measurements
+        are mostly wrong the others are not believed.
+        """
+        agrees = near & ((self._distances[rows] <= GATE) | (cell not in self._solved))
+        if 2 * agrees.sum() < len(rows):
+            agrees[:] = False
+        self._decide(rows, _CONTRADICTS)
+        self._decide(rows[~near], _JUMPED)
+        self._decide(rows[agrees], _AGREES)
+        if agrees.any():
+            self._solved.add(cell)
+        return rows[agrees]
+
+    @property
+    def _levers(self) -> Array:
+        return np.array([one.lever for one in self._measurements])
+
+    @property
+    def _variances(self) -> Array:
+        return np.array([np.diag(one.covariance) for one in self._measurements])
+
+    def _decide(self, rows: Rows, decision: Decision) -> None:
+        for row in rows.tolist():
+            self._decisions[row] = decision
+
+    def _decide_all(self, decision: Decision) -> None:
+        self._decisions = [decision] * len(self._measurements)
+        self._misfits, self._distances = np.full((2, len(self._measurements)), np.nan)
+
+    def _drifting(self, measured: Array, path: Path) -> tuple[Array, Array]:
+        """(N, 3) what drifts slowly, and the rotations (N, 3, 3) of the body with which an error of its mounting turns.
+
+        Positions less those by dead reckoning with the attitudes of the map; directions by the odometry's attitudes.
+        """
+        if self._source is Source.GRAVITY:
+            return apply(path.odometry, measured), path.odometry[:, :3, :3]
+        steps = invert(path.odometry[:-1]) @ path.odometry[1:]
+        walked = np.cumsum(np.concatenate([np.zeros((1, 3)), apply(path.poses[:-1], steps[:, :3, 3])]), axis=0)
+        return measured - walked - apply(path.poses, self._levers), path.poses[:, :3, :3]
+
+    def _judge_mounting(self, stretches: _Stretches, members: NDArray[np.bool_], rotations: Array) -> Decision:
+        """Whether a source may be accepted, by what its error does when the rover turns."""
+        large, well_known = _MOUNTING[self._source]
+        unknown = _AGREES  # an antenna that is off does little before the rover has turned
+        if self._source is Source.GRAVITY:
+            unknown = State.PENDING, AbsoluteReason.NOT_TURNED
+        if members.sum() < _FEW_STRETCHES:
+            return unknown
+        turns = np.array([rotations[rows[len(rows) // 2]] for rows in stretches.rows])
+        parts = stretches.middles, stretches.spreads, turns, stretches.travel
+        values, spreads, turns, travel = (part[members] for part in parts)
+        offset, covariance = body_offset(values, spreads, turns, travel, self._drift)
+        offset, covariance = offset[:2], covariance[:2, :2]  # along the vertical, the rover does not turn
+        if np.sqrt(np.linalg.eigvalsh(covariance).max()) > well_known:
+            return unknown
+        if np.linalg.norm(offset) > large and float(offset @ np.linalg.solve(covariance, offset)) > GATE:
+            self.mounting = offset
+            return _MOUNTED_WRONG
+        return _AGREES
+
+    def _missed(self, measured: Array, path: Path) -> Array:
+        """(N, 3) by what the measurements miss the map."""
+        if self._source is Source.GRAVITY:
+            return apply(path.poses, measured) - [0.0, 0.0, 1.0]
+        return measured - path.poses[:, :3, 3] - apply(path.poses, self._levers)
+
+    def _average(self, cell: int, rows: Rows, measured: Array, path: Path, scale: float) -> None:
+        """Make the factor of a stretch: on a rigid path, the mean of positions is that of the mean of their levers."""
+        stamp_ns, middle = path.at_middle(cell)
+        there = invert(middle) @ path.odometry[rows]
+        # as of one measurement: errors of GNSS last for longer than a stretch
+        covariance = np.mean([self._measurements[row].covariance for row in rows], axis=0) * scale**2
+        if self._source is Source.GNSS:
+            mean = measured[rows].mean(axis=0)
+            lever = (there[:, :3, 3] + apply(there, self._levers[rows])).mean(axis=0)
+            noise = gtsam.noiseModel.Gaussian.Covariance(covariance + _LEAST_SIGMA_M**2 * np.eye(3))
+            numbers = stamp_ns, *mean, *lever, covariance.trace()
+
+            def make(vertex: int) -> gtsam.NonlinearFactor:
+                return gtsam.GPSFactorArm(vertex, mean, lever, noise)
+        else:
+            up = apply(there, measured[rows]).mean(axis=0)
+            tilt = gtsam.noiseModel.Isotropic.Sigma(2, float(np.sqrt(covariance.trace() / 3)))
+            numbers = stamp_ns, *up, covariance.trace()
+
+            def make(vertex: int) -> gtsam.NonlinearFactor:
+                return gtsam.AttitudeFactorPose3(vertex, gtsam.Unit3([0, 0, 1]), tilt, gtsam.Unit3(up))
+
+        self.factors[cell] = Factor(stamp_ns, tuple(round(float(number), 6) for number in numbers), make)
+
+
+def apply(poses: Array, vectors: Array) -> Array:
+    """(N, 3) vectors turned by the rotations of (N, 4, 4) poses."""
+    return (poses[:, :3, :3] @ vectors[..., None])[..., 0]
+
+
+def _scatter(values: Array, variances: Array, stretches: _Stretches) -> float:
+    """By how much measurements scatter more than they state: one at least, in steps, so that averages stay."""
+    ratios = [
+        np.abs(values[rows] - middle) / np.sqrt(variances[rows])
+        for rows, middle in zip(stretches.rows, stretches.middles, strict=True)
+        if len(rows) > 2
+    ]
+    scale = 1.4826 * float(np.median(np.concatenate(ratios))) if ratios else 1.0
+    return float(np.exp(_STEP * max(0.0, np.ceil(np.log(max(scale, 1e-9)) / _STEP))))

@@ -1,0 +1,281 @@
+"""Absolute measurements: records, decoding of ROS messages, geodetic coordinates, and verdicts with their reasons."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from umf_ros.core.errors import ConfigError, MessageError
+from umf_ros.core.frames import State
+from umf_ros.core.geometry import Array, from_quaternion
+from umf_ros.core.io import atomic_write
+
+VERDICT_COLUMNS = ("source", "stamp_ns", "verdict", "reason", "mahalanobis", "misfit")
+"""Columns of a table of verdicts; the misfit is in metres, that of gravity in radians."""
+# WGS 84: semi-major axis, first eccentricity squared
+_RADIUS_M, _ECCENTRICITY2 = 6_378_137.0, 6.69437999014e-3
+_UNKNOWN_COVARIANCE, _NO_FIX = 0, 0
+# by hand: an IMU stands still while it turns by less than this and its acceleration varies by less
+_REST_RAD_S, _REST_M_S2, _REST_S, _GRAVITY_M_S2, _GRAVITY_TOLERANCE = 0.02, 0.15, 1.0, 9.81, 0.3
+# by hand: of attitudes without a covariance, and the least that one states, rad
+_ATTITUDE_SIGMA, _LEAST_ATTITUDE_SIGMA = np.deg2rad(1.0), np.deg2rad(0.3)
+
+
+class Source(StrEnum):
+    """Kind of an absolute measurement."""
+
+    GNSS = "gnss"
+    GRAVITY = "gravity"
+    ELEVATION = "elevation"
+
+
+ABSOLUTE_TYPES = {Source.GNSS: "sensor_msgs/msg/NavSatFix", Source.GRAVITY: "sensor_msgs/msg/Imu"}
+"""Types of message of measurements."""
+
+
+class AbsoluteReason(StrEnum):
+    """Reason of a verdict; the value is its sentence."""
+
+    AGREES = "agrees with the odometry over time"
+    NO_ODOMETRY_YET = "its odometry has not arrived"
+    INCOMPLETE = "its stretch of the path is not finished"
+    NOT_ALIGNED = "the path does not say yet how the map lies in the world"
+    UNSURE = "too little of the path beside it agrees"
+    NOT_TURNED = "the rover has not turned enough to check the mounting"
+    JUMPED = "contradicts the odometry beside it"
+    CONTRADICTS = "contradicts the map"
+    MOUNTING = "its sensor is not mounted as the calibration says"
+    MISFIT = "the elevation model does not fit the path"
+    OUTSIDE = "outside the elevation model"
+    UNUSABLE = "position or covariance is not usable"
+
+
+@dataclass(frozen=True)
+class AbsoluteMeasurement:
+    """One absolute measurement.
+
+    Attributes:
+        source: gnss or gravity.
+        stamp_ns: its stamp.
+        value: (3,) latitude and longitude in degrees and height in metres, WGS 84; or the unit vector up, body frame.
+        covariance: (3, 3) of a position east, north and up, m^2; of an upward direction, rad^2.
+        lever: (3,) m, body frame: the antenna of a position.
+    """
+
+    source: Source
+    stamp_ns: int
+    value: Array
+    covariance: Array
+    lever: Array
+
+    @property
+    def numbers(self) -> Array:
+        """(15,) value, covariance and lever, to be stored."""
+        return np.concatenate([self.value, self.covariance.ravel(), self.lever])
+
+    @classmethod
+    def stored(cls, source: str, stamp_ns: int, numbers: Array) -> AbsoluteMeasurement:
+        """The measurement of stored `numbers`; a ValueError where they are none."""
+        if np.shape(numbers) != (15,):
+            raise ValueError(f"an absolute measurement of {np.size(numbers)} numbers")
+        return cls(Source(source), stamp_ns, numbers[:3], numbers[3:12].reshape(3, 3), numbers[12:])
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether all is finite, and the covariance positive."""
+        if not np.isfinite(self.numbers).all() or np.linalg.eigvalsh(self.covariance).min() <= 0:
+            return False
+        if self.source is Source.GRAVITY:
+            return bool(abs(np.linalg.norm(self.value) - 1) < 1e-3)
+        return bool(abs(self.value[0]) <= 90 and abs(self.value[1]) <= 360 and abs(self.value[2]) < 1e5)
+
+
+class AbsoluteVerdict(NamedTuple):
+    """Decision about one absolute measurement at one moment.
+
+    Attributes:
+        source: what kind.
+        stamp_ns: of the measurement, or of the pose below which the elevation was looked up.
+        state: accepted, pending, rejected, or refused when the message itself is unusable.
+        reason: why.
+        residual: Mahalanobis distance to the map, NaN if unknown.
+        misfit: the same distance in metres, or in radians for gravity.
+    """
+
+    source: Source
+    stamp_ns: int
+    state: State
+    reason: AbsoluteReason
+    residual: float = float("nan")
+    misfit: float = float("nan")
+
+
+def write_verdicts(path: Path, verdicts: Iterable[AbsoluteVerdict]) -> None:
+    """Write the table of verdicts; an `OutputError` where that cannot be done."""
+    with atomic_write(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(VERDICT_COLUMNS)
+        for one in verdicts:
+            figures = f"{one.residual:.3f}", f"{one.misfit:.4f}"
+            writer.writerow([one.source.value, one.stamp_ns, one.state.value, one.reason.value, *figures])
+
+
+def read_verdict_counts(path: Path) -> Counter[tuple[str, str, str]]:
+    """How many measurements have which source, verdict and reason by the table of a run; none without a table."""
+    if not path.is_file():
+        return Counter()
+    with path.open(newline="", encoding="utf-8") as file:
+        return Counter((row["source"], row["verdict"], row["reason"]) for row in csv.DictReader(file))
+
+
+def decode_fix(message: Any, stamp_ns: int, lever: Array) -> AbsoluteMeasurement:
+    """Position of a sensor_msgs/NavSatFix.
+
+    Raises:
+        MessageError: of kind "no fix" or "covariance": the receiver has no position, or does not say how good it is.
+    """
+    if message.status.status < _NO_FIX:
+        raise MessageError("no fix", "the GNSS receiver has no fix")
+    covariance = np.asarray(message.position_covariance, float).reshape(3, 3)
+    if message.position_covariance_type == _UNKNOWN_COVARIANCE:
+        raise MessageError("covariance", "GNSS fix of unknown covariance: the driver must state one")
+    value = np.array([message.latitude, message.longitude, message.altitude], float)
+    found = AbsoluteMeasurement(Source.GNSS, stamp_ns, value, 0.5 * (covariance + covariance.T), np.array(lever, float))
+    if not found.is_usable:
+        raise MessageError("fix", "GNSS fix whose position or covariance is not usable")
+    return found
+
+
+class GravityFilter:
+    """Makes upward directions of sensor_msgs/Imu messages, two per second at most.
+
+    From the orientation where the driver gives one, else from the mean acceleration over a second at rest.
+    """
+
+    def __init__(self) -> None:
+        self._window: deque[tuple[int, Array, Array]] = deque()
+        self._last_ns = -(10**18)
+
+    def take(self, message: Any, stamp_ns: int, body_R_imu: Array) -> AbsoluteMeasurement | None:
+        """Take one message of an IMU that is turned so (3, 3) on the body; returns a measurement now and then.
+
+        Raises:
+            MessageError: of kind "imu": its orientation is none.
+        """
+        self._body_R_imu = body_R_imu
+        if message.orientation_covariance[0] < 0:
+            return self._at_rest(message, stamp_ns)
+        if 0 <= stamp_ns - self._last_ns < 500_000_000:
+            return None
+        turn = message.orientation
+        try:
+            world_T_imu = from_quaternion((0, 0, 0), (turn.x, turn.y, turn.z, turn.w))
+        except ValueError as error:
+            raise MessageError("imu", f"orientation of the IMU with {error}") from None
+        spread = np.asarray(message.orientation_covariance, float).reshape(3, 3)[:2, :2]
+        stated = float(np.sqrt(max(np.trace(spread) / 2, 0.0))) if np.isfinite(spread).all() else 0.0
+        sigma = max(stated, float(_LEAST_ATTITUDE_SIGMA)) if stated else float(_ATTITUDE_SIGMA)
+        return self._measured(world_T_imu[2, :3], sigma, stamp_ns)
+
+    def _at_rest(self, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
+        """The mean acceleration of the last second, if the IMU stood still meanwhile."""
+        force, rate = (
+            [vector.x, vector.y, vector.z] for vector in (message.linear_acceleration, message.angular_velocity)
+        )
+        if self._window and not 0 < stamp_ns - self._window[-1][0] < 10**9:
+            self._window.clear()
+        self._window.append((stamp_ns, np.array(force, float), np.array(rate, float)))
+        while stamp_ns - self._window[0][0] > _REST_S * 1e9:
+            self._window.popleft()
+        if stamp_ns - self._window[0][0] < 0.8 * _REST_S * 1e9 or 0 <= stamp_ns - self._last_ns < _REST_S * 1e9:
+            return None
+        forces, rates = (np.array([one[place] for one in self._window]) for place in (1, 2))
+        mean = forces.mean(axis=0)
+        size = float(np.linalg.norm(mean))
+        moves = np.ptp(rates, axis=0).max() > _REST_RAD_S or forces.std(axis=0).max() > _REST_M_S2
+        if moves or not abs(size - _GRAVITY_M_S2) < _GRAVITY_TOLERANCE:
+            return None
+        return self._measured(mean / size, float(_ATTITUDE_SIGMA), stamp_ns)
+
+    def _measured(self, up_imu: Array, sigma: float, stamp_ns: int) -> AbsoluteMeasurement:
+        self._last_ns = stamp_ns
+        up = self._body_R_imu @ up_imu
+        return AbsoluteMeasurement(Source.GRAVITY, stamp_ns, up / np.linalg.norm(up), sigma**2 * np.eye(3), np.zeros(3))
+
+
+class AbsoluteDecoder:
+    """Decodes the messages of GNSS and IMU, the same live and offline.
+
+    Args:
+        antenna: (3,) m, body frame.
+        body_T_imu: (4, 4).
+        find: pose (4, 4) of a frame on the body by `/tf_static`, which goes before those; None where it is unknown.
+    """
+
+    def __init__(self, antenna: Array, body_T_imu: Array, find: Callable[[str], Array | None]) -> None:
+        self._antenna, self._body_T_imu, self._find = antenna, body_T_imu, find
+        self._gravity = GravityFilter()
+
+    def decode(self, source: Source, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
+        """The measurement in a message; None where an IMU has nothing to say yet.
+
+        Raises:
+            MessageError: the message cannot be used.
+        """
+        mounted = self._find(message.header.frame_id)
+        if source is Source.GNSS:
+            return decode_fix(message, stamp_ns, self._antenna if mounted is None else mounted[:3, 3])
+        pose = self._body_T_imu if mounted is None else mounted
+        return self._gravity.take(message, stamp_ns, pose[:3, :3])
+
+
+def parse_numbers(text: str, count: int, what: str) -> Array | None:
+    """(count,) numbers of a parameter; None where it is empty; a `ConfigError` where it is something else."""
+    if not text.strip():
+        return None
+    try:
+        numbers = np.array([float(part) for part in text.replace(",", " ").split()])
+    except ValueError:
+        numbers = np.empty(0)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise ConfigError(f"{what}: expected {count} numbers, got {text!r}")
+    return numbers
+
+
+def to_enu(geodetic: Array, origin: Array) -> Array:
+    """(N, 3) metres east, north and up of an origin (3,); degrees and metres on WGS 84."""
+    return (_to_ecef(geodetic) - _to_ecef(origin[None])) @ _enu_axes(origin).T
+
+
+def from_enu(positions: Array, origin: Array) -> Array:
+    """(N, 3) latitudes, longitudes (deg) and heights (m) of positions about an origin; the inverse of `to_enu`."""
+    x, y, z = (_to_ecef(origin[None]) + positions @ _enu_axes(origin)).T
+    longitude, across = np.arctan2(y, x), np.hypot(x, y)
+    latitude = np.arctan2(z, across * (1 - _ECCENTRICITY2))
+    for _ in range(6):  # converges by the flattening, a factor of 300, each time
+        normal = _RADIUS_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
+        latitude = np.arctan2(z + _ECCENTRICITY2 * normal * np.sin(latitude), across)
+    height = across * np.cos(latitude) + z * np.sin(latitude) - _RADIUS_M**2 / normal
+    return np.column_stack([np.degrees(latitude), np.degrees(longitude), height])
+
+
+def _to_ecef(geodetic: Array) -> Array:
+    latitude, longitude = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
+    normal = _RADIUS_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
+    across = (normal + geodetic[:, 2]) * np.cos(latitude)
+    up = (normal * (1 - _ECCENTRICITY2) + geodetic[:, 2]) * np.sin(latitude)
+    return np.column_stack([across * np.cos(longitude), across * np.sin(longitude), up])
+
+
+def _enu_axes(origin: Array) -> Array:
+    """(3, 3) axes east, north and up, one per row."""
+    (sin_lat, sin_lon), (cos_lat, cos_lon) = np.sin(np.radians(origin[:2])), np.cos(np.radians(origin[:2]))
+    east, north = [-sin_lon, cos_lon, 0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
+    return np.array([east, north, [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]])

@@ -1,0 +1,471 @@
+"""Absolute measurements of a pose graph, and its solution with those that are accepted.
+
+`Track` decides about GNSS and gravity by their consistency over time. An elevation model is tried as a whole: the graph
+is solved with its heights, which is taken back where they cost more than their errors explain, or where they would fit
+elsewhere as well.
+
+The graph is solved in the world frame (east, north, up of the origin) and moved back, so that the map frame stays where
+the odometry began: `worlds` says where that is.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import Any, NamedTuple, Protocol
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.absolute.consistency import STRETCH_M, Path, Rows, Track, apply, turned
+from umf_ros.absolute.elevation import ElevationModel, load_elevation
+from umf_ros.absolute.measurement import (
+    AbsoluteMeasurement,
+    AbsoluteReason,
+    AbsoluteVerdict,
+    Source,
+    parse_numbers,
+    to_enu,
+)
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.errors import GraphError
+from umf_ros.core.frames import State
+from umf_ros.core.geometry import Array, heading, invert, make_pose, orthonormal
+from umf_ros.core.odometry_noise import OdometryNoise
+
+# standard deviations (m, rad) of the first pose in the world: found out, as a start pose says, and fixed
+_FREE, _FIXED, _START_M, _START_RAD = 1e3, 1e-6, 5.0, np.deg2rad(5.0)
+_FEW_HEIGHTS, _HEIGHT_GATE = 15, 3.5
+# by hand: largest cost per height that a right elevation model adds, its own noise and the odometry's strain together;
+# nats that it fits better than anywhere else; share of the heights that fit
+_MOST_COST, _EVIDENCE, _LEAST_FITTING = 1.0, 12.0, 0.8
+# by hand: where else a model is tried, m; by which factor the path grows until the next test
+_ELSEWHERE_M = 50.0 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0.7, 0.7], [-0.7, -0.7]])
+_RETEST = 1.3
+_ROUNDS, _TEST_ROUNDS = 1, 5
+_FIRST_FIXES = 5
+
+Factors = Sequence[tuple[int, Callable[[int], gtsam.NonlinearFactor]]]
+
+
+class Held(NamedTuple):
+    """A graph held in the world: poses (N, 4, 4) there, factors of vertices, noise of anchors that may move."""
+
+    poses: Array
+    absolute: Factors
+    loose: Mapping[int, gtsam.noiseModel.Base]
+
+
+class Chain(Protocol):
+    """The odometry of a session."""
+
+    @property
+    def stamps(self) -> Rows:
+        """(K,) stamps of the keyframes."""
+
+    @property
+    def travel(self) -> Array:
+        """(K,) m up to each."""
+
+    def at(self, stamps: Rows) -> NDArray[np.void]:
+        """(N,) the path at stamps."""
+
+
+class Paths(Protocol):
+    """The sessions of a pose graph; see `pose_graph.sessions.Sessions`."""
+
+    components: list[int]
+    solved: Any
+
+    @property
+    def chains(self) -> Sequence[Any]:
+        """The odometry of each session."""
+
+    @property
+    def begun(self) -> list[int]:
+        """Sessions with odometry."""
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of squared errors of the last solution."""
+
+    def at(self, points: NDArray[np.void]) -> Array:
+        """(N, 4, 4) `map_T_body`."""
+
+    def find(self, stamp_ns: int) -> int | None:
+        """Session of a stamp."""
+
+    def members(self, component: int) -> list[int]:
+        """Sessions of a component."""
+
+
+@dataclass
+class _Heights:
+    """The elevation model under one component of the map.
+
+    Attributes:
+        fits: whether it is believed; None while that is not known.
+        tested: stretches at the last test.
+        misfits: sigmas and metres of the ground under each stretch, by session and stamp.
+    """
+
+    fits: bool | None = None
+    tested: int = 0
+    misfits: dict[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
+
+    def verdict(self, stamp_ns: int, sigmas: float, misfit_m: float) -> AbsoluteVerdict:
+        """Decision about one height."""
+        if not self.fits:
+            known = (
+                (State.PENDING, AbsoluteReason.UNSURE) if self.fits is None else (State.REJECTED, AbsoluteReason.MISFIT)
+            )
+        elif np.isnan(sigmas):
+            known = State.REJECTED, AbsoluteReason.OUTSIDE
+        elif sigmas > _HEIGHT_GATE:
+            known = State.REJECTED, AbsoluteReason.CONTRADICTS
+        else:
+            known = State.ACCEPTED, AbsoluteReason.AGREES
+        return AbsoluteVerdict(Source.ELEVATION, stamp_ns, *known, sigmas, misfit_m)
+
+
+class AbsoluteReference:
+    """Absolute measurements of a pose graph.
+
+    Attributes:
+        origin: (3,) of the world frame on WGS 84; None before the first good fixes.
+        worlds: `world_T_map` (4, 4) of components of the map, by their earliest session.
+
+    Raises:
+        ConfigError: a parameter is not what it should be, or the elevation model cannot be read.
+    """
+
+    def __init__(self, settings: PoseGraphSettings) -> None:
+        self._settings, self._noise = settings, OdometryNoise.stated(settings)
+        self.origin = parse_numbers(settings.origin, 3, "pose_graph.origin")
+        self._start = parse_numbers(settings.elevation_start, 3, "pose_graph.elevation_start")
+        self._model: ElevationModel | None = None
+        if self.origin is not None or self._start is not None:
+            self._load_model()
+        self.worlds: dict[int, Array] = {}
+        self._waiting: list[AbsoluteMeasurement] = []
+        self._known: set[tuple[Source, int]] = set()
+        self._refused: list[AbsoluteVerdict] = []
+        self._tracks: dict[tuple[int, Source], Track] = {}
+        self._heights: dict[int, _Heights] = {}
+        self._seen: object = None
+        self._rounds = _ROUNDS
+
+    def add(self, measurement: AbsoluteMeasurement) -> None:
+        """Take one measurement, in any order; a second one of a stamp is dropped."""
+        key = measurement.source, measurement.stamp_ns
+        if key in self._known:
+            return
+        self._known.add(key)
+        if measurement.is_usable:
+            self._waiting.append(measurement)
+        else:
+            self._refused.append(AbsoluteVerdict(*key, State.REFUSED, AbsoluteReason.UNUSABLE))
+
+    def decide(self, paths: Paths, solve: Callable[[], None], at_last: bool = False) -> None:
+        """Decide about all measurements, and `solve` the graph where the accepted ones have changed.
+
+        Raises:
+            GraphError: it cannot be solved.
+        """
+        if not self._known and self._model is None:
+            return
+        late = self._place(paths)
+        seen = tuple(_finished(paths.chains[session])[0] for session in paths.begun), tuple(paths.components)
+        if seen == self._seen and not late and not at_last:
+            return
+        self._seen = seen
+        if at_last:
+            solve()
+        if self._judge(paths, at_last):
+            solve()
+        if self._model is not None:
+            for component in sorted(set(paths.components)):
+                self._judge_heights(self._model, component, paths, solve, at_last)
+
+    def verdicts(self) -> list[AbsoluteVerdict]:
+        """The latest verdict of every measurement."""
+        waiting = State.PENDING, AbsoluteReason.NO_ODOMETRY_YET
+        found = [AbsoluteVerdict(one.source, one.stamp_ns, *waiting) for one in self._waiting]
+        found += [verdict for track in self._tracks.values() for verdict in track.verdicts()]
+        for heights in self._heights.values():
+            found += [heights.verdict(stamp, *misfit) for (_, stamp), misfit in heights.misfits.items()]
+        return found + self._refused
+
+    def report(self) -> dict[str, object]:
+        """How many measurements have which state, by source, and what speaks against a source as a whole."""
+        counts = Counter(f"{one.source.value} {one.state.value}" for one in self.verdicts())
+        found: dict[str, object] = dict(sorted(counts.items()))
+        for (_, source), track in self._tracks.items():
+            if track.mounting is not None:
+                ahead, left = track.mounting
+                text = f"antenna off by {ahead:.2f} m ahead, {left:.2f} m left"
+                if source is Source.GRAVITY:
+                    text = f"IMU off by {np.degrees(-left):.1f} deg about x, {np.degrees(ahead):.1f} deg about y"
+                found[f"{source.value} rejected as a whole"] = f"{text}: see the calibration"
+        if any(heights.fits is False for heights in self._heights.values()):
+            found["elevation rejected as a whole"] = AbsoluteReason.MISFIT.value
+        return found
+
+    def stamps(self, session: int) -> Rows:
+        """(K,) stamps of the poses of a session that accepted measurements are about."""
+        stamps = [
+            one.stamp_ns for (own, _), track in self._tracks.items() if own == session for one in track.factors.values()
+        ]
+        stamps += [
+            stamp
+            for heights in self._heights.values()
+            if heights.fits
+            for own, stamp in heights.misfits
+            if own == session
+        ]
+        return np.unique(np.array(stamps, np.int64))
+
+    def solve(
+        self,
+        points: NDArray[np.void],
+        anchors: Sequence[int],
+        poses: Array,
+        components: list[int],
+        optimum: Callable[[Held], Array],
+    ) -> Array:
+        """(N, 4, 4) poses of a graph's vertices with all accepted measurements, in its own frames.
+
+        Args:
+            points: (N,) odometry at the vertices.
+            anchors: vertices that stay where they are, the first one of each component.
+            poses: (N, 4, 4) to start from.
+            components: the earliest session of each session's component.
+            optimum: solves the graph.
+
+        Raises:
+            GraphError: it cannot be solved.
+        """
+        of = np.array(components, np.int64)[points["session"]]
+        rows = dict(
+            zip(zip(points["session"].tolist(), points["stamp"].tolist(), strict=True), range(len(points)), strict=True)
+        )
+        firsts = {int(of[row]): row for row in anchors if int(of[row]) in self.worlds}
+        held, factors, planes, loose = poses.copy(), list[Any](), list[tuple[list[int], bool]](), dict[int, Any]()
+        for component, first in firsts.items():
+            tracks = [one for one in self._tracks.items() if components[one[0][0]] == component and one[1].factors]
+            factors += [
+                (rows[session, one.stamp_ns], one.make)
+                for (session, _), track in tracks
+                for one in track.factors.values()
+            ]
+            sources = {source for (_, source), _ in tracks}
+            heights = self._heights.get(component)
+            if heights is not None and heights.fits:
+                planes.append(([rows[key] for key in heights.misfits], Source.GNSS in sources))
+                sources.add(Source.ELEVATION)
+            if sources:
+                held[of == component] = self.worlds[component] @ held[of == component]
+                loose[first] = _first_pose_noise(held[first], sources)
+        if not loose:
+            return optimum(Held(poses, (), {}))
+        for _ in range(self._rounds if planes else 1):
+            ground = [one for under, is_free in planes for one in self._planes(held, under, is_free)]
+            held = optimum(Held(held, factors + ground, loose))
+        for component, first in firsts.items():
+            if first in loose:
+                # a rotation that is multiplied at every solution drifts off without
+                self.worlds[component] = orthonormal((held[first] @ invert(poses[first]))[None])[0]
+                held[of == component] = orthonormal(invert(self.worlds[component]) @ held[of == component])
+        return held
+
+    def _place(self, paths: Paths) -> bool:
+        """Give measurements whose odometry has arrived to their tracks; True where one is of a finished stretch."""
+        waiting, placed, late = [], dict[tuple[int, Source], list[AbsoluteMeasurement]](), False
+        for one in self._waiting:
+            session = paths.find(one.stamp_ns)
+            if session is None:
+                waiting.append(one)
+                continue
+            placed.setdefault((session, one.source), []).append(one)
+            late = late or one.stamp_ns < _finished(paths.chains[session])[1]
+        self._waiting = waiting
+        for key, new in placed.items():
+            self._tracks.setdefault(key, Track(key[1], self._noise)).add(new)
+        return late
+
+    def _judge(self, paths: Paths, at_last: bool) -> bool:
+        """Decide about the tracks; returns whether what is accepted has changed."""
+        changed = False
+        # gravity before GNSS: both say how the map lies in the world, and GNSS says more
+        for (session, source), track in sorted(
+            self._tracks.items(), key=lambda one: (one[0][1] is Source.GNSS, one[0][0])
+        ):
+            before = {cell: factor.numbers for cell, factor in track.factors.items()}
+            component, measured = paths.components[session], self._measured(source, track)
+            path = self._path(track, session, paths, at_last)
+            if source is Source.GNSS and track.mounting is None and not self._has_gnss(component, paths):
+                world = track.align(measured, path)
+                if world is None:
+                    continue
+                self.worlds[component] = world
+            known = component in self.worlds
+            if known:
+                path = Path(
+                    path.odometry, self.worlds[component] @ path.poses, path.travel, path.finished, path.at_middle
+                )
+            track.judge(measured, path, known)
+            if track.factors and not known:
+                self.worlds[component] = _upright(apply(path.poses, measured).mean(axis=0))
+            changed = changed or before != {cell: factor.numbers for cell, factor in track.factors.items()}
+        return changed
+
+    def _path(self, track: Track, session: int, paths: Paths, at_last: bool) -> Path:
+        chain = paths.chains[session]
+        points = chain.at(track.stamps)
+
+        def at_middle(cell: int) -> tuple[int, Array]:
+            point = chain.at(_middle(chain, cell))
+            return int(point["stamp"][0]), point["pose"][0]
+
+        return Path(points["pose"], paths.at(points), points["travel"], _finished(chain)[0] + at_last, at_middle)
+
+    def _measured(self, source: Source, track: Track) -> Array:
+        """(N, 3) positions in the world, or upward directions in the body."""
+        if source is not Source.GNSS:
+            return track.values
+        if self.origin is None:
+            self.origin = np.median(track.values[:_FIRST_FIXES], axis=0)
+            self._load_model()
+        return to_enu(track.values, self.origin)
+
+    def _load_model(self) -> None:
+        settings = self._settings
+        if settings.elevation_model and self._model is None:
+            self._model = load_elevation(FilePath(settings.elevation_model), settings.elevation_sigma_m, self.origin)
+
+    def _has_gnss(self, component: int, paths: Paths) -> bool:
+        """Whether accepted fixes hold a component in the world."""
+        tracks = ((session, track) for (session, source), track in self._tracks.items() if source is Source.GNSS)
+        return any(bool(track.factors) and paths.components[session] == component for session, track in tracks)
+
+    def _judge_heights(
+        self, model: ElevationModel, component: int, paths: Paths, solve: Callable[[], None], at_last: bool
+    ) -> None:
+        """Test now and then whether an elevation model fits the path; its heights are in the map where it does."""
+        if component not in self._heights and not self._has_gnss(component, paths):
+            if self._start is None or component not in paths.begun:
+                return
+            self._begin_at(self._start, model, component, paths)
+        heights = self._heights.setdefault(component, _Heights())
+        known = len(heights.misfits)
+        for session in paths.members(component):
+            chain = paths.chains[session]
+            for cell in range(_finished(chain)[0]):
+                heights.misfits.setdefault((session, int(_middle(chain, cell)[0])), (np.nan, np.nan))
+        count = len(heights.misfits)
+        due = count > heights.tested if at_last else count >= _RETEST * heights.tested
+        if count >= _FEW_HEIGHTS and due:
+            self._test(model, component, paths, solve)
+        elif heights.fits and count > known:
+            solve()
+            self._fitting(model, component, paths)
+
+    def _test(self, model: ElevationModel, component: int, paths: Paths, solve: Callable[[], None]) -> None:
+        """Solve with the heights, and take that back where they do not fit, or fit elsewhere as well.
+
+        The first time, the model is tried at other places too: heights that fit there say nothing.
+        """
+        heights = self._heights[component]
+        believed, heights.fits, heights.tested = heights.fits, False, len(heights.misfits)
+        solve()
+        before, cost, elsewhere = (dict(paths.solved), self.worlds[component]), paths.cost, np.inf
+        for shift in _ELSEWHERE_M if not believed else ():
+            added, fitting = self._try(model.shifted(shift), component, paths, solve, cost)
+            elsewhere = min(elsewhere, added if fitting > 0 else np.inf)
+            paths.solved, self.worlds[component] = dict(before[0]), before[1]
+        added, fitting = self._try(model, component, paths, solve, cost)
+        is_right = added <= _MOST_COST and fitting >= _LEAST_FITTING
+        is_sure = believed or 0.5 * heights.tested * (elsewhere - added) >= _EVIDENCE
+        heights.fits = is_sure or None if is_right else False
+        if not heights.fits:
+            paths.solved, self.worlds[component] = dict(before[0]), before[1]
+            solve()
+
+    def _try(
+        self, model: ElevationModel, component: int, paths: Paths, solve: Callable[[], None], cost: float
+    ) -> tuple[float, float]:
+        """Solve with the heights of a model; returns what each costs, and the share of them that fit."""
+        heights, given = self._heights[component], self._model
+        heights.fits, self._rounds, self._model = True, _TEST_ROUNDS, model
+        try:
+            solve()
+            return 2 * (paths.cost - cost) / len(heights.misfits), self._fitting(model, component, paths)
+        except GraphError:
+            return np.inf, 0.0
+        finally:
+            heights.fits, self._rounds, self._model = False, _ROUNDS, given
+
+    def _fitting(self, model: ElevationModel, component: int, paths: Paths) -> float:
+        """Measure all heights against the map; returns the share that fit, 0 where the model covers less than half."""
+        heights, poses = self._heights[component], list[Array]()
+        keys = sorted(heights.misfits)
+        for session in sorted({session for session, _ in keys}):
+            stamps = np.array([stamp for own, stamp in keys if own == session], np.int64)
+            poses.append(self.worlds[component] @ paths.at(paths.chains[session].at(stamps)))
+        missed, sigmas, known = model.misfits(np.concatenate(poses), self._has_gnss(component, paths))
+        ratios = np.where(known, np.abs(missed) / sigmas, np.nan)
+        heights.misfits.update(zip(keys, zip(ratios.tolist(), np.abs(missed).tolist(), strict=True), strict=True))
+        return float((ratios[known] <= _HEIGHT_GATE).mean()) if 2 * known.sum() >= len(known) else 0.0
+
+    def _planes(self, poses: Array, rows: list[int], is_free: bool) -> Factors:
+        """Factors of the ground under rows of world poses (N, 4, 4)."""
+        assert self._model is not None
+        gate = np.inf if self._rounds == _TEST_ROUNDS else _HEIGHT_GATE  # in a test the ground may be far below
+        planes = self._model.planes(poses[rows], is_free, gate)
+        return [(row, make) for row, make in zip(rows, planes, strict=True) if make is not None]
+
+    def _begin_at(self, start: Array, model: ElevationModel, component: int, paths: Paths) -> None:
+        """Say how a component lies in the world by x, y and heading of its first pose; gravity may have levelled it."""
+        chain = paths.chains[component]
+        first = paths.at(chain.at(chain.stamps[:1]))[0]
+        level = self.worlds.get(component, np.eye(4))
+        turn = turned(np.eye(3), np.deg2rad(start[2]) - float(heading(level @ first))).T @ level[:3, :3]
+        height = np.nan_to_num(model.at(start[None, :2])[0][0])
+        self.worlds[component] = make_pose(turn, np.array([*start[:2], height]) - turn @ first[:3, 3])
+
+
+def _finished(chain: Chain) -> tuple[int, int]:
+    """Number of the finished stretches of a session, and the stamp at the end of the last."""
+    cell = int(chain.travel[-1] // STRETCH_M)
+    return cell, int(chain.stamps[np.searchsorted(chain.travel, cell * STRETCH_M)])
+
+
+def _middle(chain: Chain, cell: int) -> Rows:
+    """(1,) stamp of the keyframe in the middle of a stretch."""
+    row = min(int(np.searchsorted(chain.travel, (cell + 0.5) * STRETCH_M)), len(chain.travel) - 1)
+    return chain.stamps[row : row + 1]
+
+
+def _first_pose_noise(pose: Array, sources: set[Source]) -> gtsam.noiseModel.Base:
+    """Noise of the first pose of a component, which some sources leave where it is and others find out."""
+    tilt, turn, across, up = _START_RAD, _FIXED, _FIXED, _FIXED
+    if Source.ELEVATION in sources:
+        turn, across, up = _START_RAD, _START_M, _FREE
+    if Source.GNSS in sources:
+        turn, across, up = 10 * _START_RAD, _FREE, _FREE
+    if sources & {Source.GNSS, Source.GRAVITY}:
+        tilt = 10 * _START_RAD
+    axes = np.kron(np.eye(2), pose[:3, :3].T)  # from those of the world to those of the body
+    covariance = axes @ np.diag(np.square([tilt, tilt, turn, across, across, up])) @ axes.T
+    return gtsam.noiseModel.Gaussian.Covariance(0.5 * (covariance + covariance.T))
+
+
+def _upright(up: Array) -> Array:
+    """(4, 4) rotation that turns a direction to the vertical, on the shortest way."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    angle = np.arctan2(sine, up[2])
+    return make_pose(gtsam.Rot3.Expmap(axis / max(sine, 1e-12) * angle).matrix(), np.zeros(3))
