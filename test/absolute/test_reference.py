@@ -18,7 +18,7 @@ from umf_ros.durable_graph import JOURNAL, DurableGraph
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, AbsoluteWorld, open_ground
 from umf_ros.pose_graph.backend import PoseGraph
 
-WORLD = open_ground(10_004, 400.0)
+WORLD = open_ground(10_000, 500.0)
 ORIGIN = " ".join(map(str, WORLD.origin))
 BASE = PoseGraphSettings(odometry_sigma_m=0.03, odometry_sigma_deg=0.1, max_gap_s=1.5, keyframe_spacing_m=0.5)
 

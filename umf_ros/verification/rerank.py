@@ -195,8 +195,8 @@ def _by_ransac(query: Keyframe, candidate: Candidate, match: Keyframe, settings:
     image_pairs, image = _explain(ours.image, theirs.image, fit_homography, reach, settings)
     cloud_pairs, cloud = _explain(ours.cloud, theirs.cloud, fit_rigid, const.POINT_THRESHOLD_M, settings)
     ratio = score(candidate.similarity, {settings.features: image, "cloud": cloud})
-    counts = {"inliers_image": float(image or 0), "inliers_cloud": float(cloud or 0), "superfeatures": 0.0}
-    return replace(candidate, **counts, image_pairs=image_pairs, cloud_pairs=cloud_pairs, score=ratio)
+    found = replace(candidate, image_pairs=image_pairs, cloud_pairs=cloud_pairs, score=ratio)
+    return replace(found, inliers_image=float(image or 0), inliers_cloud=float(cloud or 0), superfeatures=0.0)
 
 
 def _explain(
