@@ -86,9 +86,10 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
         as well, 1 when all others fit so much worse that the pose is known. NaN where there is no passage.
     """
     way, theirs = passage_direction(match), passage_direction(query)
-    if way is None and theirs is None:
+    if way is None and theirs is not None:
+        way = pose[:3, :3] @ theirs
+    if way is None:
         return float("nan")
-    way = pose[:3, :3] @ theirs if way is None else way
     shifted = _shifted(pose, way, np.concatenate([const.RIVAL_NEAR_M, const.PASSAGE_FAR_M]))
     fits = _surface_misfit(match, query, np.stack([pose, *shifted, *_other_peaks(match, query, pose)]))
     rival = float(fits[1:].min() - fits[0]) / const.PASSAGE_RIVAL

@@ -28,15 +28,12 @@ from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Candidate, Frame, Keyframe
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import write_atomically
-from umf_ros.core.resources import find
 from umf_ros.embedding.embedder import FeatureRequest
-from umf_ros.embedding.local_features import WEIGHTS, XFeatExtractor
-from umf_ros.embedding.runtimes import make_runtime
+from umf_ros.embedding.local_features import WithXFeat
 from umf_ros.embedding.umf import make
 from umf_ros.lab.evaluation.places import PlaceSet, read_place_sets, read_set
 from umf_ros.lab.evaluation.retrieval import THESIS_RULE, TOP_K, Mask, RetrievalTask, as_keyframe, place_recognition
 from umf_ros.lab.evaluation.worlds import FIRST, QUICK, REVISIT, TestWorld
-from umf_ros.networks.config import XFEAT_OUTPUTS
 from umf_ros.verification.rerank import log_ratio, rerank
 
 SEEDS = (*range(5000, 5016), *range(10000, 10008))
@@ -113,9 +110,9 @@ class ExampleMaker:
     """Embeds frames with every feature type, and counts what their candidates share."""
 
     def __init__(self) -> None:
-        settings, weights = EmbeddingSettings(), find(WEIGHTS)
+        settings = EmbeddingSettings()
         self._umf = make(settings, FeatureRequest(image=True, supers=True))
-        self._xfeat = XFeatExtractor(weights, make_runtime(weights, settings, XFEAT_OUTPUTS))
+        self._with_xfeat = WithXFeat(self._umf, settings)
 
     def of_world(self, seed: int) -> Examples:
         """Examples of the second pass of a world."""
@@ -136,7 +133,7 @@ class ExampleMaker:
 
     def _examples(self, name: str, simulated: bool, frames: list[Frame], task: RetrievalTask, near: Mask) -> Examples:
         own = [as_keyframe(frame, self._umf.embed(frame)) for frame in frames]
-        others = [self._with_xfeat(*pair) for pair in zip(frames, own, strict=True)]
+        others = [as_keyframe(frame, self._with_xfeat.embed(frame)) for frame in frames]
         descriptors = np.stack([one.embedding.descriptor for one in own])
         similarity = descriptors[task.queries] @ descriptors[task.references].T
         best = np.argsort(-similarity, axis=1, kind="stable")[:, :TOP_K]
@@ -149,11 +146,6 @@ class ExampleMaker:
         right, close = (np.take_along_axis(mask, best, axis=1) for mask in (task.positive, near))
         chosen = np.take_along_axis(similarity, best, axis=1)
         return Examples(name, simulated, chosen, right, ~right & ~close, counts)
-
-    def _with_xfeat(self, frame: Frame, keyframe: Keyframe) -> Keyframe:
-        if frame.left is None:
-            return keyframe
-        return replace(keyframe, embedding=replace(keyframe.embedding, image=self._xfeat.extract(frame.left)))
 
 
 def _counts(name: str, query: Keyframe, matches: list[Keyframe]) -> Array:
