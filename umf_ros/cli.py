@@ -29,7 +29,7 @@ COMMANDS = {
     "report": "umf_ros.lab.commands.report",
     "evaluate": "umf_ros.lab.commands.evaluate",
     "why": "umf_ros.lab.commands.report:why",
-    "explain": "umf_ros.lab.commands.explain",
+    "explain": "umf_ros.lab.commands.compare:explain",
     "train": "umf_ros.lab.commands.train",
     "export": "umf_ros.lab.commands.export",
     "bench": "umf_ros.lab.commands.bench:app",

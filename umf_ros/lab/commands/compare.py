@@ -1,4 +1,4 @@
-"""`umf compare`: whether two views show the same place."""
+"""`umf compare` and `umf explain`: whether two views show the same place, and a picture of why."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.commands.recordings import ConfigPath, DatasetName, EmbedderName, WeightsPath
-from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, writing
+from umf_ros.commands.recordings import BagPath, ConfigPath, DatasetName, EmbedderName, WeightsPath, open_recording
+from umf_ros.core.errors import BagError, ConfigError, OutputError, UmfError, one_line, writing
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.lab.evaluation.comparison import Comparer, Pair, PlaceView, Row
+    from umf_ros.lab.evaluation.comparison import Comparer, Moment, Pair, PlaceView, Row
 
 Image = Annotated[Path | None, typer.Option(help="Image file; needs --calibration.", show_default=False)]
 ViewName = Annotated[
@@ -157,3 +157,50 @@ def _show(row: Row, as_json: bool) -> None:
             numbers = "  ".join(f"{name.removeprefix('sigma_')} {row[name]:.4f}" for name in names)
             typer.echo(f"  {title:15} {numbers}")
     typer.echo(f"  similarity {row['similarity']:.3f}, {row['milliseconds']:.0f} ms")
+
+
+def explain(
+    bag: BagPath,
+    query: Annotated[str, typer.Argument(help="The later moment: stamp in ns, or seconds from the start.")],
+    match: Annotated[str, typer.Argument(help="The earlier moment, likewise.")],
+    out: Annotated[Path, typer.Option(help="Picture to write.")] = Path("explanation.png"),
+    config: ConfigPath = None,
+    dataset: DatasetName = "auto",
+    embedder: EmbedderName = None,
+    weights: WeightsPath = None,
+) -> None:
+    """Show both images with their matching features, both scans aligned, and the decision's numbers."""
+    from rich.console import Console
+
+    from umf_ros.bags.frames import FrameReader
+    from umf_ros.detector import make_detector_embedder, make_keyframe
+    from umf_ros.lab.evaluation import comparison
+
+    console = Console()
+    moments = [_moment(text) for text in (query, match)]
+    recording, settings = open_recording(bag, config, dataset, embedder, weights)
+    network = make_detector_embedder(settings)
+    with console.status("looking for the two moments"):
+        found = comparison.nearest_frames(FrameReader(recording, settings), moments)
+    frames = []
+    for one in found:
+        if isinstance(one, BagError):
+            raise one
+        frames.append(one)
+    query_keyframe, match_keyframe = (make_keyframe(frame, network) for frame in frames)
+    explanation = comparison.explain(query_keyframe, match_keyframe, settings.verification)
+    comparison.draw(explanation, frames[0].left, frames[1].left, out)
+    console.print(explanation.verdict, highlight=False)
+    if explanation.best is not None:
+        for name, value in explanation.best.measurements.items():
+            console.print(f"  {name:22} {value:.4g}", highlight=False)
+    console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _moment(text: str) -> Moment:
+    from umf_ros.lab.evaluation.comparison import parse_moment
+
+    try:
+        return parse_moment(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
