@@ -151,7 +151,7 @@ def test_what_is_not_python_is_installed_with_the_package(install: Path) -> None
 @pytest.mark.parametrize(
     ("wing", "lists"),
     [
-        ("runtime", ["dependencies", "fleet", "rerun"]),
+        ("runtime", ["dependencies", "elevation", "fleet", "rerun"]),
         ("lab", ["dependencies", "lab"]),
     ],
 )

@@ -122,6 +122,19 @@ def test_an_antenna_elsewhere_is_told() -> None:
     assert error_m(graph) <= 1.05 * error_m(drive([]))
 
 
+@pytest.mark.xfail(strict=True, reason="too few stretches with fixes: a mounting error is believed until it is known")
+def test_an_antenna_elsewhere_is_told_where_few_stretches_have_fixes() -> None:
+    # found in this world: 216 fixes are believed, and the map is 7 % worse than without them
+    world, graph = open_ground(10_004, 400.0), PoseGraph(BASE.model_copy(update={"origin": ORIGIN}))
+    for k, pose in enumerate(world.graph.odometry):
+        graph.add_odometry(k * PERIOD_NS, pose)
+    for one in of(Source.GNSS, world=world):
+        graph.add_absolute(replace(one, lever=np.array([1.7, -1.75, 1.1])))
+    graph.update()
+    graph.settle()
+    assert not states(graph, Source.GNSS)[State.ACCEPTED]
+
+
 def test_an_imu_that_is_turned_is_told() -> None:
     turn = Rotation.from_euler("y", 5, degrees=True).as_matrix()
     graph = drive([replace(one, value=turn @ one.value) for one in of(Source.GRAVITY)])

@@ -279,8 +279,7 @@ def open_ground(seed: int, length_m: float = 1500.0, lying: float = 0.2, cell_m:
     ends = [closure for closure in _true_closures(graph, rng, 8, 2.5) if closure.first < 40]
     graph = replace(graph, closures=ends)
     fixes, lies = _fixes(truth, rng, lying)
-    ups = _upward(truth, rng)
-    both = sorted([*zip(fixes, lies, strict=True), *((up, False) for up in ups)], key=lambda one: one[0].stamp_ns)
+    both = sorted([*zip(fixes, lies, strict=True), *_upward(truth, rng)], key=lambda one: one[0].stamp_ns)
     x, y = (np.arange(plan[:, axis].min() - 150, plan[:, axis].max() + 150, cell_m) for axis in (0, 1))
     heights = ground(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x))
     error = gaussian_filter(rng.normal(size=heights.shape), 15 / cell_m)
@@ -384,10 +383,13 @@ def _fixes(truth: Array, rng: np.random.Generator, lying: float) -> tuple[list[A
     return found, (np.linalg.norm(errors / _FIX_SIGMAS, axis=1) > 5)[heard]
 
 
-def _upward(truth: Array, rng: np.random.Generator) -> list[AbsoluteMeasurement]:
+def _upward(truth: Array, rng: np.random.Generator) -> list[tuple[AbsoluteMeasurement, bool]]:
+    """Upward directions, and whether each is wrong by more than five sigmas."""
     found = []
     for k in np.flatnonzero(np.arange(len(truth)) % 3 < 2).tolist():
         up = truth[k, 2, :3] + rng.normal(0, _UP_SIGMA, 3) + (rng.random() < 0.1) * rng.normal(0, 0.12, 3)
-        spread = _UP_SIGMA**2 * np.eye(3)
-        found.append(AbsoluteMeasurement(Source.GRAVITY, k * PERIOD_NS, up / np.linalg.norm(up), spread, np.zeros(3)))
+        up /= np.linalg.norm(up)
+        spread, angle = _UP_SIGMA**2 * np.eye(3), np.arccos(np.clip(up @ truth[k, 2, :3], -1, 1))
+        measurement = AbsoluteMeasurement(Source.GRAVITY, k * PERIOD_NS, up, spread, np.zeros(3))
+        found.append((measurement, bool(angle > 5 * _UP_SIGMA)))
     return found
