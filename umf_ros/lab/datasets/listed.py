@@ -113,7 +113,7 @@ KINDS: dict[str, type[ListEntry]] = {
 }
 
 
-class Source(Protocol):
+class TrainingData(Protocol):
     """Where training finds its sequences."""
 
     @property
@@ -142,7 +142,7 @@ class SequenceList:
         return self.worlds
 
 
-def open_source(path: Path) -> Source:
+def open_source(path: Path) -> TrainingData:
     """A folder of simulated worlds, or a YAML file that lists sequences.
 
     Raises:

@@ -24,7 +24,7 @@ from torch import nn
 from umf_ros.core.config import problems
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.io import read_values
-from umf_ros.lab.datasets.listed import Source, open_source
+from umf_ros.lab.datasets.listed import TrainingData, open_source
 from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.training.batches import made_ahead
 from umf_ros.lab.training.networks import RunSettings, read_card, write_settings
@@ -263,7 +263,7 @@ def train(settings: RunSettings, output: Path, resume: bool, report: Callable[[P
     return weights
 
 
-def _open_data(where: str) -> Source:
+def _open_data(where: str) -> TrainingData:
     """The training data; there is some."""
     source = open_source(Path(where))
     if not source.refresh():
@@ -287,7 +287,9 @@ def earlier_runs(start: str) -> list[dict[str, Any]]:
     return [*card.get("earlier_runs", []), {name: card.get(name) for name in told}]
 
 
-def _card(settings: RunSettings, name: str, network: nn.Module, data: Source, progress: Progress) -> dict[str, Any]:
+def _card(
+    settings: RunSettings, name: str, network: nn.Module, data: TrainingData, progress: Progress
+) -> dict[str, Any]:
     """Entries of every card; of folders and files only the names, in the command too."""
     words = [re.sub(r"[^=]*/", "", word.rstrip("/")) for word in sys.argv[1:]]
     said = settings.model_dump()
