@@ -62,7 +62,7 @@ FILES = {
     "requirements-dev.txt": Pinned(
         "dev",
         "everything, with tests, lint and packaging checks",
-        includes=tuple(f"requirements{part}.txt" for part in ("", "-ros", "-lab", "-rerun", "-fleet")),
+        includes=tuple(f"requirements{part}.txt" for part in ("", "-ros", "-lab", "-rerun", "-fleet", "-elevation")),
     ),
 }
 HEAD = "made by tools/requirements.py from pyproject.toml: "
