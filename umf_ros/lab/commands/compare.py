@@ -174,22 +174,23 @@ def explain(
 
     from umf_ros.bags.frames import FrameReader
     from umf_ros.detector import make_detector_embedder, make_keyframe
-    from umf_ros.lab.evaluation import comparison
+    from umf_ros.lab.evaluation.comparison import draw, nearest_frames
+    from umf_ros.lab.evaluation.comparison import explain as explained
 
     console = Console()
     moments = [_moment(text) for text in (query, match)]
     recording, settings = open_recording(bag, config, dataset, embedder, weights)
     network = make_detector_embedder(settings)
     with console.status("looking for the two moments"):
-        found = comparison.nearest_frames(FrameReader(recording, settings), moments)
+        found = nearest_frames(FrameReader(recording, settings), moments)
     frames = []
     for one in found:
         if isinstance(one, BagError):
             raise one
         frames.append(one)
     query_keyframe, match_keyframe = (make_keyframe(frame, network) for frame in frames)
-    explanation = comparison.explain(query_keyframe, match_keyframe, settings.verification)
-    comparison.draw(explanation, frames[0].left, frames[1].left, out)
+    explanation = explained(query_keyframe, match_keyframe, settings.verification)
+    draw(explanation, frames[0].left, frames[1].left, out)
     console.print(explanation.verdict, highlight=False)
     if explanation.best is not None:
         for name, value in explanation.best.measurements.items():
