@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
@@ -105,7 +106,8 @@ def read_drive(recording: Path, rover: Rover, seed: int, network: UMF) -> tuple[
     if not kept.exists():
         reader, sensors = DriveReader(network, settings), StrangeSensors(rover, seed)
         for item in FrameReader(bag, settings).stream():
-            reader.take(sensors.see(item) if isinstance(item, Frame) else item)
+            if not isinstance(item, AbsoluteMeasurement):
+                reader.take(sensors.see(item) if isinstance(item, Frame) else item)
         reader.finish().save(kept)
     drive, truth = Drive.load(kept), read_ground_truth(bag)
     assert truth is not None

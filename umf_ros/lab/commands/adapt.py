@@ -70,6 +70,7 @@ def _drive(
     bag: Path, network: UMF, weights: Path, config: Path | None, dataset: str, kept_in: Path, console: Console
 ) -> Drive:
     """The labels of one recording, from the folder if they are there."""
+    from umf_ros.absolute.measurement import AbsoluteMeasurement
     from umf_ros.commands.console import WARNING, FrameProgress
     from umf_ros.core.errors import writing
     from umf_ros.lab.fit.adaptation import Drive, DriveReader
@@ -85,7 +86,7 @@ def _drive(
     reader = DriveReader(network, settings)
     with FrameProgress(console) as progress:
         for item in frames.stream():
-            detection = reader.take(item)
+            detection = None if isinstance(item, AbsoluteMeasurement) else reader.take(item)
             if detection is not None:
                 progress.show(frames.progress, detection)
     drive = reader.finish()
