@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.absolute.measurement import AbsoluteMeasurement, Source
+from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError, OutputError, writing
 from umf_ros.core.frames import LoopClosure
@@ -29,7 +29,7 @@ _TABLES = (
 )
 _SCHEMA = Schema("pose graph", (_TABLES,), lambda tables: int({"event", "verdict"} <= tables))
 ODOMETRY, CLOSURE, REVOKED, STARTED, UNSETTLED = "odometry", "closure", "revoked", "started", "unsettled"
-_ABSOLUTE = (Source.GNSS.value, Source.GRAVITY.value)
+_ABSOLUTE = (Aid.GNSS.value, Aid.GRAVITY.value)
 # "decided" is of earlier versions
 _NUMBERS = {ODOMETRY: 16, CLOSURE: 53, REVOKED: 0, STARTED: 0, UNSETTLED: 0, "decided": 0}
 _NUMBERS |= dict.fromkeys(_ABSOLUTE, 15)

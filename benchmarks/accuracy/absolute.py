@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from umf_ros.absolute.measurement import AbsoluteMeasurement, Source
+from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.frames import State
 from umf_ros.core.geometry import Array, align, heading, transform
@@ -33,7 +33,7 @@ from umf_ros.pose_graph.backend import PoseGraph
 FIRST_SEED = 20_000
 # of odometry that is off by 1 to 2 % after 1.5 km, and a pose per second
 ODOMETRY = {"odometry_sigma_m": 0.03, "odometry_sigma_deg": 0.1, "max_gap_s": 1.5, "keyframe_spacing_m": 0.5}
-ALL = (Source.GRAVITY, Source.ELEVATION, Source.GNSS)
+ALL = (Aid.GRAVITY, Aid.ELEVATION, Aid.GNSS)
 
 
 class Drive:
@@ -64,20 +64,20 @@ class Drive:
 
     def run(
         self,
-        sources: tuple[Source, ...],
+        sources: tuple[Aid, ...],
         closures: bool = True,
         measurements: list[AbsoluteMeasurement] | None = None,
         **settings: Any,
     ) -> tuple[float, int, dict[str, object], Counter[str]]:
         """Error in metres, wrong measurements believed, counts, and reasons of what was not accepted."""
-        if Source.ELEVATION in sources:
+        if Aid.ELEVATION in sources:
             settings = {
                 "elevation_model": self.model,
                 "elevation_start": self.start(),
                 "elevation_sigma_m": 0.3,
                 **settings,
             }
-        if Source.GNSS in sources:
+        if Aid.GNSS in sources:
             settings = {"origin": " ".join(map(str, self._world.origin)), **settings}
         world, graph = self._world.graph, PoseGraph(PoseGraphSettings(**ODOMETRY | settings))
         waiting = [world.message(row) for row in range(len(world.closures))] if closures else []
@@ -106,14 +106,14 @@ class Drive:
         return error, sum(lie in believed for lie in lies), graph.reference.report(), reasons
 
 
-def altered(world: AbsoluteWorld, source: Source, **change: Any) -> list[AbsoluteMeasurement]:
+def altered(world: AbsoluteWorld, source: Aid, **change: Any) -> list[AbsoluteMeasurement]:
     return [replace(one, **change) if one.source is source else one for one in world.measurements]
 
 
 def tilted(world: AbsoluteWorld, degrees: float) -> list[AbsoluteMeasurement]:
     """The world's measurements by an IMU that is turned on the body."""
     turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
-    return [replace(one, value=turn @ one.value) if one.source is Source.GRAVITY else one for one in world.measurements]
+    return [replace(one, value=turn @ one.value) if one.source is Aid.GRAVITY else one for one in world.measurements]
 
 
 def measure(seed: int, quick: bool) -> dict[str, Any]:
@@ -143,23 +143,28 @@ def measure(seed: int, quick: bool) -> dict[str, Any]:
 
         row("odometry", (), closures=False)
         row("closures", ())
-        gravity = row("gravity", (Source.GRAVITY,))
-        elevation = row("elevation", (Source.GRAVITY, Source.ELEVATION))
+        gravity = row("gravity", (Aid.GRAVITY,))
+        elevation = row("elevation", (Aid.GRAVITY, Aid.ELEVATION))
         row("gnss", ALL)
-        row("elevation_alone", (Source.ELEVATION,), closures=False)
-        gnss_alone = row("gnss_alone", (Source.GNSS,), closures=False)
+        row("elevation_alone", (Aid.ELEVATION,), closures=False)
+        gnss_alone = row("gnss_alone", (Aid.GNSS,), closures=False)
         first = world.graph.truth[0]
         far = f"{first[0, 3] + 60:.2f} {first[1, 3] + 40:.2f} {np.degrees(heading(first)) + 40:.2f}"
-        pair("model", gravity, (Source.GRAVITY, Source.ELEVATION), elevation_model=drive.wrong_model(seed))
-        pair("start", gravity, (Source.GRAVITY, Source.ELEVATION), elevation_start=far)
+        pair(
+            "model",
+            gravity,
+            (Aid.GRAVITY, Aid.ELEVATION),
+            elevation_model=drive.wrong_model(seed),
+        )
+        pair("start", gravity, (Aid.GRAVITY, Aid.ELEVATION), elevation_start=far)
         off = world.origin + np.array([0.002, 0.002, 0.0])
-        gravity_gnss = row("gravity_gnss", (Source.GRAVITY, Source.GNSS))
+        gravity_gnss = row("gravity_gnss", (Aid.GRAVITY, Aid.GNSS))
         pair("origin", gravity_gnss, ALL, origin=" ".join(map(str, off)), elevation_start="")
-        lever = altered(world, Source.GNSS, lever=np.array([1.7, -1.75, 1.1]))
+        lever = altered(world, Aid.GNSS, lever=np.array([1.7, -1.75, 1.1]))
         pair("lever_arm", elevation, ALL, measurements=lever)
-        pair("lever_arm_alone", figures["ate_closures_m"], (Source.GNSS,), measurements=lever)
-        pair("gravity", figures["ate_closures_m"], (Source.GRAVITY,), measurements=tilted(world, 5.0))
-        pair("gravity_gnss", gnss_alone, (Source.GRAVITY, Source.GNSS), measurements=tilted(world, 5.0))
+        pair("lever_arm_alone", figures["ate_closures_m"], (Aid.GNSS,), measurements=lever)
+        pair("gravity", figures["ate_closures_m"], (Aid.GRAVITY,), measurements=tilted(world, 5.0))
+        pair("gravity_gnss", gnss_alone, (Aid.GRAVITY, Aid.GNSS), measurements=tilted(world, 5.0))
     return figures
 
 

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
@@ -54,7 +55,7 @@ from umf_ros.sensors.sessions import OdometrySessionSplitter
 WITHIN_KEYFRAMES = 20
 WRONG_M, WRONG_DEG = 1.0, 5.0
 OVERLAP_M = 20.0
-Stream = list[Frame | OdometrySample]
+Stream = list[Frame | OdometrySample | AbsoluteMeasurement]
 
 
 @dataclass(frozen=True)
@@ -189,6 +190,7 @@ def wake(
         if isinstance(item, OdometrySample):
             feed.take(item.stamp_ns, item.odom_T_body)
             continue
+        assert isinstance(item, Frame)  # localising uses no absolute measurements
         detection = detector.process(item)
         keyframes += detection.keyframe is not None
         for closure in detection.closures:

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu, NavSatFix
 
-from umf_ros.absolute.measurement import AbsoluteDecoder, AbsoluteMeasurement, Source, from_enu, parse_numbers, to_enu
+from umf_ros.absolute.measurement import (
+    AbsoluteDecoder,
+    AbsoluteMeasurement,
+    Aid,
+    from_enu,
+    parse_numbers,
+    to_enu,
+)
 from umf_ros.core.errors import ConfigError, MessageError
 from umf_ros.core.geometry import from_quaternion, make_pose
 
@@ -43,11 +50,11 @@ def test_positions_go_to_the_world_and_back() -> None:
 
 
 def test_a_fix_has_the_lever_of_the_calibration_or_of_the_transforms() -> None:
-    found = DECODER.decode(Source.GNSS, fix(), 5)
+    found = DECODER.decode(Aid.GNSS, fix(), 5)
     assert found is not None and np.allclose(found.lever, [0.1, 0.2, 1.0]) and found.covariance[2, 2] == 4.0
     message = fix()
     message.header.frame_id = "mast"
-    assert np.allclose(DECODER.decode(Source.GNSS, message, 5).lever, [0, 0, 2])
+    assert np.allclose(DECODER.decode(Aid.GNSS, message, 5).lever, [0, 0, 2])
 
 
 @pytest.mark.parametrize(
@@ -60,7 +67,7 @@ def test_a_fix_has_the_lever_of_the_calibration_or_of_the_transforms() -> None:
 )
 def test_an_unusable_fix_is_refused(message: NavSatFix, kind: str) -> None:
     with pytest.raises(MessageError) as error:
-        DECODER.decode(Source.GNSS, message, 5)
+        DECODER.decode(Aid.GNSS, message, 5)
     assert error.value.kind == kind
 
 
@@ -68,12 +75,12 @@ def test_a_receiver_without_a_fix_is_refused() -> None:
     message = fix()
     message.status.status = -1
     with pytest.raises(MessageError, match="no fix"):
-        DECODER.decode(Source.GNSS, message, 5)
+        DECODER.decode(Aid.GNSS, message, 5)
 
 
 def test_gravity_is_the_mean_acceleration_at_rest() -> None:
     decoder = AbsoluteDecoder(np.zeros(3), TURNED, lambda _: None)
-    found = [decoder.decode(Source.GRAVITY, imu((0.5, 0.0, 9.79)), k * 20_000_000) for k in range(100)]
+    found = [decoder.decode(Aid.GRAVITY, imu((0.5, 0.0, 9.79)), k * 20_000_000) for k in range(100)]
     given = [one for one in found if one is not None]
     assert 1 <= len(given) <= 2
     # the IMU is turned by a quarter: its x is the body's y
@@ -84,24 +91,24 @@ def test_gravity_is_the_mean_acceleration_at_rest() -> None:
 def test_a_moving_imu_says_nothing_of_gravity(force: tuple[float, float, float], rate: float) -> None:
     decoder = AbsoluteDecoder(np.zeros(3), np.eye(4), lambda _: None)
     swings = [imu(force, rate * (-1) ** k) for k in range(100)]
-    assert not any(decoder.decode(Source.GRAVITY, one, k * 20_000_000) for k, one in enumerate(swings))
+    assert not any(decoder.decode(Aid.GRAVITY, one, k * 20_000_000) for k, one in enumerate(swings))
 
 
 def test_an_orientation_is_gravity_twice_per_second() -> None:
     decoder = AbsoluteDecoder(np.zeros(3), np.eye(4), lambda _: None)
     message = Imu()
     message.orientation.x, message.orientation.w = np.sin(0.05), np.cos(0.05)
-    given = [one for k in range(200) if (one := decoder.decode(Source.GRAVITY, message, k * 10_000_000)) is not None]
+    given = [one for k in range(200) if (one := decoder.decode(Aid.GRAVITY, message, k * 10_000_000)) is not None]
     assert len(given) == 4 and np.allclose(given[0].value, [0, np.sin(0.1), np.cos(0.1)])
     message.orientation.w = 5.0
     with pytest.raises(MessageError, match="orientation"):
-        decoder.decode(Source.GRAVITY, message, 10**10)
+        decoder.decode(Aid.GRAVITY, message, 10**10)
 
 
 def test_a_measurement_survives_storage() -> None:
-    one = AbsoluteMeasurement(Source.GNSS, 7, np.arange(3.0), np.eye(3), np.array([0.1, 0, 1]))
+    one = AbsoluteMeasurement(Aid.GNSS, 7, np.arange(3.0), np.eye(3), np.array([0.1, 0, 1]))
     again = AbsoluteMeasurement.stored("gnss", 7, one.numbers)
-    assert again.source is Source.GNSS and np.array_equal(again.numbers, one.numbers)
+    assert again.source is Aid.GNSS and np.array_equal(again.numbers, one.numbers)
     with pytest.raises(ValueError, match="4 numbers"):
         AbsoluteMeasurement.stored("gnss", 7, np.zeros(4))
 

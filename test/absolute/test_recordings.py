@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from recordings import START_NS, small_settings, traverse, write_mcap
 
-from umf_ros.absolute.measurement import AbsoluteMeasurement, Source
+from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import AbsoluteTopics, Settings
@@ -41,10 +41,8 @@ def test_a_recording_gives_fixes_and_gravity_where_they_are_named(tmp_path: Path
     bag, told = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), list[str]()
     reader = FrameReader(bag, with_topics(tmp_path, gnss="/gnss/fix", imu="/imu/data"), warn=told.append)
     found = [item for item in reader.stream() if isinstance(item, AbsoluteMeasurement)]
-    assert [one.stamp_ns for one in found if one.source is Source.GNSS] == [
-        START_NS + k * 500_000_000 for k in range(6)
-    ]
-    up = [one.value for one in found if one.source is Source.GRAVITY]
+    assert [one.stamp_ns for one in found if one.source is Aid.GNSS] == [START_NS + k * 500_000_000 for k in range(6)]
+    up = [one.value for one in found if one.source is Aid.GRAVITY]
     assert 2 <= len(up) <= 3 and np.allclose(np.linalg.norm(up, axis=1), 1) and not told
     off = FrameReader(bag, small_settings(tmp_path))
     assert not any(isinstance(item, AbsoluteMeasurement) for item in off.stream())
@@ -67,7 +65,7 @@ def test_a_topic_that_is_not_there_is_one_line_with_the_others(tmp_path: Path) -
 
 
 def test_the_file_of_a_run_feeds_a_graph_with_them_in_order(tmp_path: Path) -> None:
-    fix = AbsoluteMeasurement(Source.GNSS, START_NS + 1, PLACE, np.eye(3), np.zeros(3))
+    fix = AbsoluteMeasurement(Aid.GNSS, START_NS + 1, PLACE, np.eye(3), np.zeros(3))
     with closing(RunFile(tmp_path)) as file:
         for number in range(4):
             file.append_odometry(number, StoredOdometry(START_NS + number * 10**9, np.eye(4)))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteReason, Source, read_verdict_counts
+from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteReason, Aid, read_verdict_counts
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.frames import State
 from umf_ros.core.geometry import align, heading, transform
@@ -23,7 +23,7 @@ ORIGIN = " ".join(map(str, WORLD.origin))
 BASE = PoseGraphSettings(odometry_sigma_m=0.03, odometry_sigma_deg=0.1, max_gap_s=1.5, keyframe_spacing_m=0.5)
 
 
-def of(*sources: Source, world: AbsoluteWorld = WORLD) -> list[AbsoluteMeasurement]:
+def of(*sources: Aid, world: AbsoluteWorld = WORLD) -> list[AbsoluteMeasurement]:
     return [one for one in world.measurements if one.source in sources]
 
 
@@ -48,7 +48,7 @@ def error_m(graph: PoseGraph) -> float:
     )
 
 
-def states(graph: PoseGraph, source: Source) -> Counter[State]:
+def states(graph: PoseGraph, source: Aid) -> Counter[State]:
     return Counter(one.state for one in graph.reference.verdicts() if one.source is source)
 
 
@@ -70,13 +70,13 @@ def start(off: tuple[float, float, float] = (0, 0, 0)) -> str:
 
 
 def test_fixes_hold_the_map_in_the_world_and_no_lie_is_believed(plain_m: float) -> None:
-    graph = drive(of(Source.GNSS), closures=False, origin=ORIGIN)
+    graph = drive(of(Aid.GNSS), closures=False, origin=ORIGIN)
     assert error_m(graph) < 0.6 * plain_m
     believed = {one.stamp_ns for one in graph.reference.verdicts() if one.state is State.ACCEPTED}
     both = zip(WORLD.measurements, WORLD.lies, strict=True)
-    lies = [one.stamp_ns for one, lie in both if lie and one.source is Source.GNSS]
+    lies = [one.stamp_ns for one, lie in both if lie and one.source is Aid.GNSS]
     assert len(lies) > 40 and not believed & set(lies)
-    assert len(believed) > 0.6 * (len(of(Source.GNSS)) - len(lies))
+    assert len(believed) > 0.6 * (len(of(Aid.GNSS)) - len(lies))
     # the world is where it is, and the map begins where the odometry does
     stamps, poses = graph.trajectory()
     there = graph.reference.worlds[0] @ poses
@@ -85,13 +85,13 @@ def test_fixes_hold_the_map_in_the_world_and_no_lie_is_believed(plain_m: float) 
 
 
 def test_the_origin_is_that_of_the_first_fixes_without_a_parameter() -> None:
-    graph = drive(of(Source.GNSS)[:80], closures=False)
+    graph = drive(of(Aid.GNSS)[:80], closures=False)
     assert graph.reference.origin is not None and np.allclose(graph.reference.origin[:2], WORLD.origin[:2], atol=0.01)
-    assert states(graph, Source.GNSS)[State.ACCEPTED] > 30
+    assert states(graph, Aid.GNSS)[State.ACCEPTED] > 30
 
 
 def test_late_measurements_lead_to_the_same_decisions() -> None:
-    fixes = of(Source.GNSS, Source.GRAVITY)
+    fixes = of(Aid.GNSS, Aid.GRAVITY)
     in_order = drive(fixes, origin=ORIGIN)
     late = drive([], origin=ORIGIN)
     for one in np.random.default_rng(1).permutation(len(fixes)):
@@ -107,15 +107,15 @@ def test_late_measurements_lead_to_the_same_decisions() -> None:
 
 
 def test_lies_alone_are_never_believed() -> None:
-    rng, fixes = np.random.default_rng(2), of(Source.GNSS)
+    rng, fixes = np.random.default_rng(2), of(Aid.GNSS)
     wild = [replace(one, value=one.value + rng.normal(0, [3e-4, 3e-4, 20])) for one in fixes]
     graph = drive(wild, origin=ORIGIN)
-    assert not states(graph, Source.GNSS)[State.ACCEPTED]
+    assert not states(graph, Aid.GNSS)[State.ACCEPTED]
     assert error_m(graph) == pytest.approx(error_m(drive([])), rel=0.02)
 
 
 def test_an_antenna_elsewhere_is_told() -> None:
-    wrong = [replace(one, lever=np.array([2.2, -2.0, 1.0])) for one in of(Source.GNSS)]
+    wrong = [replace(one, lever=np.array([2.2, -2.0, 1.0])) for one in of(Aid.GNSS)]
     graph = drive(wrong, origin=ORIGIN)
     assert {one.reason for one in graph.reference.verdicts()} == {AbsoluteReason.MOUNTING}
     assert "antenna off by" in str(graph.reference.report()["gnss rejected as a whole"])
@@ -128,24 +128,24 @@ def test_an_antenna_elsewhere_is_told_where_few_stretches_have_fixes() -> None:
     world, graph = open_ground(10_004, 400.0), PoseGraph(BASE.model_copy(update={"origin": ORIGIN}))
     for k, pose in enumerate(world.graph.odometry):
         graph.add_odometry(k * PERIOD_NS, pose)
-    for one in of(Source.GNSS, world=world):
+    for one in of(Aid.GNSS, world=world):
         graph.add_absolute(replace(one, lever=np.array([1.7, -1.75, 1.1])))
     graph.update()
     graph.settle()
-    assert not states(graph, Source.GNSS)[State.ACCEPTED]
+    assert not states(graph, Aid.GNSS)[State.ACCEPTED]
 
 
 def test_an_imu_that_is_turned_is_told() -> None:
     turn = Rotation.from_euler("y", 5, degrees=True).as_matrix()
-    graph = drive([replace(one, value=turn @ one.value) for one in of(Source.GRAVITY)])
-    assert not states(graph, Source.GRAVITY)[State.ACCEPTED]
+    graph = drive([replace(one, value=turn @ one.value) for one in of(Aid.GRAVITY)])
+    assert not states(graph, Aid.GRAVITY)[State.ACCEPTED]
     assert "IMU off by" in str(graph.reference.report()["gravity rejected as a whole"])
     assert error_m(graph) <= 1.05 * error_m(drive([]))
 
 
 def test_gravity_levels_the_world_and_leaves_the_heading(plain_m: float) -> None:
-    graph = drive(of(Source.GRAVITY), closures=False)
-    assert states(graph, Source.GRAVITY)[State.ACCEPTED] > 150
+    graph = drive(of(Aid.GRAVITY), closures=False)
+    assert states(graph, Aid.GRAVITY)[State.ACCEPTED] > 150
     stamps, poses = graph.trajectory()
     up = (graph.reference.worlds[0] @ poses)[:, 2, :3]
     tilt = np.degrees(np.arccos(np.clip((up * WORLD.graph.truth[stamps // PERIOD_NS][:, 2, :3]).sum(axis=1), -1, 1)))
@@ -157,28 +157,28 @@ def test_gravity_levels_the_world_and_leaves_the_heading(plain_m: float) -> None
 
 def test_heights_shorten_the_drift(model: str, plain_m: float) -> None:
     graph = drive([], closures=False, elevation_model=model, elevation_start=start((1, -1, 1)), elevation_sigma_m=0.3)
-    assert states(graph, Source.ELEVATION)[State.ACCEPTED] > 30
+    assert states(graph, Aid.ELEVATION)[State.ACCEPTED] > 30
     assert error_m(graph) < 0.8 * plain_m
 
 
 @pytest.mark.parametrize("off", [(70.0, 30.0, 40.0), (-40.0, 60.0, 0.0)])
 def test_a_wrong_start_is_refused(model: str, off: tuple[float, float, float]) -> None:
     given = {"elevation_model": model, "elevation_start": start(off), "elevation_sigma_m": 0.3}
-    graph = drive(of(Source.GRAVITY), **given)
-    assert not states(graph, Source.ELEVATION)[State.ACCEPTED]
-    assert error_m(graph) <= 1.05 * error_m(drive(of(Source.GRAVITY)))
+    graph = drive(of(Aid.GRAVITY), **given)
+    assert not states(graph, Aid.ELEVATION)[State.ACCEPTED]
+    assert error_m(graph) <= 1.05 * error_m(drive(of(Aid.GRAVITY)))
 
 
 def test_another_origin_moves_the_world_off_the_model(model: str) -> None:
     moved = " ".join(map(str, WORLD.origin + np.array([0.002, 0.002, 0.0])))
-    graph = drive(of(Source.GNSS), origin=moved, elevation_model=model, elevation_sigma_m=0.3)
-    assert states(graph, Source.GNSS)[State.ACCEPTED] > 150 and not states(graph, Source.ELEVATION)[State.ACCEPTED]
+    graph = drive(of(Aid.GNSS), origin=moved, elevation_model=model, elevation_sigma_m=0.3)
+    assert states(graph, Aid.GNSS)[State.ACCEPTED] > 150 and not states(graph, Aid.ELEVATION)[State.ACCEPTED]
 
 
 def test_a_restart_knows_all_measurements(tmp_path: Path) -> None:
     settings = BASE.model_copy(update={"origin": ORIGIN})
     faults: list[Exception] = []
-    durable, waiting = DurableGraph(settings, tmp_path / JOURNAL, faults.append), of(Source.GNSS)
+    durable, waiting = DurableGraph(settings, tmp_path / JOURNAL, faults.append), of(Aid.GNSS)
     for k, pose in enumerate(WORLD.graph.odometry[:150]):
         durable.take_odometry(k * PERIOD_NS, pose)
         while waiting and waiting[0].stamp_ns <= k * PERIOD_NS:
@@ -196,6 +196,6 @@ def test_a_restart_knows_all_measurements(tmp_path: Path) -> None:
 
 
 def test_an_unusable_measurement_is_refused() -> None:
-    bad = AbsoluteMeasurement(Source.GNSS, 5, np.array([np.nan, 0, 0]), np.eye(3), np.zeros(3))
+    bad = AbsoluteMeasurement(Aid.GNSS, 5, np.array([np.nan, 0, 0]), np.eye(3), np.zeros(3))
     graph = drive([bad, bad], closures=False)
     assert [one.state for one in graph.reference.verdicts()] == [State.REFUSED]

@@ -25,7 +25,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from umf_ros.absolute.measurement import Source
+from umf_ros.absolute.measurement import Aid
 from umf_ros.core.geometry import Array
 from umf_ros.lab.datasets.g2o import read_g2o
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, open_ground, rover_loops, with_wrong_closures
@@ -368,7 +368,7 @@ def test_fixes_over_dds_are_decided_about_and_told(ros_context: None, tmp_path: 
     try:
         process.wait_for("ready")
         rig.until(lambda: rig.odometry.get_subscription_count() and fixes.get_subscription_count())
-        given = {one.stamp_ns // PERIOD_NS: one for one in world.measurements if one.source is Source.GNSS}
+        given = {one.stamp_ns // PERIOD_NS: one for one in world.measurements if one.source is Aid.GNSS}
         for k in range(len(world.graph.truth)):
             rig.drive(k, k + 1)
             if k in given:

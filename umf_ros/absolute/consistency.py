@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteReason, AbsoluteVerdict, Source
+from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteReason, AbsoluteVerdict, Aid
 from umf_ros.core.frames import State
 from umf_ros.core.geometry import Array, invert, make_pose
 from umf_ros.core.odometry_noise import OdometryNoise
@@ -42,7 +42,7 @@ _MOST_DRIFT_M = 2000
 _ALIGNED_STRETCHES = 40
 _FEW_STRETCHES = 15
 # by hand: mounting errors that matter, and how well they must be known: m for an antenna, rad for an IMU
-_MOUNTING = {Source.GNSS: (0.5, 1.0), Source.GRAVITY: (np.deg2rad(2.5), np.deg2rad(1.0))}
+_MOUNTING = {Aid.GNSS: (0.5, 1.0), Aid.GRAVITY: (np.deg2rad(2.5), np.deg2rad(1.0))}
 _LEAST_SIGMA_M = 0.05
 _STEP = np.log(1.2)
 
@@ -165,7 +165,7 @@ class Factor(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Path:
+class MeasuredPath:
     """The path at N measurements, and where its stretches are.
 
     Attributes:
@@ -194,7 +194,7 @@ class _Stretches:
     travel: Array
 
     @classmethod
-    def of(cls, values: Array, variances: Array, path: Path) -> _Stretches:
+    def of(cls, values: Array, variances: Array, path: MeasuredPath) -> _Stretches:
         """Averages of (N, 3) values over the finished stretches."""
         cells = (path.travel // STRETCH_M).astype(int)
         names, first, counts = np.unique(cells, return_index=True, return_counts=True)
@@ -214,10 +214,10 @@ class Track:
         factors: what is accepted, by the number of the stretch.
     """
 
-    def __init__(self, source: Source, noise: OdometryNoise) -> None:
+    def __init__(self, source: Aid, noise: OdometryNoise) -> None:
         metres = np.arange(_MOST_DRIFT_M, dtype=float)
         self._source = source
-        self._drift = (position_drift if source is Source.GNSS else attitude_drift)(noise, metres)
+        self._drift = (position_drift if source is Aid.GNSS else attitude_drift)(noise, metres)
         self._measurements: list[AbsoluteMeasurement] = []
         self._decisions: list[Decision] = []
         self._misfits = self._distances = np.empty(0)
@@ -246,7 +246,7 @@ class Track:
         rows = zip(self._measurements, self._decisions, figures, strict=True)
         return [AbsoluteVerdict(one.source, one.stamp_ns, *decision, *figure) for one, decision, figure in rows]
 
-    def align(self, measured: Array, path: Path) -> Array | None:
+    def align(self, measured: Array, path: MeasuredPath) -> Array | None:
         """`world_T_map` by the newest stretches of (N, 3) positions; None where they do not tell."""
         mapped = path.poses[:, :3, 3] + apply(path.poses, self._levers)
         world, here = (_Stretches.of(points, self._variances, path) for points in (measured, mapped))
@@ -260,7 +260,7 @@ class Track:
             return None
         return make_pose(turned(np.eye(3), direction).T, np.median(ends[0] - turned(ends[1], direction), axis=0))
 
-    def judge(self, measured: Array, path: Path, in_world: bool) -> None:
+    def judge(self, measured: Array, path: MeasuredPath, in_world: bool) -> None:
         """Decide about all measurements; `measured` (N, 3) are positions in the world, or upward directions."""
         self.factors = {}
         if self.mounting is not None:
@@ -319,12 +319,12 @@ class Track:
         self._decisions = [decision] * len(self._measurements)
         self._misfits, self._distances = np.full((2, len(self._measurements)), np.nan)
 
-    def _drifting(self, measured: Array, path: Path) -> tuple[Array, Array]:
+    def _drifting(self, measured: Array, path: MeasuredPath) -> tuple[Array, Array]:
         """(N, 3) what drifts slowly, and the rotations (N, 3, 3) of the body with which an error of its mounting turns.
 
         Positions less those by dead reckoning with the attitudes of the map; directions by the odometry's attitudes.
         """
-        if self._source is Source.GRAVITY:
+        if self._source is Aid.GRAVITY:
             return apply(path.odometry, measured), path.odometry[:, :3, :3]
         steps = invert(path.odometry[:-1]) @ path.odometry[1:]
         walked = np.cumsum(np.concatenate([np.zeros((1, 3)), apply(path.poses[:-1], steps[:, :3, 3])]), axis=0)
@@ -334,7 +334,7 @@ class Track:
         """Whether a source may be accepted, by what its error does when the rover turns."""
         large, well_known = _MOUNTING[self._source]
         unknown = _AGREES  # an antenna that is off does little before the rover has turned
-        if self._source is Source.GRAVITY:
+        if self._source is Aid.GRAVITY:
             unknown = State.PENDING, AbsoluteReason.NOT_TURNED
         if members.sum() < _FEW_STRETCHES:
             return unknown
@@ -350,19 +350,19 @@ class Track:
             return _MOUNTED_WRONG
         return _AGREES
 
-    def _missed(self, measured: Array, path: Path) -> Array:
+    def _missed(self, measured: Array, path: MeasuredPath) -> Array:
         """(N, 3) by what the measurements miss the map."""
-        if self._source is Source.GRAVITY:
+        if self._source is Aid.GRAVITY:
             return apply(path.poses, measured) - [0.0, 0.0, 1.0]
         return measured - path.poses[:, :3, 3] - apply(path.poses, self._levers)
 
-    def _average(self, cell: int, rows: Rows, measured: Array, path: Path, scale: float) -> None:
+    def _average(self, cell: int, rows: Rows, measured: Array, path: MeasuredPath, scale: float) -> None:
         """Make the factor of a stretch: on a rigid path, the mean of positions is that of the mean of their levers."""
         stamp_ns, middle = path.at_middle(cell)
         there = invert(middle) @ path.odometry[rows]
         # as of one measurement: errors of GNSS last for longer than a stretch
         covariance = np.mean([self._measurements[row].covariance for row in rows], axis=0) * scale**2
-        if self._source is Source.GNSS:
+        if self._source is Aid.GNSS:
             mean = measured[rows].mean(axis=0)
             lever = (there[:, :3, 3] + apply(there, self._levers[rows])).mean(axis=0)
             noise = gtsam.noiseModel.Gaussian.Covariance(covariance + _LEAST_SIGMA_M**2 * np.eye(3))

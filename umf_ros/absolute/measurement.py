@@ -28,15 +28,15 @@ _REST_RAD_S, _REST_M_S2, _REST_S, _GRAVITY_M_S2, _GRAVITY_TOLERANCE = 0.02, 0.15
 _ATTITUDE_SIGMA, _LEAST_ATTITUDE_SIGMA = np.deg2rad(1.0), np.deg2rad(0.3)
 
 
-class Source(StrEnum):
-    """Kind of an absolute measurement."""
+class Aid(StrEnum):
+    """Kind of an absolute measurement, an aiding sensor or model."""
 
     GNSS = "gnss"
     GRAVITY = "gravity"
     ELEVATION = "elevation"
 
 
-ABSOLUTE_TYPES = {Source.GNSS: "sensor_msgs/msg/NavSatFix", Source.GRAVITY: "sensor_msgs/msg/Imu"}
+ABSOLUTE_TYPES = {Aid.GNSS: "sensor_msgs/msg/NavSatFix", Aid.GRAVITY: "sensor_msgs/msg/Imu"}
 """Types of message of measurements."""
 
 
@@ -69,7 +69,7 @@ class AbsoluteMeasurement:
         lever: (3,) m, body frame: the antenna of a position.
     """
 
-    source: Source
+    source: Aid
     stamp_ns: int
     value: Array
     covariance: Array
@@ -85,14 +85,14 @@ class AbsoluteMeasurement:
         """The measurement of stored `numbers`; a ValueError where they are none."""
         if np.shape(numbers) != (15,):
             raise ValueError(f"an absolute measurement of {np.size(numbers)} numbers")
-        return cls(Source(source), stamp_ns, numbers[:3], numbers[3:12].reshape(3, 3), numbers[12:])
+        return cls(Aid(source), stamp_ns, numbers[:3], numbers[3:12].reshape(3, 3), numbers[12:])
 
     @property
     def is_usable(self) -> bool:
         """Whether all is finite, and the covariance positive."""
         if not np.isfinite(self.numbers).all() or np.linalg.eigvalsh(self.covariance).min() <= 0:
             return False
-        if self.source is Source.GRAVITY:
+        if self.source is Aid.GRAVITY:
             return bool(abs(np.linalg.norm(self.value) - 1) < 1e-3)
         return bool(abs(self.value[0]) <= 90 and abs(self.value[1]) <= 360 and abs(self.value[2]) < 1e5)
 
@@ -109,7 +109,7 @@ class AbsoluteVerdict(NamedTuple):
         misfit: the same distance in metres, or in radians for gravity.
     """
 
-    source: Source
+    source: Aid
     stamp_ns: int
     state: State
     reason: AbsoluteReason
@@ -147,7 +147,7 @@ def decode_fix(message: Any, stamp_ns: int, lever: Array) -> AbsoluteMeasurement
     if message.position_covariance_type == _UNKNOWN_COVARIANCE:
         raise MessageError("covariance", "GNSS fix of unknown covariance: the driver must state one")
     value = np.array([message.latitude, message.longitude, message.altitude], float)
-    found = AbsoluteMeasurement(Source.GNSS, stamp_ns, value, 0.5 * (covariance + covariance.T), np.array(lever, float))
+    found = AbsoluteMeasurement(Aid.GNSS, stamp_ns, value, 0.5 * (covariance + covariance.T), np.array(lever, float))
     if not found.is_usable:
         raise MessageError("fix", "GNSS fix whose position or covariance is not usable")
     return found
@@ -207,7 +207,7 @@ class GravityFilter:
     def _measured(self, up_imu: Array, sigma: float, stamp_ns: int) -> AbsoluteMeasurement:
         self._last_ns = stamp_ns
         up = self._body_R_imu @ up_imu
-        return AbsoluteMeasurement(Source.GRAVITY, stamp_ns, up / np.linalg.norm(up), sigma**2 * np.eye(3), np.zeros(3))
+        return AbsoluteMeasurement(Aid.GRAVITY, stamp_ns, up / np.linalg.norm(up), sigma**2 * np.eye(3), np.zeros(3))
 
 
 class AbsoluteDecoder:
@@ -223,14 +223,14 @@ class AbsoluteDecoder:
         self._antenna, self._body_T_imu, self._find = antenna, body_T_imu, find
         self._gravity = GravityFilter()
 
-    def decode(self, source: Source, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
+    def decode(self, source: Aid, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
         """The measurement in a message; None where an IMU has nothing to say yet.
 
         Raises:
             MessageError: the message cannot be used.
         """
         mounted = self._find(message.header.frame_id)
-        if source is Source.GNSS:
+        if source is Aid.GNSS:
             return decode_fix(message, stamp_ns, self._antenna if mounted is None else mounted[:3, 3])
         pose = self._body_T_imu if mounted is None else mounted
         return self._gravity.take(message, stamp_ns, pose[:3, :3])

@@ -13,20 +13,20 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.absolute.consistency import STRETCH_M, Path, Rows, Track, apply, turned
+from umf_ros.absolute.consistency import STRETCH_M, MeasuredPath, Rows, Track, apply, turned
 from umf_ros.absolute.elevation import ElevationModel, load_elevation
 from umf_ros.absolute.measurement import (
     AbsoluteMeasurement,
     AbsoluteReason,
     AbsoluteVerdict,
-    Source,
+    Aid,
     parse_numbers,
     to_enu,
 )
@@ -128,7 +128,7 @@ class _Heights:
             known = State.REJECTED, AbsoluteReason.CONTRADICTS
         else:
             known = State.ACCEPTED, AbsoluteReason.AGREES
-        return AbsoluteVerdict(Source.ELEVATION, stamp_ns, *known, sigmas, misfit_m)
+        return AbsoluteVerdict(Aid.ELEVATION, stamp_ns, *known, sigmas, misfit_m)
 
 
 class AbsoluteReference:
@@ -151,9 +151,9 @@ class AbsoluteReference:
             self._load_model()
         self.worlds: dict[int, Array] = {}
         self._waiting: list[AbsoluteMeasurement] = []
-        self._known: set[tuple[Source, int]] = set()
+        self._known: set[tuple[Aid, int]] = set()
         self._refused: list[AbsoluteVerdict] = []
-        self._tracks: dict[tuple[int, Source], Track] = {}
+        self._tracks: dict[tuple[int, Aid], Track] = {}
         self._heights: dict[int, _Heights] = {}
         self._seen: object = None
         self._rounds = _ROUNDS
@@ -207,7 +207,7 @@ class AbsoluteReference:
             if track.mounting is not None:
                 ahead, left = track.mounting
                 text = f"antenna off by {ahead:.2f} m ahead, {left:.2f} m left"
-                if source is Source.GRAVITY:
+                if source is Aid.GRAVITY:
                     text = f"IMU off by {np.degrees(-left):.1f} deg about x, {np.degrees(ahead):.1f} deg about y"
                 found[f"{source.value} rejected as a whole"] = f"{text}: see the calibration"
         if any(heights.fits is False for heights in self._heights.values()):
@@ -264,8 +264,8 @@ class AbsoluteReference:
             sources = {source for (_, source), _ in tracks}
             heights = self._heights.get(component)
             if heights is not None and heights.fits:
-                planes.append(([rows[key] for key in heights.misfits], Source.GNSS in sources))
-                sources.add(Source.ELEVATION)
+                planes.append(([rows[key] for key in heights.misfits], Aid.GNSS in sources))
+                sources.add(Aid.ELEVATION)
             if sources:
                 held[of == component] = self.worlds[component] @ held[of == component]
                 loose[first] = _first_pose_noise(held[first], sources)
@@ -283,7 +283,7 @@ class AbsoluteReference:
 
     def _place(self, paths: Paths) -> bool:
         """Give measurements whose odometry has arrived to their tracks; True where one is of a finished stretch."""
-        waiting, placed, late = [], dict[tuple[int, Source], list[AbsoluteMeasurement]](), False
+        waiting, placed, late = [], dict[tuple[int, Aid], list[AbsoluteMeasurement]](), False
         for one in self._waiting:
             session = paths.find(one.stamp_ns)
             if session is None:
@@ -301,19 +301,19 @@ class AbsoluteReference:
         changed = False
         # gravity before GNSS: both say how the map lies in the world, and GNSS says more
         for (session, source), track in sorted(
-            self._tracks.items(), key=lambda one: (one[0][1] is Source.GNSS, one[0][0])
+            self._tracks.items(), key=lambda one: (one[0][1] is Aid.GNSS, one[0][0])
         ):
             before = {cell: factor.numbers for cell, factor in track.factors.items()}
             component, measured = paths.components[session], self._measured(source, track)
             path = self._path(track, session, paths, at_last)
-            if source is Source.GNSS and track.mounting is None and not self._has_gnss(component, paths):
+            if source is Aid.GNSS and track.mounting is None and not self._has_gnss(component, paths):
                 world = track.align(measured, path)
                 if world is None:
                     continue
                 self.worlds[component] = world
             known = component in self.worlds
             if known:
-                path = Path(
+                path = MeasuredPath(
                     path.odometry, self.worlds[component] @ path.poses, path.travel, path.finished, path.at_middle
                 )
             track.judge(measured, path, known)
@@ -322,7 +322,7 @@ class AbsoluteReference:
             changed = changed or before != {cell: factor.numbers for cell, factor in track.factors.items()}
         return changed
 
-    def _path(self, track: Track, session: int, paths: Paths, at_last: bool) -> Path:
+    def _path(self, track: Track, session: int, paths: Paths, at_last: bool) -> MeasuredPath:
         chain = paths.chains[session]
         points = chain.at(track.stamps)
 
@@ -330,11 +330,13 @@ class AbsoluteReference:
             point = chain.at(_middle(chain, cell))
             return int(point["stamp"][0]), point["pose"][0]
 
-        return Path(points["pose"], paths.at(points), points["travel"], _finished(chain)[0] + at_last, at_middle)
+        return MeasuredPath(
+            points["pose"], paths.at(points), points["travel"], _finished(chain)[0] + at_last, at_middle
+        )
 
-    def _measured(self, source: Source, track: Track) -> Array:
+    def _measured(self, source: Aid, track: Track) -> Array:
         """(N, 3) positions in the world, or upward directions in the body."""
-        if source is not Source.GNSS:
+        if source is not Aid.GNSS:
             return track.values
         if self.origin is None:
             self.origin = np.median(track.values[:_FIRST_FIXES], axis=0)
@@ -344,11 +346,11 @@ class AbsoluteReference:
     def _load_model(self) -> None:
         settings = self._settings
         if settings.elevation_model and self._model is None:
-            self._model = load_elevation(FilePath(settings.elevation_model), settings.elevation_sigma_m, self.origin)
+            self._model = load_elevation(Path(settings.elevation_model), settings.elevation_sigma_m, self.origin)
 
     def _has_gnss(self, component: int, paths: Paths) -> bool:
         """Whether accepted fixes hold a component in the world."""
-        tracks = ((session, track) for (session, source), track in self._tracks.items() if source is Source.GNSS)
+        tracks = ((session, track) for (session, source), track in self._tracks.items() if source is Aid.GNSS)
         return any(bool(track.factors) and paths.components[session] == component for session, track in tracks)
 
     def _judge_heights(
@@ -449,14 +451,14 @@ def _middle(chain: Chain, cell: int) -> Rows:
     return chain.stamps[row : row + 1]
 
 
-def _first_pose_noise(pose: Array, sources: set[Source]) -> gtsam.noiseModel.Base:
+def _first_pose_noise(pose: Array, sources: set[Aid]) -> gtsam.noiseModel.Base:
     """Noise of the first pose of a component, which some sources leave where it is and others find out."""
     tilt, turn, across, up = _START_RAD, _FIXED, _FIXED, _FIXED
-    if Source.ELEVATION in sources:
+    if Aid.ELEVATION in sources:
         turn, across, up = _START_RAD, _START_M, _FREE
-    if Source.GNSS in sources:
+    if Aid.GNSS in sources:
         turn, across, up = 10 * _START_RAD, _FREE, _FREE
-    if sources & {Source.GNSS, Source.GRAVITY}:
+    if sources & {Aid.GNSS, Aid.GRAVITY}:
         tilt = 10 * _START_RAD
     axes = np.kron(np.eye(2), pose[:3, :3].T)  # from those of the world to those of the body
     covariance = axes @ np.diag(np.square([tilt, tilt, turn, across, across, up])) @ axes.T

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.absolute.measurement import ABSOLUTE_TYPES, AbsoluteDecoder, AbsoluteMeasurement, Source
+from umf_ros.absolute.measurement import ABSOLUTE_TYPES, AbsoluteDecoder, AbsoluteMeasurement, Aid
 from umf_ros.bags.reader import Bag, decode
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics, topics_of
@@ -131,10 +131,13 @@ def read_transforms(bag: Bag) -> StaticTransforms:
     return transforms
 
 
-def _absolute_topics(settings: Settings, bag: Bag) -> dict[str, Source]:
+def _absolute_topics(settings: Settings, bag: Bag) -> dict[str, Aid]:
     """Topics of absolute measurements; a `BagError` where one that is named is missing, or of another type."""
     found = {}
-    for source, topic in ((Source.GNSS, settings.absolute.gnss), (Source.GRAVITY, settings.absolute.imu)):
+    for source, topic in (
+        (Aid.GNSS, settings.absolute.gnss),
+        (Aid.GRAVITY, settings.absolute.imu),
+    ):
         if not topic:
             continue
         info = bag.topics.get(topic)

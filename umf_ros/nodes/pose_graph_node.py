@@ -23,7 +23,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from umf_ros.absolute.measurement import AbsoluteDecoder, Source
+from umf_ros.absolute.measurement import AbsoluteDecoder, Aid
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, topics_of
 from umf_ros.core.errors import UmfError
@@ -161,11 +161,11 @@ class PoseGraphNode(BaseNode):
         calibration = calibration_of(self._settings)
         self._decoder = AbsoluteDecoder(calibration.antenna, calibration.body_T_imu, self._odometry_frames.pose_of)
         if topics.gnss:
-            self._subscribe("gnss", NavSatFix, topics.gnss, partial(self._on_absolute, Source.GNSS), qos)
+            self._subscribe("gnss", NavSatFix, topics.gnss, partial(self._on_absolute, Aid.GNSS), qos)
         if topics.imu:
-            self._subscribe("imu", Imu, topics.imu, partial(self._on_absolute, Source.GRAVITY), qos)
+            self._subscribe("imu", Imu, topics.imu, partial(self._on_absolute, Aid.GRAVITY), qos)
 
-    def _on_absolute(self, source: Source, message: Any) -> None:
+    def _on_absolute(self, source: Aid, message: Any) -> None:
         measurement = self._decoder.decode(source, message, stamp_ns(message))
         if measurement is not None:
             self._worker.submit(lambda: self._durable.take_absolute(measurement))

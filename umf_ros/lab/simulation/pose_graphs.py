@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from umf_ros.absolute.measurement import AbsoluteMeasurement, Source, from_enu
+from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid, from_enu
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, expmap, gtsam_to_ros_covariance, invert, orthonormal, relative
 
@@ -377,7 +377,7 @@ def _fixes(truth: Array, rng: np.random.Generator, lying: float) -> tuple[list[A
     antennas = (truth @ np.append(ANTENNA, 1.0))[:, :3]
     geodetic = from_enu(antennas + errors, _ORIGIN)
     found = [
-        AbsoluteMeasurement(Source.GNSS, k * PERIOD_NS, geodetic[k], np.diag(_FIX_SIGMAS**2), ANTENNA)
+        AbsoluteMeasurement(Aid.GNSS, k * PERIOD_NS, geodetic[k], np.diag(_FIX_SIGMAS**2), ANTENNA)
         for k in np.flatnonzero(heard).tolist()
     ]
     return found, (np.linalg.norm(errors / _FIX_SIGMAS, axis=1) > 5)[heard]
@@ -390,6 +390,6 @@ def _upward(truth: Array, rng: np.random.Generator) -> list[tuple[AbsoluteMeasur
         up = truth[k, 2, :3] + rng.normal(0, _UP_SIGMA, 3) + (rng.random() < 0.1) * rng.normal(0, 0.12, 3)
         up /= np.linalg.norm(up)
         spread, angle = _UP_SIGMA**2 * np.eye(3), np.arccos(np.clip(up @ truth[k, 2, :3], -1, 1))
-        measurement = AbsoluteMeasurement(Source.GRAVITY, k * PERIOD_NS, up, spread, np.zeros(3))
+        measurement = AbsoluteMeasurement(Aid.GRAVITY, k * PERIOD_NS, up, spread, np.zeros(3))
         found.append((measurement, bool(angle > 5 * _UP_SIGMA)))
     return found
