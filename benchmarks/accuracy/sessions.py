@@ -167,7 +167,7 @@ def cold_starts(
     """Keyframes until each cold start knew its pose, None where it did not, and whether it was ever wrong."""
     bag, truth = open_bag(visitor), truth_of(visitor)
     settings = settings_for(bag, None, "auto", mode="localization", map=str(folder.path))
-    stream = [item for item in FrameReader(bag, settings).stream() if isinstance(item, Frame | OdometrySample)]
+    stream: Stream = [item for item in FrameReader(bag, settings).stream() if isinstance(item, Frame | OdometrySample)]
     true = np.concatenate([truths[one.session.name].at(one.stamps)[0] for one in joint.sessions])
     placed = np.concatenate([one.poses for one in joint.sessions])
     map_T_world = align(true[:, :3, 3], placed[:, :3, 3])[0]
