@@ -393,7 +393,7 @@ def folder(source: Path) -> Imported:
 
 
 def vslam_lab(source: Path) -> Imported:
-    """An export of S3LI Vulcano by VSLAM-LAB: rgb.csv without a header, calibration.yaml; neither scans nor headings."""
+    """An export of S3LI Vulcano by VSLAM-LAB: rgb.csv without a header, calibration.yaml; neither scans nor truth."""
     matrix, baseline = _export_calibration(source / "calibration.yaml")
     found = Imported({})
     for line in lines_of(source / "rgb.csv"):
