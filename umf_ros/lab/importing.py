@@ -25,9 +25,9 @@ from umf_ros.core.errors import SensorFileError
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose, to_quaternion
 from umf_ros.core.io import read_yaml, write_atomically
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.lab.scan_files import IMAGE_SUFFIXES, SUFFIXES, read_image, read_scan
 from umf_ros.lab.simulation.bag_writer import BagWriter, image_message, pose_message
 from umf_ros.sensors.decode import Cloud
-from umf_ros.sensors.scan_files import IMAGE_SUFFIXES, SUFFIXES, read_image, read_scan
 
 OPTICAL = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """`body_T_camera` where the camera is the body: x ahead, y left, z up."""
