@@ -13,8 +13,9 @@ import numpy as np
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, expmap, make_pose, relative
+from umf_ros.core.io import write_table
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
-from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, StoredOdometry, closure_row, write_table
+from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, StoredOdometry, closure_row
 
 PERIOD_NS = 10**9
 START_NS = 1_700_000_000 * 10**9

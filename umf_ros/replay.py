@@ -86,8 +86,9 @@ class Replay:
                 continue
             if isinstance(item, AbsoluteMeasurement):
                 self._recorder.record_absolute(item)
-                self._graph.add_absolute(item)
-                self._graph.update()
+                if self._localizer is None:
+                    self._graph.add_absolute(item)
+                    self._graph.update()
                 continue
             if self._done > WARM_UP:
                 yield self._skip_known(item)

@@ -65,7 +65,6 @@ from umf_ros.networks.config import locate_weights
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.sensors.decode import OdometrySample
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
 from support.strange_rovers import ROVERS, Rover, StrangeSensors, calibration_of
@@ -109,8 +108,7 @@ def read_drive(recording: Path, rover: Rover, seed: int, network: UMF) -> tuple[
     if not kept.exists():
         reader, sensors = DriveReader(network, settings), StrangeSensors(rover, seed)
         for item in FrameReader(bag, settings).stream():
-            if isinstance(item, Frame | OdometrySample):
-                reader.take(sensors.see(item) if isinstance(item, Frame) else item)
+            reader.take(sensors.see(item) if isinstance(item, Frame) else item)
         reader.finish().save(kept)
     drive, truth = Drive.load(kept), read_ground_truth(bag)
     assert truth is not None

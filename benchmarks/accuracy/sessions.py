@@ -28,7 +28,6 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
@@ -55,7 +54,7 @@ from umf_ros.sensors.sessions import OdometrySessionSplitter
 WITHIN_KEYFRAMES = 20
 WRONG_M, WRONG_DEG = 1.0, 5.0
 OVERLAP_M = 20.0
-Stream = list[Frame | OdometrySample | AbsoluteMeasurement]
+Stream = list[Frame | OdometrySample]
 
 
 @dataclass(frozen=True)
@@ -167,7 +166,7 @@ def cold_starts(
     """Keyframes until each cold start knew its pose, None where it did not, and whether it was ever wrong."""
     bag, truth = open_bag(visitor), truth_of(visitor)
     settings = settings_for(bag, None, "auto", mode="localization", map=str(folder.path))
-    stream: Stream = [item for item in FrameReader(bag, settings).stream() if isinstance(item, Frame | OdometrySample)]
+    stream = list(FrameReader(bag, settings).stream())
     true = np.concatenate([truths[one.session.name].at(one.stamps)[0] for one in joint.sessions])
     placed = np.concatenate([one.poses for one in joint.sessions])
     map_T_world = align(true[:, :3, 3], placed[:, :3, 3])[0]

@@ -10,11 +10,10 @@ from umf_ros.absolute.measurement import (
     AbsoluteDecoder,
     AbsoluteMeasurement,
     Aid,
-    from_enu,
     parse_numbers,
-    to_enu,
 )
 from umf_ros.core.errors import ConfigError, MessageError
+from umf_ros.core.geodesy import from_enu, to_enu
 from umf_ros.core.geometry import from_quaternion, make_pose
 
 ORIGIN = np.array([37.72, 15.0, 2550.0])

@@ -74,7 +74,8 @@ def test_wrong_closures_alone_join_nothing(tmp_path: Path) -> None:
 
 
 def test_closures_within_are_moved_to_the_maps_clock(tmp_path: Path) -> None:
-    from umf_ros.runs.run_file import CLOSURES, closure_row, write_table
+    from umf_ros.core.io import write_table
+    from umf_ros.runs.run_file import CLOSURES, closure_row
 
     made = [MadeSession("first", 0, 60), MadeSession("round", 0, 160)]
     folder = made_map(tmp_path / "map", made)

@@ -19,7 +19,6 @@ from umf_ros.bags.sensor_check import SensorCheck, SensorReport, about_sensors
 from umf_ros.bags.storages import RawMessage, message_types
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings, load_preset, topics_of
-from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import from_quaternion, to_quaternion
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.lab.simulation.bag_writer import BagWriter
@@ -230,7 +229,7 @@ def check_sensors(bag: Bag, settings: Settings) -> SensorReport:
         if isinstance(item, OdometrySample):
             stamps.append(item.stamp_ns)
             poses.append(item.odom_T_body)
-        elif isinstance(item, Frame):
+        else:
             check.take(item)
     return check.report(Trajectory(np.array(stamps, np.int64), np.stack(poses)) if stamps else None)
 

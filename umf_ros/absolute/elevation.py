@@ -11,8 +11,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.absolute.measurement import from_enu
 from umf_ros.core.errors import ConfigError, one_line
+from umf_ros.core.geodesy import from_enu
 from umf_ros.core.geometry import Array
 
 _HUBER = 1.345

@@ -1,4 +1,4 @@
-"""Absolute measurements: records, decoding of ROS messages, geodetic coordinates, and verdicts with their reasons."""
+"""Absolute measurements: records, decoding of ROS messages, and verdicts with their reasons."""
 
 from __future__ import annotations
 
@@ -15,12 +15,10 @@ import numpy as np
 from umf_ros.core.errors import ConfigError, MessageError
 from umf_ros.core.frames import State
 from umf_ros.core.geometry import Array, from_quaternion
-from umf_ros.core.io import atomic_write
+from umf_ros.core.io import write_table
 
 VERDICT_COLUMNS = ("source", "stamp_ns", "verdict", "reason", "mahalanobis", "misfit")
 """Columns of a table of verdicts; the misfit is in metres, that of gravity in radians."""
-# WGS 84: semi-major axis, first eccentricity squared
-_RADIUS_M, _ECCENTRICITY2 = 6_378_137.0, 6.69437999014e-3
 _UNKNOWN_COVARIANCE, _NO_FIX = 0, 0
 # by hand: an IMU stands still while it turns by less than this and its acceleration varies by less
 _REST_RAD_S, _REST_M_S2, _REST_S, _GRAVITY_M_S2, _GRAVITY_TOLERANCE = 0.02, 0.15, 1.0, 9.81, 0.3
@@ -119,12 +117,11 @@ class AbsoluteVerdict(NamedTuple):
 
 def write_verdicts(path: Path, verdicts: Iterable[AbsoluteVerdict]) -> None:
     """Write the table of verdicts; an `OutputError` where that cannot be done."""
-    with atomic_write(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(VERDICT_COLUMNS)
-        for one in verdicts:
-            figures = f"{one.residual:.3f}", f"{one.misfit:.4f}"
-            writer.writerow([one.source.value, one.stamp_ns, one.state.value, one.reason.value, *figures])
+    rows = (
+        [one.source.value, one.stamp_ns, one.state.value, one.reason.value, f"{one.residual:.3f}", f"{one.misfit:.4f}"]
+        for one in verdicts
+    )
+    write_table(path, VERDICT_COLUMNS, rows)
 
 
 def read_verdict_counts(path: Path) -> Counter[tuple[str, str, str]]:
@@ -247,35 +244,3 @@ def parse_numbers(text: str, count: int, what: str) -> Array | None:
     if len(numbers) != count or not np.isfinite(numbers).all():
         raise ConfigError(f"{what}: expected {count} numbers, got {text!r}")
     return numbers
-
-
-def to_enu(geodetic: Array, origin: Array) -> Array:
-    """(N, 3) metres east, north and up of an origin (3,); degrees and metres on WGS 84."""
-    return (_to_ecef(geodetic) - _to_ecef(origin[None])) @ _enu_axes(origin).T
-
-
-def from_enu(positions: Array, origin: Array) -> Array:
-    """(N, 3) latitudes, longitudes (deg) and heights (m) of positions about an origin; the inverse of `to_enu`."""
-    x, y, z = (_to_ecef(origin[None]) + positions @ _enu_axes(origin)).T
-    longitude, across = np.arctan2(y, x), np.hypot(x, y)
-    latitude = np.arctan2(z, across * (1 - _ECCENTRICITY2))
-    for _ in range(6):  # converges by the flattening, a factor of 300, each time
-        normal = _RADIUS_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
-        latitude = np.arctan2(z + _ECCENTRICITY2 * normal * np.sin(latitude), across)
-    height = across * np.cos(latitude) + z * np.sin(latitude) - _RADIUS_M**2 / normal
-    return np.column_stack([np.degrees(latitude), np.degrees(longitude), height])
-
-
-def _to_ecef(geodetic: Array) -> Array:
-    latitude, longitude = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
-    normal = _RADIUS_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
-    across = (normal + geodetic[:, 2]) * np.cos(latitude)
-    up = (normal * (1 - _ECCENTRICITY2) + geodetic[:, 2]) * np.sin(latitude)
-    return np.column_stack([across * np.cos(longitude), across * np.sin(longitude), up])
-
-
-def _enu_axes(origin: Array) -> Array:
-    """(3, 3) axes east, north and up, one per row."""
-    (sin_lat, sin_lon), (cos_lat, cos_lon) = np.sin(np.radians(origin[:2])), np.cos(np.radians(origin[:2]))
-    east, north = [-sin_lon, cos_lon, 0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
-    return np.array([east, north, [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]])

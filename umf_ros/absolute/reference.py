@@ -28,11 +28,11 @@ from umf_ros.absolute.measurement import (
     AbsoluteVerdict,
     Aid,
     parse_numbers,
-    to_enu,
 )
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError
 from umf_ros.core.frames import State
+from umf_ros.core.geodesy import to_enu
 from umf_ros.core.geometry import Array, heading, invert, make_pose, orthonormal
 from umf_ros.core.odometry_noise import OdometryNoise
 

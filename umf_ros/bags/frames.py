@@ -11,6 +11,7 @@ import numpy as np
 
 from umf_ros.absolute.measurement import ABSOLUTE_TYPES, AbsoluteDecoder, AbsoluteMeasurement, Aid
 from umf_ros.bags.reader import Bag, decode
+from umf_ros.bags.storages import RawMessage
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics, topics_of
 from umf_ros.core.errors import BagError, MessageError, either
@@ -64,7 +65,6 @@ class FrameReader:
         self._absolute = _absolute_topics(settings, bag)
         find = frames.pose_of if frames is not None else lambda _: None
         self._decoder = AbsoluteDecoder(calibration.antenna, calibration.body_T_imu, find)
-        self._warn, self._warned = warn, set[tuple[str, str]]()
         if bag.warning:
             warn(bag.warning)
 
@@ -77,38 +77,39 @@ class FrameReader:
         """Frames in the order of their stamps."""
         return (item for item in self.stream() if isinstance(item, Frame))
 
-    def stream(self) -> Iterator[Frame | OdometrySample | AbsoluteMeasurement]:
-        """Every message of the odometry and absolute measurement as it comes, and the frames as they are complete."""
-        for raw in self._bag.raw_messages([*self._router.topics, *self._absolute]):
-            watchdog.feed()
-            try:
-                message = decode(raw)
-                if raw.topic in self._absolute:
-                    yield from self._decode_absolute(raw.topic, message)
-                    continue
-            except MessageError as error:
-                if raw.topic in self._absolute:
-                    self._warn_once(raw.topic, error)
-                else:
-                    self._router.refuse(raw.topic, error)
-            else:
-                self._add_odometry(message)
-                self._router.take(raw.topic, message)
-            self.progress = (raw.log_ns - self._bag.start_ns) / max(1, self._bag.end_ns - self._bag.start_ns)
-            yield from self._samples
-            self._samples.clear()
-            yield from self._synchronizer.pop()
+    def stream(self) -> Iterator[Frame | OdometrySample]:
+        """Every message of the odometry as it comes, and the frames as they are complete."""
+        for raw in self._bag.raw_messages(self._router.topics):
+            yield from self._take(raw)
         yield from self._synchronizer.flush()
 
-    def _decode_absolute(self, topic: str, message: Any) -> list[AbsoluteMeasurement]:
-        measurement = self._decoder.decode(self._absolute[topic], message, stamp_ns(message))
-        return [] if measurement is None else [measurement]
+    def graph_stream(self) -> Iterator[Frame | OdometrySample | AbsoluteMeasurement]:
+        """The same with absolute measurements, which only a pose graph takes."""
+        for raw in self._bag.raw_messages([*self._router.topics, *self._absolute]):
+            if raw.topic in self._absolute:
+                yield from self._take_absolute(raw)
+            else:
+                yield from self._take(raw)
+        yield from self._synchronizer.flush()
 
-    def _warn_once(self, topic: str, error: MessageError) -> None:
-        """Warn of the first message of each kind that cannot be used."""
-        if (topic, error.kind) not in self._warned:
-            self._warned.add((topic, error.kind))
-            self._warn(f"{topic}: {error}; such messages are skipped")
+    def _take(self, raw: RawMessage) -> Iterator[Frame | OdometrySample]:
+        watchdog.feed()
+        with self._router.refusing(raw.topic):
+            message = decode(raw)
+            self._add_odometry(message)
+            self._router.take(raw.topic, message)
+        self.progress = (raw.log_ns - self._bag.start_ns) / max(1, self._bag.end_ns - self._bag.start_ns)
+        yield from self._samples
+        self._samples.clear()
+        yield from self._synchronizer.pop()
+
+    def _take_absolute(self, raw: RawMessage) -> list[AbsoluteMeasurement]:
+        watchdog.feed()
+        measurement = None
+        with self._router.refusing(raw.topic):
+            message = decode(raw)
+            measurement = self._decoder.decode(self._absolute[raw.topic], message, stamp_ns(message))
+        return [] if measurement is None else [measurement]
 
     def _add_odometry(self, message: Any) -> None:
         """Add the poses of the trajectory up to the message's stamp that were not added before."""

@@ -12,6 +12,7 @@ from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.reader import Bag
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import BagError, MessageError
+from umf_ros.core.geodesy import to_enu
 from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import calibration_of
@@ -21,9 +22,6 @@ GPS_EPOCH_S, LEAP_SECONDS = 315_964_800, 18
 """1980-01-06 in POSIX seconds; GPS time is ahead of UTC by this much since 2017."""
 WORST_QUALITY = 2
 """1 is a fixed, 2 a floating ambiguity; the rest is off by metres."""
-
-_EQUATOR_M = 6_378_137.0
-_ECCENTRICITY_SQUARED = 6.694379990141e-3  # WGS 84
 
 
 def read_tum(path: str | Path) -> Trajectory:
@@ -135,7 +133,8 @@ def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> Traject
             geodetic.append((latitude, longitude, height))
     if not stamps:
         raise BagError(f"{path} holds no position of quality {worst_quality} or better")
-    poses = RigidTransform.from_translation(east_north_up(np.array(geodetic))).as_matrix()
+    positions = np.array(geodetic)
+    poses = RigidTransform.from_translation(to_enu(positions, positions[0])).as_matrix()
     return Trajectory(np.array(stamps, np.int64), poses, has_orientation=False)
 
 
@@ -148,20 +147,6 @@ def _parse(fields: list[str]) -> tuple[int, float, float, float, int]:
     else:
         gps_ns = _checked((GPS_EPOCH_S + int(fields[0]) * 604_800) * 10**9 + round(float(fields[1]) * 1e9))
     return gps_ns - LEAP_SECONDS * 10**9, latitude, longitude, height, int(fields[5])
-
-
-def east_north_up(geodetic: Array) -> Array:
-    """(N, 3) latitude, longitude in degrees and height in metres as metres from the first."""
-    latitude, longitude = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
-    height = geodetic[:, 2]
-    curvature = _EQUATOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
-    x = (curvature + height) * np.cos(latitude) * np.cos(longitude)
-    y = (curvature + height) * np.cos(latitude) * np.sin(longitude)
-    z = (curvature * (1 - _ECCENTRICITY_SQUARED) + height) * np.sin(latitude)
-    centred = np.stack([x - x[0], y - y[0], z - z[0]], axis=1)
-    # the earth's axes, turned to east, north and up at the first position
-    turn = Rotation.from_euler("ZX", [longitude[0] + np.pi / 2, np.pi / 2 - latitude[0]])
-    return np.asarray(turn.apply(centred, inverse=True))
 
 
 def read_lines(path: str | Path) -> list[str]:

@@ -113,7 +113,7 @@ def command(
         console.print(line, **WARNING)
     replay = Replay(folder, settings, detector, begun is not None)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
-        stream = reader.stream()
+        stream = reader.graph_stream()
         for detection in replay.run(viewer.watch(stream) if viewer else stream):
             progress.show(reader.progress, detection)
             if viewer:

@@ -27,6 +27,7 @@ from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.config import Database, Settings, Verification
 from umf_ros.core.errors import BagError, writing
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
+from umf_ros.core.io import write_table
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
@@ -34,7 +35,7 @@ from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
-from umf_ros.runs.run_file import CLOSURES, RunFile, StoredOdometry, closure_row, write_table
+from umf_ros.runs.run_file import CLOSURES, RunFile, StoredOdometry, closure_row
 from umf_ros.runs.writer import PLACES, count_drops
 from umf_ros.verification import Hypothesis, Verifier
 
@@ -112,7 +113,7 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
     settings = settings.model_copy(update={"database": store})
     reader = FrameReader(bag, settings, opening.odometry_of(recording, settings))
     replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
-    for detection in replay.run(reader.stream()):
+    for detection in replay.run(reader.graph_stream()):
         on_frame(reader.progress, detection)
     has_odometry = replay.finish(count_drops(reader.counters))
     remember_recording(folder, bag)

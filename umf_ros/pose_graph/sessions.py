@@ -234,7 +234,7 @@ class RelativeCovariances:
         order = np.argsort(lengths, kind="stable")
         self._keys, best = np.unique((low * size + high)[order], return_index=True)
         rows = order[best]
-        self.solved = csr_matrix((lengths[rows], (low[rows], high[rows])), shape=(size, size))
+        self._paths = csr_matrix((lengths[rows], (low[rows], high[rows])), shape=(size, size))
         # at the first vertex, so that covariances along a path add up
         carry = adjoint(invert(self._poses[:1]) @ self._poses[edges["second"][rows]])
         self._noise = propagate(carry, edges["covariance"][rows])
@@ -268,7 +268,7 @@ class RelativeCovariances:
         (starts, leave), (stops, enter) = sorted(ends, key=lambda one: len(np.unique(one[0])))
         sources, of_source = np.unique(starts, return_inverse=True)
         found, before = dijkstra(
-            self.solved, directed=False, indices=sources, return_predecessors=True, limit=lengths[rows].max()
+            self._paths, directed=False, indices=sources, return_predecessors=True, limit=lengths[rows].max()
         )
         totals = _length(leave) + found[of_source, stops] + _length(enter)
         shorter = np.flatnonzero(totals < lengths[rows])

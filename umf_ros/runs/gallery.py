@@ -19,7 +19,6 @@ from umf_ros.core.config import Settings
 from umf_ros.core.frames import Frame, Image, Points
 from umf_ros.core.geometry import Array, transform
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.sensors.decode import OdometrySample
 from umf_ros.verification import thin_scan
 
 MAP_CELLS, MAP_REACH_M = 700, 25.0  # by hand: bounds the picture
@@ -172,7 +171,7 @@ def walk(
                 gallery.take(item)
                 if len(waiting) > FRAMES_AHEAD:
                     waiting.popleft().result()
-            elif isinstance(item, OdometrySample) and item.stamp_ns > stamps[-1]:  # as far as its stamps grow
+            elif item.stamp_ns > stamps[-1]:  # as far as its stamps grow
                 stamps.append(item.stamp_ns)
                 poses.append(item.odom_T_body)
         for one in waiting:

@@ -22,7 +22,7 @@ from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.errors import UmfError, writing
 from umf_ros.core.frames import Candidate, LoopClosure, Points
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
-from umf_ros.core.io import Schema, SqliteFile, atomic_write
+from umf_ros.core.io import Schema, SqliteFile, write_table
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureReason, ClosureVerdict, State
 from umf_ros.verification.hypothesis import ACCEPTED, Hypothesis, RejectReason
 
@@ -229,18 +229,6 @@ def read_descriptors(folder: Path) -> dict[int, Points]:
         return {}
     with closing(RunFile(folder, read_only=True)) as file:
         return file.descriptors()
-
-
-def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a CSV file in one step.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    with atomic_write(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(rows)
 
 
 def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -71,24 +72,32 @@ class MessageRouter:
 
     def take(self, topic: str, message: Any) -> None:
         """Add one message."""
-        entry = self._entries[topic]
+        with self.refusing(topic):
+            self._take(self._entries[topic], message)
+
+    def _take(self, entry: str, message: Any) -> None:
+        if entry == ODOMETRY:
+            sample = decode_odometry(message)
+            if self._frames is not None:
+                sample = sample._replace(odom_T_body=self._frames.to_body(message, sample.odom_T_body))
+            self.take_odometry(sample)
+        elif entry in ("left_info", "right_info"):
+            self._use_info(entry, message)
+        else:
+            if self._frames is not None and entry != "right_image":
+                sensor = "lidar" if entry == "cloud" else "camera"
+                self._synchronizer.use_mounting(self._frames.mounting(sensor, message.header.frame_id))
+            decode = decode_cloud if entry == "cloud" else decode_image
+            self._synchronizer.add(_INPUTS[entry], stamp_ns(message), decode(message))
+
+    @contextmanager
+    def refusing(self, topic: str) -> Iterator[None]:
+        """Refuse a message that raises anything: whatever it provokes, it is the message's fault."""
         try:
-            if entry == ODOMETRY:
-                sample = decode_odometry(message)
-                if self._frames is not None:
-                    sample = sample._replace(odom_T_body=self._frames.to_body(message, sample.odom_T_body))
-                self.take_odometry(sample)
-            elif entry in ("left_info", "right_info"):
-                self._use_info(entry, message)
-            else:
-                if self._frames is not None and entry != "right_image":
-                    sensor = "lidar" if entry == "cloud" else "camera"
-                    self._synchronizer.use_mounting(self._frames.mounting(sensor, message.header.frame_id))
-                decode = decode_cloud if entry == "cloud" else decode_image
-                self._synchronizer.add(_INPUTS[entry], stamp_ns(message), decode(message))
+            yield
         except MessageError as error:
             self.refuse(topic, error)
-        except Exception as error:  # whatever a message provokes, it is the message's fault
+        except Exception as error:
             text = f"message provokes {type(error).__name__}: {error}"
             self.refuse(topic, MessageError("unusable", text))
 
@@ -98,8 +107,9 @@ class MessageRouter:
         self._synchronizer.add(ODOMETRY, sample.stamp_ns, sample.odom_T_body)
 
     def refuse(self, topic: str, error: MessageError) -> None:
-        """Count a message that cannot be used."""
-        self._synchronizer.reject(_INPUTS[self._entries[topic]], error.kind)
+        """Count a message that cannot be used, and warn of the first of its kind; also of topics that others take."""
+        if topic in self._entries:
+            self._synchronizer.reject(_INPUTS[self._entries[topic]], error.kind)
         if (topic, error.kind) not in self._warned:
             self._warned.add((topic, error.kind))
             self._warn(f"{topic}: {error}; such messages are skipped")

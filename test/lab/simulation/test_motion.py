@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.bags.trajectories import east_north_up, read_rtklib
+from umf_ros.bags.trajectories import read_rtklib
+from umf_ros.core.geodesy import to_enu
 from umf_ros.core.geometry import heading, make_pose, relative
 from umf_ros.lab.simulation import motion_sensors
 from umf_ros.lab.simulation.motion_sensors import Drift, Motion, drifting
@@ -153,7 +154,7 @@ def test_satellites_err_as_they_say():
     motion = move(circle(20, turns=7))
     track = motion_sensors.measure_gnss(motion, motion.duration_s, seed=2)
     world = motion.poses(track.times_s)[:, :3, 3]
-    found = east_north_up(track.geodetic)
+    found = to_enu(track.geodetic, track.geodetic[0])
     error = (found - found.mean(0)) - (world - world.mean(0))
     fixed = track.quality == 1
     assert error[fixed].std() == pytest.approx(0.012, rel=0.1)
@@ -172,7 +173,7 @@ def test_positions_written_for_rtklib_are_read_back(tmp_path, start_ns):
     path.write_text(motion_sensors.rtklib_text(track, start_ns))
     found = read_rtklib(path)
     assert np.abs(found.stamps_ns - start_ns - np.round(track.times_s * 1e9)).max() < 1_000_000
-    np.testing.assert_allclose(found.poses[:, :3, 3], east_north_up(track.geodetic), atol=2e-3)
+    np.testing.assert_allclose(found.poses[:, :3, 3], to_enu(track.geodetic, track.geodetic[0]), atol=2e-3)
 
 
 def test_the_twist_of_the_odometry_is_that_of_its_poses():

@@ -17,10 +17,11 @@ from scipy.spatial.transform import Rotation
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.trajectories import east_north_up, read_ground_truth, read_odometry
+from umf_ros.bags.trajectories import read_ground_truth, read_odometry
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import BagError, UmfError, one_line
 from umf_ros.core.frames import Frame, Image
+from umf_ros.core.geodesy import to_enu
 from umf_ros.core.geometry import Array, align, transform
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.embedding.inputs import shrink
@@ -305,7 +306,8 @@ def read_toolkit(pickles: Sequence[Path], images: Path | None = None, dataset: s
     calibration = load_calibration(dataset)
     tables = [_read_table(path) for path in pickles]
     geodetic = [np.stack([table[name] for name in COLUMNS[3:]], axis=1).astype(float) for table in tables]
-    positions = np.split(east_north_up(np.concatenate(geodetic)), np.cumsum([len(part) for part in geodetic])[:-1])
+    places = np.concatenate(geodetic)
+    positions = np.split(to_enu(places, places[0]), np.cumsum([len(part) for part in geodetic])[:-1])
     poses = np.concatenate(
         [_toolkit_poses(table, place, calibration) for table, place in zip(tables, positions, strict=True)]
     )

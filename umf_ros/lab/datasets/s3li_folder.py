@@ -1,4 +1,4 @@
-"""A download of S3LI: what is there, what is missing, and the calibrations and pairs that come with it."""
+"""Files of a download of S3LI, and readers of its calibrations and lists of pairs."""
 
 from __future__ import annotations
 

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from scipy.stats import binomtest
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
@@ -73,16 +74,14 @@ CLEARLY = 0.5
 NOISE = {"pose_graph__odometry_sigma_m": 0.1, "pose_graph__odometry_sigma_deg": 5.0}
 """Of trajectories that are off by 94 m after the crater's kilometre: the defaults, of a tenth of that drift, let the
 graph refuse the one revisit that would set it right (measured on the twin)."""
-Z = 1.959964
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
     """95 % interval of a share [Wilson 1927]; 0 to 1 of nothing."""
     if not count:
         return 0.0, 1.0
-    share, weight = hits / count, Z**2 / count
-    middle, reach = share + weight / 2, Z * math.sqrt(share * (1 - share) / count + weight / 4 / count)
-    return max(0.0, (middle - reach) / (1 + weight)), min(1.0, (middle + reach) / (1 + weight))
+    found = binomtest(hits, count).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
 
 
 def recall_of_places(

@@ -50,7 +50,7 @@ METHODS = {
 USED = {"ransac": ("xfeat", "cloud"), "ransac, umf": ("umf", "cloud"), "superfeatures": ("super_image", "super_cloud")}
 NEIGHBOURS = 5  # by hand: references of a set this near to a true one, in their order, are neither right nor wrong
 # on squared slopes, per standard deviation: real sets in which the similarity leaves no doubt must not set its slope.
-# Measured: the likelihood of what is left out is flat from 1e-3 to 1e-2, and recall falls with more
+# Measured: the likelihood of sets that are left out is flat from 1e-3 to 1e-2; with more, recall falls
 RIDGE = 1e-3
 EDGES = np.array([0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0])
 FOLDS = 3  # of simulated worlds; a real set is left out by itself

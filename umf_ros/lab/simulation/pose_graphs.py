@@ -12,8 +12,9 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid, from_enu
+from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geodesy import from_enu
 from umf_ros.core.geometry import Array, expmap, gtsam_to_ros_covariance, invert, orthonormal, relative
 
 Kind = Literal["random", "groups", "near"]
