@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import traceback
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from umf_ros.absolute.measurement import AbsoluteMeasurement
+from umf_ros.bags.sensor_check import SensorCheck
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
@@ -25,6 +27,8 @@ from umf_ros.sensors.sessions import OdometrySessionSplitter
 FAULTS = "faults.log"
 WARM_UP = 12
 """Keyframes before an interruption that are processed again: twice the number that verification remembers."""
+FRAMES_AHEAD = 20
+"""Frames that the check of the sensors may lag behind; bounds the memory."""
 FLEET_PATIENCE_S = 30.0
 """Time that a replay waits at its end for a fleet's server; the next run sends the places that are still waiting."""
 
@@ -42,6 +46,7 @@ class Replay:
         resume: continue an earlier replay of the same recording into this folder.
 
     Attributes:
+        sensor_check: has seen every frame.
         faults: frames that were skipped after internal errors; `faults.log` in the folder has the tracebacks.
         counts: of a localising run, as in its summary: `keyframes`, those up to the first known pose (None while there
             is none), those with a known pose, how often a pose was found or another one than before, and closures that
@@ -60,6 +65,9 @@ class Replay:
         self._graph = PoseGraph(settings.pose_graph)
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometrySessionSplitter(self._localizer or self._graph)
+        self.sensor_check = SensorCheck()
+        self._checking = ThreadPoolExecutor(1, "sensor-check")  # OpenCV and small_gicp hold no interpreter lock
+        self._unchecked: deque[Future[None]] = deque()
         self.faults = 0
         self.counts: dict[str, Any] = {"keyframes": 0, "keyframes_until_found": None, "located": 0}
         self.counts |= {"relocalised": 0, "agreed": 0, "contradicted": 0}
@@ -90,6 +98,7 @@ class Replay:
                     self._graph.add_absolute(item)
                     self._graph.update()
                 continue
+            self._check_sensors(item)
             if self._done > WARM_UP:
                 yield self._skip_known(item)
                 continue
@@ -105,6 +114,11 @@ class Replay:
             yield detection
             if detection.fault is not None:
                 raise detection.fault
+
+    def _check_sensors(self, frame: Frame) -> None:
+        self._unchecked.append(self._checking.submit(self.sensor_check.take, frame))
+        while len(self._unchecked) > FRAMES_AHEAD or (self._unchecked and self._unchecked[0].done()):
+            self._unchecked.popleft().result()
 
     def _process(self, frame: Frame) -> Detection:
         """Return the result of a frame, without a keyframe after an internal error."""
@@ -187,6 +201,7 @@ class Replay:
         write_summary(self._folder, self._recorder.summary(drops) | known)
         self._recorder.close()
         self._detector.close()
+        self._checking.shutdown()
         return has_trajectory
 
     def _write_localization(self) -> bool:

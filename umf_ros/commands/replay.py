@@ -141,7 +141,7 @@ def command(
             status = _report_localization(console, folder, replay.counts, newest)
         else:
             shown = frozenset(warnings + absent)
-            status = finish_run(folder, recording, console, ground_truth, shown).exit_code
+            status = finish_run(folder, recording, console, ground_truth, shown, replay.sensor_check).exit_code
     replay.raise_if_frames_failed()
     raise typer.Exit(status)
 

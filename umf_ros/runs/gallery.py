@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import base64
 import math
-from collections import deque
-from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Container
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.reader import Bag
-from umf_ros.bags.sensor_check import SensorCheck, SensorReport
-from umf_ros.core.config import Settings
-from umf_ros.core.frames import Frame, Image, Points
+from umf_ros.core.frames import Image
 from umf_ros.core.geometry import Array, transform
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.verification import thin_scan
+from umf_ros.runs.run_file import NAME, SCAN_UNIT_M, Picture, RunFile
 
 MAP_CELLS, MAP_REACH_M = 700, 25.0  # by hand: bounds the picture
 
@@ -65,116 +62,68 @@ class HeightMap:
         return data.tobytes()
 
 
-PHOTO_WIDTH, PHOTO_QUALITY = 360, 60  # by hand: rocks are still rocks, at some 15 kB
-SCAN_POINTS, SCAN_UNIT_M = 600, 0.02  # by hand: enough to see the ground, and what int16 counts in
-MAP_POINTS = 4000  # by hand: of a scan
-FRAMES_AHEAD = 20  # by hand: bounds the memory
+SHOWN_POINTS = 600  # by hand: of a scan, enough to see the ground
 
 
-Photograph = tuple[str, int, int]
-"""A small picture: a `data:` address, and width and height in pixels of the image that it was made from."""
-
-
+@dataclass
 class Gallery:
-    """Collects the pictures of the page, frame by frame.
-
-    Args:
-        shown: stamps of the frames of which photograph and scan are kept.
-        whole: stamps of the frames whose images are kept whole.
-        drawn: trajectory along which the scans are laid into a map from above; None: no map.
+    """Pictures of the page.
 
     Attributes:
-        photographs: by stamp.
-        scans: by stamp, as base64 of little-endian int16 triples in `SCAN_UNIT_M`, body frame.
-        images: (H, W) uint8 left images by stamp.
+        pictures: those that are shown, by the stamps of their keyframes.
+        heights: map from above; None without a trajectory.
     """
 
-    def __init__(self, shown: Iterable[int], whole: Iterable[int], drawn: Trajectory | None) -> None:
-        self._shown, self._whole, self._drawn = set(shown), set(whole), drawn
-        self.photographs: dict[int, Photograph] = {}
-        self.scans: dict[int, str] = {}
-        self.images: dict[int, Image] = {}
-        self._heights = HeightMap(drawn.poses[:, :2, 3]) if drawn is not None and len(drawn) else None
+    pictures: dict[int, Picture] = field(default_factory=dict)
+    heights: HeightMap | None = None
 
-    def take(self, frame: Frame) -> None:
-        """Look at one frame."""
-        if frame.left is not None:
-            if frame.stamp_ns in self._whole:
-                self.images[frame.stamp_ns] = frame.left
-            if frame.stamp_ns in self._shown:
-                self.photographs[frame.stamp_ns] = photograph(frame.left)
-        if frame.points is not None:
-            if frame.stamp_ns in self._shown:
-                self.scans[frame.stamp_ns] = encode_scan(thin_scan(frame.points))
-            self._lay_into_map(frame.stamp_ns, frame.points)
+    def image(self, stamp_ns: int) -> Image | None:
+        """The left image (H, W) of a keyframe in its size, without the detail that was reduced."""
+        picture = self.pictures.get(stamp_ns)
+        if picture is None or not picture.jpeg:
+            return None
+        reduced: Any = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+        return cv2.resize(reduced, (picture.width, picture.height), interpolation=cv2.INTER_CUBIC)
+
+    def scan(self, stamp_ns: int) -> str:
+        """Some points of a keyframe's scan as base64 of little-endian int16 triples in `SCAN_UNIT_M`, body frame."""
+        scan = self.pictures[stamp_ns].scan
+        chosen = scan[np.linspace(0, len(scan) - 1, min(len(scan), SHOWN_POINTS)).astype(int)]
+        return base64.b64encode(chosen.astype("<i2").tobytes()).decode("ascii")
 
     def map_picture(self) -> dict[str, Any] | None:
-        """The map so far: `data:` address, (x, y) in m of `lower` left and `upper` right corner; None if empty."""
-        png = self._heights.png() if self._heights is not None else None
-        if self._heights is None or png is None:
+        """The map: `data:` address, (x, y) in m of `lower` left and `upper` right corner; None if empty."""
+        png = self.heights.png() if self.heights is not None else None
+        if self.heights is None or png is None:
             return None
-        corners = {"lower": self._heights.lower.tolist(), "upper": self._heights.upper.tolist()}
+        corners = {"lower": self.heights.lower.tolist(), "upper": self.heights.upper.tolist()}
         return {"address": data_address("image/png", png), **corners}
 
-    def _lay_into_map(self, stamp_ns: int, points: Points) -> None:
-        if self._heights is None or self._drawn is None:
-            return
-        poses, known = self._drawn.at(np.array([stamp_ns], np.int64))
-        if known[0]:
-            near = points[:: max(1, len(points) // MAP_POINTS)]
-            near = near[np.linalg.norm(near, axis=1) < MAP_REACH_M]
-            self._heights.add(transform(poses[0], near.astype(float)))
 
+def read_gallery(folder: Path, shown: Container[int], drawn: Trajectory | None) -> Gallery:
+    """Read the pictures of a run.
 
-def photograph(image: Image) -> Photograph:
-    """A small JPEG of an image (H, W) uint8."""
-    height, width = image.shape
-    size = PHOTO_WIDTH, max(1, round(height * PHOTO_WIDTH / width))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if width > PHOTO_WIDTH else image
-    _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, PHOTO_QUALITY])
-    return data_address("image/jpeg", data.tobytes()), width, height
-
-
-def encode_scan(points: Points) -> str:
-    """Some of the points (N, 3) m as base64 of little-endian int16 triples in `SCAN_UNIT_M`."""
-    chosen = points[np.linspace(0, len(points) - 1, min(len(points), SCAN_POINTS)).astype(int)]
-    return _base64(np.clip(np.rint(chosen / SCAN_UNIT_M), -32767, 32767).astype("<i2").tobytes())
+    Args:
+        folder: of the run.
+        shown: stamps of the keyframes whose pictures are kept.
+        drawn: trajectory along which the scans are laid into a map from above; None: no map.
+    """
+    gallery = Gallery(heights=HeightMap(drawn.poses[:, :2, 3]) if drawn is not None and len(drawn) else None)
+    if not (folder / NAME).is_file():  # of an earlier release
+        return gallery
+    with closing(RunFile(folder, read_only=True)) as file:
+        for picture in file.pictures():
+            if picture.stamp_ns in shown:
+                gallery.pictures[picture.stamp_ns] = picture
+            if drawn is not None and gallery.heights is not None:
+                poses, known = drawn.at(np.array([picture.stamp_ns], np.int64))
+                points = picture.scan * SCAN_UNIT_M
+                near = points[np.linalg.norm(points, axis=1) < MAP_REACH_M]
+                if known[0]:
+                    gallery.heights.add(transform(poses[0], near))
+    return gallery
 
 
 def data_address(kind: str, content: bytes) -> str:
     """Content inside an address."""
-    return f"data:{kind};base64,{_base64(content)}"
-
-
-def _base64(content: bytes) -> str:
-    return base64.b64encode(content).decode("ascii")
-
-
-def walk(
-    bag: Bag, settings: Settings, gallery: Gallery, odometry: Trajectory | None, known_odometry: Trajectory | None
-) -> SensorReport:
-    """Read the recording once: fill the gallery, and check the sensors against its odometry.
-
-    Args:
-        bag: the recording.
-        settings: of the run.
-        gallery: is filled.
-        odometry: that the run took from a file instead of the recording's.
-        known_odometry: at any rate, where the recording has none.
-    """
-    check, stamps, poses = SensorCheck(), [-1], list[Array]([np.eye(4)])
-    waiting: deque[Future[None]] = deque()
-    with ThreadPoolExecutor(1, "sensor-check") as pool:  # OpenCV and the reader of the recording share no lock
-        for item in FrameReader(bag, settings, odometry, warn=lambda _: None).stream():
-            if isinstance(item, Frame):
-                waiting.append(pool.submit(check.take, item))
-                gallery.take(item)
-                if len(waiting) > FRAMES_AHEAD:
-                    waiting.popleft().result()
-            elif item.stamp_ns > stamps[-1]:  # as far as its stamps grow
-                stamps.append(item.stamp_ns)
-                poses.append(item.odom_T_body)
-        for one in waiting:
-            one.result()
-    heard = Trajectory(np.array(stamps[1:], np.int64), np.stack(poses)[1:]) if len(stamps) > 1 else known_odometry
-    return check.report(heard)
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

@@ -22,19 +22,21 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as Grid
 
+from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.reader import Bag
+from umf_ros.bags.sensor_check import SensorCheck, SensorReport
 from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.errors import UmfError
-from umf_ros.core.frames import Image, LoopClosure
+from umf_ros.core.frames import Frame, Image, LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.findings import RunVerdict, conclude, look_first
-from umf_ros.runs.gallery import Gallery, walk
+from umf_ros.runs.gallery import Gallery, read_gallery
 from umf_ros.runs.reader import FinishedRun, read_run
-from umf_ros.runs.run_file import Endpoints, read_inliers
+from umf_ros.runs.run_file import Endpoints, read_inliers, read_odometry_of
 from umf_ros.runs.scene import build_scene, by_need, drawn_trajectory, named_curves, pairs_of, size_of
 from umf_ros.runs.truth import MEDIAN_EXPECTED, Judged, JudgedRun, in_words, judge_run
 from umf_ros.runs.writer import write_summary
@@ -259,7 +261,12 @@ MAX_SHOWN = 400
 
 
 def finish_run(
-    folder: Path, bag: Bag, console: Console, ground_truth: Path | None = None, told: frozenset[str] = frozenset()
+    folder: Path,
+    bag: Bag,
+    console: Console,
+    ground_truth: Path | None = None,
+    told: frozenset[str] = frozenset(),
+    check: SensorCheck | None = None,
 ) -> RunVerdict:
     """Judge a run, write its pictures and its report, print its summary, and return the verdict.
 
@@ -269,6 +276,7 @@ def finish_run(
         console: where the summary is printed.
         ground_truth: RTKLIB .pos or TUM file; None takes that of the recording, if there is one.
         told: lines that were printed before the run, and are not repeated.
+        check: that has seen the frames of the recording; None: it is read for one.
     """
     run = read_run(folder, bag, ground_truth)
     with console.status("Judging, drawing and writing the report"):
@@ -279,8 +287,9 @@ def finish_run(
         shown = [stamp for key in by_need(pairs)[:MAX_SHOWN] for stamp in key]
         rows = np.linspace(0, len(run.closures) - 1, min(len(run.closures), MAX_PICTURES)).astype(int)
         chosen = [run.closures[row] for row in rows]
-        gallery = Gallery(shown, (stamp for one in chosen for stamp in one.endpoints), drawn_trajectory(about))
-        about = replace(about, sensors=walk(bag, run.settings, gallery, _odometry_file(run), run.odometry))
+        drawn = {*shown, *(stamp for one in chosen for stamp in one.endpoints)}
+        gallery = read_gallery(folder, drawn, drawn_trajectory(about))
+        about = replace(about, sensors=_report_sensors(run, bag, check))
         _draw_matches(about, chosen, gallery, inliers)
         findings = look_first(about)
         verdict = conclude(about, findings)
@@ -332,7 +341,7 @@ def _draw_matches(
 
     def draw(closure: LoopClosure) -> None:
         key = closure.endpoints
-        query, match = (gallery.images.get(stamp) for stamp in key)
+        query, match = (gallery.image(stamp) for stamp in key)
         if query is not None and match is not None:
             lines = inliers.get(key, np.empty((0, 4)))
             picture = draw_match(query, match, lines, describe(closure, len(lines), about.by_endpoints.get(key)))
@@ -340,6 +349,21 @@ def _draw_matches(
 
     with ThreadPoolExecutor() as pool:
         list(pool.map(draw, chosen))
+
+
+def _report_sensors(run: FinishedRun, bag: Bag, check: SensorCheck | None) -> SensorReport:
+    """Hold the frames that were checked, or else those of the recording, against the odometry."""
+    if check is not None:
+        return check.report(read_odometry_of(run.folder) or run.odometry)
+    check, stamps, poses = SensorCheck(), [-1], list[Array]([np.eye(4)])
+    for item in FrameReader(bag, run.settings, _odometry_file(run), warn=lambda _: None).stream():
+        if isinstance(item, Frame):
+            check.take(item)
+        elif item.stamp_ns > stamps[-1]:  # as far as its stamps grow
+            stamps.append(item.stamp_ns)
+            poses.append(item.odom_T_body)
+    heard = Trajectory(np.array(stamps[1:], np.int64), np.stack(poses)[1:]) if len(stamps) > 1 else run.odometry
+    return check.report(heard)
 
 
 def _odometry_file(run: FinishedRun) -> Trajectory | None:

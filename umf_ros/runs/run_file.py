@@ -23,6 +23,7 @@ from umf_ros.core.errors import UmfError, writing
 from umf_ros.core.frames import Candidate, LoopClosure, Points
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.core.io import Schema, SqliteFile, write_table
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureReason, ClosureVerdict, State
 from umf_ros.verification.hypothesis import ACCEPTED, Hypothesis, RejectReason
 
@@ -61,8 +62,11 @@ SCHEMA = Schema(
             "CREATE TABLE absolute (source TEXT, stamp_ns INTEGER, odometry_before INTEGER, data BLOB NOT NULL, "
             "PRIMARY KEY (source, stamp_ns))",
         ),
+        ("CREATE TABLE picture (stamp_ns INTEGER, jpeg BLOB, width INTEGER, height INTEGER, scan BLOB NOT NULL)",),
     ),
 )
+SCAN_UNIT_M = 0.02
+"""Unit of the points of a `Picture`."""
 Row = TypeVar("Row")
 
 Endpoints = tuple[int, int]
@@ -82,6 +86,23 @@ class StoredOdometry(NamedTuple):
     stamp_ns: int
     odom_T_body: Array
     covariance: Array | None = None
+
+
+class Picture(NamedTuple):
+    """Small pictures of a keyframe for the report.
+
+    Attributes:
+        stamp_ns: of the keyframe.
+        jpeg: reduced left image, empty without one.
+        width, height: pixels of the image before it was reduced.
+        scan: (N, 3) int16 points in `SCAN_UNIT_M`, body frame.
+    """
+
+    stamp_ns: int
+    jpeg: bytes
+    width: int
+    height: int
+    scan: NDArray[np.int16]
 
 
 GraphInput = LoopClosure | StoredOdometry | AbsoluteMeasurement
@@ -129,6 +150,11 @@ class RunFile:
         """Add the descriptor (D,) of a keyframe in half precision, within a transaction."""
         data = np.asarray(descriptor, np.float16).tobytes()
         self._file.connection.execute("INSERT INTO descriptor VALUES (?, ?)", (stamp_ns, data))
+
+    def append_picture(self, picture: Picture) -> None:
+        """Add the pictures of a keyframe, within a transaction."""
+        values = (*picture[:4], picture.scan.astype("<i2").tobytes())
+        self._file.connection.execute("INSERT INTO picture VALUES (?, ?, ?, ?, ?)", values)
 
     def append_odometry(self, number: int, odometry: StoredOdometry) -> None:
         """Add the n-th odometry of the recording with the next transaction; a known one stays."""
@@ -195,6 +221,13 @@ class RunFile:
             rows = connection.execute("SELECT stamp_ns, data FROM descriptor ORDER BY rowid")
             return {int(stamp): np.frombuffer(data, np.float16).astype(np.float32) for stamp, data in rows}
 
+    def pictures(self) -> Iterator[Picture]:
+        """The pictures of the keyframes; none in files of an earlier release."""
+        with self._file.reading() as connection:
+            if connection.execute("SELECT name FROM sqlite_master WHERE name = 'picture'").fetchone():
+                for stamp_ns, jpeg, width, height, scan in connection.execute("SELECT * FROM picture ORDER BY rowid"):
+                    yield Picture(stamp_ns, jpeg, width, height, np.frombuffer(scan, "<i2").reshape(-1, 3))
+
     def export(self, localizing: bool = False) -> None:
         """Write the CSV tables; that of the poses in a map also without rows where the run is localising."""
         for name, columns in COLUMNS.items():
@@ -229,6 +262,17 @@ def read_descriptors(folder: Path) -> dict[int, Points]:
         return {}
     with closing(RunFile(folder, read_only=True)) as file:
         return file.descriptors()
+
+
+def read_odometry_of(folder: Path) -> Trajectory | None:
+    """The odometry messages that a run has recorded, as far as their stamps grow; None without any."""
+    with closing(RunFile(folder, read_only=True)) as file:
+        messages = [one for one in file.odometry() if one.covariance is None]
+    if not messages:
+        return None
+    stamps = np.array([one.stamp_ns for one in messages], np.int64)
+    newer = np.flatnonzero(stamps > np.maximum.accumulate(np.concatenate([[-1], stamps[:-1]])))
+    return Trajectory(stamps[newer], np.stack([messages[row].odom_T_body for row in newer]))
 
 
 def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:

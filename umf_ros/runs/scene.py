@@ -14,9 +14,9 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, contributions, explain, missing, most_probable
 from umf_ros.runs.findings import explain_missed
-from umf_ros.runs.gallery import SCAN_UNIT_M, Gallery, Photograph
+from umf_ros.runs.gallery import Gallery, data_address
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.run_file import Endpoints
+from umf_ros.runs.run_file import SCAN_UNIT_M, Endpoints
 from umf_ros.runs.truth import JudgedRun, pose_in_truth, positions_in_truth
 from umf_ros.verification.hypothesis import Hypothesis
 
@@ -24,6 +24,8 @@ ORDER = ("false", "missed", "rejected", "pending", "tested", "accepted")
 """Kinds of pairs: the pictures of the first ones come first where not all find room."""
 MOST = {"missed": 60, "tested": 20, "accepted": 400}
 """Pairs of a kind that are explained in full."""
+Photograph = tuple[str, int, int]
+"""A reduced image: a `data:` address, and width and height in pixels of the image that it was made from."""
 Pairs = dict[Endpoints, dict[str, Any]]
 """Entries of the page about pairs of keyframes, by their stamps."""
 
@@ -197,13 +199,15 @@ def _media(pairs: Iterable[Endpoints], gallery: Gallery) -> tuple[dict[str, Phot
     photographs: dict[str, Photograph] = {}
     scans: dict[str, str] = {}
     for stamp in dict.fromkeys(stamp for key in pairs for stamp in key):
-        photograph, scan = gallery.photographs.get(stamp), gallery.scans.get(stamp, "")
-        size = (len(photograph[0]) if photograph else 0) + len(scan)
-        if size <= room:
-            room -= size
+        if (picture := gallery.pictures.get(stamp)) is None:
+            continue
+        address = data_address("image/jpeg", picture.jpeg) if picture.jpeg else ""
+        scan = gallery.scan(stamp)
+        if len(address) + len(scan) <= room:
+            room -= len(address) + len(scan)
             scans[str(stamp)] = scan
-            if photograph is not None:
-                photographs[str(stamp)] = photograph
+            if address:
+                photographs[str(stamp)] = address, picture.width, picture.height
     return photographs, scans
 
 

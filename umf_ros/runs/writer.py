@@ -15,18 +15,21 @@ from math import isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
 from umf_ros import __version__
 from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError
-from umf_ros.core.frames import Frame
+from umf_ros.core.frames import Frame, Keyframe
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import create_run_folder, write_atomically
 from umf_ros.runs.run_file import (
     NAME,
+    SCAN_UNIT_M,
     STAGES,
+    Picture,
     RunFile,
     StoredOdometry,
     candidate_row,
@@ -44,6 +47,7 @@ if TYPE_CHECKING:
 
 PLACES = "places.sqlite"
 """Store of places of a replay whose settings name none, until it is finished."""
+PHOTO_WIDTH, PHOTO_QUALITY, SCAN_POINTS = 360, 60, 3000  # by hand: rocks are still rocks, at some 30 kB a keyframe
 
 
 def create_folder(out: Path, bag: Path) -> Path:
@@ -147,6 +151,7 @@ class RunRecorder:
             self._file.append("keyframes", [[stamp_ns, keyframe.session, f"{keyframe.path_length_m:.4f}"]])
             self._file.append("latencies", [[stamp_ns, *times]])
             self._file.append_descriptor(stamp_ns, keyframe.embedding.descriptor)
+            self._file.append_picture(picture_of(frame, keyframe))
             self._file.append("candidates", [candidate_row(one) for one in detection.verdicts])
             self._file.append("closures", closures, odometry_before=self._odometry)
             self._file.append("inliers", [row for one in new for row in inlier_rows(one)])
@@ -231,6 +236,21 @@ class RunRecorder:
             "closures_published": len(self.earlier_closures),
             "closures_rejected": sum(row[3] != "accepted" for row in candidates),
         }
+
+
+def picture_of(frame: Frame, keyframe: Keyframe) -> Picture:
+    """Reduce the left image and the scan of a keyframe to what the report shows."""
+    points = keyframe.points[
+        np.linspace(0, len(keyframe.points) - 1, min(len(keyframe.points), SCAN_POINTS)).astype(int)
+    ]
+    scan = np.clip(np.rint(points / SCAN_UNIT_M), -32767, 32767).astype(np.int16)
+    if frame.left is None:
+        return Picture(frame.stamp_ns, b"", 0, 0, scan)
+    height, width = frame.left.shape
+    size = min(width, PHOTO_WIDTH), max(1, round(height * min(1.0, PHOTO_WIDTH / width)))
+    reduced = cv2.resize(frame.left, size, interpolation=cv2.INTER_AREA)
+    _, jpeg = cv2.imencode(".jpg", reduced, [cv2.IMWRITE_JPEG_QUALITY, PHOTO_QUALITY])
+    return Picture(frame.stamp_ns, jpeg.tobytes(), width, height, scan)
 
 
 def count_drops(counters: Mapping[Input, InputCounter], worker: int = 0) -> dict[str, int]:
