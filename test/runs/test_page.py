@@ -51,7 +51,7 @@ class Read(HTMLParser):
 
 def written(about: JudgedRun, findings: list[Advice] | None = None) -> str:
     findings = look_first(about) if findings is None else findings
-    scene = build_scene(about, pairs_of(about), Gallery([], [], None), {})
+    scene = build_scene(about, pairs_of(about), Gallery(), {})
     write_page(about, conclude(about, findings), findings, scene)
     return (about.run.folder / "report.html").read_text(encoding="utf-8")
 

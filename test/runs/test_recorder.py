@@ -4,10 +4,12 @@ import csv
 import json
 import sys
 import threading
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from conftest import make_frame, make_keyframe
@@ -18,7 +20,7 @@ from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.detector import Detection
 from umf_ros.runs import writer as recorder_module
-from umf_ros.runs.run_file import ALWAYS, read_closures, read_descriptors
+from umf_ros.runs.run_file import ALWAYS, SCAN_UNIT_M, RunFile, read_closures, read_descriptors
 from umf_ros.runs.writer import RunRecorder, count_drops, read_summary
 from umf_ros.sensors.synchronizer import INPUTS, SURPLUS, InputCounter
 from umf_ros.verification import Hypothesis, RejectReason
@@ -230,3 +232,24 @@ def test_nothing_but_the_file_of_the_run_and_its_exports_is_left(tmp_path: Path)
     read_descriptors(tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {f"{name}.csv" for name in ALWAYS} | {"run.sqlite", "config.yaml"}
+
+
+@pytest.mark.parametrize("width", [200, 900])
+def test_a_keyframe_keeps_a_reduced_image_and_its_scan(tmp_path: Path, width: int) -> None:
+    image = np.tile(np.linspace(0, 255, width).astype(np.uint8), (width // 2, 1))
+    points = np.random.default_rng(0).uniform(-30, 30, (5000, 3)).astype(np.float32)
+    found = detection(5, [])
+    assert found.keyframe is not None
+    recorder = RunRecorder(tmp_path, Settings(), "w")
+    recorder.record(replace(make_frame(5), left=image), replace(found, keyframe=replace(found.keyframe, points=points)))
+    recorder.close()
+    with closing(RunFile(tmp_path, read_only=True)) as file:
+        (picture,) = file.pictures()
+    assert (picture.stamp_ns, picture.width, picture.height) == (5 * 10**9, width, width // 2)
+    reduced = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert reduced is not None and reduced.shape == (min(width, 360) // 2, min(width, 360))
+    assert (
+        abs(float(reduced.mean()) - float(image.mean())) < 3 and reduced[:, -1].mean() > 240 > 15 > reduced[:, 0].mean()
+    )
+    assert len(picture.scan) == 3000 and len(picture.jpeg) < 20_000
+    np.testing.assert_allclose(picture.scan[[0, -1]] * SCAN_UNIT_M, points[[0, -1]], atol=SCAN_UNIT_M)

@@ -110,7 +110,7 @@ class EmbeddingSettings(Group):
     )
     runtime: Literal["auto", "torch", "openvino"] = Field("auto", description="what runs the network")
     device: str = Field("cpu", description="torch device")
-    threads: int = Field(0, ge=0, le=64, description="threads of the network; 0: as many as there are cores")
+    threads: int = Field(0, ge=0, le=64, description="threads of each of the two networks; 0: half of the cores")
 
 
 class Loop(Group):

@@ -106,7 +106,8 @@ def make_runtime(weights: Path, settings: EmbeddingSettings, outputs: tuple[str,
 
     Args:
         weights: safetensors file of the network.
-        settings: runtime ("auto" prefers OpenVINO on a CPU), device and threads (0: number of cores).
+        settings: runtime ("auto" prefers OpenVINO on a CPU), device and threads (0: half of the cores, for
+            two networks run side by side).
         outputs: names of the outputs to compute.
 
     Raises:
@@ -115,7 +116,7 @@ def make_runtime(weights: Path, settings: EmbeddingSettings, outputs: tuple[str,
     """
     of_xfeat = outputs == XFEAT_OUTPUTS
     blank: Arrays = [np.zeros(XFEAT_SHAPE, np.float32)] if of_xfeat else blank_input(read_config(weights))
-    threads = settings.threads or len(os.sched_getaffinity(0))
+    threads = settings.threads or max(1, len(os.sched_getaffinity(0)) // 2)
     runtime: Runtime
     if _wants_openvino(weights, settings):
         runtime = OpenVinoRuntime(weights, outputs, threads)

@@ -25,7 +25,7 @@ from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection
 from umf_ros.runs.reader import remember_recording
 from umf_ros.runs.writer import RunRecorder
-from umf_ros.verification import Hypothesis, RejectReason
+from umf_ros.verification import Hypothesis, RejectReason, thin_scan
 
 LATENCY = {"embed": 30.0, "query": 1.0, "verify": 9.0, "total": 40.0}
 PIXELS = np.array([[10, 12, 50, 30], [40, 20, 20, 41]], np.float32)
@@ -54,7 +54,7 @@ def record_run(folder: Path, bag: Path, settings_folder: Path) -> list[Frame]:
     closures = {10: verdict(frames[10], frames[5], 0.1, 0.99), 11: verdict(frames[11], frames[6], 0.3, 0.95)}
     closures[12] = verdict(frames[12], frames[7], 0.8, 0.9123)
     for i, frame in enumerate(frames):
-        keyframe = replace(make_keyframe(0, 0.2 * i), stamp_ns=frame.stamp_ns)
+        keyframe = replace(make_keyframe(0, 0.2 * i), stamp_ns=frame.stamp_ns, points=thin_scan(frame.points))
         rejected = Hypothesis(
             frames[0].stamp_ns, Candidate(1, frames[0].stamp_ns, 0.1), {"similarity": 0.1}, RejectReason.NO_POSE
         )
@@ -144,6 +144,10 @@ def test_the_page_shows_every_closure_with_pictures_scans_and_errors(run: Path, 
     assert scene["map"]["lower"][0] < scene["map"]["upper"][0]
 
 
+def test_the_recording_is_read_for_a_check_of_the_sensors(run: Path, bag: Path) -> None:
+    assert "warning: scans have 200 returns in the median" in report(run, bag).text
+
+
 def test_the_table_lists_every_closure_with_its_errors(run: Path, bag: Path) -> None:
     report(run, bag)
     rows = rows_of(run)
@@ -165,7 +169,7 @@ def test_match_pictures_show_both_images_joined_at_the_inliers(run: Path, bag: P
         left, right = picture[margin:, :64], picture[margin:, 64 + gap :]
         coloured = [np.ptp(side, axis=2) > 0 for side in (left, right)]
         for side, image, drawn in zip((left, right), (query, match), coloured, strict=True):
-            np.testing.assert_array_equal(side[~drawn][:, 0], image[~drawn])
+            assert np.abs(side[~drawn][:, 0] - image[~drawn]).mean() < 0.3 * image.std()  # reduced for the run's file
         for u, v, match_u, match_v in PIXELS.astype(int):
             # a circle of three pixels around the feature, in both images
             assert coloured[0][v - 4 : v + 5, u - 4 : u + 5].any()
@@ -209,9 +213,9 @@ def test_closures_outside_of_the_truth_are_not_judged(run: Path, bag: Path, tmp_
     assert [row[10] for row in rows_of(run)] == ["yes", "yes", ""]
 
 
-def test_without_images_there_are_no_match_pictures(bag: Path, tmp_path: Path) -> None:
-    record_run(tmp_path / "run", bag, tmp_path)
+def test_without_images_there_are_no_match_pictures(tmp_path: Path) -> None:
     dark = write_mcap(tmp_path / "dark.mcap", [entry for entry in traverse(4.0) if entry[0] in (CLOUD, TRUTH)])
+    record_run(tmp_path / "run", dark, tmp_path)
     report(tmp_path / "run", dark)
     assert list((tmp_path / "run" / "matches").iterdir()) == []
     assert scene_of(tmp_path / "run")["photographs"] == {}
