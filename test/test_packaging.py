@@ -173,7 +173,7 @@ def test_what_is_imported_is_required(wing: str, lists: list[str]) -> None:
     [
         ("open3d", "the lab needs it: pip install 'umf_ros[lab]'"),
         # it is the lab that asks, but its extra would not bring this one
-        ("cv2", "umf doctor says what helps"),
+        ("cv2", "run umf doctor for a remedy"),
     ],
 )
 def test_a_package_that_is_missing_is_asked_for_in_one_line(module: str, advice: str, tmp_path: Path) -> None:

@@ -84,13 +84,13 @@ def _what_helps(package: str) -> str:
         return "the lab needs it: pip install 'umf_ros[lab]'"
     if package in FLEET_PACKAGES:
         return "pip install 'umf_ros[fleet]' brings it"
-    return "umf doctor says what helps"
+    return "run umf doctor for a remedy"
 
 
 def main() -> NoReturn:
     """Run the command line; 0 for success, 1 for an error, 2 for wrong arguments, 130 after Ctrl-C.
 
-    SIGTERM ends with 143 and tidies up on the way: no unfinished file stays behind, no node goes on.
+    SIGTERM ends with 143 after a clean-up: unfinished files are removed, nodes are ended.
     """
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:

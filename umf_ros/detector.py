@@ -156,13 +156,13 @@ class LoopDetector:
         self._embedder = embedder
         self._verifier = Verifier(settings.verification)
         self.database = _open_places(settings, embedder)
-        self.inter_robot = _encounters(settings, self.database, embedder)
+        self.inter_robot = _connect_fleet(settings, self.database, embedder)
         self._map = range(self.database.next_session) if settings.localizing else None
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
         self._session: int | None = None
         self._stored_session = self.database.next_session
         self._ahead_m = 0.0
-        self._depth_told = False
+        self._warned_without_depth = False
         self.embed_ms = 0.0
         self._network = ThreadPoolExecutor(1, "embedding")
         self._queue: deque[_Upcoming] = deque()
@@ -267,7 +267,7 @@ class LoopDetector:
     def verify(self, keyframe: Keyframe, candidates: Sequence[Candidate]) -> list[Hypothesis]:
         """Test the candidates geometrically."""
         verdicts = self._verifier.verify(keyframe, [(found, self.database[found.index]) for found in candidates])
-        self._tell_depthless(verdicts)
+        self._warn_without_depth(verdicts)
         return verdicts
 
     def match_submaps(self, keyframe: Keyframe, verdicts: list[Hypothesis]) -> list[Hypothesis]:
@@ -287,7 +287,7 @@ class LoopDetector:
         self._submaps.remember(keyframe)
 
     def resume(self, frame: Frame) -> bool:
-        """Take note of a frame that an earlier run over the same store has dealt with: nothing is looked for.
+        """Record a frame that an earlier run over the same store has processed, without a search.
 
         Returns:
             Whether it had become a keyframe.
@@ -299,8 +299,8 @@ class LoopDetector:
             self._submaps.remember(self._go_on_from(known))
         return True
 
-    def meet(self) -> InterRobotClosure | None:
-        """Verify what a fleet's server found for an earlier keyframe, if there is anything new."""
+    def next_inter_robot_closure(self) -> InterRobotClosure | None:
+        """Return the next verified closure with another rover of a fleet; None without a new one."""
         return self.inter_robot.next() if self.inter_robot is not None else None
 
     def close(self) -> None:
@@ -315,14 +315,14 @@ class LoopDetector:
         self._session = None
         self._selector.reset()
 
-    def _tell_depthless(self, verdicts: Sequence[Hypothesis]) -> None:
-        """Say, once, why nothing becomes metric: one camera without a LiDAR recognises places, no more."""
-        if not self._depth_told and any(verdict.reason is RejectReason.NO_DEPTH for verdict in verdicts):
-            self._depth_told = True
+    def _warn_without_depth(self, verdicts: Sequence[Hypothesis]) -> None:
+        """Warn once that candidates stay without a metric pose: one camera without a LiDAR measures no depth."""
+        if not self._warned_without_depth and any(verdict.reason is RejectReason.NO_DEPTH for verdict in verdicts):
+            self._warned_without_depth = True
             logger.warning("%s: %s", NOTHING_METRIC, RejectReason.NO_DEPTH.value)
 
     def _start_session(self, frame: Frame) -> None:
-        """A new way begins; where the clock was set back, what was stored later than now waits for its time."""
+        """Begin a session; where the clock was set back, keyframes with later stamps are not found until then."""
         self._session = frame.session
         self._stored_session, self._ahead_m = self.database.next_session, 0.0
         if len(self.database) and self._map is None:
@@ -331,7 +331,7 @@ class LoopDetector:
         self._submaps.reset()
 
     def _go_on_from(self, known: int) -> Keyframe:
-        """The stored keyframe that a frame became before; what follows belongs to its session, and to its way."""
+        """Return the stored keyframe of a frame that was processed before, and continue its session and path length."""
         keyframe = self.database[known]
         self._stored_session = keyframe.session
         ahead_m = keyframe.path_length_m - self._current.path_length_m if self._current else math.nan
@@ -374,12 +374,12 @@ def _assemble(frame: Frame, embedding: Embedding, path_length_m: float, session:
     )
 
 
-def _encounters(settings: Settings, database: PlaceDatabase, embedder: Embedder) -> InterRobotMatcher | None:
-    """The way to other rovers' places, where there is a fleet; what it takes is imported only then.
+def _connect_fleet(settings: Settings, database: PlaceDatabase, embedder: Embedder) -> InterRobotMatcher | None:
+    """Connect to the places of a fleet; its packages are imported only then.
 
     Raises:
         ConfigError: the settings name no server.
-        UmfError: what it takes is not installed.
+        UmfError: a package of the fleet is not installed.
     """
     if settings.database.backend == "sqlite" or settings.localizing:
         return None

@@ -288,7 +288,7 @@ class MapFollower(PoseGraph):
         return usable
 
     def add_absolute(self, measurement: AbsoluteMeasurement) -> None:
-        """Count a measurement: the map stays as it is, and tells the pose."""
+        """Count a measurement; the map stays unchanged."""
         self.counts["absolute measurements unused"] += 1
 
     def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:

@@ -109,8 +109,8 @@ class Replay:
             self._add_closures(detection.closures)
             if self._localizer is not None and detection.keyframe is not None:
                 self._record_pose(self._localizer)
-            while (inter_closure := self._detector.meet()) is not None:
-                self._recorder.record_encounter(inter_closure)
+            while (inter_closure := self._detector.next_inter_robot_closure()) is not None:
+                self._recorder.record_inter_robot(inter_closure)
             yield detection
             if detection.fault is not None:
                 raise detection.fault
@@ -192,7 +192,7 @@ class Replay:
         """
         if self._detector.inter_robot is not None:
             for inter_closure in self._detector.inter_robot.rest(FLEET_PATIENCE_S):
-                self._recorder.record_encounter(inter_closure)
+                self._recorder.record_inter_robot(inter_closure)
         if self._localizer is not None:
             has_trajectory = self._write_localization()
         elif has_trajectory := self._has_odometry:

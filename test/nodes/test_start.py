@@ -50,4 +50,4 @@ def test_without_its_venv_a_workspace_says_so_in_one_line(command: list[str]) ->
 def test_a_package_that_is_missing_is_named_in_one_line() -> None:
     code = f"import sys; sys.modules['gtsam'] = None; {START}('umf_ros.nodes.pose_graph_node')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
-    assert (done.returncode, done.stderr) == (1, "umf: gtsam is not installed; umf doctor says what helps\n")
+    assert (done.returncode, done.stderr) == (1, "umf: gtsam is not installed; run umf doctor for a remedy\n")

@@ -124,7 +124,7 @@ class FrameReader:
 
 
 def read_transforms(bag: Bag) -> StaticTransforms:
-    """The static transforms of a recording, whenever they were said: they are latched."""
+    """The static transforms of a recording, whenever they were published: they are latched."""
     transforms = StaticTransforms()
     if TOPIC in bag.topics:
         for _, _, message in bag.messages([TOPIC]):

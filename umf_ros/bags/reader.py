@@ -49,7 +49,7 @@ class Bag:
         """Topic, time of recording in ns and message, in the order of their recording.
 
         Raises:
-            BagError: a message is not what its type says.
+            BagError: a message does not match its type.
         """
         for raw in self.raw_messages(topics):
             try:
@@ -68,7 +68,7 @@ def decode(raw: RawMessage) -> Any:
         return message_types().deserialize_cdr(raw.data, raw.type)
     except Exception as error:  # damaged bytes provoke anything
         cause = one_line(error)
-        raise MessageError("undecodable", f"message is not what its type {raw.type} says ({cause})") from None
+        raise MessageError("undecodable", f"message does not match its type {raw.type} ({cause})") from None
 
 
 @contextmanager
@@ -87,7 +87,7 @@ def _one_line(path: Path) -> Iterator[None]:
 def open_bag(path: str | Path) -> Bag:
     """Open an mcap file, a ROS 2 folder (mcap or db3), a db3 file or a ROS 1 `.bag`.
 
-    A recording that breaks off is opened as far as it goes; `Bag.warning` says so.
+    A recording that breaks off is opened as far as it goes; `Bag.warning` is set.
 
     Raises:
         BagError: there is no such recording, it is none, or it holds no message.

@@ -240,7 +240,7 @@ def _check_chunks(path: Path, indexes: Collection[ChunkIndex]) -> None:
 
 
 def _check_chunk(claimed: int, compression: str, start: bytes) -> None:
-    if compression == "zstd":  # the frame says it again, and is believed by the decompressor
+    if compression == "zstd":  # the frame repeats the size, and the decompressor uses that
         claimed = max(claimed, frame_content_size(start))
     if claimed > LARGEST_CHUNK:
         raise ValueError(f"a chunk claims {claimed} bytes")
@@ -308,7 +308,7 @@ def open_files(path: Path) -> list[RecordedFile]:
     """
     if path.is_dir():
         return _open_folder(path)
-    if not path.is_file():  # a pipe says nothing until somebody writes
+    if not path.is_file():  # a pipe blocks until it is written to
         raise BagError(f"{path} is no recording: neither a file nor a folder")
     with path.open("rb") as file:
         start = file.read(16)

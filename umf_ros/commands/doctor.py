@@ -59,7 +59,7 @@ class Finding:
 
 
 def command() -> None:
-    """Check this machine: packages, ROS 2, DDS, weights; says what helps where something is wrong."""
+    """Check this machine: packages, ROS 2, DDS, weights; names a remedy for every fault."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

@@ -152,7 +152,7 @@ class PoseGraphSettings(Group):
     """The GTSAM back-end."""
 
     keyframe_period_s: float = Field(0.5, gt=0, le=60, description="odometry is sampled this often, s")
-    keyframe_spacing_m: float = Field(0.25, gt=0, description="a pose of the graph after this much way, m")
+    keyframe_spacing_m: float = Field(0.25, gt=0, description="path length between poses of the graph, m")
     max_gap_s: float = Field(2.0, gt=0, description="longest gap of the odometry that is interpolated, s")
     odometry_sigma_m: float = Field(0.05, gt=0, description="odometry noise after one metre (grows with the root), m")
     odometry_sigma_deg: float = Field(

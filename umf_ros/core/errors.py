@@ -1,4 +1,4 @@
-"""The exceptions a user of the package can meet, and how they name a choice."""
+"""The exceptions that a user of the package can see, and how they name a choice."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class BagError(UmfError):
 
 
 class SensorFileError(UmfError):
-    """A file of a scan or an image that is missing, or not what its name says."""
+    """A file of a scan or an image that is missing, or of another format than its name."""
 
 
 class ConfigError(UmfError):

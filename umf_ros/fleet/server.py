@@ -61,7 +61,7 @@ def migrate(connection: Connection, embedder: str, dimension: int) -> tuple[int,
     """Bring the tables up to date in one transaction; returns the version before and after.
 
     The connection is of a user who may create roles and tables; new tables are for descriptors of this embedder with
-    so many numbers. An `UmfError` says that a later version of umf_ros made the tables.
+    so many numbers. Tables made by a later version of umf_ros raise an `UmfError`.
     """
     with connection.transaction():
         # a second administrator waits here, and finds nothing to do

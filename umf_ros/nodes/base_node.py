@@ -53,7 +53,7 @@ class BaseNode(LifecycleNode, ABC):
     """
 
     def __init__(self, name: str, results: str) -> None:
-        """Declare the parameters; `results` says what the folder `results_dir` is for."""
+        """Declare the parameters; `results` describes the folder `results_dir`."""
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
         self._settings, self._results = declare(self, results)
         self._watches: list[InputWatch] = []
@@ -260,7 +260,7 @@ class BaseNode(LifecycleNode, ABC):
             from tf2_msgs.msg import TFMessage
         except ImportError:
             if self._settings.frames.extrinsics == "tf":
-                self.get_logger().info("tf2_msgs is not installed: the sensors are where the calibration file says")
+                self.get_logger().info("tf2_msgs is not installed: extrinsics are those of the calibration file")
         else:
             self.create_subscription(TFMessage, TOPIC, self._guarded("transforms", transforms.add), STATIC_QOS)
         return BodyFrames(self._settings.frames, transforms, warn, PATIENCE_S, calibration)
@@ -301,7 +301,7 @@ class BaseNode(LifecycleNode, ABC):
         return own
 
     def _complain(self, error: Exception, what: str = "") -> None:
-        """Count a fault; the first of each kind is told at once, the others now and then."""
+        """Count a fault; log the first of each kind at once and later ones at a limited rate."""
         kind = error.kind if isinstance(error, MessageError) else type(error).__name__
         self._faults[kind] += 1
         where = f"{what}: " if what else ""

@@ -102,7 +102,7 @@ def closure_to_message(closure: LoopClosure, query_robot: str = "", match_robot:
     """A loop closure as odometry between two keyframes that are not consecutive.
 
     `header.frame_id` is the match, `child_frame_id` the query, `pose` is `match_T_query`, its
-    covariance is in ROS order about the axes of the match body. There is no twist, as `twist.covariance[0] = -1` says;
+    covariance is in ROS order about the axes of the match body. `twist.covariance[0] = -1` marks the twist as unused;
     `twist.covariance[1]` is the probability. Between two rovers of a fleet both frames name theirs.
     """
     message = Odometry(child_frame_id=keyframe_frame(closure.query_stamp_ns, query_robot))

@@ -137,12 +137,12 @@ class LoopClosureNode(BaseNode):
         if self._recorder is not None:
             self._recorder.record(frame, detection)
         with self._lock:
-            inter_closure = self._detector.meet()
+            inter_closure = self._detector.next_inter_robot_closure()
         if inter_closure is not None:
             self._publisher.announce_encounter(inter_closure)
             self._between += len(inter_closure.closures)
             if self._recorder is not None:
-                self._recorder.record_encounter(inter_closure)
+                self._recorder.record_inter_robot(inter_closure)
 
     def _drops(self) -> dict[str, int]:
         return count_drops(self._synchronizer.counters, self._worker.dropped + self._decoder.dropped)

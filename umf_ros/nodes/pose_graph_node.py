@@ -56,7 +56,7 @@ UNSETTLED = "no time to settle the graph: results as they stand; they are settle
 DRAWING = 20.0
 """Path and markers are published again after this many times the time that they took: long paths are large."""
 GRACE_S = 0.5
-"""A front-end that was asked to end together with us says so within this."""
+"""Time within which a front-end that shuts down together with this node reports it."""
 
 
 class PoseGraphNode(BaseNode):
@@ -112,7 +112,7 @@ class PoseGraphNode(BaseNode):
             self._durable.close()
 
     def ready_to_close(self) -> bool:
-        """Whether the front-end, if it was asked to end as well, has said its last words."""
+        """Whether a front-end that shuts down as well has published its last closures."""
         now_s = time.monotonic()
         if self._asked_s is None:
             self._asked_s = now_s

@@ -31,7 +31,7 @@ def start(module: str) -> None:
     except UmfError as error:
         sys.exit(f"umf: {error}")
     except ModuleNotFoundError as error:
-        sys.exit(f"umf: {error.name} is not installed; umf doctor says what helps")
+        sys.exit(f"umf: {error.name} is not installed; run umf doctor for a remedy")
     main()
 
 

@@ -76,7 +76,7 @@ def likelihood_ratio(false_alarms: Array, distances: Array, settings: PoseGraphS
 
     Args:
         false_alarms: (N,) false-alarm probabilities of the predictions.
-        distances: (N,) squared Mahalanobis distances from them; better than most right ones says no more.
+        distances: (N,) squared Mahalanobis distances from them; those below that of most right closures count alike.
         settings: of the pose graph.
     """
     right = chi2.pdf(np.maximum(distances, _DEGREES - 2), _DEGREES)

@@ -320,7 +320,7 @@ class OutlierRejection:
         return best
 
     def _odds_against(self, place: list[int], at_last: bool) -> Array:
-        """(N,) odds that closures of one place are wrong, as far as the map and, at last, all else tell."""
+        """(N,) odds that closures of one place are wrong, by the map and, at the end, by all other evidence."""
         odds = np.array([self._ratios[row] for row in place])
         if not at_last:
             return odds

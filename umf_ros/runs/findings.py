@@ -79,7 +79,7 @@ def _pairs(about: JudgedRun) -> Iterator[Advice]:
         yield Advice("fault", what, "the clocks of camera and LiDAR differ, or sync.slop_s is too small")
     if not summary["keyframes"]:
         what = f"no keyframe came of {summary['frames']} frames"
-        yield Advice("fault", what, "umf inspect says what the recording holds")
+        yield Advice("fault", what, "umf inspect lists what the recording holds")
 
 
 def _gaps(about: JudgedRun) -> Iterator[Advice]:
@@ -143,7 +143,7 @@ def _absolute(about: JudgedRun) -> Iterator[Advice]:
         if accepted:
             yield Advice("note", what)
         else:
-            yield Advice("warning", what, "docs/absolute.md says what each reason means")
+            yield Advice("warning", what, "docs/absolute.md explains each reason")
 
 
 def _closures(about: JudgedRun) -> Iterator[Advice]:
@@ -163,11 +163,11 @@ def _closures(about: JudgedRun) -> Iterator[Advice]:
         share = f"{number / len(whys):.0%} of them at the gate '{gate}'"
         what = f"{count} of {revisits} revisits are missed, {share} (at {at_s:.1f} s: {first.what})"
         severity: Severity = "fault" if count == revisits and not about.run.closures else "warning"
-        yield Advice(severity, what, first.parameter or "umf why RUN STAMP says it of each")
+        yield Advice(severity, what, first.parameter or "umf why RUN STAMP explains each")
 
 
 def _unjudged(about: JudgedRun) -> Iterator[Advice]:
-    """Nothing was found, and no truth tells whether there was anything to find."""
+    """Nothing was found, and without a truth it is unknown whether there was anything to find."""
     run = about.run
     if run.closures or run.truth is not None or not run.candidates:
         return

@@ -98,7 +98,7 @@ def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = N
 
 
 def describe_recording(bag: Bag) -> dict[str, Any]:
-    """The `recording` entry of a summary: its path, and what tells a recording from any other."""
+    """The `recording` entry of a summary: its path, start, end and message counts."""
     return {
         "path": str(bag.path.resolve()),
         "start_ns": bag.start_ns,

@@ -174,7 +174,7 @@ class RunRecorder:
         """Write the next absolute measurement of the recording, with the next keyframe."""
         self._file.append_absolute(self._odometry, measurement)
 
-    def record_encounter(self, inter_closure: InterRobotClosure) -> None:
+    def record_inter_robot(self, inter_closure: InterRobotClosure) -> None:
         """Write the closures with another rover of a fleet."""
         rows = [[inter_closure.robot, *closure_row(one, nan)] for one in inter_closure.closures]
         with self._file.writing():

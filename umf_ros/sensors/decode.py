@@ -171,7 +171,7 @@ def _time_offsets_ns(records: NDArray[Any], message: Any) -> NDArray[np.int64] |
         offsets = np.rint((times - stamp_ns(message) * 1e-9) * 1e9).astype(np.int64)
     else:
         offsets = np.rint(times.astype(float) * 1e9).astype(np.int64)
-    # no sweep takes a second: what says so counts from elsewhere
+    # no sweep takes a second: such offsets count from another origin
     return offsets if not len(offsets) or np.abs(offsets).max() < LONGEST_SWEEP_NS else None
 
 

@@ -34,7 +34,7 @@ _INPUTS: dict[str, Input] = {
 
 
 def wanted_inputs(topics: Topics) -> set[Input]:
-    """Inputs of the synchronizer for which there is a topic; the right camera_info alone says nothing."""
+    """Inputs of the synchronizer for which there is a topic; the right camera_info alone does not count."""
     return {name for entry, name in _INPUTS.items() if getattr(topics, entry) and entry != "right_info"}
 
 
@@ -117,7 +117,7 @@ class MessageRouter:
     def _use_info(self, entry: str, message: Any) -> None:
         """Use the camera_info of the pair, or the left one alone when the right camera stays silent.
 
-        The first is used at once. A later one that says something else replaces it when it is said twice in a row:
+        The first is used at once. A later one with other contents replaces it when it comes twice in a row:
         one message may be damaged, a camera that was set up anew goes on saying so.
         """
         content = (message.width, message.height, bytes(np.array(message.k)), bytes(np.array(message.p)))

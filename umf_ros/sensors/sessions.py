@@ -12,12 +12,12 @@ from umf_ros.core.geometry import Array
 
 Input = Literal["left", "right", "cloud", "odometry", "camera_info"]
 ODOMETRY: Input = "odometry"
-"""The input whose values are poses, (4, 4) `odom_T_body`: they tell a reset even when its clock runs on."""
+"""The input whose values are poses, (4, 4) `odom_T_body`: their jump reveals a reset even when its clock runs on."""
 
 CLOCK_STEP_NS = 1_000_000_000
 """A stamp this much older than the newest of its input is not late: the clock was set back."""
 AGREEMENT_NS = 5_000_000_000
-"""Two messages out of line tell of the same new session when their stamps lie this close together."""
+"""Two messages out of line belong to the same new session when their stamps lie this close together."""
 FASTEST_M_PER_S = 20.0
 LEAST_JUMP_M = 2.0
 DROPPED = ("clock jump", "position jump")
@@ -48,7 +48,7 @@ class Reset:
 
 
 class SessionClock:
-    """Keeps the time of some inputs and tells a new session from a single message that is wrong.
+    """Follows the clocks of some inputs and distinguishes a new session from a single wrong message.
 
     A message out of line with the newest of its input (its stamp went back, or the odometry jumped) is held until
     another agrees with it: of its own input one that goes on from it or, where the stamps went back, one of any
@@ -111,7 +111,7 @@ class SessionClock:
         return [replace(one, fault=DROPPED[0] if reset.of_clock else DROPPED[1]) for one, reset in pairs]
 
     def _advance(self, arrival: StampedInput) -> StampedInput:
-        """Take note of a message that is in line, and tell its fault."""
+        """Record a message that is in line, and return its fault."""
         newest = self._newest.get(arrival.name)
         if newest is None and self._is_stale(arrival.stamp_ns):
             return replace(arrival, fault="stale")
@@ -147,7 +147,7 @@ def _reset(before: StampedInput, after: StampedInput) -> Reset | None:
 
 
 def _agree(held: StampedInput, why: Reset, arrival: StampedInput, reset: Reset) -> bool:
-    """Whether two messages out of line tell of the same new session."""
+    """Whether two messages out of line belong to the same new session."""
     if abs(arrival.stamp_ns - held.stamp_ns) > AGREEMENT_NS:
         return False
     if held.name == arrival.name:
@@ -189,7 +189,7 @@ class OdometrySessionSplitter:
 
     @property
     def held(self) -> int:
-        """Messages of which the next will tell whether they are wrong or begin a session."""
+        """Messages that are wrong or begin a session; the next message decides."""
         return self._clock.held
 
     def interrupted(self) -> None:

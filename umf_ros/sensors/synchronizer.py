@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 INPUTS: tuple[Input, ...] = ("left", "right", "cloud", ODOMETRY)
 
 STEREO_SLOP_NS = 17_000_000
-"""Exposures of a pair carry the same stamp; half a period at 30 Hz tells a pair from the neighbouring one."""
+"""Exposures of a pair carry the same stamp; half a period at 30 Hz separates neighbouring pairs."""
 
 SILENCE_NS = 5_000_000_000
 """An input of which nothing has come in this much stream time is taken to be absent."""
@@ -253,7 +253,7 @@ class Synchronizer:
         return name in self._inputs and name not in self._absent
 
     def _is_silent(self, name: Input, now_ns: int) -> bool:
-        """Whether an input has said nothing for long, by the stamps of the others."""
+        """Whether an input has been silent for long, by the stamps of the others."""
         newest_ns = self._clock.newest_ns(name)
         return now_ns - (self._clock.start_ns if newest_ns is None else newest_ns) > SILENCE_NS
 

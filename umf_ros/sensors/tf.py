@@ -1,4 +1,4 @@
-"""How the parts of a robot are mounted, as `/tf_static` says."""
+"""Extrinsics from `/tf_static`."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class StaticTransforms:
                 self.version += 1
 
     def find(self, frame: str, other: str) -> Array | None:
-        """(4, 4) `frame_T_other`, or None where no static way leads from one to the other."""
+        """(4, 4) `frame_T_other`, or None where no chain of static transforms connects the two."""
         ours, theirs = self._to_roots(frame.lstrip("/")), self._to_roots(other.lstrip("/"))
         common = next((name for name in ours if name in theirs), None)
         return None if common is None else invert(ours[common]) @ theirs[common]
@@ -93,7 +93,7 @@ class BodyFrames:
     def mounting(self, sensor: str, frame_id: str) -> dict[str, Any]:
         """Return the new pose of a "camera" or a "lidar", as `body_T_camera` or `body_T_lidar`; empty: as before.
 
-        A new pose is one line of warning that says how far it is from that of the calibration.
+        Warn once about a new pose, with its distance from that of the calibration.
         """
         state = frame_id, self._transforms.version
         if self._calibration is None or self._mounted.get(sensor) == state:

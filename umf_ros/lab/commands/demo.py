@@ -64,7 +64,7 @@ def play(
     import sys
 
     if importlib.util.find_spec("rclpy") is None:
-        raise UmfError("playing needs ROS 2 (rclpy is not installed); umf doctor says what helps")
+        raise UmfError("playing needs ROS 2 (rclpy is not installed); run umf doctor for a remedy")
     arguments = [str(bag), "--rate", str(rate), *["--loop"] * loop, *["--wait-for-subscribers"] * wait_for_subscribers]
     # the player takes the place of this process: signals and the exit status are its own
     os.execv(sys.executable, [sys.executable, "-m", "umf_ros.lab.live.bag_player_node", *arguments])
