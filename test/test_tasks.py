@@ -46,7 +46,7 @@ def test_what_a_task_says_is_the_one_line(tmp_path: Path, workers: int, ray: str
 
 def test_a_task_that_kills_every_worker_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(spread_module, "ATTEMPTS", 2)
-    with pytest.raises(UmfError, match="1 tasks end the process"):
+    with pytest.raises(UmfError, match="1 tasks crashed their worker"):
         spread(die, [(tmp_path, 1)], 2)
 
 

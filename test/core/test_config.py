@@ -89,10 +89,10 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (BOMB, "its aliases stand for too much"),
+        (BOMB, "its aliases expand to too many nodes"),
         ("a: &a [*a]", "contains itself"),
-        ("1: 2", "a name is text, not 1"),
-        ("loop: {3: 4}", "a name is text, not 3"),
+        ("1: 2", "a name must be text, not 1"),
+        ("loop: {3: 4}", "a name must be text, not 3"),
         ("[" * 100_000, "not valid YAML"),
         ("a: " + "b" * 2**23, "larger than 4 MB"),
         ("? {a: b}\n: c", "not valid YAML"),

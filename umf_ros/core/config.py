@@ -32,7 +32,7 @@ def _known(name: str) -> str:
 
 
 def without_password(address: str) -> str:
-    """The address of a server, unless it holds a password, which would be written beside the results."""
+    """Return the address of a server; refuse one with a password, which would be written beside the results."""
     if "password" in address.lower() or (":" in address.partition("://")[2].partition("@")[0] and "@" in address):
         raise ValueError("the password belongs into ~/.pgpass or PGPASSWORD, not into the address")
     return address
@@ -54,7 +54,7 @@ class Topics(Group):
 
 
 class AbsoluteTopics(Group):
-    """Topics of measurements that say where the rover is on the planet."""
+    """Topics of measurements of absolute position and attitude."""
 
     gnss: str = Field("", description="GNSS, sensor_msgs/NavSatFix; empty: none")
     imu: str = Field("", description="IMU for the direction of gravity, sensor_msgs/Imu; empty: none")
@@ -74,30 +74,30 @@ class Qos(Group):
     reliability: Literal["best_effort", "reliable"] = Field(
         "best_effort", description="best_effort matches every publisher"
     )
-    depth: int = Field(50, ge=1, le=1000, description="messages kept per subscription: bridges a busy second")
+    depth: int = Field(50, ge=1, le=1000, description="messages queued per subscription; covers a busy second")
 
 
 class Sync(Group):
-    """How messages become synchronised frames."""
+    """Synchronisation of messages into frames."""
 
-    slop_s: float = Field(0.05, gt=0, le=1, description="largest distance of an image's stamp from the scan's, s")
+    slop_s: float = Field(0.05, gt=0, le=1, description="largest time difference between image and scan, s")
     max_wait_s: float = Field(
         1.0, gt=0, le=10, description="stream time after which a scan stops waiting for a late input, s"
     )
-    queue_size: int = Field(60, ge=2, le=1000, description="at most this many messages buffered per input")
+    queue_size: int = Field(60, ge=2, le=1000, description="messages buffered per input at most")
     odometry_buffer_s: float = Field(10.0, gt=0, le=600, description="odometry kept for interpolation, s")
-    max_odometry_gap_s: float = Field(1.0, gt=0, le=60, description="no pose is interpolated across a longer gap, s")
+    max_odometry_gap_s: float = Field(1.0, gt=0, le=60, description="longest odometry gap that is interpolated, s")
     require_image: bool = Field(False, description="drop scans without an image, rather than use the scan alone")
 
 
 class KeyframePolicy(Group):
-    """When a frame becomes a keyframe."""
+    """Selection of keyframes."""
 
-    min_translation_m: float = Field(0.5, ge=0, description="a keyframe after this much motion, m")
-    min_rotation_deg: float = Field(15.0, ge=0, le=180, description="or after this much rotation, deg")
-    min_period_s: float = Field(0.4, ge=0, description="but never sooner than this, s")
-    max_period_s: float = Field(5.0, gt=0, description="and at the latest after this if the rover moved at all, s")
-    untracked_period_s: float = Field(1.0, gt=0, description="without odometry: a keyframe every so often, s")
+    min_translation_m: float = Field(0.5, ge=0, description="translation after which a frame becomes a keyframe, m")
+    min_rotation_deg: float = Field(15.0, ge=0, le=180, description="or rotation after which it becomes one, deg")
+    min_period_s: float = Field(0.4, ge=0, description="shortest time between keyframes, s")
+    max_period_s: float = Field(5.0, gt=0, description="longest time between keyframes of a moving rover, s")
+    untracked_period_s: float = Field(1.0, gt=0, description="time between keyframes without odometry, s")
 
 
 class EmbeddingSettings(Group):
@@ -108,40 +108,40 @@ class EmbeddingSettings(Group):
         "",
         description="safetensors file; empty: umf_scene, or another method's own",
     )
-    runtime: Literal["auto", "torch", "openvino"] = Field("auto", description="what runs the network")
+    runtime: Literal["auto", "torch", "openvino"] = Field("auto", description="inference runtime")
     device: str = Field("cpu", description="torch device")
     threads: int = Field(0, ge=0, le=64, description="threads of each of the two networks; 0: half of the cores")
 
 
 class Loop(Group):
-    """Which keyframes may be candidates for a loop closure."""
+    """Candidates for loop closures."""
 
-    min_time_gap_s: float = Field(20.0, ge=0, le=1e9, description="a match is at least this much older, s")
-    min_travel_m: float = Field(15.0, ge=0, description="and lies at least this far back along the path, m")
-    top_k: int = Field(20, ge=1, le=200, description="candidates handed to verification")
-    min_similarity: float = Field(0.0, ge=-1, le=1, description="candidates below this cosine similarity are dropped")
+    min_time_gap_s: float = Field(20.0, ge=0, le=1e9, description="least age of a match, s")
+    min_travel_m: float = Field(15.0, ge=0, description="least path length from match to query, m")
+    top_k: int = Field(20, ge=1, le=200, description="candidates per keyframe passed to verification")
+    min_similarity: float = Field(0.0, ge=-1, le=1, description="least cosine similarity of a candidate")
 
 
 class Verification(Group):
     """Reranking, metric pose and acceptance of candidates."""
 
-    min_probability: float = Field(0.9, ge=0, le=1, description="a closure is published from this probability on")
+    min_probability: float = Field(0.9, ge=0, le=1, description="least probability of a published closure")
     seed: int = Field(0, ge=0, description="seed of every RANSAC")
     rerank: Literal["ransac", "superfeatures"] = Field(
-        "ransac", description="how local features reorder the candidates"
+        "ransac", description="method that reranks candidates by local features"
     )
     features: Literal["umf", "xfeat"] = Field(
-        "xfeat", description="local features of images: xfeat's, or those of the network that embeds"
+        "xfeat", description="local features of images: XFeat's, or those of the embedding network"
     )
     modalities: Literal["both", "image", "cloud"] = Field("both", description="local features that reranking uses")
     rerank_features: int = Field(
         200, ge=20, le=2000, description="strongest features per modality that reranking matches"
     )
-    ransac_iterations: int = Field(100, ge=10, le=5000, description="hypotheses per RANSAC")
-    refine_best: int = Field(4, ge=1, le=50, description="best candidates that get a metric pose")
+    ransac_iterations: int = Field(100, ge=10, le=5000, description="iterations of every RANSAC")
+    refine_best: int = Field(4, ge=1, le=50, description="reranked candidates whose metric pose is estimated")
     max_closures: int = Field(1, ge=1, le=50, description="closures published per keyframe at most")
-    max_turn_deg: float = Field(0.0, ge=0, le=180, description="closures turned further are refused, deg; 0: none")
-    max_shift_m: float = Field(11.5, ge=0, description="closures farther apart are refused, m; 0: none")
+    max_turn_deg: float = Field(0.0, ge=0, le=180, description="largest rotation of a closure, deg; 0: no limit")
+    max_shift_m: float = Field(11.5, ge=0, description="largest translation of a closure, m; 0: no limit")
     odometry_drift: float = Field(
         0.05, gt=0, le=1, description="odometry error per distance driven, for the soft prior"
     )
@@ -151,34 +151,32 @@ class Verification(Group):
 class PoseGraphSettings(Group):
     """The GTSAM back-end."""
 
-    keyframe_period_s: float = Field(0.5, gt=0, le=60, description="odometry is sampled this often, s")
+    keyframe_period_s: float = Field(0.5, gt=0, le=60, description="sampling period of the odometry, s")
     keyframe_spacing_m: float = Field(0.25, gt=0, description="path length between poses of the graph, m")
     max_gap_s: float = Field(2.0, gt=0, description="longest gap of the odometry that is interpolated, s")
-    odometry_sigma_m: float = Field(0.05, gt=0, description="odometry noise after one metre (grows with the root), m")
-    odometry_sigma_deg: float = Field(
-        0.5, gt=0, description="odometry noise after one metre (grows with the root), deg"
-    )
-    max_closure_m: float = Field(100.0, gt=0, description="a closure longer than this is refused as absurd, m")
-    max_correction_m: float = Field(0.0, ge=0, description="a closure that moves a pose further is refused, m; 0: off")
+    odometry_sigma_m: float = Field(0.05, gt=0, description="odometry noise after one metre (random walk), m")
+    odometry_sigma_deg: float = Field(0.5, gt=0, description="odometry noise after one metre (random walk), deg")
+    max_closure_m: float = Field(100.0, gt=0, description="translation beyond which a closure is refused, m")
+    max_correction_m: float = Field(0.0, ge=0, description="largest correction of a pose by a closure, m; 0: no limit")
     gate_chi2: float = Field(
         27.9, gt=0, description="largest squared Mahalanobis distance to the map (6 degrees of freedom)"
     )
-    pair_chi2: float = Field(33.6, gt=0, description="the same between two closures, to be consistent")
-    alias_radius_m: float = Field(15.0, gt=0, description="wrong closures to similar places are expected this close, m")
+    pair_chi2: float = Field(33.6, gt=0, description="the same between two consistent closures")
+    alias_radius_m: float = Field(15.0, gt=0, description="radius of wrong closures to similar places, m")
     max_chance: float = Field(
-        0.02, gt=0, le=1, description="a closure is accepted at once up to this false-alarm probability"
+        0.02, gt=0, le=1, description="largest false-alarm probability of a closure accepted at once"
     )
     min_support: float = Field(
         8.0,
         ge=0,
-        description="evidence that makes closures of several places believed, nats; a further place gives up to 4",
+        description="evidence that closures of several places need, nats; each further place gives up to 4",
     )
-    place_m: float = Field(10.0, ge=0, description="closures this close along the path are of one place, m")
-    support_range_m: float = Field(80.0, gt=0, description="closures this close along the path are compared, m")
+    place_m: float = Field(10.0, ge=0, description="path length within which closures count as one place, m")
+    support_range_m: float = Field(80.0, gt=0, description="path length within which closures are compared, m")
     patience_m: float = Field(
-        60.0, ge=0, description="an uncertain closure nothing speaks against is believed after this way, m"
+        60.0, ge=0, description="path length after which an uncontradicted closure is accepted, m"
     )
-    max_pending_s: float = Field(30.0, gt=0, description="a closure waits this long for its odometry, stream time, s")
+    max_pending_s: float = Field(30.0, gt=0, description="longest wait of a closure for its odometry, stream time, s")
     origin: str = Field(
         "", description="latitude, longitude (deg) and height (m) of the world frame; empty: the first good GNSS fixes"
     )
@@ -188,7 +186,7 @@ class PoseGraphSettings(Group):
         "", description="x and y (m) and heading (deg) of the first pose in the elevation model; empty: by GNSS"
     )
     reject_outliers: bool = Field(
-        True, description="find out which closures are wrong and which stated noise is; false: believe all of it"
+        True, description="reject outliers and estimate the noise scale; false: accept every closure as stated"
     )
 
 
@@ -197,36 +195,36 @@ class FrameIds(Group):
 
     map: str = Field("map", description="map frame")
     odom: str = Field("odom", description="odometry frame, where the odometry's messages name none")
-    base: str = Field("base_link", description="body frame: what calibration, transforms and closures are about")
+    base: str = Field("base_link", description="body frame of calibration, transforms and closures")
     extrinsics: Literal["tf", "calibration"] = Field(
         "tf",
-        description="where camera and LiDAR are on the body: /tf_static, as far as it says so, or the file alone; "
-        "a data set that is named keeps its own",
+        description="extrinsics of camera and LiDAR: /tf_static where it has them, or the calibration file alone; "
+        "a named data set keeps its own",
     )
     publish_tf: bool = Field(False, description="publish map -> odom on /tf when tf2_ros is installed")
 
 
 class Database(Group):
-    """Where places are kept."""
+    """Storage of places."""
 
-    path: str = Field("", description="file to keep places in, loaded when it exists; empty: a temporary file")
+    path: str = Field("", description="file of the place database, loaded when it exists; empty: a temporary file")
     cached_keyframes: int = Field(400, ge=20, description="keyframes whose local features stay in memory")
     backend: Literal["sqlite", "postgres"] = Field(
         "sqlite",
-        description="postgres: what is kept here goes to a fleet's server too, and others' places are asked for",
+        description="postgres: also push places to a fleet's server and query those of other rovers",
     )
     server: Annotated[str, AfterValidator(without_password)] = Field(
-        "", description="of a fleet, postgresql://ROVER@HOST/DATABASE; the password is in ~/.pgpass or PGPASSWORD"
+        "", description="fleet server, postgresql://ROVER@HOST/DATABASE; the password is in ~/.pgpass or PGPASSWORD"
     )
     fleet_candidates: int = Field(
-        5, ge=1, le=50, description="places of other rovers handed to verification, of each keyframe"
+        5, ge=1, le=50, description="places of other rovers per keyframe passed to verification"
     )
 
 
 class WorkerSettings(Group):
-    """The thread that does the work of the live node."""
+    """Worker thread of the live node."""
 
-    queue_size: int = Field(10, ge=1, le=1000, description="frames that may wait; the oldest is dropped and counted")
+    queue_size: int = Field(10, ge=1, le=1000, description="frames queued at most; the oldest is dropped and counted")
 
 
 class Settings(Group):
@@ -237,9 +235,9 @@ class Settings(Group):
     )
     calibration: str = Field("", description="calibration file (YAML); empty: the data set's")
     mode: Literal["mapping", "localization"] = Field(
-        "mapping", description="remember new places, or say where the rover is in the map that `map` names"
+        "mapping", description="mapping: add places; localization: localise in the map that `map` names"
     )
-    map: str = Field("", description="folder of a map that `umf map` made, for mode localization; it stays as it is")
+    map: str = Field("", description="folder of a map made by `umf map`, for mode localization; read only")
     topics: Topics = Topics()
     absolute: AbsoluteTopics = AbsoluteTopics()
     qos: Qos = Qos()
@@ -254,24 +252,24 @@ class Settings(Group):
     worker: WorkerSettings = WorkerSettings()
 
     @model_validator(mode="after")
-    def _names_its_map(self) -> Settings:
+    def _check_map(self) -> Settings:
         if self.localizing and not self.map:
             raise ValueError("mode localization needs a map: the parameter map names its folder")
         return self
 
     @property
     def localizing(self) -> bool:
-        """Whether places are looked for in a map that stays as it is."""
+        """Whether the rover is localised in a fixed map."""
         return self.mode == "localization"
 
     @property
     def uses_transforms(self) -> bool:
-        """Whether `/tf_static` says where the sensors are: a data set that was chosen has a calibration of its own."""
+        """Whether extrinsics come from `/tf_static`; a named data set keeps its own calibration."""
         return self.frames.extrinsics == "tf" and self.dataset == DEFAULT_DATASET
 
 
 def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:
-    """Settings from a YAML file, plain or a ROS parameter file (`/**: ros__parameters:`); None gives the defaults.
+    """Return the settings in a YAML file, plain or with ROS parameters (`/**: ros__parameters:`); None: the defaults.
 
     Overrides are by dotted name with `__` for the dot, as in `loop__top_k=10`; None is skipped.
 
@@ -286,7 +284,7 @@ def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:
 
 
 def load_preset(dataset: str) -> DatasetPreset:
-    """The preset of a data set, its calibration as a path that can be opened.
+    """Return the preset of a data set, its calibration as a path that can be opened.
 
     Raises:
         UmfError: there is no such data set.
@@ -301,14 +299,14 @@ def load_preset(dataset: str) -> DatasetPreset:
 
 
 def topics_of(settings: Settings) -> Topics:
-    """Input topics: those of the data set, except where the settings differ from the defaults."""
+    """Return the input topics: those of the data set, except where the settings differ from the defaults."""
     defaults = Topics().model_dump()
     own = {name: topic for name, topic in settings.topics.model_dump().items() if topic != defaults[name]}
     return load_preset(settings.dataset).topics.model_copy(update=own)
 
 
 def parse_settings(values: dict[str, Any]) -> Settings:
-    """Settings from a nested dictionary.
+    """Return settings from a nested dictionary.
 
     Raises:
         ConfigError: names every wrong entry on one line.
@@ -320,13 +318,13 @@ def parse_settings(values: dict[str, Any]) -> Settings:
 
 
 def dump_settings(settings: Settings) -> str:
-    """The effective settings as YAML that `load_settings` and a ROS node both read."""
+    """Return the effective settings as YAML that `load_settings` and a ROS node both read."""
     body = {"/**": {"ros__parameters": settings.model_dump()}}
     return yaml.safe_dump(body, sort_keys=False, allow_unicode=True)
 
 
 def nest(flat: dict[str, Any]) -> dict[str, Any]:
-    """`{"a.b": 1}` as `{"a": {"b": 1}}`."""
+    """Return `{"a.b": 1}` as `{"a": {"b": 1}}`."""
     nested: dict[str, Any] = {}
     for name, value in flat.items():
         _set(nested, name.split("."), value)
@@ -358,7 +356,7 @@ NODE_ONLY = frozenset({"use_sim_time", "results_dir", "autostart"})
 
 
 def problems(error: ValidationError) -> str:
-    """Every wrong value and what is wrong with it, on one line."""
+    """Return every wrong value with its error, on one line."""
     return "; ".join(_explain(problem) for problem in error.errors())
 
 
@@ -371,5 +369,5 @@ def _explain(problem: Any) -> str:
         return f"unknown parameter {name}"
     if problem["type"] == "missing":
         return f"{name} is missing"
-    got = "" if problem["type"] == "value_error" else f" (got {problem['input']!r})"  # our own may hold a password
+    got = "" if problem["type"] == "value_error" else f" (got {problem['input']!r})"  # may hold a password
     return f"{name}: {text[0].lower()}{text[1:]}{got}"

@@ -6,22 +6,22 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 LONGEST = 300
-"""Letters of an error's text or of a name in it: both may come from outside."""
+"""Most characters of an error's text or of a name in it; both may come from outside."""
 
 
 def shortened(text: object) -> str:
-    """A text of anybody's on one line that a person can read, its middle left out where it is long."""
+    """Return a text on one line, with the middle of a long one left out."""
     line = " ".join(str(text).split())
     return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 3 :]}"
 
 
 def one_line(error: BaseException) -> str:
-    """Text of an exception on one line; its kind where it has none."""
+    """Return the text of an exception on one line; its type where it has none."""
     return shortened(error) or type(error).__name__
 
 
 class UmfError(Exception):
-    """Base of every error the package raises on purpose; its text is one line for a person."""
+    """Base of the package's own errors; the text is one line for the user."""
 
 
 class MessageError(UmfError):
@@ -62,7 +62,7 @@ class GraphError(UmfError):
 
 @contextmanager
 def writing(what: object, *kinds: type[Exception]) -> Iterator[None]:
-    """Tell what goes wrong while the block writes `what` (an `OSError`, or one of `kinds`) as an `OutputError`."""
+    """Raise an `OutputError` if the block cannot write `what` (an `OSError`, or one of `kinds`)."""
     caught: tuple[type[Exception], ...] = (OSError, *kinds)
     try:
         yield
@@ -71,5 +71,5 @@ def writing(what: object, *kinds: type[Exception]) -> Iterator[None]:
 
 
 def either(names: Sequence[str]) -> str:
-    """The names as a choice, "a, b or c": for messages and help."""
+    """Return the names as a choice, "a, b or c": for messages and help."""
     return " or ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)

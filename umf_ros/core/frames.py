@@ -1,4 +1,4 @@
-"""The nouns of the package: what flows from the sensors to a loop closure.
+"""Records of the pipeline, from sensor data to loop closures.
 
 Stamps are integer nanoseconds since the epoch. The body frame is REP-103 (x forward, y left,
 z up), the camera frame is optical (x right, y down, z forward). Poses follow `geometry`.
@@ -48,7 +48,7 @@ class StereoCamera:
     baseline: float
 
     def project(self, points: Array, body_T_camera: Array) -> tuple[Array, Array]:
-        """Left pixels (N, 2) and depths (N,) m of points (N, 3), body frame; depths <= 0 lie behind the camera."""
+        """Return left pixels (N, 2) and depths (N,) m of points (N, 3), body frame; depths <= 0: behind the camera."""
         optical = transform(invert(body_T_camera), points)
         depth = optical[:, 2]
         safe = np.where(depth > 0, depth, 1.0)
@@ -66,8 +66,8 @@ class ScanMotion:
         rates: (6,) x y z rx ry rz, m/s and rad/s about the body's axes.
         noise: (6,) m^2/s and rad^2/s: the variance that the odometry's error gains in a second.
         removed: whether the motion during each scan was removed; else only that between merged scans was.
-        body_T_lidars: (K, 4, 4) where the scans that were merged into one were seen from, in order of their moments;
-            none of a single scan.
+        body_T_lidars: (K, 4, 4) poses of the LiDAR at the scans that were merged into one, in order of time;
+            empty for a single scan.
     """
 
     moments_s: Points
@@ -78,7 +78,7 @@ class ScanMotion:
 
     @classmethod
     def none(cls, count: int) -> ScanMotion:
-        """Of a scan of `count` points taken from one place, or whose motion is known exactly."""
+        """Return the motion of `count` points taken from one place, or whose motion is known exactly."""
         return cls(np.zeros(count, np.float32), np.zeros(6), np.zeros(6))
 
 
@@ -95,7 +95,7 @@ class Frame:
         odom_T_body: odometry at `stamp_ns`.
         image_stamp_ns: exposure of the left image.
         session: counts the resets of the clock or the odometry.
-        motion: during the scan; None where it was not removed, for want of odometry or of times per point.
+        motion: during the scan; None where it was not removed, without odometry or times per point.
     """
 
     stamp_ns: int
@@ -158,7 +158,7 @@ class Embedding:
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """A remembered place: all that retrieval and verification need, and no more.
+    """A stored place with the data that retrieval and verification need.
 
     Attributes:
         stamp_ns: the frame's key.
@@ -182,7 +182,7 @@ class Keyframe:
 
     @property
     def has_depth(self) -> bool:
-        """Whether any distance was measured, by a scan or a stereo pair: two keyframes without make no metric pose."""
+        """Whether a scan or a stereo pair measured depth; two keyframes without it give no metric pose."""
         image = self.embedding.image
         return len(self.points) > 0 or (image is not None and bool(np.isfinite(image.points).any()))
 

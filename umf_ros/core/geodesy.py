@@ -11,16 +11,16 @@ _RADIUS_M, _ECCENTRICITY2 = 6_378_137.0, 6.694379990141e-3
 
 
 def to_enu(geodetic: Array, origin: Array) -> Array:
-    """(N, 3) metres east, north and up of an origin (3,); degrees and metres on WGS 84."""
+    """Return (N, 3) metres east, north and up of an origin (3,); degrees and metres on WGS 84."""
     return (_to_ecef(geodetic) - _to_ecef(origin[None])) @ _enu_axes(origin).T
 
 
 def from_enu(positions: Array, origin: Array) -> Array:
-    """(N, 3) latitudes, longitudes (deg) and heights (m) of positions about an origin; the inverse of `to_enu`."""
+    """Return (N, 3) latitude, longitude (deg) and height (m) of positions about an origin; inverse of `to_enu`."""
     x, y, z = (_to_ecef(origin[None]) + positions @ _enu_axes(origin)).T
     longitude, across = np.arctan2(y, x), np.hypot(x, y)
     latitude = np.arctan2(z, across * (1 - _ECCENTRICITY2))
-    for _ in range(6):  # converges by the flattening, a factor of 300, each time
+    for _ in range(6):  # each iteration reduces the error 300 times, by the flattening
         normal = _RADIUS_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
         latitude = np.arctan2(z + _ECCENTRICITY2 * normal * np.sin(latitude), across)
     height = across * np.cos(latitude) + z * np.sin(latitude) - _RADIUS_M**2 / normal
@@ -36,7 +36,7 @@ def _to_ecef(geodetic: Array) -> Array:
 
 
 def _enu_axes(origin: Array) -> Array:
-    """(3, 3) axes east, north and up, one per row."""
+    """Return (3, 3) axes east, north and up, one per row."""
     (sin_lat, sin_lon), (cos_lat, cos_lon) = np.sin(np.radians(origin[:2])), np.cos(np.radians(origin[:2]))
     east, north = [-sin_lon, cos_lon, 0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
     return np.array([east, north, [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]])

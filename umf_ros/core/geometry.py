@@ -17,7 +17,7 @@ Array = NDArray[np.floating[Any]]
 
 
 def make_pose(rotation: ArrayLike, translation: ArrayLike) -> Array:
-    """Pose from a (3, 3) rotation matrix and a (3,) translation."""
+    """Return the pose from a (3, 3) rotation matrix and a (3,) translation."""
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = translation
@@ -25,7 +25,7 @@ def make_pose(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 
 def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> Array:
-    """Pose from a (3,) translation and a quaternion (x, y, z, w).
+    """Return the pose from a (3,) translation and a quaternion (x, y, z, w).
 
     Raises:
         ValueError: a number is not finite, or the norm of the quaternion is further than 1 % from one.
@@ -40,12 +40,12 @@ def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> Array:
 
 
 def to_quaternion(pose: ArrayLike) -> Array:
-    """Quaternion (x, y, z, w) with w >= 0 of the rotation of a pose (..., 4, 4) or of a matrix (..., 3, 3)."""
+    """Return quaternion (x, y, z, w) with w >= 0 of the rotation of a pose (..., 4, 4) or of a matrix (..., 3, 3)."""
     return Rotation.from_matrix(np.asarray(pose)[..., :3, :3]).as_quat(canonical=True)
 
 
 def invert(a_T_b: Array) -> Array:
-    """`b_T_a` of a (4, 4) pose, or of each of a stack (..., 4, 4)."""
+    """Return `b_T_a` of a (4, 4) pose, or of each of a stack (..., 4, 4)."""
     inverse = np.zeros(a_T_b.shape)
     turned = np.swapaxes(a_T_b[..., :3, :3], -1, -2)
     inverse[..., :3, :3] = turned
@@ -55,38 +55,38 @@ def invert(a_T_b: Array) -> Array:
 
 
 def relative(world_T_a: Array, world_T_b: Array) -> Array:
-    """`a_T_b` of two poses in one world."""
+    """Return `a_T_b` of two poses in one world."""
     return invert(world_T_a) @ world_T_b
 
 
 def transform(a_T_b: Array, points_b: Array) -> Array:
-    """(N, 3) points of frame b in frame a; keeps the dtype of the points."""
+    """Return (N, 3) points of frame b in frame a; keeps the dtype of the points."""
     return points_b @ a_T_b[:3, :3].T.astype(points_b.dtype) + a_T_b[:3, 3].astype(points_b.dtype)
 
 
 def rotation_angle(pose: ArrayLike) -> float:
-    """Angle of the pose's rotation in radians, 0 to pi."""
+    """Return the angle of the pose's rotation in radians, 0 to pi."""
     return float(Rotation.from_matrix(np.asarray(pose)[:3, :3]).magnitude())
 
 
 def near(a: Array, b: Array, metres: float, radians: float) -> bool:
-    """Whether two poses in one frame are nearer to each other than these tolerances."""
+    """Return whether two poses in one frame are nearer to each other than these tolerances."""
     gap = relative(a, b)
     return bool(np.linalg.norm(gap[:3, 3]) < metres and rotation_angle(gap) < radians)
 
 
 def heading(world_T_body: Array) -> Any:
-    """Direction of the body's x axis in the world's x-y plane, radians from the x axis; of one pose or (..., 4, 4)."""
+    """Return the angle of the body's x axis in the world's x-y plane, radians, of one pose or (..., 4, 4)."""
     return np.arctan2(world_T_body[..., 1, 0], world_T_body[..., 0, 0])
 
 
 def wrap_angle(angle: Any) -> Any:
-    """Angle or array of angles in radians, wrapped to [-pi, pi)."""
+    """Return the angle or array of angles in radians, wrapped to [-pi, pi)."""
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
 
 
 def interpolate(a: Array, b: Array, fraction: ArrayLike) -> Array:
-    """Poses between `a` (fraction 0) and `b` (1), (..., 4, 4) each: linear in translation, shortest arc in rotation.
+    """Return poses (..., 4, 4) between `a` (fraction 0) and `b` (1): linear translation, shortest arc in rotation.
 
     Fractions (...) outside [0, 1] extrapolate at the same rate.
     """
@@ -99,9 +99,9 @@ def interpolate(a: Array, b: Array, fraction: ArrayLike) -> Array:
 
 
 def align(a: Array, b: Array) -> tuple[Array, Array]:
-    """Pose `b_T_a` of points `a` and `b` (N, 3) with least squared distance [Kabsch 1976, Horn 1987].
+    """Return the pose `b_T_a` of points `a` and `b` (N, 3) with least squared distance [Kabsch 1976, Horn 1987].
 
-    The three spreads of the points come with it, largest first: on a line the second is zero.
+    The three spreads of the points are returned too, largest first; on a line the second is zero.
 
     Raises:
         ValueError: fewer than three points, or sets of different size.
@@ -115,22 +115,22 @@ def align(a: Array, b: Array) -> tuple[Array, Array]:
 
 
 def expmap(twists: Array) -> Array:
-    """(N, 4, 4) poses of (N, 6) twists."""
+    """Return (N, 4, 4) poses of (N, 6) twists."""
     return RigidTransform.from_exp_coords(twists).as_matrix()
 
 
 def logmap(poses: Array) -> Array:
-    """(N, 6) twists of (N, 4, 4) poses, the inverse of `expmap`."""
+    """Return (N, 6) twists of (N, 4, 4) poses, the inverse of `expmap`."""
     return RigidTransform.from_matrix(poses).as_exp_coords()
 
 
 def orthonormal(poses: Array) -> Array:
-    """(N, 4, 4) poses with the rotation nearest to each: products of many poses drift off it."""
+    """Return (N, 4, 4) poses with the nearest orthonormal rotations, from which products of many poses drift."""
     return RigidTransform.from_matrix(poses).as_matrix()
 
 
 def adjoint(poses: Array) -> Array:
-    """(..., 6, 6) adjoints of (..., 4, 4) poses: a twist at the child, seen at the parent."""
+    """Return (..., 6, 6) adjoints of (..., 4, 4) poses: they map twists of the child to the parent."""
     result = np.zeros((*poses.shape[:-2], 6, 6))
     rotation = poses[..., :3, :3]
     result[..., :3, :3] = rotation
@@ -140,19 +140,19 @@ def adjoint(poses: Array) -> Array:
 
 
 def propagate(matrices: Array, covariances: Array) -> Array:
-    """`A S A'` for stacks of matrices and covariances."""
+    """Return `A S A'` for stacks of matrices and covariances."""
     return matrices @ covariances @ np.swapaxes(matrices, -1, -2)
 
 
 def skew(vectors: Array) -> Array:
-    """(..., 3, 3) matrices of (..., 3) vectors with `skew(v) @ x == cross(v, x)`."""
+    """Return (..., 3, 3) matrices of (..., 3) vectors with `skew(v) @ x == cross(v, x)`."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vectors.shape[:-1], 3, 3)
 
 
 def ros_to_gtsam_covariance(covariance: ArrayLike, pose: Array) -> Array:
-    """Covariance (6, 6), or 36 numbers row by row, of the pose `parent_T_child`, from the ROS to the GTSAM convention.
+    """Convert the covariance (6, 6), or 36 numbers row by row, of `parent_T_child` from the ROS to the GTSAM order.
 
     ROS (geometry_msgs/PoseWithCovariance) orders x y z rx ry rz about the *parent* axes; a GTSAM
     `BetweenFactorPose3` wants rx ry rz x y z in the tangent space of the *child*.
@@ -163,7 +163,7 @@ def ros_to_gtsam_covariance(covariance: ArrayLike, pose: Array) -> Array:
 
 
 def gtsam_to_ros_covariance(covariance: ArrayLike, pose: Array) -> Array:
-    """Inverse of `ros_to_gtsam_covariance`: (6, 6) in ROS order about the parent axes."""
+    """Return the inverse of `ros_to_gtsam_covariance`: (6, 6) in ROS order about the parent axes."""
     turn = np.kron(np.eye(2), pose[:3, :3])
     return turn @ _swap_blocks(np.asarray(covariance, dtype=float).reshape(6, 6)) @ turn.T
 

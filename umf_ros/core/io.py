@@ -75,13 +75,13 @@ def check_writable(folder: Path) -> None:
 
 
 def create_run_folder(out: Path, latest: bool = True) -> Path:
-    """Make a new folder inside `out`, named after the local time; `out/latest` leads to it unless `latest` is false."""
+    """Make a new folder inside `out`, named after the local time; `out/latest` links to it unless `latest` is false."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     with writing(f"to {out}"):
         out.mkdir(parents=True, exist_ok=True)
         names = (stamp if number == 1 else f"{stamp}_{number}" for number in count(1))
         folder = next(folder for name in names if _is_new(folder := out / name))
-        if latest:  # in one step, so that it always leads to a folder
+        if latest:  # atomic, so that the link never dangles
             fresh = out / f".latest-{os.getpid()}"
             fresh.symlink_to(folder.name, target_is_directory=True)
             fresh.replace(out / "latest")
@@ -89,7 +89,7 @@ def create_run_folder(out: Path, latest: bool = True) -> Path:
 
 
 def _is_new(folder: Path) -> bool:
-    """Make a folder; returns false where there is one of this name."""
+    """Make a folder; return false if the name exists."""
     try:
         folder.mkdir()
     except FileExistsError:
@@ -237,7 +237,7 @@ class SqliteFile:
             with writing(self.name, sqlite3.Error):
                 if path is not None:
                     path.parent.mkdir(parents=True, exist_ok=True)
-                # SQLite keeps a file without a name out of every folder
+                # SQLite deletes a database without a name when it is closed
                 return sqlite3.connect(path or "", check_same_thread=False)
         if path is None or not path.is_file():
             raise UmfError(f"there is no {schema.name} {shortened(path)}")
@@ -260,7 +260,7 @@ class SqliteFile:
             self.migrate(schema)
 
     def _version(self, schema: Schema) -> int:
-        """Version of a schema's tables in the file, 0 where there are none.
+        """Return the version of a schema's tables in the file, 0 where there are none.
 
         Raises:
             UmfError: a later release wrote them.
@@ -296,11 +296,11 @@ class SqliteFile:
 
 LARGEST_YAML = 2**22
 MOST_NODES = 100_000
-"""A file of settings has some hundreds; aliases of aliases are how a small one stands for a thousand million."""
+"""Most nodes of a file; settings have some hundreds, and nested aliases expand a small file to billions."""
 
 
 def read_yaml(path: Path) -> Any:
-    """Content of a YAML file; None where it is empty.
+    """Return the content of a YAML file; None where it is empty.
 
     Raises:
         ConfigError: the file cannot be read.
@@ -321,7 +321,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
-    """Nodes of a document with every alias written out.
+    """Return the nodes of a document with every alias written out.
 
     Raises:
         ValueError: they are too many, a node is its own part, or a name is given twice: one value would be lost.
@@ -340,12 +340,12 @@ def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
         count = sum(_count_nodes(item, known) for pair in node.value for item in pair)
     known[id(node)] = count + 1
     if count > MOST_NODES:
-        raise ValueError("its aliases stand for too much")
+        raise ValueError("its aliases expand to too many nodes")
     return count + 1
 
 
 def read_values(path: Path) -> dict[str, Any]:
-    """The names and values of a YAML file; none where it is empty.
+    """Return the names and values of a YAML file; none where it is empty.
 
     Raises:
         ConfigError: the file cannot be read, or holds something else.
@@ -360,6 +360,6 @@ def read_values(path: Path) -> dict[str, Any]:
         group = groups.pop()
         wrong = [name for name in group if not isinstance(name, str)]
         if wrong:
-            raise ConfigError(f"{path}: a name is text, not {wrong[0]!r}")
+            raise ConfigError(f"{path}: a name must be text, not {wrong[0]!r}")
         groups += [value for value in group.values() if isinstance(value, dict)]
     return content

@@ -1,9 +1,9 @@
-"""Upright direction of a scan, found in the scan itself, and scans set upright on their ground.
+"""Levelling of scans: the upright direction and the height of the ground, estimated from the scan itself.
 
-Recognition of places must not depend on the mount of a LiDAR: the same rocks are seen from a mast and from a tilted
-bracket. The stand of a rover on a slope is another matter: the network has seen that in training, and two looks at
-rough ground from metres apart find two upright directions, which would turn the same rocks against each other.
-A scan that does not determine the upright direction, as of a bare wall, stays as its mount holds it.
+Place recognition must not depend on the mount of a LiDAR, a mast or a tilted bracket. A slope under the rover stays:
+the training data has slopes, and on rough ground the upright directions of scans taken metres apart differ, which
+would rotate the same rocks against each other. A scan that does not determine the upright direction, as of a bare
+wall, keeps the orientation of its mount.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from umf_ros.core.frames import Points
 from umf_ros.core.geometry import Array, make_pose
 
 CONES = np.radians([32.0, 24.0, 16.0, 12.0])  # measured: rights LiDARs tilted by 28 deg to 1 or 2
-MIN_GROUND = 10  # by hand: normals of ground that a direction is worth
+MIN_GROUND = 10  # by hand: least normals of ground for a direction
 # measured: gap between the two largest eigenvalues as a share of the normals; single facades have .02 to .13, corridors
-# .18 to .27, ground and rooms .25 to .98; between these a direction is trusted in part, as between so many normals
+# .18 to .27, ground and rooms .25 to .98; in between, a direction is weighted, as between these numbers of normals
 SHARES, GAPS = (0.13, 0.17), (40.0, 80.0)
-CELL_M, NEIGHBOURS = 0.4, 10  # by hand: coarse normals do, and small_gicp's own default
-GROUND_M, GROUND_COS, GROUND_SHARE = 15.0, 0.9, 0.2  # by hand: how near and how level ground is; how low among that
-OWN_TILT_DEG, MOUNT_TILT_DEG = 12.0, 24.0  # measured: of ground in scans by which networks were trained; of brackets
+CELL_M, NEIGHBOURS = 0.4, 10  # by hand: coarse normals suffice, and small_gicp's own default
+GROUND_M, GROUND_COS, GROUND_SHARE = 15.0, 0.9, 0.2  # by hand: range and slope of ground, quantile of its heights
+OWN_TILT_DEG, MOUNT_TILT_DEG = 12.0, 24.0  # measured: of ground in the training data; of brackets
 MIN_GROUND_POINTS = 50  # by hand: below, the height of the LiDAR is unknown
 
 
 def level(points: Points, keep_slope: bool = False) -> Array:
-    """Pose (4, 4) of the body in a frame that is upright, its heading the body's and its z = 0 the ground around.
+    """Return the pose (4, 4) of the body in an upright frame with the body's heading and z = 0 on the ground.
 
     Args:
         points: (N, 3) m, body frame; any N, any that are not finite.
-        keep_slope: leave a tilt such as a rover has on a slope as it is, and take away a mount's alone; between the
-            two there is no step.
+        keep_slope: remove the tilt of a mount only, and keep one that a slope explains; the transition between both
+            is continuous.
     """
     finite = np.isfinite(points)
     known = (points if finite.all() else points[finite.all(axis=1)]).astype(float)
@@ -49,7 +49,7 @@ def level(points: Points, keep_slope: bool = False) -> Array:
 
 
 def _of_mount(turn: Array) -> Array:
-    """The share of a rotation (3, 3) that the way a LiDAR is mounted must account for."""
+    """Return the part of a rotation (3, 3) that is attributed to the mount of the LiDAR."""
     vector = Rotation.from_matrix(turn).as_rotvec()
     tilt_deg = np.degrees(np.linalg.norm(vector))
     share = np.clip((tilt_deg - OWN_TILT_DEG) / (MOUNT_TILT_DEG - OWN_TILT_DEG), 0, 1)
@@ -58,11 +58,11 @@ def _of_mount(turn: Array) -> Array:
 
 
 def upright(normals: Array) -> Array:
-    """Rotation (3, 3) that sets a scan upright, so that two of them differ by a heading and a little tilt.
+    """Return the rotation (3, 3) that sets a scan upright, so that two scans differ by a heading and a little tilt.
 
     The upright direction is nearly parallel to the normals of the ground and nearly square to those of walls. Starting
-    from the body's own z axis, normals near either are counted in and the others left out, in a cone that closes step
-    by step. As far as the normals do not determine a direction, the body's own holds.
+    from the body's own z axis, normals near either are counted in and the others left out, in a cone that narrows step
+    by step. As far as the normals do not determine a direction, the body's z axis is kept.
 
     Args:
         normals: (N, 3) unit normals of either sign, zero where unknown; body frame.
@@ -71,7 +71,7 @@ def upright(normals: Array) -> Array:
 
 
 def _upright(normals: Array) -> tuple[Array, float]:
-    """The rotation, and how far the normals determine it, 0 to 1."""
+    """Return the rotation, and how well the normals determine it, 0 to 1."""
     normals = normals[np.einsum("ij,ij->i", normals, normals) > 0.5]
     up, trust = np.array([0.0, 0.0, 1.0]), 0.0
     for cone in CONES:

@@ -38,24 +38,24 @@ class OdometryNoise:
 
     @staticmethod
     def stated(settings: PoseGraphSettings) -> OdometryNoise:
-        """The noise that the settings of the pose graph state."""
+        """Return the noise that the settings of the pose graph state."""
         return OdometryNoise(settings.odometry_sigma_m, float(np.deg2rad(settings.odometry_sigma_deg)))
 
     def path_lengths(self, a: Array, b: Array, elapsed_s: Array) -> Array:
-        """(N,) path lengths in metres of the steps from (N, 4, 4) poses `a` to `b` in (N,) seconds."""
+        """Return (N,) path lengths in metres of the steps from (N, 4, 4) poses `a` to `b` in (N,) seconds."""
         turns = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], -1, -2) @ b[:, :3, :3]).magnitude()
         moved = np.linalg.norm(b[:, :3, 3] - a[:, :3, 3], axis=1)
         return np.asarray(moved + self.m_per_rad * turns + self.m_per_s * elapsed_s)
 
     def deviations(self, path_m: Array | float) -> tuple[Array, Array]:
-        """Standard deviations of position, m, and orientation, rad, per axis, after path lengths."""
+        """Return standard deviations of position, m, and orientation, rad, per axis, after path lengths."""
         path = np.asarray(path_m, float)
         position = np.hypot(self.sigma_m * np.sqrt(path), self.drift_m * path)
         orientation = np.hypot(self.sigma_rad * np.sqrt(path), self.drift_rad * path)
         return self.scale * position, self.scale * orientation
 
     def covariances(self, path_m: Array) -> Array:
-        """(N, 6, 6) covariances of steps of (N,) path lengths in GTSAM's order (rx ry rz x y z), rad^2 and m^2."""
+        """Return (N, 6, 6) covariances of steps of (N,) path lengths, GTSAM's order (rx ry rz x y z), rad^2 and m^2."""
         position, orientation = self.deviations(path_m)
         diagonals = np.stack([orientation] * 3 + [position] * 3, axis=-1) ** 2
         return diagonals[..., None] * np.eye(6)

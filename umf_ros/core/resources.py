@@ -10,13 +10,13 @@ from umf_ros.core.errors import UmfError
 
 DEFAULT_DATASET = "simulated"
 LAB_PACKAGES = {"nncf": ("nncf", "3.4"), "open3d": ("open3d", "0.19"), "sklearn": ("scikit-learn", "1.4")}
-"""Packages that a rover does not need: distribution and first version known to work, by module."""
+"""Optional packages: distribution and first version known to work, by module."""
 FLEET_PACKAGES = ("pgvector", "psycopg", "ray")
 """Modules that only a rover of a fleet or a cluster needs."""
 
 
 def share_folders() -> list[Path]:
-    """Folders that can hold `config/` and `models/`, the most specific first."""
+    """Return folders that can hold `config/` and `models/`, the most specific first."""
     checkout = Path(__file__).resolve().parents[2]
     folders = [checkout] if (checkout / "package.xml").is_file() else []
     # <prefix>/lib/python3.x/site-packages/umf_ros -> <prefix>/share/umf_ros
@@ -25,7 +25,7 @@ def share_folders() -> list[Path]:
 
 
 def find(relative: str) -> Path:
-    """Path of a shipped file, such as `config/calibration/simulated.yaml`.
+    """Return the path of a shipped file, such as `config/calibration/simulated.yaml`.
 
     Raises:
         UmfError: no such file is installed.
@@ -37,7 +37,7 @@ def find(relative: str) -> Path:
 
 
 def dataset_names() -> list[str]:
-    """Data sets that have a file in `config/datasets`, the default first."""
+    """Return data sets that have a file in `config/datasets`, the default first."""
     names = {path.stem for folder in share_folders() for path in (folder / "config" / "datasets").glob("*.yaml")}
     return sorted(names, key=lambda name: (name != DEFAULT_DATASET, name))
 
@@ -49,4 +49,4 @@ def check_packages() -> None:
         UmfError: it has none of them.
     """
     if not any(find_spec(name) for name in ("rosbags", "pydantic_core")):
-        raise UmfError(f"{sys.executable} has none of the packages that are needed: source venv/bin/activate first")
+        raise UmfError(f"{sys.executable} lacks the required packages: source venv/bin/activate first")

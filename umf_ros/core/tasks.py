@@ -15,10 +15,10 @@ from umf_ros.core.errors import UmfError, one_line
 
 Task = TypeVar("Task")
 Done = Callable[[int], None]
-"""Told how many tasks are done."""
+"""Callback that takes the number of finished tasks."""
 
 ATTEMPTS = 3
-"""Tasks that end their workers are begun again so often without any of them being done."""
+"""Attempts at tasks that crash their workers, without one of them being finished."""
 LOCAL = "local"
 
 
@@ -29,7 +29,7 @@ def spread(
     ray: str | None = None,
     done: Done = lambda count: None,
 ) -> None:
-    """Do all tasks, in any order. A worker that dies is replaced, and its task begun again.
+    """Run all tasks, in any order. A worker that dies is replaced, and its task restarted.
 
     Args:
         work: a function of a module, whose results are files.
@@ -39,7 +39,7 @@ def spread(
         done: called with the number of tasks that are done.
 
     Raises:
-        UmfError: a task failed, or took its workers with it time and again; the other tasks are not waited for.
+        UmfError: a task failed, or crashed its workers repeatedly; the other tasks are abandoned.
         ModuleNotFoundError: Ray is asked for and not installed.
     """
     if ray is not None:
@@ -60,7 +60,7 @@ def _by_processes(work: Callable[[Task], None], tasks: Sequence[Task], workers: 
             running = {pool.submit(work, task): number for number, task in left.items()}
             try:
                 for future in as_completed(running):
-                    with suppress(BrokenProcessPool):  # all that run with it have to be begun again
+                    with suppress(BrokenProcessPool):  # all tasks that ran with it have to be restarted
                         future.result()
                         del left[running[future]]
                         done(len(tasks) - len(left))
@@ -69,7 +69,7 @@ def _by_processes(work: Callable[[Task], None], tasks: Sequence[Task], workers: 
                 raise
         attempts -= len(left) == before
     if left:
-        raise UmfError(f"{len(left)} tasks end the process that works at them: too little memory?")
+        raise UmfError(f"{len(left)} tasks crashed their worker: too little memory?")
 
 
 def _by_ray(work: Callable[[Task], None], tasks: Sequence[Task], address: str, workers: int, done: Done) -> None:
@@ -82,7 +82,7 @@ def _by_ray(work: Callable[[Task], None], tasks: Sequence[Task], address: str, w
                 num_cpus=max(workers, 1), include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR
             )
         else:
-            _knock(address)
+            _check_cluster(address)
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (RayError, OSError, ValueError, RuntimeError) as error:
         raise UmfError(f"no Ray cluster at {address}: {one_line(error)}") from None
@@ -98,13 +98,13 @@ def _by_ray(work: Callable[[Task], None], tasks: Sequence[Task], address: str, w
             raise UmfError(str(error.cause)) from None
         raise
     except RayError as error:
-        raise UmfError(f"Ray gave a task up: {one_line(error)}") from None
+        raise UmfError(f"Ray abandoned a task: {one_line(error)}") from None
     finally:
         ray.shutdown()
 
 
-def _knock(address: str) -> None:
-    """Ray itself looks for a cluster that is not there for minutes."""
+def _check_cluster(address: str) -> None:
+    """Check that a cluster answers; Ray itself would try for minutes."""
     host, _, port = address.rpartition("://")[2].partition(":")
     if port.isdigit():
         socket.create_connection((host, int(port)), 5).close()

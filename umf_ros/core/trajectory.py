@@ -12,13 +12,13 @@ from umf_ros.core.errors import writing
 from umf_ros.core.geometry import Array, interpolate, to_quaternion
 
 MAX_GAP_S = 2.0
-"""Nothing is interpolated across a longer gap."""
+"""Longest gap that poses are interpolated across."""
 
 
 def bracket(
     known_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Rows (K,) before and after each stamp among sorted known stamps, and its share (K,) of the way between, 0 to 1.
+    """Return rows (K,) before and after each stamp among sorted known stamps, and its fraction (K,) between, 0 to 1.
 
     Both rows are the same where a stamp is known or before the first one.
     """
@@ -29,7 +29,7 @@ def bracket(
 
 
 def interpolated(known_ns: NDArray[np.int64], poses: Array, stamps_ns: NDArray[np.int64]) -> Array:
-    """Poses (K, 4, 4) at stamps between sorted known ones, of (N, 4, 4) poses; held constant outside.
+    """Return poses (K, 4, 4) at stamps between sorted known ones, of (N, 4, 4) poses; held constant outside.
 
     Positions are interpolated linearly, rotations along the shortest arc.
     """
@@ -58,7 +58,7 @@ class Trajectory:
         return len(self.stamps_ns)
 
     def at(self, stamps_ns: NDArray[np.int64], max_gap_s: float = MAX_GAP_S) -> tuple[Array, NDArray[np.bool_]]:
-        """Interpolated (K, 4, 4) poses at (K,) stamps, and (K,) whether each is known.
+        """Return the interpolated (K, 4, 4) poses at (K,) stamps, and (K,) whether each is known.
 
         Positions are interpolated linearly, rotations along the shortest arc. A pose is known between
         two poses no further apart than `max_gap_s`; the others are the identity.
@@ -74,7 +74,7 @@ class Trajectory:
         return poses, known
 
     def of_body(self, body_T_sensor: Array) -> Trajectory:
-        """Poses of the body, where these are of a sensor on it (as SLAM systems give the IMU's or the camera's)."""
+        """Return the poses of the body, where these are of a sensor on it, such as a SLAM system's IMU or camera."""
         return Trajectory(self.stamps_ns, self.poses @ np.linalg.inv(body_T_sensor), self.has_orientation)
 
 

@@ -1,7 +1,7 @@
-"""End a process that stands still: stacks of all threads on stderr, status 1, so that it can be started again.
+"""End a stalled process with the stacks of all threads on stderr and status 1, so that it can be restarted.
 
 The timer is that of `faulthandler`, a thread that needs no interpreter lock: it also ends a process in which a library
-holds that lock for ever. `watching` arms it, `feed` re-arms it, `task` names work that must not stand still while other
+holds that lock forever. `watching` arms it, `feed` re-arms it, `task` names work that must not stall while other
 threads feed.
 """
 
@@ -52,7 +52,7 @@ def feed() -> None:
         return
     for name, deadline_s in list(_deadlines.values()):
         if now_s > deadline_s:
-            sys.stderr.write(f"umf: {name} stands still: the process ends\n")
+            sys.stderr.write(f"umf: {name} is stalled: ending the process\n")
             faulthandler.dump_traceback(_log(), all_threads=True)
             os._exit(1)
     _arm(_limit_s)
@@ -80,5 +80,5 @@ def _arm(limit_s: float) -> None:
 
 
 def _log() -> int:
-    """The process's own stderr, whatever stands in for it in Python."""
+    """Return the file descriptor of stderr, also where Python's `sys.stderr` is replaced."""
     return sys.__stderr__.fileno() if sys.__stderr__ is not None else 2

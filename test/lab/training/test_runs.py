@@ -79,7 +79,7 @@ def test_the_command_line_overrules_the_file(tmp_path):
         (b"steps: 0\nbatch: 2\n", "steps: .*; batch: "),
         (b"speed: 3\n", "unknown parameter speed"),
         (b"loss: hinge\n", "loss: "),
-        (b"1: 2\n", "a name is text, not 1"),
+        (b"1: 2\n", "a name must be text, not 1"),
     ],
 )
 def test_wrong_settings_are_one_clear_line(tmp_path, content, word):
