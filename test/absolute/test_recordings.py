@@ -67,7 +67,7 @@ def test_a_message_that_breaks_the_decoder_costs_itself_alone(tmp_path: Path, mo
     bag, told = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), list[str]()
     reader = FrameReader(bag, with_topics(tmp_path, gnss="/gnss/fix"), warn=told.append)
     assert any(isinstance(item, Frame) for item in reader.graph_stream())
-    assert told == ["/gnss/fix: message provokes ZeroDivisionError: of a message; such messages are skipped"]
+    assert told == ["/gnss/fix: message raises ZeroDivisionError: of a message; such messages are skipped"]
 
 
 def test_a_stream_without_a_graph_decodes_no_absolute_measurement(

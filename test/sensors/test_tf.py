@@ -113,13 +113,13 @@ def test_odometry_of_another_part_waits_for_transforms_that_come_late() -> None:
     for message in messages:
         message.child_frame_id = "imu"
     for message in messages[:2]:  # counted, like everything that cannot be used
-        with pytest.raises(MessageError, match="waits for /tf_static") as caught:
+        with pytest.raises(MessageError, match="waits for its transform on /tf_static") as caught:
             frames.to_body(message, at(3))
         assert caught.value.kind == "transforms"
     transforms.add(SimpleNamespace(transforms=[stamped("base_link", "imu", at(0.5))]))
     np.testing.assert_allclose(frames.to_body(messages[1], at(3)), at(2.5), atol=1e-12)
     patient = BodyFrames(FrameIds(), StaticTransforms(), told.append, patience_s=2.0)
-    with pytest.raises(MessageError, match="waits for /tf_static"):
+    with pytest.raises(MessageError, match="waits for its transform on /tf_static"):
         patient.to_body(messages[0], at(3))
     assert told == []
     np.testing.assert_array_equal(patient.to_body(messages[3], at(3)), at(3))

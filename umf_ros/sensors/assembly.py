@@ -22,15 +22,15 @@ from umf_ros.sensors.sessions import StampedInput
 Mask = NDArray[np.bool_]
 
 HISTORY_NS = 5_000_000_000
-"""Over so long the noise of the odometry is measured; by hand: some twenty scans, on the same ground at one speed."""
+"""Window in which the odometry noise is measured; by hand: some twenty scans, on the same ground at one speed."""
 FINEST = 6
-"""Poses looked at per scan, at most: odometry may come much faster than is needed."""
+"""Most poses used per scan: odometry may come much faster than is needed."""
 BINOMIALS = (-1.0, 3.0, -3.0, 1.0)
-"""Third differences of the steps over a scan leave out whatever motion bends evenly."""
+"""Third differences of the steps over a scan cancel smooth motion."""
 STEPS = sum(binomial**2 for binomial in BINOMIALS)
-"""The variance of a third difference of independent steps, in variances of one."""
+"""Variance of a third difference of independent steps, in variances of one step."""
 UNKNOWN_NOISE = np.array([1e-4] * 3 + [2e-5] * 3)
-"""Taken where the history is too short: 1 cm and .25 deg per root of a second; by hand."""
+"""Noise where the history is too short: 1 cm and .25 deg per root of a second; by hand."""
 
 
 class OdometryBuffer:
@@ -51,28 +51,28 @@ class OdometryBuffer:
             del self._stamps[:old], self._poses[:old]
 
     def passed(self, stamp_ns: int) -> bool:
-        """Whether the odometry has reached a stamp."""
+        """Return whether the odometry has reached a stamp."""
         return bool(self._stamps) and self._stamps[-1] >= stamp_ns
 
     def at(self, stamp_ns: int) -> Array | None:
-        """`odom_T_body` at a stamp, or None outside of what is known."""
+        """Return `odom_T_body` at a stamp, or None outside of the known poses."""
         poses = self.path(stamp_ns, stamp_ns).poses
         return poses[0] if len(poses) else None
 
     def path(self, start_ns: int, end_ns: int) -> Trajectory:
-        """Poses `odom_T_body` from start to end, both interpolated, as far as they are known; maybe none."""
+        """Return poses `odom_T_body` from start to end, both interpolated, as far as they are known; possibly none."""
         first, last = bisect_left(self._stamps, start_ns), bisect_left(self._stamps, end_ns)
         stamps = np.unique(np.array([start_ns, *self._stamps[first:last], end_ns], np.int64))
         poses, known = self._between(max(first - 1, 0), last + 1).at(stamps, self._max_gap_s)
         return Trajectory(stamps[known], poses[known])
 
     def samples(self, start_ns: int, end_ns: int) -> Trajectory:
-        """Poses from start to end as they came, no further back than the buffer's length before the end."""
+        """Return the received poses from start to end, no further back than the buffer's length before the end."""
         first = bisect_left(self._stamps, max(start_ns, end_ns - self._length_ns))
         return self._between(first, bisect_right(self._stamps, end_ns))
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Delete all poses."""
         self._stamps.clear()
         self._poses.clear()
 
@@ -93,10 +93,10 @@ def scan_motion(moments_s: Array, span_ns: tuple[int, int], path: Trajectory, od
 
 
 def odometry_noise(history: Trajectory, duration_ns: int) -> Array:
-    """Variance (6,) that the odometry's error gains in a second: x y z rx ry rz about the body's axes, m^2/s, rad^2/s.
+    """Return the variance (6,) of the odometry's error per second: x y z rx ry rz, body's axes, m^2/s and rad^2/s.
 
-    A rover moves smoothly, its odometry beside it at random. Third differences of the steps over the duration of a scan
-    leave this noise, as much of it as bends such a scan. Rougher motion counts as noise too: the odometry may not have
+    A rover moves smoothly, the errors of its odometry are random. Third differences of the steps over the duration of a
+    scan leave the noise that distorts such a scan. Rougher motion counts as noise too: the odometry may not have
     followed it. `history` are poses before the end of the scan, at about equal distances in time.
     """
     if len(history) < 2 or duration_ns <= 0:
@@ -114,7 +114,7 @@ def odometry_noise(history: Trajectory, duration_ns: int) -> Array:
 
 
 def twists(poses: Array, lag: int = 1) -> Array:
-    """Steps (N - lag, 6) x y z rx ry rz between poses (N, 4, 4), about the axes of the first of each two."""
+    """Return steps (N - lag, 6) x y z rx ry rz between poses (N, 4, 4), about the axes of each pair's first pose."""
     moved = invert(poses[:-lag]) @ poses[lag:]
     return np.hstack([moved[:, :3, 3], Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()])
 
@@ -125,7 +125,7 @@ Cube-1's drops a quarter of a scan at most, one written for 0 to 4095 drops all 
 
 
 class ScanLimits:
-    """Drops weak returns and those far above or below the LiDAR.
+    """Filter of weak returns and of returns far above or below the LiDAR.
 
     A limit of the calibration is applied only while it spares enough of all that the sensor has seen so far: no scan is
     lost because its intensities go from 0 to 1, or because its z axis is not the vertical, and one poor scan of the
@@ -144,7 +144,7 @@ class ScanLimits:
         self._strongest = 0.0
 
     def apply(self, cloud: Cloud) -> Cloud:
-        """Return the returns to use; those of the next scan in time."""
+        """Return the returns of the next scan in time that pass the limits."""
         keep = np.ones(len(cloud.points), bool)
         if math.isfinite(self._max_height_m):
             near = np.abs(cloud.points[:, 2]) <= self._max_height_m
@@ -154,10 +154,10 @@ class ScanLimits:
             strong = cloud.intensity > self._min_intensity
             self._strongest = max(self._strongest, float(np.nanmax(cloud.intensity, initial=0.0)))
             hint = f"intensities reach {self._strongest:.3g}"
-            # where there is no intensity at all, drivers send 0: neither for nor against the limit
+            # drivers send 0 where there is no intensity: not counted
             keep = keep & self._limited(f"min_intensity {self._min_intensity:g}", strong, cloud.intensity > 0, hint)
         if not keep.any():
-            self._warn_once("empty", f"a scan of {len(keep)} returns, none of which can be used; such are skipped")
+            self._warn_once("empty", f"a scan of {len(keep)} returns, none of them usable; such scans are skipped")
         return Cloud(
             cloud.points[keep],
             None if cloud.intensity is None else cloud.intensity[keep],
@@ -165,7 +165,7 @@ class ScanLimits:
         )
 
     def _limited(self, limit: str, kept: Mask, counted: Mask, hint: str) -> Mask:
-        """Which returns (N,) a limit keeps: all, if it would drop too many of those counted to be for this sensor."""
+        """Return the mask (N,) of returns that a limit keeps: all, if it would drop too many of the counted ones."""
         self._dropped[limit] += int(np.count_nonzero(counted & ~kept))
         self._seen[limit] += int(np.count_nonzero(counted))
         dropped, seen = self._dropped[limit], self._seen[limit]
@@ -194,7 +194,7 @@ class Anchor:
     cloud: Cloud | None = None
 
     def span_ns(self) -> tuple[int, int]:
-        """Stamps of the first and the last point; the key where the driver sends no times."""
+        """Return stamps of the first and the last point; the key where the driver sends no times."""
         if self.cloud is None or self.cloud.time_offset_ns is None or not len(self.cloud.points):
             return self.stamp_ns, self.stamp_ns
         offsets = self.cloud.time_offset_ns
@@ -236,7 +236,7 @@ def assemble(
 def _scan(
     anchor: Anchor, odometry: OdometryBuffer, calibration: Calibration, odom_T_body: Array | None
 ) -> tuple[Points | None, Points | None, ScanMotion | None]:
-    """Points in the body frame at the anchor's key, their intensity, and the motion that was removed from them."""
+    """Return points in the body frame at the anchor's key, their intensity, and the motion that was removed."""
     cloud = anchor.cloud
     if cloud is None or not len(cloud.points):
         return None, None, None
@@ -252,10 +252,10 @@ def _scan(
 
 
 def deskew(points: Points, point_stamps_ns: NDArray[np.int64], path: Trajectory, odom_T_body: Array) -> Points:
-    """Points (N, 3) float32, m, each in the body frame at its own stamp (N,), as measured from the pose `odom_T_body`.
+    """Return points (N, 3) float32, m, each in the body frame at its stamp (N,), as measured from `odom_T_body`.
 
     `path` is the odometry over the scan, at least one pose. Between them the motion is taken as
-    uniform; before the first and after the last the rover is taken to stand.
+    uniform; before the first and after the last the rover is assumed to stand.
     """
     moved = invert(odom_T_body) @ path.poses
     turns = Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()

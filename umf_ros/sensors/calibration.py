@@ -18,7 +18,7 @@ from umf_ros.core.io import read_values
 from umf_ros.core.resources import dataset_names
 
 TO_BE_MEASURED = "TO BE MEASURED"
-"""Marks an entry of a file that `umf inspect` or `umf import` could only guess."""
+"""Mark of an entry of a file that `umf inspect` or `umf import` guessed."""
 LARGEST_IMAGE = 20_000
 """Pixels of a side."""
 
@@ -47,14 +47,14 @@ class RawCamera(Pinhole):
         return distortion
 
     def matrix(self, size: tuple[int, int]) -> Array:
-        """(3, 3) intrinsics of the image scaled to `size`; pixel (0, 0) is a pixel's centre."""
+        """Return (3, 3) intrinsics of the image scaled to `size`; pixel (0, 0) is a pixel's centre."""
         sx, sy = size[0] / self.width, size[1] / self.height
         cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
         return np.array([[self.fx * sx, 0, cx], [0, self.fy * sy, cy], [0, 0, 1]])
 
 
 class StereoRectifier:
-    """Rectifies raw images of `raw_size` and scales them down to those of the rectified pair `camera`.
+    """Rectification of raw images of `raw_size`, scaled down to the size of the rectified pair `camera`.
 
     `raw_T_rectified` is the (4, 4) rotation of the rectified left camera in the raw one.
     """
@@ -81,7 +81,7 @@ class StereoRectifier:
         self.camera = StereoCamera(*size, fx, fy, cx, cy, baseline)
 
     def apply(self, raw: Image, side: int) -> Image:
-        """Rectified image, (H, W) uint8, of a raw one; `side` 0: left, 1: right."""
+        """Return the rectified image, (H, W) uint8, of a raw one; `side` 0: left, 1: right."""
         # area averaging first: the remap below takes four pixels only and would alias
         small = cv2.resize(raw, self._size, interpolation=cv2.INTER_AREA)
         return np.asarray(cv2.remap(small, *self._maps[side], interpolation=cv2.INTER_LINEAR), np.uint8)
@@ -89,7 +89,7 @@ class StereoRectifier:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """How the sensors are built and mounted; poses are in the body frame (REP-103).
+    """Intrinsics and extrinsics of the sensors; poses are in the body frame (REP-103).
 
     Attributes:
         camera: the rectified stereo pair; `body_T_camera` is the pose of its left optical frame.
@@ -126,12 +126,12 @@ class Calibration:
 
 
 def calibration_of(settings: Settings) -> Calibration:
-    """The calibration that the settings name, else that of the data set; raises as `load_calibration`."""
+    """Return the calibration that the settings name, else that of the data set; raises as `load_calibration`."""
     return load_calibration(settings.calibration or settings.dataset)
 
 
 def load_calibration(source: str | Path) -> Calibration:
-    """Calibration from a YAML file, or of a data set by its name, as in `s3li-etna`.
+    """Return the calibration from a YAML file, or of a data set by its name, as in `s3li-etna`.
 
     Raises:
         CalibrationError: the file cannot be read, or a key, which is named, is missing, unknown or wrong.
@@ -149,7 +149,7 @@ def load_calibration(source: str | Path) -> Calibration:
 
 
 def _guesses(path: Path) -> tuple[str, ...]:
-    """Entries marked as guesses: keys, or the text of a comment that stands alone."""
+    """Return entries marked as guesses: keys, or the text of a comment that stands alone."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     return tuple(
         line.partition(TO_BE_MEASURED)[2].strip(": ") if line.startswith("#") else line.partition(":")[0].strip()

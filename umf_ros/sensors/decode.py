@@ -36,22 +36,22 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 LAST_STAMP_NS = 2**31 * 10**9
-"""Stamps with seconds of 32 bits stay below."""
+"""Upper bound of stamps with 32-bit seconds."""
 FURTHEST_M = 1e7
-"""No odometry is further from its origin: a quarter of the earth."""
+"""Largest distance of odometry from its origin: a quarter of the Earth's circumference."""
 NARROWEST_RAD, WIDEST_RAD = 0.02, 3.1
-"""Angles of view that a rectified camera can have."""
+"""Limits of a rectified camera's field of view."""
 LARGEST_RECORD = 4096
-"""Bytes of a point; drivers have some dozens."""
+"""Most bytes of a point; drivers have some dozens."""
 INTENSITY_NAMES = ("intensity", "scalar_intensity", "reflectivity", "reflectance", "remission", "i")
 """Fields of the strength of a return, by driver; the second is CloudCompare's."""
 TIME_NAMES = ("point_time_offset", "offset_time", "t", "time", "time_offset", "timestamp")
 """Fields of the time of a point: whole numbers are ns, others s; Blickfeld, Livox, Ouster, Velodyne, Hesai."""
 FURTHEST_RETURN_M = 1e4
-"""No LiDAR of a rover sees ten kilometres (*by hand*); grids over points further apart run out of cells."""
+"""Largest range of a return (*by hand*); grids over points further apart run out of cells."""
 LONGEST_SWEEP_NS = 1_000_000_000
 NO_RETURN_RANGE_M = 1.0
-"""Range at which the Blickfeld driver puts the pulses that came back from nowhere, with intensity 0."""
+"""Range that the Blickfeld driver gives pulses without a return, with intensity 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,22 +77,22 @@ class OdometrySample(NamedTuple):
 
 
 def stamp_ns(message: Any) -> int:
-    """Stamp of the message's header in nanoseconds.
+    """Return the stamp of the message's header in nanoseconds.
 
     Raises:
-        MessageError: of kind "stamp" when there is no such time, or none is set: that looks like a restart.
+        MessageError: of kind "stamp" when it is out of range or not set, which looks like a reset.
     """
     stamp = message.header.stamp
     nanoseconds = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
     if nanoseconds <= 0:
         raise MessageError("stamp", "message without a stamp")
-    if nanoseconds >= LAST_STAMP_NS:  # could not be sent on
+    if nanoseconds >= LAST_STAMP_NS:  # does not fit a message
         raise MessageError("stamp", f"message with a stamp of {stamp.sec} s and {stamp.nanosec} ns")
     return nanoseconds
 
 
 def decode_image(message: Any) -> Image:
-    """Grey image (H, W) uint8 of a sensor_msgs/Image, which may share its memory, or of a CompressedImage.
+    """Return the grey image (H, W) uint8 of a sensor_msgs/Image, which may share its memory, or of a CompressedImage.
 
     16-bit images are taken as full scale: the upper byte is kept.
 
@@ -114,7 +114,7 @@ def decode_image(message: Any) -> Image:
 
 
 def _image_rows(message: Any, row_bytes: int) -> Image:
-    """(H, row_bytes) bytes of an image without the padding at the end of the rows."""
+    """Return (H, row_bytes) bytes of an image without the padding at the end of the rows."""
     if message.width == 0 or message.height == 0:
         raise MessageError("size", f"image of {message.width} x {message.height} pixels")
     if message.step < row_bytes:
@@ -124,12 +124,12 @@ def _image_rows(message: Any, row_bytes: int) -> Image:
     if data.size < expected:
         raise MessageError("truncated", f"image holds {data.size} bytes of {expected}")
     if data.size > expected:
-        raise MessageError("step", f"image holds {data.size} bytes, step and height say {expected}")
+        raise MessageError("step", f"image holds {data.size} bytes, step and height require {expected}")
     return np.ascontiguousarray(data.reshape(message.height, message.step)[:, :row_bytes])
 
 
 def decode_cloud(message: Any) -> Cloud:
-    """Real returns, possibly none, of a Livox CustomMsg or a PointCloud2, its fields found by name and data type.
+    """Return the real returns, possibly none, of a Livox CustomMsg or a PointCloud2 with fields of known names.
 
     Raises:
         MessageError: of kind "fields", "datatype", "step" or "truncated".
@@ -140,11 +140,11 @@ def decode_cloud(message: Any) -> Cloud:
 
 
 def real_returns(columns: Any, names: Collection[str]) -> tuple[Cloud, NDArray[np.bool_]]:
-    """The echoes among points, and (N,) which these are: away from the sensor, not too far, no dummy of the Cube-1.
+    """Return the real returns among points, and their mask (N,): not at the sensor, not too far, no Cube-1 dummy.
 
-    `columns` holds (N,) numbers by name, `names` are those there are, x, y and z in metres among them.
+    `columns` holds (N,) numbers by name, `names` are the present ones, x, y and z in metres among them.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is too far
+    with np.errstate(over="ignore", invalid="ignore"):  # values that overflow are too far
         points = np.stack([columns[axis] for axis in "xyz"], axis=1, dtype=np.float32, casting="unsafe")
         strength = next((name for name in INTENSITY_NAMES if name in names), None)
         intensity = None if strength is None else columns[strength].astype(np.float32)
@@ -153,12 +153,12 @@ def real_returns(columns: Any, names: Collection[str]) -> tuple[Cloud, NDArray[n
     dummy = np.abs(squared - NO_RETURN_RANGE_M**2) < 2e-5
     if intensity is not None:
         dummy &= intensity == 0
-    real = (squared > 0) & (squared <= FURTHEST_RETURN_M**2) & ~dummy  # neither holds of what is not a number
+    real = (squared > 0) & (squared <= FURTHEST_RETURN_M**2) & ~dummy  # both are false for NaN
     return Cloud(points[real], None if intensity is None else intensity[real]), real
 
 
 def _time_offsets_ns(records: NDArray[Any], message: Any) -> NDArray[np.int64] | None:
-    """(N,) ns after the message's stamp, from which or since the epoch drivers count; None where there are no times."""
+    """Return (N,) ns after the message's stamp; drivers count from there or from the epoch. None without times."""
     name = next((name for name in TIME_NAMES if name in (records.dtype.names or ())), None)
     if name is None:
         return None
@@ -176,7 +176,7 @@ def _time_offsets_ns(records: NDArray[Any], message: Any) -> NDArray[np.int64] |
 
 
 def _cloud_records(message: Any) -> NDArray[Any]:
-    """(N,) structured array over the fields the package uses."""
+    """Return an (N,) structured array of the fields that the package uses."""
     wanted = {"x", "y", "z", *INTENSITY_NAMES, *TIME_NAMES}
     fields = {field.name: field for field in message.fields if field.name in wanted}
     missing = [axis for axis in "xyz" if axis not in fields]
@@ -213,12 +213,12 @@ def _record_type(fields: list[Any], point_step: int, order: str) -> np.dtype[Any
 
 
 def decode_odometry(message: Any) -> OdometrySample:
-    """Pose of a nav_msgs/Odometry; raises as `decode_pose`."""
+    """Return the pose of a nav_msgs/Odometry; raises as `decode_pose`."""
     return OdometrySample(stamp_ns(message), decode_pose(message.pose.pose))
 
 
 def decode_pose(pose: Any) -> Array:
-    """(4, 4) matrix of a geometry_msgs/Pose.
+    """Return (4, 4) matrix of a geometry_msgs/Pose.
 
     Raises:
         MessageError: of kind "pose" when it is not finite or its quaternion is not of unit length.
@@ -236,7 +236,7 @@ def decode_pose(pose: Any) -> Array:
 
 
 def decode_camera_info(left: Any, right: Any | None = None) -> StereoCamera:
-    """Rectified pair of one or two sensor_msgs/CameraInfo; without the right one the baseline is 0.
+    """Return the rectified pair of one or two sensor_msgs/CameraInfo; without the right one the baseline is 0.
 
     Raises:
         MessageError: of kind "camera_info": no calibrated camera, or no pair.
@@ -253,7 +253,7 @@ def decode_camera_info(left: Any, right: Any | None = None) -> StereoCamera:
 
 
 def _projection(info: Any, name: str) -> Array:
-    """(3, 4) projection of the rectified image; from K where the driver leaves P empty."""
+    """Return (3, 4) projection of the rectified image; from K where the driver leaves P empty."""
     if max(info.width, info.height) > LARGEST_IMAGE:
         raise MessageError("camera_info", f"{name} camera_info for {info.width} x {info.height} pixels")
     matrix = np.array(info.p, dtype=float).reshape(3, 4)
@@ -289,16 +289,16 @@ def _decode_compressed(message: Any) -> Image:
     image = decode_picture(message.data)
     if image is None:
         raise MessageError("compressed", f"compressed image of format {message.format!r} cannot be read")
-    if "bayer" in message.format:  # the mosaic was compressed as it lies: smooth it as a demosaicing would
+    if "bayer" in message.format:  # the raw mosaic was compressed: smooth it as demosaicing would
         half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         image = np.asarray(cv2.resize(half, image.shape[::-1]), np.uint8)
     return image
 
 
 def decode_picture(content: bytes) -> Image | None:
-    """(H, W) uint8 grey image of a compressed file, its pixels as the camera sees them; None where it is none."""
+    """Return the (H, W) uint8 grey image of a compressed file, in the camera's orientation; None where it is none."""
     data = np.frombuffer(content, np.uint8)
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # a photograph that was turned for people is another
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # intrinsics hold for unrotated images
     image = cv2.imdecode(data, flags) if len(data) else None
     return None if image is None else np.asarray(image, np.uint8)
 

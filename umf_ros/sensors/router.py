@@ -34,12 +34,12 @@ _INPUTS: dict[str, Input] = {
 
 
 def wanted_inputs(topics: Topics) -> set[Input]:
-    """Inputs of the synchronizer for which there is a topic; the right camera_info alone does not count."""
+    """Return the inputs of the synchronizer for which there is a topic; the right camera_info alone does not count."""
     return {name for entry, name in _INPUTS.items() if getattr(topics, entry) and entry != "right_info"}
 
 
 class MessageRouter:
-    """Decodes the messages of the input topics and adds them to a synchronizer.
+    """Decoder of the input topics, which adds their messages to a synchronizer.
 
     A message that cannot be used is counted by kind and skipped, with a warning for the first of each kind and topic.
     """
@@ -49,13 +49,13 @@ class MessageRouter:
         synchronizer: Synchronizer,
         topics: Topics,
         warn: Callable[[str], None],
-        hear_odometry: Callable[[OdometrySample], None] = lambda _: None,
+        on_odometry: Callable[[OdometrySample], None] = lambda _: None,
         frames: BodyFrames | None = None,
     ) -> None:
-        """Give `hear_odometry` every sample; without `frames` sensors are as calibrated, and odometry is the body's."""
+        """Pass every sample to `on_odometry`; without `frames` sensors are as calibrated, odometry is the body's."""
         self._frames = frames
         self._synchronizer = synchronizer
-        self._hear_odometry = hear_odometry
+        self._on_odometry = on_odometry
         self._warn = warn
         self._warned: set[tuple[str, str]] = set()
         self._stereo_info = bool(topics.right_info and topics.right_image)
@@ -92,22 +92,22 @@ class MessageRouter:
 
     @contextmanager
     def refusing(self, topic: str) -> Iterator[None]:
-        """Refuse a message that raises anything: whatever it provokes, it is the message's fault."""
+        """Refuse a message whose processing raises any exception: it is faulty."""
         try:
             yield
         except MessageError as error:
             self.refuse(topic, error)
         except Exception as error:
-            text = f"message provokes {type(error).__name__}: {error}"
+            text = f"message raises {type(error).__name__}: {error}"
             self.refuse(topic, MessageError("unusable", text))
 
     def take_odometry(self, sample: OdometrySample) -> None:
         """Add one pose of the odometry."""
-        self._hear_odometry(sample)
+        self._on_odometry(sample)
         self._synchronizer.add(ODOMETRY, sample.stamp_ns, sample.odom_T_body)
 
     def refuse(self, topic: str, error: MessageError) -> None:
-        """Count a message that cannot be used, and warn of the first of its kind; also of topics that others take."""
+        """Count a message that cannot be used, warn of the first of its kind; also for other consumers' topics."""
         if topic in self._entries:
             self._synchronizer.reject(_INPUTS[self._entries[topic]], error.kind)
         if (topic, error.kind) not in self._warned:
@@ -115,10 +115,10 @@ class MessageRouter:
             self._warn(f"{topic}: {error}; such messages are skipped")
 
     def _use_info(self, entry: str, message: Any) -> None:
-        """Use the camera_info of the pair, or the left one alone when the right camera stays silent.
+        """Use the camera_info of the pair, or the left one alone when the right camera is silent.
 
         The first is used at once. A later one with other contents replaces it when it comes twice in a row:
-        one message may be damaged, a camera that was set up anew goes on saying so.
+        one message may be damaged, a camera with new settings repeats them.
         """
         content = (message.width, message.height, bytes(np.array(message.k)), bytes(np.array(message.p)))
         repeated, self._said[entry] = self._said.get(entry) == content, content
@@ -134,4 +134,4 @@ class MessageRouter:
         first, self._used = not self._used, (left[0], right[0])
         self._synchronizer.use_camera(decode_camera_info(left[1], right[1]))
         if not first and right[1] is not None:
-            self._warn(f"{entry}: other intrinsics than before; they are used from here on")
+            self._warn(f"{entry}: the intrinsics changed; the new ones are used from now on")

@@ -1,4 +1,4 @@
-"""Sessions of a stream of messages, decided by stamps and odometry."""
+"""Session resets in a stream of messages, detected by stamps and odometry."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from umf_ros.core.geometry import Array
 
 Input = Literal["left", "right", "cloud", "odometry", "camera_info"]
 ODOMETRY: Input = "odometry"
-"""The input whose values are poses, (4, 4) `odom_T_body`: their jump reveals a reset even when its clock runs on."""
+"""The input whose values are poses, (4, 4) `odom_T_body`: a jump of them is a reset even when the clock continues."""
 
 CLOCK_STEP_NS = 1_000_000_000
-"""A stamp this much older than the newest of its input is not late: the clock was set back."""
+"""A stamp this much older than the newest of its input means that the clock was set back."""
 AGREEMENT_NS = 5_000_000_000
 """Two messages out of line belong to the same new session when their stamps lie this close together."""
 FASTEST_M_PER_S = 20.0
 LEAST_JUMP_M = 2.0
 DROPPED = ("clock jump", "position jump")
-"""Faults of messages that were held and turned out to be wrong."""
+"""Faults of messages that were held and then dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class StampedInput:
     """A message as it arrives; of the odometry the value is (4, 4) `odom_T_body`.
 
     Attributes:
-        fault: why it does not go on from its input's newest message ("duplicate", "out of order", "stale"), why it was
+        fault: why it does not continue its input's newest message ("duplicate", "out of order", "stale"), why it was
             dropped ("clock jump", "position jump"), or "late" for its scan; empty for an ordinary one.
     """
 
@@ -41,18 +41,18 @@ class StampedInput:
 
 @dataclass(frozen=True, slots=True)
 class Reset:
-    """Why a new session begins: the clock's stamps went back, or the odometry alone jumped and time goes on."""
+    """Reason of a session reset: the clock was set back, or the odometry alone jumped while time continued."""
 
     reason: str
     of_clock: bool
 
 
 class SessionClock:
-    """Follows the clocks of some inputs and distinguishes a new session from a single wrong message.
+    """Clock of some inputs, which distinguishes a session reset from a single wrong message.
 
     A message out of line with the newest of its input (its stamp went back, or the odometry jumped) is held until
-    another agrees with it: of its own input one that goes on from it or, where the stamps went back, one of any
-    input. Then a new session begins. When its input goes on as before, the message is dropped. `session` counts the
+    another agrees with it: of its own input one that continues from it or, where the stamps went back, one of any
+    input. Then a new session begins. When its input continues as before, the message is dropped. `session` counts the
     resets; `start_ns` is the first stamp on this clock.
     """
 
@@ -65,11 +65,11 @@ class SessionClock:
         self._held: dict[Input, tuple[StampedInput, Reset]] = {}
 
     def newest_ns(self, *names: Input) -> int | None:
-        """Latest stamp of some inputs on this clock, or None before their first."""
+        """Return the latest stamp of some inputs on this clock, or None before their first."""
         return max((self._newest[name].stamp_ns for name in names if name in self._newest), default=None)
 
     def take(self, arrival: StampedInput) -> tuple[Reset | None, list[StampedInput]]:
-        """Take one message; return why a new session begins, and the messages that are decided by now.
+        """Take one message; return the session reset, if any, and the messages that are decided by now.
 
         Dropped messages come first, then those of the running session in the order of their arrival; none while the
         message is held.
@@ -87,11 +87,11 @@ class SessionClock:
 
     @property
     def held(self) -> int:
-        """Messages whose fate is open."""
+        """Number of messages that are not decided yet."""
         return len(self._held)
 
     def give_up(self) -> list[StampedInput]:
-        """Drop what is still held, at the end of the stream."""
+        """Drop the messages that are still held, at the end of the stream."""
         return self._drop(set(self._held))
 
     def _begin(self, agreeing: list[Input], arrival: StampedInput) -> tuple[Reset, list[StampedInput]]:
@@ -127,14 +127,14 @@ class SessionClock:
         return arrival
 
     def _is_stale(self, stamp_ns: int) -> bool:
-        """Whether the first message of an input on a new clock lies closer to the end of the one before."""
+        """Return whether the first message of an input on a new clock is closer to the end of the previous session."""
         if self._previous_end_ns is None or self._now_ns is None or stamp_ns <= self._now_ns:
             return False
         return abs(self._previous_end_ns - stamp_ns) < stamp_ns - self._now_ns
 
 
 def _reset(before: StampedInput, after: StampedInput) -> Reset | None:
-    """Why the second message of an input cannot go on from the first; None when it can."""
+    """Return the reset between two messages of an input; None when the second continues from the first."""
     elapsed_ns = after.stamp_ns - before.stamp_ns
     if elapsed_ns <= -CLOCK_STEP_NS:
         return Reset(f"the clock of the {after.name} went back", of_clock=True)
@@ -147,7 +147,7 @@ def _reset(before: StampedInput, after: StampedInput) -> Reset | None:
 
 
 def _agree(held: StampedInput, why: Reset, arrival: StampedInput, reset: Reset) -> bool:
-    """Whether two messages out of line belong to the same new session."""
+    """Return whether two messages out of line belong to the same new session."""
     if abs(arrival.stamp_ns - held.stamp_ns) > AGREEMENT_NS:
         return False
     if held.name == arrival.name:
@@ -159,24 +159,24 @@ class OdometryTaker(Protocol):
     """A user of odometry in sessions: a pose graph, or a localizer."""
 
     def begin_session(self) -> None:
-        """The messages to come do not go on from those before."""
+        """Begin a session: later messages do not continue from the earlier ones."""
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> bool:
-        """Take one message; returns whether it could be used."""
+        """Take one message; return whether it was usable."""
 
 
 GOES_ON_NS = 60_000_000_000
-"""Odometry that a restarted process hears this much later may still be that of before (*by hand*)."""
+"""Longest interruption that odometry may continue its session after (*by hand*)."""
 SLACK_M = 2.0
-"""So much further than at its latest speed the rover may have come meanwhile (*by hand*)."""
+"""Motion during an interruption beyond that at the latest speed (*by hand*)."""
 
 
 class OdometrySessionSplitter:
-    """Gives a graph every odometry message, in sessions, alike live and in a replay.
+    """Splitter of the odometry of a graph into sessions, the same live and in a replay.
 
     Attributes:
         newest_ns: latest stamp of the running session, -1 before its first.
-        dropped: messages that were out of line, and wrong.
+        dropped: messages that were out of line and wrong.
     """
 
     def __init__(self, graph: OdometryTaker) -> None:
@@ -189,15 +189,15 @@ class OdometrySessionSplitter:
 
     @property
     def held(self) -> int:
-        """Messages that are wrong or begin a session; the next message decides."""
+        """Number of messages that are wrong or begin a session, as the next message decides."""
         return self._clock.held
 
     def interrupted(self) -> None:
-        """The process was not there for a while: the next message need not go on from the last."""
+        """Note an interruption: the next message need not continue from the last one."""
         self._interrupted = True
 
     def take(self, stamp_ns: int, odom_T_body: Array) -> Reset | None:
-        """Take one message, (4, 4); returns why a new session has begun with it, None when it goes on."""
+        """Take one message, (4, 4); return the reset of a session that begins with it, else None."""
         restart = self._restart(stamp_ns, odom_T_body) if self._interrupted else None
         self._interrupted = False
         if restart is not None:
@@ -218,16 +218,16 @@ class OdometrySessionSplitter:
         return reset or restart
 
     def _restart(self, stamp_ns: int, odom_T_body: Array) -> Reset | None:
-        """Why the odometry after an interruption is not that of before; None when it is, or nothing was before."""
+        """Return the reset after an interruption; None when the odometry continues, or there was none before."""
         if not self._recent:
             return None
         (first_ns, first), (last_ns, last) = self._recent[0], self._recent[-1]
         elapsed_s = (stamp_ns - last_ns) * 1e-9
         if not 0 <= elapsed_s <= GOES_ON_NS * 1e-9:
-            return Reset("the odometry before the restart is of another time", of_clock=elapsed_s < 0)
+            return Reset("the odometry before the restart is from another time", of_clock=elapsed_s < 0)
         speed = float(np.linalg.norm(last[:3, 3] - first[:3, 3])) / max((last_ns - first_ns) * 1e-9, 1.0)
         moved_m = float(np.linalg.norm(odom_T_body[:3, 3] - last[:3, 3]))
         begins_anew = np.allclose(odom_T_body, np.eye(4), atol=1e-3) and not np.allclose(last, np.eye(4), atol=1e-3)
         if begins_anew or moved_m > SLACK_M + 2 * speed * elapsed_s:
-            return Reset("the odometry began anew meanwhile", of_clock=False)
+            return Reset("the odometry was reset during the interruption", of_clock=False)
         return None

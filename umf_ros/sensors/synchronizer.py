@@ -1,4 +1,4 @@
-"""From single measurements to synchronised frames."""
+"""Synchronisation of measurements into frames."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ STEREO_SLOP_NS = 17_000_000
 """Exposures of a pair carry the same stamp; half a period at 30 Hz separates neighbouring pairs."""
 
 SILENCE_NS = 5_000_000_000
-"""An input of which nothing has come in this much stream time is taken to be absent."""
+"""An input without a message in this much stream time counts as absent."""
 
 
 SURPLUS = "surplus"
-"""Reason of images that lie nearest to no scan: no fault, cameras are faster than LiDARs."""
+"""Reason of images that are nearest to no scan; no fault, as cameras are faster than LiDARs."""
 
 
 @dataclass(slots=True)
@@ -63,11 +63,11 @@ class ImageBuffer:
         self.newest_ns = image.stamp_ns
 
     def passed(self, stamp_ns: int) -> bool:
-        """Whether no image to come can be nearer to the stamp than those that came."""
+        """Return whether no later image can be nearer to the stamp than the buffered ones."""
         return self.newest_ns is not None and self.newest_ns >= stamp_ns
 
     def nearest(self, stamp_ns: int, slop_ns: int) -> StampedInput | None:
-        """The image nearest to a stamp, or None when it is further than the slop; the earlier of two equals."""
+        """Return the image nearest to a stamp, or None when it is further than the slop; the earlier of two equals."""
         nearest = min(self._images, key=lambda image: abs(image.stamp_ns - stamp_ns), default=None)
         return nearest if nearest and abs(nearest.stamp_ns - stamp_ns) <= slop_ns else None
 
@@ -78,12 +78,12 @@ class ImageBuffer:
             self._counter.used += 1
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Let go of older images."""
+        """Delete older images."""
         while self._images and self._images[0].stamp_ns < stamp_ns:
             self._forget(SURPLUS)
 
     def clear(self) -> None:
-        """Let go of everything."""
+        """Delete all images."""
         self.forget_before(2**63)
         self.newest_ns = None
 
@@ -96,18 +96,18 @@ class ImageBuffer:
 
 
 class Synchronizer:
-    """Builds one frame per scan from the image nearest to it and the odometry; without a LiDAR one per image.
+    """Builder of one frame per scan from the nearest image and the odometry; without a LiDAR one per image.
 
-    Add measurements as they come, input by input in the order of their stamps, and `pop` what is complete: every input
-    has passed it. Only stamps decide, never the time of arrival: as long as no input lags behind another by more than
+    Add measurements as they come, input by input in the order of their stamps, and `pop` complete frames: every input
+    has passed them. Only stamps decide, never the time of arrival: as long as no input lags behind another by more than
     `max_wait_s`, the same measurements give the same frames however their arrivals interleave. A frame that has waited
-    longer is completed with what is there; an input that has been silent for long is not waited for until it speaks.
+    longer is completed with the data at hand; an input silent for long is not waited for before its next message.
 
-    When a new session begins (see `SessionClock`), the waiting frames are completed with what is there, and all that
-    cannot be compared with the measurements to come is forgotten. Not for several threads at once.
+    When a new session begins (see `SessionClock`), the waiting frames are completed with the data at hand, and all that
+    cannot be compared with later measurements is deleted. Not thread-safe.
 
     Attributes:
-        counters: what became of the messages of each input.
+        counters: used and dropped messages of each input.
         session: number of resets of the clock or the odometry so far.
     """
 
@@ -141,7 +141,7 @@ class Synchronizer:
     def use_camera(self, camera: StereoCamera) -> None:
         """Replace the intrinsics by those of a camera_info."""
         self._calibration = self._calibration.with_camera(camera)
-        self._absent.add("camera_info")  # comes no second time
+        self._absent.add("camera_info")  # not waited for again
 
     def use_mounting(self, poses: dict[str, Any]) -> None:
         """Replace poses of the sensors, `body_T_camera` or `body_T_lidar` by name."""
@@ -180,12 +180,12 @@ class Synchronizer:
             self._absent.add(name)
 
     def pop(self) -> list[Frame]:
-        """Frames completed since the last call, in the order of their stamps."""
+        """Return the frames completed since the last call, in the order of their stamps."""
         frames, self._frames = self._frames, []
         return frames
 
     def flush(self) -> list[Frame]:
-        """Complete the waiting frames with what is there, at the end of the stream, and pop them."""
+        """Complete the waiting frames with the data at hand, at the end of the stream, and pop them."""
         for one in self._clock.give_up():
             self.reject(one.name, one.fault)
         self._end_session()
@@ -205,7 +205,7 @@ class Synchronizer:
                 self._anchors.append(Anchor(one.stamp_ns, one.stamp_ns))
 
     def _end_session(self, of_clock: bool = True) -> None:
-        """Complete the waiting frames with what is there; images go on where the odometry alone was reset."""
+        """Complete the waiting frames with the data at hand; images are kept where the odometry alone was reset."""
         while self._anchors:
             self._complete(self._anchors.popleft())
         self._odometry.clear()
@@ -215,7 +215,7 @@ class Synchronizer:
             self._given_up_ns = -1
 
     def _build(self) -> None:
-        """Complete the frames that wait for nothing more, in order."""
+        """Complete the frames that lack no input, in order."""
         while self._anchors and self._is_complete(self._anchors[0]):
             anchor = self._anchors.popleft()
             self._complete(anchor)
@@ -230,7 +230,7 @@ class Synchronizer:
         return self._clock.newest_ns("left", "right", "cloud")
 
     def _forget_before(self, key_ns: int) -> None:
-        """Let go of the images that are too old for a frame at this key."""
+        """Delete the images that are too old for a frame at this key."""
         self._left.forget_before(key_ns - self._slop_ns)
         self._right.forget_before(key_ns - self._slop_ns - STEREO_SLOP_NS)
 
@@ -253,7 +253,7 @@ class Synchronizer:
         return name in self._inputs and name not in self._absent
 
     def _is_silent(self, name: Input, now_ns: int) -> bool:
-        """Whether an input has been silent for long, by the stamps of the others."""
+        """Return whether an input has been silent for long, by the stamps of the others."""
         newest_ns = self._clock.newest_ns(name)
         return now_ns - (self._clock.start_ns if newest_ns is None else newest_ns) > SILENCE_NS
 
@@ -269,7 +269,7 @@ class Synchronizer:
         self._frames.append(assemble(anchor, left, right, self._odometry, self._calibration, self.session))
 
     def _count_scan(self, cloud: Cloud, left: StampedInput | None) -> bool:
-        """Count a scan as used or dropped; returns whether there will be a frame."""
+        """Count a scan as used or dropped; return whether there will be a frame."""
         counter = self.counters["cloud"]
         without_image = left is None and (self._settings.require_image or not len(cloud.points))
         if not len(cloud.points):

@@ -16,7 +16,7 @@ from umf_ros.sensors.decode import stamp_ns
 TOPIC = "/tf_static"
 _UP = 0.9
 PATIENCE_S = 3.0
-"""Latched messages come this soon after a node has started, as a rule much sooner."""
+"""Time within which latched messages arrive after the start of a node."""
 
 
 class StaticTransforms:
@@ -27,7 +27,7 @@ class StaticTransforms:
         self.version = 0
 
     def add(self, message: Any) -> None:
-        """Take a tf2_msgs/TFMessage; what is no rigid transform in it is left out."""
+        """Take a tf2_msgs/TFMessage; transforms that are not rigid are left out."""
         for stamped in message.transforms:
             shift, turn = stamped.transform.translation, stamped.transform.rotation
             parent, child = (name.lstrip("/") for name in (stamped.header.frame_id, stamped.child_frame_id))
@@ -41,18 +41,18 @@ class StaticTransforms:
                 self.version += 1
 
     def find(self, frame: str, other: str) -> Array | None:
-        """(4, 4) `frame_T_other`, or None where no chain of static transforms connects the two."""
+        """Return (4, 4) `frame_T_other`, or None where no chain of static transforms connects the two."""
         ours, theirs = self._to_roots(frame.lstrip("/")), self._to_roots(other.lstrip("/"))
         common = next((name for name in ours if name in theirs), None)
         return None if common is None else invert(ours[common]) @ theirs[common]
 
     def _to_roots(self, frame: str) -> dict[str, Array]:
-        """`ancestor_T_frame` of every ancestor, the nearest first."""
+        """Return `ancestor_T_frame` of every ancestor, the nearest first."""
         poses: dict[str, Array] = {frame: np.eye(4)}
         name = frame
         while name in self._parents:
             parent, pose = self._parents[name]
-            if parent in poses:  # a circle is no tree
+            if parent in poses:  # a cycle
                 break
             poses[parent] = pose @ poses[name]
             name = parent
@@ -60,7 +60,7 @@ class StaticTransforms:
 
 
 class BodyFrames:
-    """Converts poses of sensors and of odometry to those of the body, as far as static transforms state them.
+    """Conversion of poses of sensors and odometry to the body frame, as far as static transforms allow.
 
     Odometry of another part of the robot waits `patience_s` for the transforms, by its stamps; then it is taken as the
     body's, with a warning. Another source of odometry on the same topic is refused. `odom` is the name of the
@@ -75,7 +75,7 @@ class BodyFrames:
         patience_s: float = 0.0,
         calibration: Calibration | None = None,
     ) -> None:
-        """Without a calibration `mounting` has no poses: sensors stay where they are."""
+        """Without a calibration, `mounting` returns no poses."""
         self._base, self._transforms, self._warn = frames.base, transforms, warn
         self._calibration = calibration
         self._mounted: dict[str, tuple[str, int]] = {}
@@ -87,11 +87,11 @@ class BodyFrames:
         self.odom = frames.odom
 
     def pose_of(self, frame_id: str) -> Array | None:
-        """(4, 4) pose of a frame on the body; None where the transforms do not say it."""
+        """Return (4, 4) pose of a frame on the body; None where the transforms lack it."""
         return self._transforms.find(self._base, frame_id) if frame_id else None
 
     def mounting(self, sensor: str, frame_id: str) -> dict[str, Any]:
-        """Return the new pose of a "camera" or a "lidar", as `body_T_camera` or `body_T_lidar`; empty: as before.
+        """Return the new pose of a "camera" or a "lidar", as `body_T_camera` or `body_T_lidar`; empty if unchanged.
 
         Warn once about a new pose, with its distance from that of the calibration.
         """
@@ -118,7 +118,7 @@ class BodyFrames:
         return {name: pose}
 
     def to_body(self, message: Any, odom_T_part: Array) -> Array:
-        """(4, 4) `odom_T_body` of a nav_msgs/Odometry whose pose is `odom_T_part`.
+        """Return (4, 4) `odom_T_body` of a nav_msgs/Odometry whose pose is `odom_T_part`.
 
         Raises:
             MessageError: of kind "frame": another source than the first message's; of kind "transforms": not yet known.
@@ -134,16 +134,16 @@ class BodyFrames:
         if self._part_T_body is None:
             self._part_T_body = self._look_up(names[1], stamp_ns(message) - self._first_ns)
         if self._part_T_body is None:
-            raise MessageError("transforms", f"odometry of {names[1]} waits for {TOPIC} to say where that is")
+            raise MessageError("transforms", f"odometry of {names[1]} waits for its transform on {TOPIC}")
         return np.asarray(odom_T_part @ self._part_T_body)
 
     def _look_up(self, part: str, waited_ns: int) -> Array | None:
-        """`part_T_body`; None while it is worth waiting."""
+        """Return `part_T_body`; None while the transform may still arrive."""
         if not part or part == self._base:
             return np.eye(4)
         part_T_body = self._transforms.find(part, self._base)
         if part_T_body is None and not 0 <= waited_ns < self._patience_ns:
-            text = f"and {TOPIC} does not say where {self._base} is on it: taken as the body's"
+            text = f"and {TOPIC} has no transform from it to {self._base}: taken as the body's"
             self._warn(f"the odometry is that of {part}, {text} (parameter frames.base)")
             return np.eye(4)
         return part_T_body
