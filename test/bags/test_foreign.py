@@ -164,7 +164,7 @@ def test_of_a_split_recording_only_the_broken_part_is_lost(tmp_path: Path) -> No
     read = [(topic, log_ns) for topic, log_ns, _ in bag.messages()]
     expected = [(topic, log_ns) for topic, log_ns, _ in ENTRIES]
     assert read == expected[: len(read)] and len(read) >= len(thirds[0]) + len(thirds[1])
-    assert f"{last} breaks off" in bag.warning and bag.warning.count("breaks off") == 1
+    assert f"{last} is truncated" in bag.warning and bag.warning.count("is truncated") == 1
 
 
 @pytest.mark.parametrize("damage", [b"", b"\x00" * 4, b"\xff" * 40])

@@ -107,7 +107,7 @@ def test_truncated_mcap_is_read_as_far_as_it_goes(part: float, tmp_path: Path) -
     assert 0 < len(read) == sum(info.count for info in bag.topics.values())
     assert read == expected[: len(read)]
     assert part < 0.5 or len(read) > 0.5 * len(expected)
-    assert f"{path} breaks off" in bag.warning and f"{len(read)} messages" in bag.warning
+    assert f"{path} is truncated" in bag.warning and f"{len(read)} messages" in bag.warning
 
 
 def test_mcap_whose_tail_is_garbage_is_read_up_to_it(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_mcap_whose_tail_is_garbage_is_read_up_to_it(tmp_path: Path) -> None:
     path.write_bytes(whole[: len(whole) // 2] + bytes(range(256)) * 50)
     bag = open_bag(path)
     assert len(list(bag.messages())) > 20
-    assert "breaks off" in bag.warning
+    assert "is truncated" in bag.warning
 
 
 def test_mcap_without_an_index_is_put_in_order(tmp_path: Path) -> None:
@@ -130,9 +130,9 @@ def test_mcap_without_an_index_is_put_in_order(tmp_path: Path) -> None:
     ("name", "content", "text"),
     [
         ("empty.mcap", b"", "is empty"),
-        ("foreign.mcap", b"PK\x03\x04 a zip file, renamed", "is no recording"),
+        ("foreign.mcap", b"PK\x03\x04 a zip file, renamed", "is not a recording"),
         ("short.mcap", b"\x89MCAP0\r\n", "holds no message"),
-        ("foreign.bag", b"\x00" * 5000, "is no recording"),
+        ("foreign.bag", b"\x00" * 5000, "is not a recording"),
         ("broken.bag", b"#ROSBAG V2.0\n" + bytes(50), "cannot be read"),
         ("broken.db3", b"SQLite format 3\x00" + bytes(5000), "cannot be read"),
     ],

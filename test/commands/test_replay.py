@@ -249,6 +249,6 @@ def test_a_recording_without_truth_is_not_judged_and_its_name_keeps_its_brackets
     bag.write_bytes(whole[: len(whole) * 2 // 3])
     ended = umf_here("replay", bag, "--embedder", "thumbnail", "--dataset", "simulated", "--out", tmp_path / "out")
     assert ended.status == 3, ended.text  # images of another size, and three keyframes
-    assert f"{bag} breaks off; its first" in ended.out
+    assert f"{bag} is truncated; its first" in ended.out
     assert "there is no ground truth to judge them by" in ended.text
     assert json.loads((tmp_path / "out" / "latest" / "summary.json").read_text())["ground_truth"] is None

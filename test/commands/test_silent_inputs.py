@@ -9,8 +9,8 @@ from command_line import umf
 from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, traverse, write_mcap
 
 SAID = {
-    LEFT: "no images on /stereo/left/image_rect: places are told apart by scans alone",
-    CLOUD: "no scans on /bf_lidar/points_raw: everything rests on the images",
+    LEFT: "no images on /stereo/left/image_rect: running LiDAR-only",
+    CLOUD: "no scans on /bf_lidar/points_raw: running camera-only",
     ODOMETRY: "no odometry on /odom: closures only, the pose graph is skipped",
 }
 

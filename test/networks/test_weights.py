@@ -110,7 +110,7 @@ def test_someone_elses_tensors(weights):
 
 def test_no_word_about_the_architecture(weights):
     save_file(load_file(weights), weights)
-    with pytest.raises(WeightsError, match="does not say which"):
+    with pytest.raises(WeightsError, match="states none"):
         load_weights(weights)
 
 

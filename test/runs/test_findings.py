@@ -184,7 +184,7 @@ def test_losses_of_an_input_are_told_with_their_reasons_and_surplus_images_are_n
         Advice(
             "warning",
             "30 of 100 messages of the left images could not be used (late 20, size 10)",
-            "sync.max_wait_s waits longer",
+            "a larger sync.max_wait_s waits longer",
         )
     ]
 

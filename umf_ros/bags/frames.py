@@ -30,7 +30,7 @@ IMU_HINT = "; an IMU is no odometry: run one (KISS-ICP, Basalt, FAST-LIO) and gi
 
 
 class FrameReader:
-    """The frames of a recording, read once, and the fate of its messages.
+    """Frames of a recording, read once, with counts of its messages.
 
     Messages that cannot be used are counted and skipped, the first of each kind with a warning. Inputs without a topic
     in the recording are not waited for. `progress` is the part of the recording that was read, 0 to 1.
@@ -46,7 +46,7 @@ class FrameReader:
         """Take the odometry from a trajectory instead of the recording's topic, if given.
 
         Raises:
-            BagError: there are neither images nor scans, or of other types, or the trajectory is of another time.
+            BagError: there are neither images nor scans, they have other types, or the trajectory covers another time.
             CalibrationError: the calibration cannot be read.
         """
         topics = _present(topics_of(settings), bag)
@@ -70,21 +70,21 @@ class FrameReader:
 
     @property
     def counters(self) -> dict[Input, InputCounter]:
-        """The fate of the messages of each input."""
+        """Used and dropped messages of each input."""
         return self._synchronizer.counters
 
     def __iter__(self) -> Iterator[Frame]:
-        """Frames in the order of their stamps."""
+        """Yield frames in the order of their stamps."""
         return (item for item in self.stream() if isinstance(item, Frame))
 
     def stream(self) -> Iterator[Frame | OdometrySample]:
-        """Every message of the odometry as it comes, and the frames as they are complete."""
+        """Yield every odometry message in its order, and the frames when they are complete."""
         for raw in self._bag.raw_messages(self._router.topics):
             yield from self._take(raw)
         yield from self._synchronizer.flush()
 
     def graph_stream(self) -> Iterator[Frame | OdometrySample | AbsoluteMeasurement]:
-        """The same with absolute measurements, which only a pose graph takes."""
+        """Yield the same with absolute measurements, which only a pose graph takes."""
         for raw in self._bag.raw_messages([*self._router.topics, *self._absolute]):
             if raw.topic in self._absolute:
                 yield from self._take_absolute(raw)
@@ -124,7 +124,7 @@ class FrameReader:
 
 
 def read_transforms(bag: Bag) -> StaticTransforms:
-    """The static transforms of a recording, whenever they were published: they are latched."""
+    """Return the static transforms of a recording, published at any time, as they are latched."""
     transforms = StaticTransforms()
     if TOPIC in bag.topics:
         for _, _, message in bag.messages([TOPIC]):
@@ -133,7 +133,7 @@ def read_transforms(bag: Bag) -> StaticTransforms:
 
 
 def _absolute_topics(settings: Settings, bag: Bag) -> dict[str, Aid]:
-    """Topics of absolute measurements; a `BagError` where one that is named is missing, or of another type."""
+    """Return the topics of absolute measurements; raise a `BagError` if a named one is missing or of another type."""
     found = {}
     for source, topic in (
         (Aid.GNSS, settings.absolute.gnss),
@@ -151,7 +151,7 @@ def _absolute_topics(settings: Settings, bag: Bag) -> dict[str, Aid]:
 
 
 def _present(topics: Topics, bag: Bag) -> Topics:
-    """The topics that the recording has messages of; the others empty.
+    """Return the topics with messages in the recording; the others empty.
 
     Raises:
         BagError: a topic is of another type than expected, or there are neither images nor scans.

@@ -1,4 +1,4 @@
-"""Inputs that a recording lacks, or whose messages could not be used, with what helps."""
+"""Inputs that a recording lacks, or whose messages could not be used, with remedies."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from umf_ros.sensors.synchronizer import InputCounter
 Severity = Literal["fault", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("fault", "warning", "note")
 _ABSENT: dict[str, tuple[Severity, str]] = {
-    "left_image": ("warning", "no images on {}: places are told apart by scans alone"),
-    "right_image": ("note", "no right images on {}: depth of images comes from the scans alone"),
-    "cloud": ("warning", "no scans on {}: everything rests on the images"),
+    "left_image": ("warning", "no images on {}: running LiDAR-only"),
+    "right_image": ("note", "no right images on {}: image depth from the scans only"),
+    "cloud": ("warning", "no scans on {}: running camera-only"),
     "odometry": ("warning", "no odometry on {}: closures only, the pose graph is skipped"),
 }
 _NAMES: dict[str, str] = {"left": "left images", "right": "right images", "cloud": "scans", "odometry": "odometry"}
 _HELP = {
     "size": "the calibration is for images of another size: width, height, fx, fy, cx, cy",
-    "encoding": "umf inspect names the encodings that can be read",
+    "encoding": "umf inspect lists the supported encodings",
     "fields": "the cloud needs fields x, y and z",
     "stamp": "the driver must set header.stamp",
     "pose": "the odometry must send unit quaternions",
-    "late": "sync.max_wait_s waits longer",
-    "queue full": "sync.queue_size keeps more",
+    "late": "a larger sync.max_wait_s waits longer",
+    "queue full": "a larger sync.queue_size keeps more",
 }
 """Remedy by the reason for which messages are dropped."""
 MUCH_LOST = 0.2
-"""Share of an input's messages; more of them lost than this is worth a line."""
+"""Least share of lost messages of an input that is reported."""
 
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """Something a person should know.
+    """Advice to the user.
 
     Attributes:
-        severity: a fault spoils the result, a warning may, a note is good to know.
-        what: the problem, with its number; a sentence without a full stop.
-        remedy: what helps; likewise, or empty.
+        severity: a fault spoils the result, a warning may, a note is information.
+        what: the problem, with its figures; a sentence without a full stop.
+        remedy: the remedy, likewise, or empty.
     """
 
     severity: Severity
@@ -57,7 +57,7 @@ class Advice:
 
 
 def absent_inputs(bag: Bag, settings: Settings, odometry_from_file: bool = False) -> list[Advice]:
-    """Inputs that the settings name and the recording lacks."""
+    """Return inputs that the settings name and the recording lacks."""
     topics = topics_of(settings).model_dump()
     absent = [name for name in _ABSENT if not (topics[name] in bag.topics and bag.topics[topics[name]].count)]
     found: list[Advice] = []
@@ -75,14 +75,14 @@ def absent_inputs(bag: Bag, settings: Settings, odometry_from_file: bool = False
 def _remedy(name: str, bag: Bag) -> str:
     others = sorted(topic for topic, info in bag.topics.items() if info.type in TYPES[name] and info.count)
     if name == "odometry":
-        return f"name yours: topics.odometry ({', '.join(others)})" if others else "--odometry FILE.tum supplies it"
+        return f"set topics.odometry ({', '.join(others)})" if others else "--odometry FILE.tum supplies it"
     if not others:
         return f"the recording has no {TYPES[name][0]} at all"
-    return f"name yours in a --config: topics.{name} ({', '.join(others)})"
+    return f"set topics.{name} in a --config ({', '.join(others)})"
 
 
 def input_counts(counters: Mapping[Input, InputCounter]) -> dict[str, Any]:
-    """The `inputs` entry of a summary: messages received, used and dropped, with reasons."""
+    """Return the `inputs` entry of a summary: messages received, used and dropped, with reasons."""
     return {
         name: {"received": counter.received, "used": counter.used, "dropped": dict(counter.dropped)}
         for name, counter in counters.items()
@@ -90,7 +90,7 @@ def input_counts(counters: Mapping[Input, InputCounter]) -> dict[str, Any]:
 
 
 def useless_inputs(inputs: Mapping[str, Any]) -> list[Advice]:
-    """Inputs whose messages came and could not be used, all or many of them."""
+    """Return inputs of which all or many messages could not be used."""
     found = []
     for name, count in inputs.items():
         lost = Counter({reason: number for reason, number in count["dropped"].items() if reason != "surplus"})
@@ -98,7 +98,7 @@ def useless_inputs(inputs: Mapping[str, Any]) -> list[Advice]:
             continue
         reasons = ", ".join(f"{reason} {number}" for reason, number in lost.most_common())
         messages = f"{lost.total()} of {count['received']} messages of the {_NAMES.get(name, name)}"
-        remedy = _HELP.get(lost.most_common(1)[0][0], "umf inspect looks closer")
+        remedy = _HELP.get(lost.most_common(1)[0][0], "run umf inspect for details")
         what = f"{messages} could not be used ({reasons})"
         found.append(Advice("warning" if count["used"] else "fault", what, remedy))
     return found

@@ -14,12 +14,12 @@ from umf_ros.core.resources import dataset_names
 from umf_ros.sensors.calibration import load_calibration
 
 SAMPLES = 5
-"""Messages of camera_info that are looked at: a single one may be damaged."""
+"""Number of camera_info messages that are read: a single one may be damaged."""
 GROUND_TRUTH_TOPIC = "/ground_truth/pose"
 
 
 def detect_dataset(bag: Bag, own_calibration: bool = False) -> str:
-    """Data set of a recording: the one most of whose topics are there; its mark counts as one more.
+    """Return the data set of a recording: the one with most topics present; its mark counts as one more.
 
     Its camera_info must be of the data set's cameras, unless the calibration is the user's own.
 
@@ -33,12 +33,12 @@ def detect_dataset(bag: Bag, own_calibration: bool = False) -> str:
     if not scores[best]:
         reason = f"the recording has no topic of a known data set (topics: {', '.join(sorted(known)) or 'none'})"
     if reason:
-        raise BagError(f"{reason}; name yours in a config file: umf inspect {bag.path} --write . writes a first one")
+        raise BagError(f"{reason}; set the topics in a config file: umf inspect {bag.path} --write . writes a draft")
     return best
 
 
 def _contradiction(bag: Bag, name: str) -> str:
-    """Reason why a recording with the topics of a data set is of another camera, else empty."""
+    """Return the reason why a recording with the topics of a data set is of another camera, else empty."""
     topics = load_preset(name).topics
     infos = {topics.left_info, f"{topics.left_image.rpartition('/')[0]}/camera_info"}
     kind = "sensor_msgs/msg/CameraInfo"
@@ -63,9 +63,9 @@ def _match(preset: DatasetPreset, known: set[str]) -> int:
 
 
 def settings_for(bag: Bag, config: Path | None, dataset: str, **overrides: Any) -> Settings:
-    """Settings to read a recording with: those of a parameter file and overrides as in `load_settings`.
+    """Return settings to read a recording with: those of a parameter file and overrides as in `load_settings`.
 
-    A data set that is named goes before that of the file; "auto" takes it from the file, or from the recording's topics
+    A named data set precedes that of the file; "auto" takes it from the file, or from the recording's topics
     where the file names neither a data set nor topics.
 
     Raises:

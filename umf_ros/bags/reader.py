@@ -12,7 +12,7 @@ from umf_ros.core.errors import BagError, MessageError, one_line, shortened
 
 
 class Bag:
-    """A recording: its topics by name, and its messages as often as wanted.
+    """A recording: its topics by name, and its messages, any number of times.
 
     Attributes:
         start_ns, end_ns: time of recording of the first and the last message.
@@ -35,7 +35,7 @@ class Bag:
         return (self.end_ns - self.start_ns) * 1e-9
 
     def raw_messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Serialised messages of some or all topics in the order of their recording.
+        """Yield serialised messages of some or all topics in the order of their recording.
 
         Raises:
             BagError: the recording is damaged.
@@ -46,7 +46,7 @@ class Bag:
                 yield from file.messages(wanted)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, Any]]:
-        """Topic, time of recording in ns and message, in the order of their recording.
+        """Yield topic, time of recording in ns and message, in the order of their recording.
 
         Raises:
             BagError: a message does not match its type.
@@ -59,14 +59,14 @@ class Bag:
 
 
 def decode(raw: RawMessage) -> Any:
-    """The message, with attributes as in ROS.
+    """Return the decoded message, with attributes as in ROS.
 
     Raises:
         MessageError: of kind "undecodable" when the bytes are not a message of its type.
     """
     try:
         return message_types().deserialize_cdr(raw.data, raw.type)
-    except Exception as error:  # damaged bytes provoke anything
+    except Exception as error:  # damaged bytes raise any exception
         cause = one_line(error)
         raise MessageError("undecodable", f"message does not match its type {raw.type} ({cause})") from None
 
@@ -87,10 +87,10 @@ def _one_line(path: Path) -> Iterator[None]:
 def open_bag(path: str | Path) -> Bag:
     """Open an mcap file, a ROS 2 folder (mcap or db3), a db3 file or a ROS 1 `.bag`.
 
-    A recording that breaks off is opened as far as it goes; `Bag.warning` is set.
+    A truncated recording is opened up to its last readable message; `Bag.warning` is set.
 
     Raises:
-        BagError: there is no such recording, it is none, or it holds no message.
+        BagError: there is no such recording, it is another kind of file, or it holds no message.
     """
     path = Path(path)
     with _one_line(path):

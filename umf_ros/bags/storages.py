@@ -31,7 +31,7 @@ from umf_ros.core.errors import BagError
 from umf_ros.sensors.decode import LIVOX
 
 LARGEST_CHUNK = 2**28
-"""Bytes of a chunk after unpacking, and of any record; recorders write some megabytes."""
+"""Most bytes of an unpacked chunk, and of any record; recorders write some megabytes."""
 
 
 LIVOX_DEFINITION = """
@@ -74,7 +74,7 @@ class RawMessage:
 
 @cache
 def message_types() -> Typestore:
-    """The message definitions of ROS 2 Jazzy, and those of Livox."""
+    """Return the message definitions of ROS 2 Jazzy, and those of Livox."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for kind in LIVOX:
         definition = LIVOX_DEFINITION.format(package=kind.split("/")[0])
@@ -86,10 +86,10 @@ _DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompres
 
 
 def unpack(compression: str, data: bytes) -> bytes:
-    """Contents of a chunk packed as "bz2" or "lz4".
+    """Return the contents of a chunk compressed as "bz2" or "lz4".
 
     Raises:
-        ValueError: they are larger than any that recorders write.
+        ValueError: they are larger than `LARGEST_CHUNK`.
     """
     unpacked = _DECOMPRESSORS[compression]().decompress(data, LARGEST_CHUNK + 1)
     if len(unpacked) > LARGEST_CHUNK:
@@ -97,22 +97,22 @@ def unpack(compression: str, data: bytes) -> bytes:
     return unpacked
 
 
-# what the mcap library and the decompressors raise on damaged data
+# exceptions of the mcap library and the decompressors on damaged data
 _DAMAGE = (McapError, struct.error, ZstdError, ValueError, RuntimeError, EOFError, LookupError, TypeError, MemoryError)
 
 _CHUNK_HEAD = 64
-"""Bytes at the start of a chunk's record that say how large it claims to be, compression included."""
+"""Bytes at the start of a chunk's record that hold its stated size, compression included."""
 
 SORTING_WINDOW_NS = 1_000_000_000
-"""Without an index, messages are put in order as far as they lie this close together."""
+"""Without an index, messages are sorted within this window of time."""
 MOST_WAITING = 2**28
-"""Bytes of messages that wait for earlier ones; those of a recorder's second are some dozens of megabytes."""
+"""Most bytes of messages in the reorder buffer; a second of a recording has some dozens of megabytes."""
 PlacedMessage = tuple[int, tuple[int, int], RawMessage]
-"""The time before which no message comes any more, a place in the file that decides between equal times, a message."""
+"""Lower bound of the times of later messages, position in the file to order equal times, message."""
 
 
 class McapFile:
-    """An mcap file, read by its index; without one, as a killed recorder leaves it, up to where it breaks off."""
+    """An mcap file, read by its index; without one, as a killed recorder leaves it, up to its truncation."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._fault, self.warning = path, "", ""
@@ -125,7 +125,7 @@ class McapFile:
             self._read_through()
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of some topics in the order of their recording."""
+        """Yield messages of some topics in the order of their recording."""
         return _in_order(self._by_index(topics) if self._chunks else self._up_to_the_end(topics))
 
     def _read_index(self) -> None:
@@ -157,7 +157,7 @@ class McapFile:
             self.end_ns = max(self.end_ns, message.log_ns)
         if self._fault:
             seconds, count = max(0, self.end_ns - self.start_ns) * 1e-9, self.counts.total()
-            self.warning = f"{self._path} breaks off; its first {seconds:.1f} s ({count} messages) are readable"
+            self.warning = f"{self._path} is truncated; its first {seconds:.1f} s ({count} messages) are readable"
 
     def _by_index(self, topics: Collection[str]) -> Iterator[PlacedMessage]:
         wanted = {key: channel for key, channel in self._channels.items() if channel[0] in topics}
@@ -178,7 +178,7 @@ class McapFile:
                 yield message.log_ns - SORTING_WINDOW_NS, (0, number), message
 
     def _stream(self) -> Iterator[RawMessage]:
-        """Messages as they lie in the file."""
+        """Yield messages as they lie in the file."""
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
         with self._path.open("rb") as stream:
@@ -202,7 +202,7 @@ class McapFile:
 
 
 def _in_order(messages: Iterable[PlacedMessage]) -> Iterator[RawMessage]:
-    """Sort messages by time within limits of memory: on overflow they pass unsorted."""
+    """Sort messages by time in a bounded reorder buffer; on overflow they pass unsorted."""
     waiting: list[tuple[int, tuple[int, int], RawMessage]] = []
     held = 0
     for bound_ns, place, message in messages:
@@ -217,7 +217,7 @@ def _in_order(messages: Iterable[PlacedMessage]) -> Iterator[RawMessage]:
 
 
 def _unpacked(chunk: Chunk) -> Iterable[McapRecord]:
-    """The records of a chunk; raises a `ValueError` if it is larger than any that recorders write."""
+    """Return the records of a chunk; raise a `ValueError` if it is larger than `LARGEST_CHUNK`."""
     _check_chunk(chunk.uncompressed_size, chunk.compression, chunk.data[:18])
     if chunk.compression == "lz4":
         chunk = replace(chunk, compression="", data=unpack("lz4", chunk.data))
@@ -225,12 +225,12 @@ def _unpacked(chunk: Chunk) -> Iterable[McapRecord]:
 
 
 def _check_chunks(path: Path, indexes: Collection[ChunkIndex]) -> None:
-    """Raise a `ValueError` if a chunk, by its own claim or the index', lies outside of the file or is too large."""
+    """Raise a `ValueError` if a chunk, by its own header or the index, lies outside of the file or is too large."""
     size = path.stat().st_size
     with path.open("rb") as stream:
         for index in indexes:
             if index.chunk_start_offset + index.chunk_length > size or index.chunk_length > LARGEST_CHUNK:
-                raise ValueError("a chunk beyond the end")
+                raise ValueError("a chunk lies beyond the end")
             stream.seek(index.chunk_start_offset + 9)  # after opcode and length
             head = stream.read(_CHUNK_HEAD)
             (claimed,) = struct.unpack_from("<Q", head, 16)
@@ -243,7 +243,7 @@ def _check_chunk(claimed: int, compression: str, start: bytes) -> None:
     if compression == "zstd":  # the frame repeats the size, and the decompressor uses that
         claimed = max(claimed, frame_content_size(start))
     if claimed > LARGEST_CHUNK:
-        raise ValueError(f"a chunk claims {claimed} bytes")
+        raise ValueError(f"a chunk states {claimed} bytes")
 
 
 _LIMITED: dict[Any, Any] = {bz2.decompress: partial(unpack, "bz2"), lz4.frame.decompress: partial(unpack, "lz4")}
@@ -253,7 +253,7 @@ _LIMITED: dict[Any, Any] = {bz2.decompress: partial(unpack, "bz2"), lz4.frame.de
 class RosbagsFile:
     """A folder of ROS 2, a db3 file, or a ROS 1 bag.
 
-    The messages of ROS 1 come out as those of ROS 2; types that ROS 2 does not know are left out.
+    Messages of ROS 1 are converted to ROS 2; types without a counterpart are left out.
     """
 
     def __init__(self, path: Path, ros1: bool = False) -> None:
@@ -270,7 +270,7 @@ class RosbagsFile:
             self.counts[connection.topic] += connection.msgcount
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of some topics in the order of their recording."""
+        """Yield messages of some topics in the order of their recording."""
         with self._reader(self._path) as reader:
             wanted = [connection for connection in self._readable(reader) if connection.topic in topics]
             for place, chunk in getattr(reader, "chunks", {}).items():  # of ROS 1
@@ -286,7 +286,7 @@ class RosbagsFile:
 
 
 def _warning_of_log(path: Path) -> str:
-    """Warning about messages that a killed recorder left in a log of SQLite, which is not read."""
+    """Return a warning about messages that a killed recorder left in an SQLite log, which is not read."""
     for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
         log = file.with_name(file.name + "-wal")
         if log.is_file() and log.stat().st_size:
@@ -304,12 +304,12 @@ def open_files(path: Path) -> list[RecordedFile]:
     """Open the files of a recording, a file or a folder, in the order in which they were written.
 
     Raises:
-        BagError: it is no recording, or damaged beyond use.
+        BagError: it is not a recording, or damaged beyond use.
     """
     if path.is_dir():
         return _open_folder(path)
     if not path.is_file():  # a pipe blocks until it is written to
-        raise BagError(f"{path} is no recording: neither a file nor a folder")
+        raise BagError(f"{path} is not a recording: neither a file nor a folder")
     with path.open("rb") as file:
         start = file.read(16)
     if not start:
@@ -318,7 +318,7 @@ def open_files(path: Path) -> list[RecordedFile]:
         return [McapFile(path)]
     if start.startswith((_SQLITE, _ROS1)):
         return [RosbagsFile(path, ros1=start.startswith(_ROS1))]
-    raise BagError(f"{path} is no recording: neither mcap nor db3 nor a ROS 1 bag")
+    raise BagError(f"{path} is not a recording: neither mcap nor db3 nor a ROS 1 bag")
 
 
 def _open_folder(path: Path) -> list[RecordedFile]:
@@ -329,11 +329,11 @@ def _open_folder(path: Path) -> list[RecordedFile]:
         return [RosbagsFile(path)]
     if db3:  # the recorder was killed before it wrote its metadata
         return [RosbagsFile(one) for one in db3]
-    raise BagError(f"{path} is no recording: it holds neither metadata.yaml nor mcap or db3 files")
+    raise BagError(f"{path} is not a recording: it holds neither metadata.yaml nor mcap or db3 files")
 
 
 def _in_number_order(paths: Iterable[Path]) -> list[Path]:
-    """Files of one recording as they were written: `x_10` after `x_9`."""
+    """Return the files of one recording in the order of writing: `x_10` after `x_9`."""
 
     def number(path: Path) -> int:
         numbers = re.findall(r"\d+", path.stem)

@@ -21,14 +21,14 @@ from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose, stamp_ns
 GPS_EPOCH_S, LEAP_SECONDS = 315_964_800, 18
 """1980-01-06 in POSIX seconds; GPS time is ahead of UTC by this much since 2017."""
 WORST_QUALITY = 2
-"""1 is a fixed, 2 a floating ambiguity; the rest is off by metres."""
+"""Worst accepted quality: 1 is a fixed, 2 a floating ambiguity; others err by metres."""
 
 
 def read_tum(path: str | Path) -> Trajectory:
-    """Trajectory from a TUM file: `seconds x y z qx qy qz qw` per line, # for comments.
+    """Return the trajectory from a TUM file: `seconds x y z qx qy qz qw` per line, # for comments.
 
     Raises:
-        BagError: the file cannot be read; names the line that is wrong.
+        BagError: the file cannot be read; names the wrong line.
     """
     stamps: list[int] = []
     rows: list[list[float]] = []
@@ -56,7 +56,7 @@ def read_tum(path: str | Path) -> Trajectory:
 
 
 def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajectory:
-    """Odometry of the body from a TUM file of the poses of `frame`: body, imu, camera or lidar.
+    """Return the odometry of the body from a TUM file of the poses of `frame`: body, imu, camera or lidar.
 
     Raises:
         BagError: the file cannot be read, or there is no such frame.
@@ -70,10 +70,10 @@ def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajector
 
 
 def read_ground_truth(bag: Bag | None, path: str | Path | None = None) -> Trajectory | None:
-    """Ground truth from a file (RTKLIB .pos or TUM), else from the simulator's topic in the recording, else None.
+    """Return the ground truth of a file (RTKLIB .pos or TUM), else of the recording's topic of the simulator, or None.
 
     Raises:
-        BagError: the file cannot be read or is wrong.
+        BagError: the file cannot be read or has a wrong line.
     """
     if path is not None:
         if Path(path).suffix.lower() != ".pos":
@@ -95,10 +95,10 @@ def read_ground_truth(bag: Bag | None, path: str | Path | None = None) -> Trajec
 
 
 def _to_ns(seconds: str) -> int:
-    """Nanoseconds of decimal seconds, without the rounding of a float.
+    """Return nanoseconds of decimal seconds, without the rounding of a float.
 
     Raises:
-        ArithmeticError: it is no number, or there is no such time.
+        ArithmeticError: it is not a number, or out of range.
     """
     return _checked(int(Decimal(seconds) * 10**9))
 
@@ -110,13 +110,13 @@ def _checked(nanoseconds: int) -> int:
 
 
 def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> Trajectory:
-    """Positions east, north and up of the first one, in metres, without orientation, and their stamps in UTC.
+    """Return positions east, north and up of the first one, in metres, without orientation, and their stamps in UTC.
 
     Lines are `date time lat lon height Q ...` or `week seconds lat lon height Q ...`, in GPS time, degrees and metres.
-    Positions of a worse quality Q than asked for are left out.
+    Positions of a quality Q worse than `worst_quality` are left out.
 
     Raises:
-        BagError: the file cannot be read or holds no position of that quality; names the line that is wrong.
+        BagError: the file cannot be read or holds no position of that quality; names the wrong line.
     """
     stamps: list[int] = []
     geodetic: list[tuple[float, float, float]] = []
@@ -150,14 +150,14 @@ def _parse(fields: list[str]) -> tuple[int, float, float, float, int]:
 
 
 def read_lines(path: str | Path) -> list[str]:
-    """Lines of a text file.
+    """Return lines of a text file.
 
     Raises:
-        BagError: the file cannot be read or is no text.
+        BagError: the file cannot be read or is not text.
     """
     try:
         return Path(path).read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise BagError(f"cannot read {path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise BagError(f"{path} is no text file") from None
+        raise BagError(f"{path} is not a text file") from None

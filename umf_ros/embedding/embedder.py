@@ -8,7 +8,7 @@ from umf_ros.core.frames import Embedding, Frame
 
 
 class FeatureRequest(NamedTuple):
-    """Local features that an embedder is asked for; features that are not requested are not computed.
+    """Requested local features; others are not computed.
 
     Attributes:
         image: local features of the image.
@@ -20,7 +20,7 @@ class FeatureRequest(NamedTuple):
 
 
 class Embedder(Protocol):
-    """Turns a frame into a global descriptor and local features."""
+    """Protocol of a method that turns a frame into a global descriptor and local features."""
 
     name: str
     dimension: int

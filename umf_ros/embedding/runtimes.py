@@ -28,7 +28,7 @@ Arrays = Sequence[NDArray[Any]]
 Outputs = dict[str, NDArray[np.float32]]
 XFEAT_SHAPE = 1, 1, 384, 512
 OUTPUTS = ("descriptor", "image_local", "image_saliency", "cloud_local", "cloud_saliency")
-"""None of them is the name of an input: OpenVINO renames a tensor that has another's name."""
+"""Distinct from the names of inputs: OpenVINO renames a tensor whose name is taken."""
 SUPERS = ("super_image", "super_image_strength", "super_cloud", "super_cloud_strength")
 MODEL_SUFFIX = ".openvino"
 """Suffix of the zip archive of `model.xml` and `model.bin` beside a weights file."""
@@ -70,7 +70,7 @@ class OpenVinoRuntime:
             with zipfile.ZipFile(path) as archive:
                 model = openvino_core().read_model(archive.read("model.xml"), archive.read("model.bin"))
             self.precision, made_from = (model.get_rt_info([FACTS, name]).value for name in ("precision", "weights"))
-        except Exception as error:  # of a damaged file anything may be raised
+        except Exception as error:  # a damaged file raises any exception
             raise WeightsError(f"{path} is damaged: {one_line(error)}") from None
         if made_from != hashlib.sha256(weights.read_bytes()).hexdigest():
             raise WeightsError(f"{path} was made from other weights; delete it, or make it again with umf export")
@@ -132,7 +132,7 @@ def make_runtime(weights: Path, settings: EmbeddingSettings, outputs: tuple[str,
 
 
 def name_outputs(weights: Path, runtime: Runtime, preprocessing: bytes = b"") -> str:
-    """Return the name of what a runtime computes: outputs of other weights, precision or preprocessing differ in it."""
+    """Return a name of a runtime's outputs, which differs with the weights, the precision and the preprocessing."""
     mark = "" if runtime.precision == "float32" else f"-{runtime.precision}"
     return f"{weights.stem}{mark}-{hashlib.sha256(runtime.file.read_bytes() + preprocessing).hexdigest()[:8]}"
 

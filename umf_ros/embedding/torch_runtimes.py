@@ -65,7 +65,7 @@ class TorchRuntime:
 
     Raises:
         WeightsError: the weights cannot be used.
-        ConfigError: torch does not know the device.
+        ConfigError: torch does not support the device.
     """
 
     precision = "float32"

@@ -18,7 +18,7 @@ from umf_ros.networks.config import locate_weights, read_config
 
 KEYPOINTS = 400
 MIN_SALIENCY = 0.01
-"""In fair shares of attention; it limits the features of a poor view, and `KEYPOINTS` those of a rich one."""
+"""In fair shares of attention; limits the features of a poor view, as `KEYPOINTS` those of a rich one."""
 PREPROCESSING = b"scans without the tilt of their mount"
 """Part of the name of the descriptors; it changes with the preprocessing."""
 
@@ -60,7 +60,7 @@ def ground_regions(points: Points, side_m: float = 4.0) -> NDArray[np.int64]:
 
 
 class UmfEmbedder:
-    """Computes the descriptor and the local features of a frame with the UMF network.
+    """Embedder with the UMF network: descriptor and local features of a frame.
 
     Image features are the centres of the fine cells, in pixels of the full-resolution image; cloud features are the
     means of the points of a voxel.

@@ -28,7 +28,7 @@ XFEAT_OUTPUTS = ("descriptors", "corners", "reliability")
 """Names of the outputs of XFeat."""
 Size = Annotated[int, Field(ge=1, le=8192)]
 Depth = Annotated[int, Field(ge=1, le=64)]
-"""Limits of what a weights file may state: a damaged one must not fill the memory."""
+"""Limits of the sizes in a weights file: a damaged one must not fill the memory."""
 Backbone = Literal["resnet18", "resnet34", "resnet50", "efficientnet_lite0"]
 
 
@@ -142,8 +142,8 @@ def parse_architecture(path: Path, stream: Any) -> dict[str, Any]:
     """
     metadata = stream.metadata() or {}
     if "architecture" not in metadata:
-        raise WeightsError(f"{path} holds weights of another architecture: it does not say which")
+        raise WeightsError(f"{path} holds weights of another architecture: it states none")
     try:
         return dict(json.loads(metadata["architecture"]))
     except (TypeError, ValueError, RecursionError):
-        raise WeightsError(f"{path} holds weights of another architecture: it does not say which clearly") from None
+        raise WeightsError(f"{path} holds weights of another architecture: its statement cannot be parsed") from None

@@ -44,7 +44,7 @@ class SamePadding(nn.Module):
         self._kernel, self._stride = kernel, stride
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to (B, C', H / stride, W / stride), H and W being multiples of the stride."""
+        """Map (B, C, H, W) to (B, C', H / stride, W / stride), H and W being multiples of the stride."""
         total = self._kernel - self._stride
         before, after = total // 2, total - total // 2
         return self.conv(F.pad(x, (before, after, before, after)))
@@ -62,7 +62,7 @@ class LiteBlock(nn.Module):
         self._residual = stride == 1 and inputs == outputs
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to (B, C', H / stride, W / stride)."""
+        """Map (B, C, H, W) to (B, C', H / stride, W / stride)."""
         y = x if self.expand is None else F.relu6(self.expand(x))
         y = self.project(F.relu6(self.depthwise(y)))
         return x + y if self._residual else y
@@ -89,12 +89,12 @@ class EfficientNetLite0(nn.Module):
         for module in self.modules():
             if (
                 isinstance(module, nn.Conv2d) and module.bias is not None
-            ):  # without normalisation the usual start would let the signal fade
+            ):  # without normalisation, the default initialisation lets the signal vanish
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(module.bias)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """(B, 1, H, W) to the maps at strides 4, 8, 16 and 32, finest first, as far as the trunk goes."""
+        """Map (B, 1, H, W) to the maps at strides 4, 8, 16 and 32, finest first, as far as the trunk goes."""
         x = F.relu6(self.stem(image * CONTRAST))
         maps = []
         for number, stage in enumerate(self.stages):
@@ -121,15 +121,15 @@ class SceneDescriptor(nn.Module):
         self.projection = nn.Linear(GRID[0] * GRID[1] * channels, length, bias=False)
 
     def pool(self, image: Tensor) -> Tensor:
-        """Maps (B, C, 3, 5) of a standardised image (B, 1, H, W), with the mean over the cells removed."""
+        """Return maps (B, C, 3, 5) of a standardised image (B, 1, H, W), with the mean over the cells removed."""
         cells = F.adaptive_avg_pool2d(self.trunk(image)[-1], GRID)
         return cells - cells.mean(dim=(2, 3), keepdim=True)
 
     def project(self, cells: Tensor) -> Tensor:
-        """(B, C * 15) pooled maps to (B, length)."""
+        """Map pooled maps (B, C * 15) to (B, length)."""
         scene: Tensor = self.projection(cells)
         return scene * scene.norm(dim=1, keepdim=True)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 1, H, W) to (B, length), shorter for views similar to the data it was fitted to."""
+        """Map (B, 1, H, W) to (B, length), shorter for views similar to the data it was fitted to."""
         return self.project(self.pool(image).flatten(1))

@@ -15,7 +15,7 @@ RESNET_DEPTHS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3), "resnet50":
 
 
 def conv_norm(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    """Convolution without bias, and batch normalisation."""
+    """Return the convolution without bias, and batch normalisation."""
     conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
     return nn.Sequential(conv, nn.BatchNorm2d(outputs))
 
@@ -35,7 +35,7 @@ class ResidualBlock(nn.Module):
         self.shortcut = nn.Identity() if same else conv_norm(inputs, outputs, 1, stride)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to (B, C', H / stride, W / stride)."""
+        """Map (B, C, H, W) to (B, C', H / stride, W / stride)."""
         y = x
         for number, layer in enumerate(self.layers):
             y = layer(y)
@@ -60,7 +60,7 @@ class Backbone(nn.Module):
         self.stages = nn.ModuleList(stages)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """(B, 1, H, W) to the maps of the four stages, finest first."""
+        """Map (B, 1, H, W) to the maps of the four stages, finest first."""
         x = self.stem(image)
         maps = []
         for stage in self.stages:
@@ -89,7 +89,7 @@ class FeaturePyramid(nn.Module):
         self.fine = nn.Conv2d(pyramid, fine, 3, padding=1)
 
     def forward(self, maps: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Coarse map (B, coarse, H/16, W/16) and fine map (B, fine, H/4, W/4)."""
+        """Return the coarse map (B, coarse, H/16, W/16) and fine map (B, fine, H/4, W/4)."""
         top = self.laterals[3](maps[3])
         merged = []
         for level in (2, 1, 0):
@@ -109,25 +109,25 @@ class ImageEncoder(nn.Module):
         self.pyramid = FeaturePyramid(self.backbone.channels, config.pyramid, config.tokens, config.local)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Coarse (B, tokens, H/16, W/16) and fine (B, local, H/4, W/4) maps of an image (B, 1, H, W)."""
+        """Return the coarse (B, tokens, H/16, W/16) and fine (B, local, H/4, W/4) maps of an image (B, 1, H, W)."""
         return self.pyramid(self.backbone(image))
 
 
 def parent_and_child(voxels: Tensor) -> tuple[Tensor, Tensor]:
-    """Flat index in the 20^3 grid, and which of its eight children, of flat indices in the 40^3 grid."""
+    """Return the flat index in the 20^3 grid and the number of the child (0 to 7) of flat indices in the 40^3 grid."""
     x, y, z = voxels // (CELLS * CELLS), voxels // CELLS % CELLS, voxels % CELLS
     half = CELLS // 2
     return (x // 2 * half + y // 2) * half + z // 2, x % 2 * 4 + y % 2 * 2 + z % 2
 
 
 def take(cells: Tensor, index: Tensor) -> Tensor:
-    """Features (B, N, C) of the cells of a dense map (B, C, X, Y, Z) at flat indices (B, N)."""
+    """Return features (B, N, C) of the cells of a dense map (B, C, X, Y, Z) at flat indices (B, N)."""
     wanted = index.unsqueeze(1).expand(-1, cells.shape[1], -1)
     return cells.flatten(2).gather(2, wanted).transpose(1, 2)
 
 
 def conv_block(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
-    """3-D convolution, batch normalisation, ReLU."""
+    """Return a 3-D convolution, batch normalisation, ReLU."""
     conv = nn.Conv3d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
     return nn.Sequential(conv, nn.BatchNorm3d(outputs), nn.ReLU())
 
@@ -141,7 +141,7 @@ class ResidualBlock3d(nn.Module):
         self.layers = nn.Sequential(conv_block(channels, channels), second, nn.BatchNorm3d(channels))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, X, Y, Z) to the same shape; `x` is not negative."""
+        """Map (B, C, X, Y, Z) to the same shape; `x` is not negative."""
         return F.relu(x + self.layers(x))
 
 
@@ -157,7 +157,7 @@ class VoxelEncoder(nn.Module):
         self.up_middle = nn.Conv3d(deep, middle, 1)
         self.up_fine = nn.Conv3d(middle, fine, 1)
         self.coarse = nn.Conv3d(middle, config.tokens, 1)
-        # a voxel's feature: its parent cell's, its own measurements, and which child it is
+        # a voxel's feature: its parent cell's, its own measurements, and its number as a child
         self.fine = nn.Sequential(
             nn.Linear(fine + FEATURES + 8, config.local), nn.GELU(), nn.Linear(config.local, config.local)
         )
@@ -192,7 +192,7 @@ class VoxelEncoder(nn.Module):
 
 
 def _voxel_encoder_stage(inputs: int, outputs: int, blocks: int) -> nn.Sequential:
-    """Half the resolution."""
+    """Return a stage that halves the resolution."""
     further = (ResidualBlock3d(outputs) for _ in range(blocks))
     return nn.Sequential(conv_block(inputs, outputs, stride=2), conv_block(outputs, outputs), *further)
 

@@ -25,7 +25,7 @@ class Attention(nn.Module):
         self.output = nn.Linear(width, width)
 
     def forward(self, queries: Tensor, keys: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Attend.
+        """Return the attended values and the attention maps.
 
         Args:
             queries: (B, N, C).
@@ -59,7 +59,7 @@ class Block(nn.Module):
         )
 
     def forward(self, tokens: Tensor, keys: Tensor | None = None, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Tokens (B, N, C) after attending to `keys` (B, M, C), or to themselves; and the attention maps."""
+        """Return tokens (B, N, C) after attention to `keys` (B, M, C), or to themselves, and the attention maps."""
         queries = self.norm(tokens)
         if keys is None or self.norm_keys is None:
             update, weights = self.attention(queries, queries, mask)
@@ -106,13 +106,13 @@ def sine_encoding(positions: Tensor, channels: int) -> Tensor:
 
 
 def cell_positions(*shape: int) -> Tensor:
-    """(N, A) centres of the cells of a map or grid of A axes, the last of them fastest, in [0, 1]."""
+    """Return (N, A) centres of the cells of a map or grid of A axes, the last of them fastest, in [0, 1]."""
     axes = [(torch.arange(size) + 0.5) / size for size in shape]
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, len(shape))
 
 
 class VoxelPositions(nn.Module):
-    """Position encodings of the cells of a cubic grid, from one table per axis; a table of all cells has megabytes."""
+    """Position encodings of the cells of a cubic grid, from one table per axis; one of all cells takes megabytes."""
 
     def __init__(self, cells: int, channels: int) -> None:
         super().__init__()
@@ -165,7 +165,7 @@ class FusionLayer(nn.Module):
         self.image_cross, self.cloud_cross = Block(*sizes, cross=True), Block(*sizes, cross=True)
 
     def forward(self, image: Tokens, cloud: Tokens) -> tuple[Tokens, Tokens]:
-        """Both sets of tokens after the layer."""
+        """Return both sets of tokens after the layer."""
         own_image, _ = self.image_self(image.values, mask=image.mask)
         own_cloud, _ = self.cloud_self(cloud.values, mask=cloud.mask)
         new_image, _ = self.image_cross(own_image, own_cloud, cloud.mask)
@@ -181,7 +181,7 @@ class GeneralisedMean(nn.Module):
         self.exponent = nn.Parameter(torch.tensor(exponent))
 
     def forward(self, tokens: Tokens) -> Tensor:
-        """(B, N, C) to (B, C)."""
+        """Map (B, N, C) to (B, C)."""
         weight = tokens.mask.unsqueeze(-1).float()
         powered = tokens.values.float().clamp(min=1e-4).pow(self.exponent) * weight
         return (powered.sum(1) / weight.sum(1)).pow(1 / self.exponent)

@@ -50,7 +50,7 @@ class ImageLocal(nn.Module):
         self.descriptor = nn.Linear(width, config.image_local)
 
     def forward(self, fine: Tensor) -> LocalMap:
-        """Local features of a fine map (B, C, H/4, W/4); N = H/4 * W/4, row by row."""
+        """Return local features of a fine map (B, C, H/4, W/4); N = H/4 * W/4, row by row."""
         batch, width = fine.shape[:2]
         tokens = fine.permute(0, 2, 3, 1) + self.positions.to(fine.dtype)
         windows = tokens.view(batch, self.rows // WINDOW, WINDOW, self.columns // WINDOW, WINDOW, width)
@@ -68,7 +68,7 @@ class ImageLocal(nn.Module):
         return LocalMap(tokens, _describe(self, tokens), saliency, mask)
 
     def _unfold(self, windows: Tensor) -> Tensor:
-        """(B, windows, cells, C) back to (B, N, C), row by row."""
+        """Reshape (B, windows, cells, C) to (B, N, C), row by row."""
         batch, channels = windows.shape[0], windows.shape[-1]
         grid = windows.reshape(batch, self.rows // WINDOW, self.columns // WINDOW, WINDOW, WINDOW, channels)
         return grid.transpose(2, 3).reshape(batch, self.rows * self.columns, channels)
@@ -85,7 +85,7 @@ class CloudLocal(nn.Module):
         self.descriptor = nn.Linear(width, config.cloud_local)
 
     def forward(self, fine: Tensor, positions: Tensor, mask: Tensor) -> LocalMap:
-        """Local features of occupied voxels.
+        """Return local features of occupied voxels.
 
         Args:
             fine: (B, V, C) features.

@@ -47,7 +47,7 @@ class NetworkInput(NamedTuple):
     fine_mask: Tensor
 
     def to(self, device: torch.device) -> Self:
-        """The batch on another device."""
+        """Return the batch on another device."""
         return type(self)(*(tensor.to(device) for tensor in self))
 
 
@@ -133,7 +133,7 @@ class UMF(nn.Module):
         return Features(Tokens(image, everywhere), Tokens(cloud, batch.coarse_mask), fine_image, fine_cloud, scene)
 
     def fuse(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> Fused:
-        """Descriptors, with the modalities that are present (B,) bool."""
+        """Return descriptors, with the modalities that are present (B,) bool."""
         image, cloud = self.stand_in(features, image_present, cloud_present)
         return self.fusion(image, cloud, image_present, cloud_present, features.scene)
 
@@ -142,7 +142,7 @@ class UMF(nn.Module):
         return self.absent_image(features.image, image_present), self.absent_cloud(features.cloud, cloud_present)
 
     def describe_local(self, features: Features, batch: NetworkInput) -> tuple[LocalMap, LocalMap]:
-        """Local features of the images and of the scans."""
+        """Return local features of the images and of the scans."""
         positions = self.voxels(batch.fine_index)
         cloud = self.cloud_local(features.fine_cloud, positions, batch.fine_mask)
         return self.image_local(features.fine_image), cloud
@@ -159,7 +159,7 @@ class UMF(nn.Module):
 
 
 def count_parameters(network: nn.Module) -> int:
-    """Number of trainable parameters."""
+    """Return the number of trainable parameters."""
     return sum(parameter.numel() for parameter in network.parameters())
 
 

@@ -1,4 +1,4 @@
-"""The place database: every keyframe on disk, and a FAISS index of half-precision descriptors in memory."""
+"""Place database: all keyframes on disk, and a FAISS index of half-precision descriptors in memory."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from umf_ros.places.store import KeyframeStore, index_path
 logger = logging.getLogger(__name__)
 
 SAME_KEYFRAME = 0.98
-"""Least similarity of two keyframes of one stamp that are one measurement read twice (*by hand*: runtimes of the
+"""Least similarity of two keyframes of one stamp that count as one measurement (*by hand*: runtimes of the
 network differ by less than 0.001; clocks that begin at 0 give the same stamps to different scans)."""
 VISITS = 4
-"""Most sessions of which one place is returned (*by hand*): as many as get a metric pose."""
+"""Most sessions in which one place is returned (*by hand*): as many as get a metric pose."""
 WIDER = 10
-"""Multiple of the candidates asked for that is searched for diverse ones (*by hand*)."""
+"""Multiple of the requested candidates that is searched for diverse ones (*by hand*)."""
 MARGIN = 24
-"""Rows found in half precision beyond those asked for: full precision orders them (*by hand*)."""
+"""Rows found in half precision beyond the requested ones: full precision orders them (*by hand*)."""
 BATCH = 8192
-"""Descriptors read from the store at once; with so many new ones the file of the index is written again."""
+"""Descriptors read from the store at once; as many new ones cause a new file of the index."""
 SPOT_CHECKS = 64
 """Descriptors of the index that are compared with the store's when its file is opened."""
 PLACES_OF_MAP = "places.sqlite"
 """Name of the place database in the folder of a map."""
 EXACT_UP_TO = 50_000
-"""Up to so many places every descriptor is compared (*measured*: 4 ms with 768 numbers each)."""
+"""Largest number of places that is searched exhaustively (*measured*: 4 ms with 768 numbers each)."""
 SHORTLIST = 3000
 """Descriptors whose half-precision products decide in a larger database (*measured*, as above: recall)."""
 DIRECTIONS = 96
@@ -44,7 +44,7 @@ DIRECTIONS = 96
 SAMPLE = 16_384
 """Descriptors that the compressed codes are trained with (*by hand*)."""
 SAME_NUMBER = 1e-3
-"""Half precision changes a component of a unit vector by less."""
+"""Upper bound of the half-precision error of a component of a unit vector."""
 
 Rows = NDArray[np.intp]
 Mask = NDArray[np.bool_]
@@ -52,24 +52,24 @@ Admissible = Callable[[Rows | slice], Mask]
 """Mask of the rows that may be returned, among some rows or a slice of all."""
 
 
-def is_past(age_ns: NDArray[np.int64], way_m: Array, rules: Loop, same_session: Mask | bool = True) -> Mask:
-    """Whether earlier keyframes are old enough and far enough back to be a place seen again.
+def is_past(age_ns: NDArray[np.int64], path_m: Array, rules: Loop, same_session: Mask | bool = True) -> Mask:
+    """Return whether earlier keyframes are old enough and far enough back to be a revisited place.
 
     Args:
-        age_ns: (...) by how much they are older, ns.
-        way_m: (...) metres driven since; where it is unknown (NaN), age alone decides.
-        rules: how old and how far back.
-        same_session: (...) the way is compared within a session only.
+        age_ns: (...) age relative to the query, ns.
+        path_m: (...) metres driven since; where it is unknown (NaN), age alone decides.
+        rules: least age and path length.
+        same_session: (...) path lengths are compared within a session only.
     """
     old = age_ns >= round(rules.min_time_gap_s * 1e9)
-    near = way_m < rules.min_travel_m  # False for NaN
+    near = path_m < rules.min_travel_m  # False for NaN
     return np.asarray(old & ~(near & same_session), bool)
 
 
 class PlaceDatabase:
     """Keyframes of all sessions by index, and the search among their descriptors.
 
-    Keyframes are only added. Beside a large file lies `<path>.faiss`, the index of their descriptors; it is built again
+    Keyframes are only added. The index of a large file is kept beside it as `<path>.faiss`; it is rebuilt
     where it is missing or does not match the store.
 
     Args:
@@ -103,7 +103,7 @@ class PlaceDatabase:
         """
         path = folder / PLACES_OF_MAP
         if not path.is_file():
-            raise UmfError(f"{folder} holds no map: {PLACES_OF_MAP} is missing (umf map makes one)")
+            raise UmfError(f"{folder} is not a map: {PLACES_OF_MAP} is missing; make one with umf map")
         return cls(Database(path=str(path)), embedder, dimension, read_only=True)
 
     def __len__(self) -> int:
@@ -113,16 +113,16 @@ class PlaceDatabase:
         return self.store[index]
 
     def index_of(self, stamp_ns: int, session: int) -> int | None:
-        """Index of a keyframe by its key; None when it is not there."""
+        """Return the index of a keyframe by its key; None when it is not there."""
         sessions = self.store.keys["session"]
         return next((row for row in reversed(self.store.rows_at(stamp_ns)) if sessions[row] == session), None)
 
     def newest_at(self, stamp_ns: int) -> int | None:
-        """Index of the newest keyframe of a stamp; None when there is none."""
+        """Return the index of the newest keyframe of a stamp; None when there is none."""
         return next(reversed(self.store.rows_at(stamp_ns)), None)
 
     def find_duplicate(self, keyframe: Keyframe) -> int | None:
-        """Index of the same measurement, stored before, as when a recording is played again; or None."""
+        """Return the index of the same measurement, stored in an earlier replay of the recording; None without one."""
         rows = self.store.rows_at(keyframe.stamp_ns)
         if not rows:
             return None
@@ -132,7 +132,7 @@ class PlaceDatabase:
 
     @property
     def next_session(self) -> int:
-        """A session number no stored keyframe has."""
+        """Number of a new session."""
         return int(self.store.keys["session"].max(initial=-1)) + 1
 
     def add(self, keyframe: Keyframe) -> int:
@@ -145,10 +145,10 @@ class PlaceDatabase:
         return row
 
     def query(self, keyframe: Keyframe, rules: Loop, sessions: range | None = None) -> list[Candidate]:
-        """The most similar earlier places, best first.
+        """Return the most similar earlier places, best first.
 
         Keyframes must be older than `min_time_gap_s`, and those of the same session further back along
-        the path than `min_travel_m`; where either path length is unknown, time alone decides. A place that was
+        the path than `min_travel_m`; where either path length is unknown, only the age counts. A place that was
         visited in many sessions does not displace the others.
 
         Args:
@@ -184,13 +184,13 @@ class PlaceDatabase:
         self.store.close()
 
     def _open_index(self, dimension: int) -> PlaceIndex:
-        """The index from its file where that matches the store, and completed from the store."""
+        """Return the index of the file, if it matches the store, completed from the store."""
         path, size = self._index_path, len(self.store)
         index = PlaceIndex.load(path, dimension) if path is not None else None
         if index is None or not self._matches(index):
             if path is not None and not self.store.read_only:
                 path.unlink(missing_ok=True)
-                path.with_suffix(".codes").unlink(missing_ok=True)  # what earlier versions kept
+                path.with_suffix(".codes").unlink(missing_ok=True)  # index of earlier versions
             index = PlaceIndex(dimension)
         self._saved = len(index)
         for first in range(len(index), size, BATCH):
@@ -211,17 +211,17 @@ class PlaceDatabase:
         try:
             self.index.save(self._index_path)
         except OutputError as error:
-            logger.warning("%s; the index is built again at the next start", error)
+            logger.warning("%s; the index is rebuilt at the next start", error)
 
     def _most_similar(self, descriptor: Array, wanted: int, admissible: Admissible) -> list[tuple[int, float]]:
-        """Rows and cosine similarities of the most similar places, best first; equal ones in order of row."""
+        """Return rows and cosine similarities of the most similar places, best first; equal ones in order of row."""
         rows = np.sort(self.index.search(descriptor, wanted + MARGIN, admissible))
         similarity = self.store.descriptors(rows) @ descriptor
         order = np.argsort(-similarity, kind="stable")[:wanted]
         return [(int(rows[i]), float(similarity[i])) for i in order]
 
     def _diverse(self, found: list[tuple[int, float]], count: int) -> list[tuple[int, float]]:
-        """The best `count`, of one place those of `VISITS` sessions at most.
+        """Return the best `count`, with keyframes of one place from `VISITS` sessions at most.
 
         Two keyframes of different sessions show one place when they are more similar to each other than to the query.
         """
@@ -244,7 +244,7 @@ class PlaceDatabase:
 class PlaceIndex:
     """Growing index of unit descriptors in half precision, searched by inner product on one thread.
 
-    Up to `EXACT_UP_TO` descriptors all are compared. In a larger index compressed codes select a shortlist, whose
+    Up to `EXACT_UP_TO` descriptors the search is exact. In a larger index compressed codes select a shortlist, whose
     half-precision products decide.
 
     Args:
@@ -289,11 +289,11 @@ class PlaceIndex:
             self._index = faiss.IndexRefine(codes, self._flat)
 
     def descriptors(self, rows: Rows) -> Points:
-        """(N, D) descriptors of some rows, in half precision."""
+        """Return (N, D) descriptors of some rows, in half precision."""
         return np.asarray(self._flat.reconstruct_batch(rows))
 
     def search(self, descriptor: Points, count: int, admissible: Admissible) -> Rows:
-        """Rows of the `count` descriptors that are most similar to a unit vector (D,), best first.
+        """Return the rows of the `count` descriptors that are most similar to a unit vector (D,), best first.
 
         A large index is searched through its shortlist, and exhaustively where too few of the list are admissible.
         """
@@ -307,7 +307,7 @@ class PlaceIndex:
         return self.search_exactly(descriptor, count, admissible)
 
     def search_exactly(self, descriptor: Points, count: int, admissible: Admissible) -> Rows:
-        """The same by comparing every descriptor, however many there are."""
+        """Return the same by an exhaustive search."""
         if not len(self):
             return np.empty(0, np.intp)
         with _one_thread() as faiss:
@@ -323,7 +323,7 @@ class PlaceIndex:
 
     @classmethod
     def load(cls, path: Path, dimension: int) -> PlaceIndex | None:
-        """The index in a file; None where there is none of this kind and dimension."""
+        """Return the index in a file; None where there is none of this kind and dimension."""
         if not path.is_file():
             return None
         index = cls(dimension)
@@ -331,7 +331,7 @@ class PlaceIndex:
             try:
                 stored = faiss.read_index(str(path))
             except Exception as error:  # damaged bytes raise any exception
-                logger.warning("%s cannot be read and is built again: %s", path, one_line(error))
+                logger.warning("%s cannot be read and is rebuilt: %s", path, one_line(error))
                 return None
             flat = faiss.downcast_index(stored.refine_index) if isinstance(stored, faiss.IndexRefine) else stored
             if not isinstance(flat, faiss.IndexScalarQuantizer) or flat.d != dimension:
@@ -342,7 +342,7 @@ class PlaceIndex:
 
 @contextmanager
 def _one_thread() -> Iterator[Any]:
-    """FAISS on the calling thread alone: waiting OpenMP threads would take the cores from the network."""
+    """Run FAISS on the calling thread only: waiting OpenMP threads would take cores from the network."""
     import faiss
 
     threads = faiss.omp_get_max_threads()

@@ -44,7 +44,7 @@ OUTBOX = Schema(
         (
             "CREATE TABLE fleet (store TEXT NOT NULL)",
             "CREATE TABLE outbox (id INTEGER PRIMARY KEY)",
-            # keyframes from before there was a fleet are sent too
+            # keyframes stored before the fleet was set up are sent too
             "INSERT INTO outbox SELECT id FROM keyframe",
             "INSERT INTO fleet VALUES (lower(hex(randomblob(16))))",
         ),
@@ -60,7 +60,7 @@ FEATURES: dict[str, type[LocalFeatures] | type[SuperFeatures]] = {
     "super_cloud": SuperFeatures,
 }
 _SHAPES = {"points": (3,), "body_T_camera": (4, 4), "body_T_lidar": (4, 4), "odom_T_body": (4, 4)}
-"""Ends of the shapes of what geometry is done with."""
+"""Last dimensions of the geometric arrays."""
 _KEYS = np.dtype([("id", np.int64), ("stamp_ns", np.int64), ("session", np.int64), ("travelled_m", np.float64)])
 
 
@@ -75,7 +75,7 @@ class KeyframeStore:
         identity: the embedder's name and dimension; a stored file of another embedder is refused.
         cached: keyframes kept in memory.
         read_only: the file must exist and is only read; another process may write it.
-        outgoing: whether every keyframe has to be sent to a fleet's server.
+        outgoing: whether every keyframe is queued for a fleet's server.
 
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use; any method: it is damaged.
@@ -113,7 +113,7 @@ class KeyframeStore:
         return self._keys[: self._count]
 
     def __getitem__(self, index: int) -> Keyframe:
-        """The keyframe of an index."""
+        """Return the keyframe of an index."""
         row = int(self.keys["id"][index])
         with self._lock:
             if row not in self._cache:
@@ -122,7 +122,7 @@ class KeyframeStore:
             return self._cache[row]
 
     def descriptors(self, rows: NDArray[np.intp]) -> NDArray[np.float32]:
-        """(N, D) float32 descriptors of some indices, 30,000 at most, in their order."""
+        """Return (N, D) float32 descriptors of some indices, 30,000 at most, in their order."""
         ids = self.keys["id"][rows].tolist()
         statement = f"SELECT id, descriptor FROM keyframe WHERE id IN ({','.join('?' * len(ids))})"
         with self._reading() as connection:
@@ -131,7 +131,7 @@ class KeyframeStore:
             return np.frombuffer(content, np.float32).reshape(len(ids), self._dimension)
 
     def rows_at(self, stamp_ns: int) -> list[int]:
-        """Indices of the keyframes of a stamp, in order."""
+        """Return indices of the keyframes of a stamp, in order."""
         return self._rows("SELECT id FROM keyframe WHERE stamp_ns = ? ORDER BY id", stamp_ns)
 
     def add(self, keyframe: Keyframe) -> int:
@@ -159,11 +159,11 @@ class KeyframeStore:
             return UUID(connection.execute("SELECT store FROM fleet").fetchone()[0])
 
     def outgoing(self, count: int) -> list[int]:
-        """Indices of the first keyframes that the fleet's server does not have yet."""
+        """Return indices of the first keyframes that the fleet's server does not have yet."""
         return self._rows("SELECT id FROM outbox JOIN keyframe USING (id) ORDER BY id LIMIT ?", count)
 
     def waiting(self) -> int:
-        """Number of keyframes that the fleet's server does not have yet."""
+        """Return the number of keyframes that the fleet's server does not have yet."""
         with self._reading() as connection:
             return int(connection.execute("SELECT count(*) FROM outbox JOIN keyframe USING (id)").fetchone()[0])
 
@@ -207,7 +207,7 @@ class KeyframeStore:
 
 
 def pack(keyframe: Keyframe) -> bytes:
-    """All of a keyframe in one safetensors blob."""
+    """Return a keyframe as one safetensors blob."""
     embedding = keyframe.embedding
     arrays: dict[str, Any] = {
         "stamp_session": np.array([keyframe.stamp_ns, keyframe.session], np.int64),
@@ -228,16 +228,16 @@ def pack(keyframe: Keyframe) -> bytes:
 
 
 def unpack(blob: bytes) -> Keyframe:
-    """The keyframe that `pack` was given.
+    """Return the keyframe in a blob of `pack`.
 
     Raises:
-        SafetensorError, ValueError, LookupError, TypeError: they are other bytes.
+        SafetensorError, ValueError, LookupError, TypeError: the bytes are no such blob.
     """
     arrays = load(blob)
     for name, shape in _SHAPES.items():
         found = arrays.get(name)
         if found is not None and (found.shape[-len(shape) :] != shape or not np.isfinite(found).all()):
-            raise ValueError(f"{name} is not what it should be")
+            raise ValueError(f"{name} has a wrong shape or is not finite")
     stamp_ns, session = (int(number) for number in arrays["stamp_session"])
     width, height, *rest = (float(number) for number in arrays["camera"])
     features = {group: _group(arrays, group, kind) for group, kind in FEATURES.items()}
@@ -273,15 +273,15 @@ class StoredSession(NamedTuple):
 
 
 def stored_sessions(path: Path) -> list[StoredSession]:
-    """The sessions of a place database; another process may write it."""
+    """Return the sessions of a place database; another process may write it."""
     columns = "SELECT session, count(*), min(stamp_ns), max(stamp_ns) FROM keyframe GROUP BY session"
-    with _looking(path) as connection:
+    with _open_read_only(path) as connection:
         return [StoredSession(*row) for row in connection.execute(columns)]
 
 
 def stored_identity(path: Path) -> tuple[str, int]:
-    """Embedder and numbers per descriptor of a place database; another process may write it."""
-    with _looking(path) as connection:
+    """Return the embedder and numbers per descriptor of a place database; another process may write it."""
+    with _open_read_only(path) as connection:
         stored = _identity(connection)
         return stored["embedder"], int(stored["dimension"])
 
@@ -303,18 +303,18 @@ def delete_sessions(path: Path, numbers: Collection[int]) -> int:
 
 
 def index_path(path: Path) -> Path:
-    """File beside a place database that its index is kept in."""
+    """Return the file beside a place database that its index is kept in."""
     return path.with_name(path.name + ".faiss")
 
 
 @contextmanager
-def _looking(path: Path) -> Iterator[sqlite3.Connection]:
+def _open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     with closing(SqliteFile(path, SCHEMA, read_only=True)) as file, file.reading() as connection:
         yield connection
 
 
 def _identity(connection: sqlite3.Connection) -> dict[str, Any]:
-    """Embedder and dimension of a file, as text; raise a `ValueError` if they cannot be read."""
+    """Return the embedder and dimension of a file, as text; raise a `ValueError` if they cannot be read."""
     about = connection.execute("SELECT content FROM about").fetchone()
     stored = json.loads(about[0]) if about else {}
     if not isinstance(stored, dict) or not all(isinstance(value, str) for value in stored.values()):
@@ -337,7 +337,7 @@ def _read_keys(connection: sqlite3.Connection) -> NDArray[np.void]:
     columns = "SELECT id, stamp_ns, session, ifnull(travelled_m, 9e999) FROM keyframe"
     keys = np.fromiter(connection.execute(columns), _KEYS)
     keys = keys[np.argsort(keys["id"])]
-    for name in ("id", "session"):  # the next one has to be a number too
+    for name in ("id", "session"):  # the next one must fit too
         if keys[name].min(initial=0) < 0 or keys[name].max(initial=0) > LARGEST_NUMBER:
             raise ValueError(f"a keyframe's {name} is out of range")
     keys["travelled_m"][np.isinf(keys["travelled_m"])] = np.nan
