@@ -1,1 +1,1 @@
-"""Odometry and loop closures bent into one trajectory."""
+"""Pose graph: one trajectory from odometry and loop closures."""

@@ -40,9 +40,9 @@ logger = logging.getLogger(__name__)
 
 
 class PoseGraph:
-    """Keep the optimal trajectory from odometry and loop closures that arrive in any order.
+    """Pose graph of odometry and loop closures that arrive in any order.
 
-    Unusable messages are refused with a reason and counted. `reference` decides about absolute measurements.
+    Unusable messages are refused with a reason and counted; `reference` decides about absolute measurements.
     """
 
     def __init__(self, settings: PoseGraphSettings | None = None) -> None:
@@ -50,7 +50,7 @@ class PoseGraph:
         self.reference = AbsoluteReference(self._settings)
         self._sessions = Sessions(self._settings, self.reference)
         self._rejection = OutlierRejection(self._settings, self._sessions)
-        # decisions in order of stamps as far as they have come, and the sessions with odometry that they know
+        # decisions in order of stamps so far, and the sessions with odometry that they are based on
         self._ordered: tuple[list[int], Sessions, OutlierRejection] | None = None
         self._waiting: list[tuple[LoopClosure, int | None]] = []  # with the newest stamp when the closure came
         self._held: list[PlacedClosure] = []
@@ -60,7 +60,7 @@ class PoseGraph:
         self.counts: Counter[str] = Counter()
 
     def retune(self, settings: PoseGraphSettings) -> None:
-        """Use other gates from now on; the model of the odometry's noise stays."""
+        """Use other gates from now on; the odometry noise model stays."""
         self._settings, self._ordered, self._settled = settings, None, False
         self._rejection.retune(settings)
 
@@ -69,7 +69,7 @@ class PoseGraph:
         self._sessions.begin()
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
-        """Take one odometry message, in any order; a second one of a stamp is dropped. False when it was refused.
+        """Add an odometry message, in any order; drop a second one of a stamp. Return false if it is refused.
 
         Args:
             stamp_ns: its stamp.
@@ -90,31 +90,31 @@ class PoseGraph:
         return True
 
     def add_absolute(self, measurement: AbsoluteMeasurement) -> None:
-        """Take one absolute measurement, in any order; `update` decides about it."""
+        """Add an absolute measurement, in any order; `update` decides about it."""
         self._settled = False
         self.reference.add(measurement)
 
     def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
-        """Take one closure; returns every verdict that it brought about or changed."""
+        """Add a closure; return every verdict that it caused or changed."""
         return self.add_closures([closure])
 
     def add_closures(self, closures: list[LoopClosure]) -> list[ClosureVerdict]:
-        """Take several closures with a single optimisation; see `add_closure`."""
+        """Add several closures with a single optimisation; see `add_closure`."""
         self._refresh()
         refused = [verdict for closure in closures if (verdict := self._receive(closure))]
         decided, known = self.update(), {id(closure) for closure in closures}
         return refused + [verdict for verdict in self._pending() if id(verdict.closure) in known] + decided
 
     def hold(self, closure: LoopClosure) -> None:
-        """Take one closure that was decided about before; `resume` gives it its verdict."""
+        """Add a closure with an earlier verdict, which `resume` restores."""
         self._refresh()
         self._receive(closure)
         self._held += self._take_waiting()[1]
 
     def resume(self, verdicts: Mapping[tuple[int, int], Decision]) -> None:
-        """Give the closures that are held their earlier verdicts, by the stamps of match and query.
+        """Restore the earlier verdicts of the held closures, by the stamps of match and query.
 
-        Closures without one, and closures that share both stamps, are decided anew.
+        Closures without a verdict, and closures that share both stamps, are decided again.
         """
         self._refresh()
         held, self._held = self._held + self._take_waiting()[1], []
@@ -133,7 +133,7 @@ class PoseGraph:
         self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
 
     def update(self) -> list[ClosureVerdict]:
-        """Decide about closures whose odometry has arrived; returns new verdicts."""
+        """Decide about closures whose odometry has arrived; return new verdicts."""
         self._refresh()
         refused, arrived = self._take_waiting()
         verdicts = refused + self._attempt(lambda: self._rejection.consider(arrived))
@@ -141,7 +141,7 @@ class PoseGraph:
         return verdicts
 
     def prepare(self, within_s: float) -> None:
-        """Do a part of the work of `settle`, for so long at most: at the end of a long mission it takes minutes."""
+        """Do part of the work of `settle` within a time limit; after a long mission it takes minutes."""
         self._refresh()
         last_ns = [chain.stamps[-1:] for chain in self._sessions.chains]
         self._reprocess(
@@ -155,14 +155,14 @@ class PoseGraph:
     def settle(self, within_s: float = float("inf")) -> list[ClosureVerdict] | None:
         """Decide finally and solve for the exact optimum, as at the end of a mission.
 
-        All closures are decided anew in the order of their stamps, so that the order of arrival has no influence: a
+        All closures are decided again in the order of their stamps, so that the order of arrival has no influence: a
         live run and a replay end with the same verdicts. Pending closures are accepted if nothing contradicts them.
 
         Returns:
-            The verdicts that changed; None when the time was up first, and nothing has changed.
+            The changed verdicts; None when the time was up first, and nothing has changed.
         """
         verdicts = self.update()
-        if self._settled:  # nothing has come since
+        if self._settled:  # no input since
             return verdicts
         before = self._rejection
         if not self._reprocess(within_s) or self._ordered is None:
@@ -174,7 +174,7 @@ class PoseGraph:
         after = zip(self._rejection.placed, self._rejection.verdicts, strict=True)
         verdicts += [verdict for placed, verdict in after if verdict.state is not states[id(placed)]]
         verdicts += self._attempt(self._rejection.settle)
-        for _ in range(3):  # the map that measurements move may contradict others
+        for _ in range(3):  # the map moved by measurements may contradict others
             self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve, at_last=True))
         if self._sessions.solution is not None:
             self._attempt(lambda: self._sessions.refine(self._rejection.accepted))
@@ -182,7 +182,7 @@ class PoseGraph:
         return verdicts
 
     def _reprocess(self, within_s: float, is_ready: Callable[[PlacedClosure], bool] = lambda _: True) -> bool:
-        """Decide anew, from the odometry alone, by the stamps of query and match; False when the time was up first."""
+        """Decide again, from the odometry alone, by the stamps of query and match; return false if out of time."""
         until_s = time.monotonic() + within_s
         order = sorted(self._rejection.placed, key=lambda placed: _endpoints(placed.closure)[::-1])
         begun, sessions, rejection = self._ordered or (None, self._sessions, self._rejection)
@@ -199,14 +199,14 @@ class PoseGraph:
         return True
 
     def _refresh(self) -> None:
-        """Take in the odometry that has come."""
+        """Process the new odometry."""
         if self._sessions.update():
             self.counts["odometry out of order"] += 1
             self._ordered = None
             self._attempt(self._rejection.renew)
 
     def _attempt(self, step: Callable[[], list[ClosureVerdict] | None]) -> list[ClosureVerdict]:
-        """Run a step that solves; a failure of the optimiser is counted and the last trajectory stays."""
+        """Run a step that solves; count a failure of the optimiser and keep the last trajectory."""
         try:
             return step() or []
         except GraphError as error:
@@ -215,7 +215,7 @@ class PoseGraph:
             return []
 
     def revoke(self, match_stamp_ns: int, query_stamp_ns: int) -> list[ClosureVerdict]:
-        """Take every closure between two keyframes out for good.
+        """Revoke every closure between two keyframes for good.
 
         Raises:
             GraphError: there is no such closure, or the graph cannot be solved without it.
@@ -228,7 +228,7 @@ class PoseGraph:
         return [verdict for row in rows for verdict in self._rejection.revoke(row)]
 
     def _receive(self, closure: LoopClosure) -> ClosureVerdict | None:
-        """Queue a closure; returns the verdict of an unusable one."""
+        """Queue a closure; return the verdict of an unusable one."""
         try:
             check_closure(closure, self._settings.max_closure_m)
         except GraphError as error:
@@ -242,7 +242,7 @@ class PoseGraph:
         return self._refused[-1]
 
     def _take_waiting(self) -> tuple[list[ClosureVerdict], list[PlacedClosure]]:
-        """Refusals of closures that waited too long for odometry, and closures whose odometry has arrived."""
+        """Return refusals of closures that were pending too long, and closures whose odometry has arrived."""
         refused, arrived, waiting = [], [], []
         oldest_ns = min((first for first, _ in self._spans()), default=None)
         newest_ns = max((last for _, last in self._spans()), default=None)
@@ -252,7 +252,7 @@ class PoseGraph:
             query = self._sessions.find(closure.query_stamp_ns)
             match = self._sessions.find(closure.match_stamp_ns, before=query)
             if query is not None and match is not None:
-                # two measurements of one pair are two closures; the same again is a message of a latched topic
+                # two measurements of one pair are two closures; an equal one is a repeated latched message
                 key = match, query, *_endpoints(closure), closure.match_T_query.tobytes()
                 if key in self._placed:
                     self.counts["closure twice"] += 1
@@ -270,11 +270,11 @@ class PoseGraph:
         return refused, arrived
 
     def closures(self) -> list[ClosureVerdict]:
-        """The latest verdict of every closure, in order of arrival."""
+        """Return the latest verdict of every closure, in order of arrival."""
         return self._rejection.verdicts + self._pending() + self._refused
 
     def _pending(self) -> list[ClosureVerdict]:
-        """Verdicts of closures whose odometry has not arrived."""
+        """Return verdicts of closures whose odometry has not arrived."""
         return [ClosureVerdict(one, State.PENDING, ClosureReason.NO_ODOMETRY_YET) for one, _ in self._waiting]
 
     @property
@@ -283,11 +283,11 @@ class PoseGraph:
         return self._rejection.scale
 
     def verdict_counts(self) -> Counter[State]:
-        """How many closures have which verdict."""
+        """Return the number of closures by state."""
         return Counter(verdict.state for verdict in self.closures())
 
     def trajectory(self, optimized: bool = True) -> tuple[Stamps, Array]:
-        """Stamps (N,) in ns and `map_T_body` or `odom_T_body` (N, 4, 4) of every keyframe joined to the map."""
+        """Return stamps (N,) in ns and `map_T_body` or `odom_T_body` (N, 4, 4) of every keyframe joined to the map."""
         self._refresh()
         chains = [self._sessions.chains[session] for session in self._sessions.members(0)]
         poses = [self._sessions.at(chain.at(chain.stamps)) if optimized else chain.poses for chain in chains]
@@ -295,7 +295,7 @@ class PoseGraph:
         return np.concatenate(stamps), np.concatenate([np.empty((0, 4, 4)), *poses])
 
     def poses_at(self, stamps: Stamps) -> tuple[Array, NDArray[np.bool_]]:
-        """(N, 4, 4) `map_T_body` at stamps, in the frame of the largest part of the map, and (N,) whether it has them.
+        """Return (N, 4, 4) `map_T_body` at stamps, in the frame of the map's largest part, and (N,) whether known.
 
         The sessions of that part share its frame: that of the earliest of them.
         """
@@ -309,11 +309,11 @@ class PoseGraph:
         return poses, known
 
     def sessions_of_map(self) -> list[int]:
-        """Numbers of the sessions in the largest part of the map, by the order in which they began."""
+        """Return numbers of the sessions in the largest part of the map, by the order in which they began."""
         return self._sessions.members(self._sessions.largest)
 
     def session_spans(self) -> list[tuple[int, int] | None]:
-        """First and last stamp of the odometry of every session; None without any."""
+        """Return the first and last stamp of the odometry of every session; None without any."""
         self._refresh()
         return [chain.span for chain in self._sessions.chains]
 
@@ -321,19 +321,19 @@ class PoseGraph:
         return [chain.span for chain in self._sessions.chains if chain.span is not None]
 
     def map_T_odom(self) -> Array | None:
-        """(4, 4) pose of the newest session's odometry frame in the map: where its newest pose went."""
+        """Return (4, 4) pose of the newest session's odometry frame in the map, by its newest pose."""
         last, chain = self._newest(), self._sessions.chains[-1]
         return self._sessions.at(last)[0] @ invert(chain.poses_at(last["stamp"])[0]) if len(last) else np.eye(4)
 
     def covariance(self) -> Array:
-        """(6, 6) marginal covariance of the newest pose in ROS order about the map's axes; zero without odometry."""
+        """Return the (6, 6) marginal covariance of the newest pose, ROS order, map's axes; zero without odometry."""
         last = self._newest()
         if not len(last):
             return np.zeros((6, 6))
         return gtsam_to_ros_covariance(self._sessions.covariance(last), self._sessions.at(last)[0])
 
     def _newest(self) -> PathPoints:
-        """(1,) the newest odometry of the newest session; (0,) without any."""
+        """Return the newest odometry (1,) of the newest session; (0,) without any."""
         self._refresh()
         chain = self._sessions.chains[-1]
         return np.empty(0, POINT) if chain.span is None else chain.at(np.array(chain.span[1:]))
@@ -349,13 +349,13 @@ class PoseGraph:
         write_tum(path, Trajectory(stamps[order], poses[order]))
 
     def closure_lines(self) -> tuple[list[ClosureVerdict], Array]:
-        """Verdicts of the N closures with known endpoints, and (N, 2, 3) map positions of match and query."""
+        """Return verdicts of the N closures with known endpoints, and (N, 2, 3) map positions of match and query."""
         self._refresh()
         positions = [self._sessions.at(self._rejection.closures[end])[:, :3, 3] for end in ("match", "query")]
         return list(self._rejection.verdicts), np.stack(positions, axis=1)
 
     def graph(self) -> Graph:
-        """Keyframes by session and stamp, odometry and accepted closures, with the covariances of the solution."""
+        """Return keyframes by session and stamp, odometry and accepted closures, with the solution's covariances."""
         self._refresh()
         return self._sessions.expand(self._rejection.accepted, self._rejection.closures)
 
@@ -374,7 +374,7 @@ class PoseGraph:
     def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
         """Settle, and write trajectories (TUM), the graph (g2o and id-stamp table) and all verdicts (CSV).
 
-        Without the time to settle all is written as it stands, and the result is False.
+        If the time is up before that, the current state is written and false is returned.
 
         Raises:
             OutputError: the folder cannot be written.

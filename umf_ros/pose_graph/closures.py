@@ -67,7 +67,7 @@ class ClosureVerdict:
         closure: the closure.
         state: accepted or rejected; pending while the evidence or the odometry is insufficient; refused when the
             message itself is unusable.
-        reason: why.
+        reason: its reason.
         residual: Mahalanobis distance to the map when it was decided, NaN if unknown; 3 to 4 is usual at most.
         residual_m: distance in metres between the closure's and the map's pose of the query, NaN if unknown.
     """
@@ -101,7 +101,7 @@ tangent space of the query."""
 
 
 def as_closures(placed: PlacedClosure, row: int, chains: Sequence[OdometryChain]) -> Closures:
-    """(1,) a closure with the odometry at its endpoints."""
+    """Return a closure (1,) with the odometry at its endpoints."""
     match, query, closure = placed
     found = np.zeros(1, CLOSURE)
     found["row"], found["pose"] = row, closure.match_T_query
@@ -115,7 +115,7 @@ def check_closure(closure: LoopClosure, max_length_m: float) -> Array:
     """Return the (6, 6) covariance of a usable closure in GTSAM's order, tangent space of the query.
 
     Raises:
-        GraphError: of a `ClosureReason`; of the other checks too.
+        GraphError: with a `ClosureReason`; also raised by the other checks.
     """
     if closure.query_stamp_ns == closure.match_stamp_ns:
         raise GraphError(ClosureReason.ITSELF)

@@ -1,9 +1,9 @@
 """Consistency of closures with each other, its evidence, and the noise scale estimated from it.
 
 Two closures close to each other and the odometry between their endpoints form a loop, whose residual has to fit the
-stated covariances: then both are consistent [Mangelson 2018], kept up with each new closure. The evidence
-is the larger, the smaller the area that the prediction leaves open within the area in which wrong closures to similar
-places are found. Closures of one place count once.
+stated covariances: then both are consistent [Mangelson 2018], updated with each closure. The evidence
+grows as the area of the predicted pose shrinks relative to the area in which wrong closures to similar places are
+found. Closures of one place count once.
 
 Over many loops the factor by which residuals do not fit is found by maximum likelihood. Loops with a wrong closure are
 outliers of that likelihood, and wrong closures that are consistent with each other do no harm: they are so through the
@@ -27,52 +27,52 @@ from umf_ros.pose_graph.odometry import Rows, Table, noise_between
 
 Loops = NDArray[np.void]
 LOOP = np.dtype([("residual", "f8", 6), ("odometry", "f8", (6, 6)), ("closures", "f8", (6, 6))])
-"""Fields of `Loops`: by how much a loop misses closing, and the covariances of it that the stated noise of odometry and
-of closures explains."""
+"""Fields of `Loops`: residual of a loop, and its covariances by the stated noise of odometry and
+of closures."""
 _MOST_COMPARED = 40
 _DEGREES = 6
-# nats: where one place is mistaken for another, the next is too more often than by chance
+# nats: where one place is mistaken for another, the next place is too with more than chance probability
 _MOST_PER_PLACE = 4.0
 
 _GRID = np.exp(np.linspace(np.log(1 / 64), np.log(64), 33))
-# standard deviations of the residual of a loop with a wrong closure: of aliases close by, and of anything at all
+# standard deviations of the residual of a loop with a wrong closure: of nearby aliases, and of any place
 _ALIAS_SIGMAS = np.array([[0.5] * 3 + [5.0] * 3, [1.5] * 3 + [50.0] * 3])
 _OUTLIERS = 0.5
-# loops share closures and odometry, so that together they say less than their sum: to trust odometry more than
-# stated takes more than to trust it less
+# loops share closures and odometry, so their joint evidence is less than their sum: a smaller scale of odometry needs
+# more evidence than a larger one
 _NATS_PER_FACTOR, _NATS_TO_TRUST = 5.0, 20.0
 _FEWEST_LOOPS = 10
 _TOLERANCE = np.log(1.8)
 _SAME_UNITS = np.log(4.0)
-# an error that builds up in one direction hardly shows in short loops, unless all is stated in other units
+# a systematic error hardly shows in short loops, unless all noise is stated in other units
 _LEAST_ODOMETRY = 0.3
 
 
 @dataclass(frozen=True)
 class NoiseScale:
-    """By how much the true standard deviations exceed the stated ones."""
+    """Factors of the true standard deviations over the stated ones."""
 
     odometry: float = 1.0
     closures: float = 1.0
 
     def covariances(self, odometry: Array, closures: Array) -> Array:
-        """(..., 6, 6) sum of stated covariances of odometry and of closures, scaled."""
+        """Return (..., 6, 6) sum of stated covariances of odometry and of closures, scaled."""
         return self.odometry**2 * odometry + self.closures**2 * closures
 
 
 def squared_mahalanobis(twists: Array, covariances: Array) -> Array:
-    """(N,) squared Mahalanobis lengths of (N, 6) twists."""
+    """Return (N,) squared Mahalanobis lengths of (N, 6) twists."""
     return np.einsum("...i,...i->...", twists, np.linalg.solve(covariances, twists[..., None])[..., 0])
 
 
 def false_alarm_probability(covariances: Array, settings: PoseGraphSettings) -> Array:
-    """(N,) share of wrong closures that pass for right ones under predictions of the (N, 6, 6) covariances."""
+    """Return the share (N,) of wrong closures that pass for right ones under predicted covariances (N, 6, 6)."""
     spreads = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[..., 3:, 3:])[..., 1:], 0.0))
     return np.minimum(settings.gate_chi2 * spreads.prod(axis=-1) / settings.alias_radius_m**2, 1.0)
 
 
 def likelihood_ratio(false_alarms: Array, distances: Array, settings: PoseGraphSettings) -> Array:
-    """(N,) how much likelier wrong closures are to miss predictions by this than right ones; one at most.
+    """Return the likelihood ratios (N,) of distances from predictions, wrong over right closures; one at most.
 
     Args:
         false_alarms: (N,) false-alarm probabilities of the predictions.
@@ -84,7 +84,7 @@ def likelihood_ratio(false_alarms: Array, distances: Array, settings: PoseGraphS
 
 
 def loops_between(one: Closures, others: Closures) -> Loops:
-    """(N,) the loops of one closure (1,) with (N,) others, whose endpoints are pairwise in one session.
+    """Return the loops (N,) of one closure (1,) with (N,) others, whose endpoints are pairwise in one session.
 
     A loop leads from the match of one to its query, the query of the other, the match of the other, and back.
     """
@@ -103,7 +103,7 @@ def loops_between(one: Closures, others: Closures) -> Loops:
 
 
 def paths_between(one: Closures, other: Closures) -> Array:
-    """(2, N) metres driven between the matches and between the queries of closures; infinite between sessions."""
+    """Return (2, N) path lengths in m between matches and between queries of closures; infinite between sessions."""
     found = []
     for a, b in ((one["match"], other["match"]), (one["query"], other["query"])):
         found.append(np.where(a["session"] == b["session"], np.abs(a["travel"] - b["travel"]), np.inf))
@@ -111,7 +111,7 @@ def paths_between(one: Closures, other: Closures) -> Array:
 
 
 class ConsistencyGraph:
-    """Which closures are consistent; a row is the number of a closure.
+    """Pairwise consistency of closures; a row is the number of a closure.
 
     Attributes:
         settings: of the pose graph.
@@ -131,7 +131,7 @@ class ConsistencyGraph:
         return self._table["closure"]
 
     def add(self, closure: Closures) -> Loops:
-        """Take one closure (1,) and compare it with all near ones; returns the loops it makes with them."""
+        """Add a closure (1,) and compare it with all near ones; return the loops it makes with them."""
         self._table.extend(closure=closure)
         return self._compare(len(self._table) - 1)
 
@@ -145,7 +145,7 @@ class ConsistencyGraph:
             self._compare(row)
 
     def consistency_set(self, row: int, members: NDArray[np.bool_]) -> tuple[list[int], float]:
-        """Closures out of `members` consistent with `row` and among each other, and the evidence for them in nats.
+        """Return the closures of `members` consistent with `row` and each other, and the evidence for them in nats.
 
         From place to place the evidence grows by the improbability that the next one is consistent with the nearest
         by chance.
@@ -167,16 +167,16 @@ class ConsistencyGraph:
         return found, evidence
 
     def companions(self, row: int, members: NDArray[np.bool_]) -> list[int]:
-        """Closures out of `members` of the same place that are consistent with this one."""
+        """Return closures out of `members` of the same place that are consistent with this one."""
         others = [other for other in self._consistent[row] if members[other]]
         return [other for other, same in zip(others, self._same_place(others, row), strict=True) if same]
 
     def opponents(self, row: int, members: NDArray[np.bool_]) -> list[int]:
-        """Closures out of `members` that are inconsistent with this one."""
+        """Return closures out of `members` that are inconsistent with this one."""
         return [other for other in self._inconsistent[row] if members[other]]
 
     def count_places(self, rows: list[int]) -> int:
-        """How many different places closures are of."""
+        """Return the number of places of closures."""
         count = 0
         while rows:
             rows, count = self._elsewhere(rows, rows[0]), count + 1
@@ -206,20 +206,20 @@ class ConsistencyGraph:
         return loops
 
     def _same_place(self, rows: Sequence[int] | Rows, other: int) -> NDArray[np.bool_]:
-        """(N,) whether closures are of the place of another one."""
+        """Return (N,) whether closures are of the same place as another one."""
         paths_m = paths_between(self.closures[np.array(rows, np.int64)], self.closures[other : other + 1])
         return np.isfinite(paths_m).all(axis=0) & (paths_m.min(axis=0) < self.settings.place_m)
 
     def _elsewhere(self, rows: list[int], other: int) -> list[int]:
-        """Those of other places than one closure."""
+        """Return the closures of other places than one closure."""
         return [row for row, same in zip(rows, self._same_place(rows, other), strict=True) if not same]
 
 
 class NoiseScaleEstimator:
-    """Adds up the likelihood of both factors on a grid, loop by loop and place by place.
+    """Sums of the log-likelihood of both factors on a grid, by loop and place.
 
     Attributes:
-        loops: how many were taken in.
+        loops: number of added loops.
     """
 
     def __init__(self) -> None:
@@ -230,7 +230,7 @@ class NoiseScaleEstimator:
         self.loops = 0
 
     def add(self, loops: Loops, place: int) -> None:
-        """Take in N loops of one place, to which others may have been added before."""
+        """Add N loops of one place, which may have loops already."""
         new = _likelihoods(loops).sum(axis=0)
         self._of_place[place] = self._of_place.get(place, 0.0) + new
         self._likelihood = self._likelihood + new
@@ -242,25 +242,25 @@ class NoiseScaleEstimator:
         if self.loops < _FEWEST_LOOPS:
             return NoiseScale()
         one = len(_GRID) // 2
-        # a factor has to earn its freedom, else noise in few loops would be taken for a wrong scale
+        # a factor needs a minimum of evidence, else noise in few loops would be taken for a wrong scale
         cost = np.where(np.arange(len(_GRID)) == one, 0.0, _NATS_PER_FACTOR)
         trusting = np.where(np.arange(len(_GRID)) < one, _NATS_TO_TRUST - _NATS_PER_FACTOR, 0.0)
         merit = self._likelihood - (cost + trusting)[:, None] - cost
         plain = int(np.argmax(merit[:, one])), one
         best = int(np.argmax(merit) // len(_GRID)), int(np.argmax(merit) % len(_GRID))
         accepted = best[1] <= one or self._is_widely_better(best, plain)
-        # closures that are about as stated are taken as stated, and odometry is judged by that
+        # closures about as stated are taken as stated, and odometry is estimated given that
         row, column = best if accepted and _unless_small(_GRID[best[1]]) != 1 else plain
         odometry_factor, closures_factor = float(_GRID[row]), float(_GRID[column])
         if one not in (row, column) and abs(np.log(odometry_factor / closures_factor)) < _SAME_UNITS:
-            # rather other units than two mistakes: the ratio counts, and that is as stated
+            # a common factor of units is likelier than two errors: the ratio counts, and it is as stated
             odometry_factor = closures_factor = max(odometry_factor, closures_factor)
         closures_factor = _unless_small(closures_factor)
         least = _LEAST_ODOMETRY * min(closures_factor, 1.0)
         return NoiseScale(max(_unless_small(odometry_factor), least), closures_factor)
 
     def _is_widely_better(self, one: tuple[int, int], other: tuple[int, int]) -> bool:
-        """Whether one choice would be better without the place that speaks for it most."""
+        """Return whether one choice is better even without the place that favours it most."""
         gains = np.array([likelihood[one] - likelihood[other] for likelihood in self._of_place.values()])
         return bool(gains.sum() - gains.max() > _NATS_PER_FACTOR)
 
@@ -270,7 +270,7 @@ def _unless_small(factor: float) -> float:
 
 
 def _likelihoods(loops: Loops) -> Array:
-    """(N, G, G) log-likelihood of each loop over the grids of odometry and closure factors."""
+    """Return (N, G, G) log-likelihood of each loop over the grids of odometry and closure factors."""
     residuals = loops["residual"]
     # whiten by the closures' noise, then turn the odometry's to its axes: both become diagonal
     lower = np.linalg.cholesky(loops["closures"])

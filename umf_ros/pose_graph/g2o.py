@@ -19,7 +19,7 @@ _ROTATION_LAST = np.array([3, 4, 5, 0, 1, 2])
 
 
 def verdict_table(verdicts: Iterable[ClosureVerdict]) -> str:
-    """All verdicts as CSV."""
+    """Return all verdicts as CSV."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(VERDICT_COLUMNS)
@@ -54,11 +54,11 @@ def write_g2o(path: Path, poses: Array, edges: ArrayLike, ids: Sequence[int] | N
 
 
 def g2o_lines(tag: str, ids: Sequence[tuple[int, ...]], numbers: Array) -> list[str]:
-    """Lines of a tag, the ids of vertices and (N, M) numbers."""
+    """Return lines of a tag, the ids of vertices and (N, M) numbers."""
     form = tag + " %d" * len(ids[0]) + " %.12g" * numbers.shape[1] + "\n" if len(ids) else ""
     return [form % (*names, *row) for names, row in zip(ids, numbers.tolist(), strict=True)]
 
 
 def _numbers(poses: Array) -> Array:
-    """(N, 7) position and quaternion of (N, 4, 4) poses."""
+    """Return (N, 7) position and quaternion of (N, 4, 4) poses."""
     return np.concatenate([poses[:, :3, 3], to_quaternion(poses) if len(poses) else np.empty((0, 4))], axis=1)

@@ -36,7 +36,7 @@ conditioned."""
 
 
 def noise_between(a: PathPoints, b: PathPoints) -> Array:
-    """(..., 6, 6) noise of the odometry between points of one session, at the origin of both."""
+    """Return (..., 6, 6) noise of the odometry between points of one session, at the origin of both."""
     forward = (a["stamp"] <= b["stamp"])[..., None, None]
     return np.where(forward, 1.0, -1.0) * (b["noise"] - a["noise"])
 
@@ -56,7 +56,7 @@ class Table:
         return self._size
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """(N, ...) rows of a column; valid until the next change."""
+        """Return (N, ...) rows of a column; valid until the next change."""
         return self._columns[name][: self._size]
 
     def extend(self, **rows: ArrayLike) -> None:
@@ -73,7 +73,7 @@ class Table:
 
 
 class OdometryChain:
-    """All messages of one session, and keyframes among them with the noise of the path so far.
+    """All messages of one session, and keyframes among them with the accumulated noise.
 
     The noise of the path from a to b is a difference of prefix sums: with `W` the covariance of a
     step carried to the origin by the adjoint, `cov(a_T_b) = Ad(b)^-1 (sum_b W - sum_a W) Ad(b)^-T`
@@ -111,13 +111,13 @@ class OdometryChain:
         return (int(stamps[0]), int(stamps[-1])) if len(stamps) else None
 
     def add(self, stamp_ns: int, pose: Array, covariance: Array | None = None) -> None:
-        """Remember a message; see `PoseGraph.add_odometry`."""
+        """Add a message; see `PoseGraph.add_odometry`."""
         self._arrived.append((stamp_ns, pose))
         if covariance is not None:
             self._covariances.setdefault(stamp_ns, covariance)
 
     def update(self) -> bool:
-        """Take the new messages in; True when the past changed, not only the end grew."""
+        """Process the new messages; return true if the past changed and not only the end grew."""
         span, changed = self.span, self._sort_in()
         if changed is None:
             return False
@@ -125,7 +125,7 @@ class OdometryChain:
         return span is not None and changed < span[1]
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether a stamp is a message's own or lies in a gap between two that is short enough to trust."""
+        """Return whether a stamp is a message's own or lies in a gap that is short enough to interpolate."""
         known = self._messages["stamp"]
         if not len(known) or not known[0] <= stamp_ns <= known[-1]:
             return False
@@ -133,11 +133,11 @@ class OdometryChain:
         return bool(known[upper] - known[lower] <= self._settings.max_gap_s * 1e9)
 
     def poses_at(self, stamps: Stamps) -> Array:
-        """(N, 4, 4) odometry poses interpolated at the stamps, held constant outside the messages."""
+        """Return (N, 4, 4) odometry poses interpolated at the stamps, held constant outside the messages."""
         return interpolated(self._messages["stamp"], self._messages["pose"], stamps)
 
     def at(self, stamps: Stamps) -> PathPoints:
-        """(N,) the path at stamps the odometry covers."""
+        """Return the path (N,) at stamps that the odometry covers."""
         poses, travel, collected = self.poses_at(stamps), self._keyframes["travel"], self._keyframes["noise"]
         lower, upper, share = bracket(self.stamps, stamps)
         points = np.zeros(len(stamps), POINT)
@@ -159,7 +159,7 @@ class OdometryChain:
         return shifted
 
     def _sort_in(self) -> int | None:
-        """Sort the new messages in, the first of each stamp; returns the earliest stamp that is new."""
+        """Sort the new messages in, the first of each stamp; return the earliest new stamp."""
         if not self._arrived:
             return None
         stamps = np.array([stamp for stamp, _ in self._arrived], np.int64)
@@ -170,7 +170,7 @@ class OdometryChain:
         start = int(np.searchsorted(known, stamps.min()))
         stamps = np.concatenate([known[start:], stamps])
         poses = np.concatenate([self._messages["pose"][start:], poses])
-        # the first index of a stamp is the one that arrived first: unique is stable and old ones lead
+        # the first index of a stamp arrived first: unique is stable, and older messages precede
         ordered, first = np.unique(stamps, return_index=True)
         new = ordered[first >= len(known) - start]
         self._messages.truncate(start)
@@ -211,10 +211,10 @@ class OdometryChain:
 
 @dataclass(frozen=True)
 class CorrectedPath:
-    """Where every pose of a session is, given the solved poses of a few.
+    """Poses of a session, interpolated between solved poses.
 
-    Between two solved poses the correction is shared out in proportion to the odometry's noise,
-    which is its least-squares optimum; beyond the last one the path follows the odometry.
+    Between two solved poses the correction is distributed in proportion to the odometry's noise,
+    which is the least-squares optimum; beyond the last one the path follows the odometry.
 
     Attributes:
         points: (N,) the odometry at the solved poses, sorted by stamp.
@@ -225,7 +225,7 @@ class CorrectedPath:
     poses: Array
 
     def at(self, points: PathPoints) -> Array:
-        """(M, 4, 4) `map_T_body` at points of the session."""
+        """Return (M, 4, 4) `map_T_body` at points of the session."""
         after = np.searchsorted(self.points["stamp"], points["stamp"], side="right")
         lower = np.maximum(after - 1, 0)
         twists = np.zeros((len(points), 6))

@@ -1,6 +1,6 @@
-"""Outlier rejection: decide which closures shape the map.
+"""Outlier rejection: decide which closures the map is solved with.
 
-A closure is accepted at once if it is consistent with the map and a wrong one would hardly be. Where the map is too
+A closure is accepted at once if it is consistent with the map and a wrong one is unlikely to be. Where the map is too
 uncertain, closures of other places have to be consistent with it. Closures that contradict the map can overrule it,
 and accepted closures of fewer places, if enough places agree: odometry may be biased. No decision is final: rejected
 closures are compared again when the map moves.
@@ -41,19 +41,19 @@ _MOST_ROUNDS = 4
 _CLOSE_M = 2.0
 # largest odds against a closure without support: during the drive, and at the end
 _MOST_ODDS, _MOST_ODDS_AT_LAST = 0.1, 0.2
-# before any verdict, one of five closures counts as wrong
+# prior: one of five closures is wrong
 _WRONG_BEFORE, _RIGHT_BEFORE = 1, 4
-# wrong closures seldom come alone: of those pending at the end of drives in worlds 10200-10473 of
-# `pose_graph.py` (benchmarks) 1 of 67 wrong ones was alone and 59 of 213 right ones
+# wrong closures are seldom single: of those pending at the end of drives in worlds 10200-10473 of
+# `pose_graph.py` (benchmarks) 1 of 67 wrong ones was single and 59 of 213 right ones
 _WRONG_ALONE = 0.1
-# nothing contradicts a wrong closure between sessions that are not joined: at the end two places have to agree, by 2.5
+# nothing contradicts a wrong closure between sessions that are not joined: at the end two places have to agree by 2.5
 # nats at least (*by hand*; `aliased_sessions.py`: without, one group of wrong closures joined 4 of 40 graphs)
 _WRONG_BETWEEN = 10.0
 _EVEN = 0.5
 
 
 class OutlierRejection:
-    """Decide about closures and keep the map solved accordingly.
+    """Decisions about closures, and the map solved accordingly.
 
     Attributes:
         settings: of the pose graph.
@@ -85,12 +85,12 @@ class OutlierRejection:
 
     @property
     def accepted(self) -> Closures:
-        """(M,) closures that shape the map."""
+        """(M,) accepted closures."""
         return self.closures[self._of(State.ACCEPTED)]
 
     @property
     def revoked(self) -> NDArray[np.bool_]:
-        """(N,) which closures were taken out for good."""
+        """(N,) whether closures were revoked for good."""
         return self._of(ClosureReason.BY_HAND)
 
     def retune(self, settings: PoseGraphSettings) -> None:
@@ -98,9 +98,9 @@ class OutlierRejection:
         self.settings = self._consistency.settings = settings
 
     def consider(self, arrived: Sequence[PlacedClosure]) -> list[ClosureVerdict]:
-        """Take closures in; returns the verdicts that are new or changed.
+        """Add closures; return the verdicts that are new or changed.
 
-        The map is solved once at most; closures that the moved map comes close to are compared by the next call.
+        The map is solved once at most; closures near the moved map are compared by the next call.
         """
         before = list(self.verdicts)
         rows = [self._take(placed) for placed in arrived]
@@ -113,7 +113,7 @@ class OutlierRejection:
         return self._changed_since(before)
 
     def resume(self, decided: Sequence[tuple[PlacedClosure, Decision]]) -> None:
-        """Take closures in with the verdicts that they had, and solve the map once, to its optimum."""
+        """Add closures with their earlier verdicts, and solve the map once, to its optimum."""
         for placed, decision in decided:
             self.verdicts[self._take(placed)] = ClosureVerdict(placed.closure, *decision)
         self._rescale()
@@ -124,7 +124,7 @@ class OutlierRejection:
             self._joined[row], self._ratios[row] = joined, ratio if is_pending else 1.0
 
     def settle(self) -> list[ClosureVerdict]:
-        """Decide about pending closures; returns changed verdicts."""
+        """Decide about pending closures; return changed verdicts."""
         if self._map is None:
             return []
         before = list(self.verdicts)
@@ -139,7 +139,7 @@ class OutlierRejection:
         return self._changed_since(before)
 
     def renew(self) -> None:
-        """Solve again after the odometry's past changed; no verdict changes by that."""
+        """Solve again after the odometry's past changed; verdicts stay."""
         for end in (self.closures["match"], self.closures["query"]):
             for session in np.unique(end["session"]):
                 rows = end["session"] == session
@@ -148,7 +148,7 @@ class OutlierRejection:
             self.solve()
 
     def revoke(self, row: int) -> list[ClosureVerdict]:
-        """Take a closure out for good."""
+        """Revoke a closure for good."""
         before = list(self.verdicts)
         self._reject(row, ClosureReason.BY_HAND)
         if before[row].state is State.ACCEPTED:
@@ -163,17 +163,17 @@ class OutlierRejection:
             rows = self._brought_close
 
     def _decide(self, rows: Iterable[int]) -> bool:
-        """Decide about closures and solve the map with those that are accepted; False without any."""
+        """Decide about closures and solve the map with the accepted ones; return false without any."""
         rows = sorted(rows)
         agreed = self._gate(rows)
         supported = [member for found in self._supported_sets(rows, State.PENDING) for member in found]
         supported += self._overrule(rows)
         reasons = dict.fromkeys(supported, ClosureReason.SUPPORTED) | dict.fromkeys(agreed, ClosureReason.AGREES)
-        # only where no other closure is accepted: the map that those move may contradict these
+        # only without other accepted closures: the map moved by those may contradict these
         if not reasons:
             reasons = dict.fromkeys(self._unopposed(), ClosureReason.UNOPPOSED)
         self._brought_close = []
-        if self._accept(reasons):  # closures not accepted that the moved map comes close to are compared again
+        if self._accept(reasons):  # closures near the moved map that are not accepted are compared again
             rows = np.flatnonzero(~self._of(State.ACCEPTED) & ~self.revoked)
             self._brought_close = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
         return bool(reasons)
@@ -189,7 +189,7 @@ class OutlierRejection:
         return row
 
     def _rescale(self) -> bool:
-        """Adopt a new scale of the covariances; True when it changed."""
+        """Update the scale of the covariances; return whether it changed."""
         scale = self._estimator.scale if self.settings.reject_outliers else self.scale
         if scale == self.scale:
             return False
@@ -197,7 +197,7 @@ class OutlierRejection:
         return True
 
     def _gate(self, rows: Iterable[int]) -> list[int]:
-        """Compare closures with the map; returns those whose consistency with it suffices."""
+        """Compare closures with the map; return those that are consistent enough."""
         closed = self._of(State.ACCEPTED) | self.revoked
         at = np.array([row for row in rows if not closed[row]], np.int64)
         if not len(at):
@@ -221,7 +221,7 @@ class OutlierRejection:
         return agreed
 
     def _compare(self, rows: NDArray[np.int64]) -> tuple[Array, Array, NDArray[np.bool_], Array, Array]:
-        """Compare N closures with the map; a closure between endpoints that nothing joins agrees with it.
+        """Compare N closures with the map; a closure between unconnected endpoints agrees with it.
 
         Returns:
             (N,) squared Mahalanobis distances, misfits in metres, whether the map joins the endpoints, likelihoods of
@@ -240,25 +240,25 @@ class OutlierRejection:
         return distances, metres, joined, ratios, false_alarms
 
     def _misfits(self, rows: NDArray[np.int64]) -> Array:
-        """(N, 4, 4) poses of the queries of closures by the map, in the frames where the closures put them."""
+        """Return (N, 4, 4) residual poses: queries of closures by the map, relative to their poses by the closures."""
         chosen = self.closures[rows]
         return invert(self._sessions.at(chosen["match"]) @ chosen["pose"]) @ self._sessions.at(chosen["query"])
 
     def _supported_sets(self, rows: Iterable[int], state: State) -> list[list[int]]:
-        """Consistency sets among the closures of one state, each with one of `rows`, that no chance explains."""
+        """Return consistency sets of closures of one state, each with one of `rows`, beyond chance."""
         members = self._of(state) & ~self.revoked & ~self._of(ClosureReason.TOO_FAR)
         sets: list[list[int]] = []
         for row in rows:
             if members[row] and not any(row in found for found in sets):
                 found, evidence = self._consistency.consistency_set(row, members)
-                # that all are consistent with the map as well is one more thing that chance has to explain
+                # their consistency with the map is further evidence against chance
                 evidence -= float(np.log(max(self._ratios[member] for member in found)))
                 if evidence >= self.settings.min_support:
                     sets.append(found)
         return sets
 
     def _overrule(self, rows: Iterable[int]) -> list[int]:
-        """Revoke accepted closures for a set that the map contradicts, of more places than those; returns the set."""
+        """Revoke accepted closures for a contradicted set of more places than those; return the set."""
         accepted = self._of(State.ACCEPTED)
         for found in self._supported_sets(rows, State.REJECTED):
             losers = sorted({loser for row in found for loser in self._consistency.opponents(row, accepted)})
@@ -269,9 +269,9 @@ class OutlierRejection:
         return []
 
     def _revoke_outvoted(self) -> bool:
-        """Revoke closures that were accepted too early: more places contradict than support them, and the map does too.
+        """Revoke closures accepted too early: more places contradict than support them, and so does the map.
 
-        Where enough supports a closure, the odometry between is wrong, not the closure.
+        Where the support of a closure suffices, the odometry between is wrong, not the closure.
         """
         members, outvoted = self._of(State.ACCEPTED), dict[int, ClosureVerdict]()
         for row in np.flatnonzero(members).tolist():
@@ -292,9 +292,9 @@ class OutlierRejection:
         return len(right) < len(outvoted)
 
     def _unopposed(self, at_last: bool = False) -> list[int]:
-        """Pending closures of the best fitting place among those that have waited long enough.
+        """Return pending closures of the best fitting place among those that have waited long enough.
 
-        Neither the map nor another closure contradicts them. One place at a time: the map that the first one moves may
+        Neither the map nor another closure contradicts them. One place at a time: the map moved by the first one may
         contradict the next. The closures of a place are accepted together, by their median odds, so that one of a wrong
         set is not accepted by chance. The decision at the end does not wait, and counts how many closures were wrong
         and the evidence of other places.
@@ -307,7 +307,7 @@ class OutlierRejection:
         companions = ~self._of(State.ACCEPTED) & ~self.revoked
         places = [[row, *self._consistency.companions(row, companions)] for row in np.flatnonzero(waiting).tolist()]
         self._gate(sorted({member for place in places for member in place}))
-        # those that the map itself finds wrong rather than right do not speak against others
+        # closures that are likelier wrong than right by the map do not count against others
         against = self._of(State.ACCEPTED) | (np.array(self._ratios) < _EVEN)
         best: list[int] = []
         most_odds = _MOST_ODDS_AT_LAST if at_last else _MOST_ODDS
@@ -320,7 +320,7 @@ class OutlierRejection:
         return best
 
     def _odds_against(self, place: list[int], at_last: bool) -> Array:
-        """(N,) odds that closures of one place are wrong, by the map and, at the end, by all other evidence."""
+        """Return (N,) odds that closures of one place are wrong, by the map and, at the end, by all other evidence."""
         odds = np.array([self._ratios[row] for row in place])
         if not at_last:
             return odds
@@ -332,11 +332,11 @@ class OutlierRejection:
         return odds * prior * (_WRONG_ALONE if len(place) == 1 else 1.0)
 
     def _of(self, decision: State | ClosureReason) -> NDArray[np.bool_]:
-        """(N,) which closures have verdicts of a state or a reason."""
+        """Return (N,) whether closures have verdicts of a state or a reason."""
         return np.array([decision in (verdict.state, verdict.reason) for verdict in self.verdicts], bool)
 
     def _accept(self, reasons: dict[int, ClosureReason]) -> bool:
-        """Accept closures and solve the map with them; False without any."""
+        """Accept closures and solve the map with them; return false without any."""
         for row, reason in reasons.items():
             self.verdicts[row] = replace(self.verdicts[row], state=State.ACCEPTED, reason=reason)
         if reasons:
@@ -352,6 +352,6 @@ class OutlierRejection:
         self.verdicts[row] = ClosureVerdict(self.placed[row].closure, State.REJECTED, reason)
 
     def _changed_since(self, before: list[ClosureVerdict]) -> list[ClosureVerdict]:
-        """Verdicts that are new or of another state than before."""
+        """Return verdicts that are new or of another state than before."""
         known = zip(self.verdicts, before, strict=False)
         return [new for new, old in known if new.state is not old.state] + self.verdicts[len(before) :]

@@ -17,14 +17,14 @@ from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.odometry import POINT, CorrectedPath, OdometryChain, PathPoints, Rows, Stamps, noise_between
 from umf_ros.pose_graph.solver import EDGE, Graph, GraphSolver
 
-# metres at which an angular error counts like a displacement when paths through the graph are compared
+# lever arm in m that converts angular errors to displacements when paths through the graph are compared
 _LEVER_M = 10.0
-# pairs whose shortest paths are searched together: their trees fill some tens of megabytes
+# pairs whose shortest paths are searched together: their trees take some tens of megabytes
 _AT_ONCE = 256
 
 
 class Sessions:
-    """Odometry chains that share a map as far as closures join them; `chains` that grow elsewhere can be given.
+    """Odometry chains, joined to maps by closures; `chains` that grow elsewhere can be given.
 
     Each session begins in a gauge of its own, its odometry frame. Accepted closures join sessions
     to components; the earliest session of a component keeps its gauge, the others are moved.
@@ -34,7 +34,7 @@ class Sessions:
         components: for each session the earliest one that shares its map.
         vertices: (N,) of `POINT`, the vertices that were solved last.
         solved: the corrected paths.
-        reference: absolute measurements that hold the map in the world.
+        reference: absolute measurements, which fix the map in the world.
         cost: half the sum of squared, normalised errors of the last solution.
         solution: the graph that was solved last; None before.
         scale: of the stated noise, in that solution.
@@ -58,7 +58,7 @@ class Sessions:
         self.chains.append(OdometryChain(self._settings, len(self.chains)))
 
     def update(self) -> bool:
-        """Take new odometry in; True when the past of a session changed."""
+        """Process new odometry; return true if the past of a session changed."""
         self.components += range(len(self.components), len(self.chains))
         late = [session for session, chain in enumerate(self.chains) if chain.update()]
         for session in self.begun:
@@ -77,12 +77,12 @@ class Sessions:
         return [session for session, chain in enumerate(self.chains) if len(chain.stamps)]
 
     def find(self, stamp_ns: int, before: int | None = None) -> int | None:
-        """The newest session (not newer than `before`) whose odometry covers the stamp, or None."""
+        """Return the newest session (not newer than `before`) whose odometry covers the stamp, or None."""
         newest = len(self.chains) - 1 if before is None else before
         return next((session for session in range(newest, -1, -1) if self.chains[session].covers(stamp_ns)), None)
 
     def members(self, component: int) -> list[int]:
-        """Sessions with odometry of one component, which goes by the number of its earliest session."""
+        """Return sessions with odometry of one component, which has the number of its earliest session."""
         return [session for session in self.begun if self.components[session] == component]
 
     @property
@@ -94,7 +94,7 @@ class Sessions:
         return int(np.argmax(path_m))
 
     def at(self, points: PathPoints) -> Array:
-        """(N, 4, 4) `map_T_body` at points of sessions with odometry."""
+        """Return (N, 4, 4) `map_T_body` at points of sessions with odometry."""
         poses = np.empty((len(points), 4, 4))
         for session in np.unique(points["session"]).tolist():
             rows = points["session"] == session
@@ -125,18 +125,18 @@ class Sessions:
         self.solved |= _paths_through(vertices, self._optimum(vertices, graph, self.components))
 
     def _optimum(self, points: PathPoints, graph: Graph, components: list[int]) -> Array:
-        """(N, 4, 4) poses at the minimum, absolute measurements included."""
+        """Return (N, 4, 4) poses at the minimum, absolute measurements included."""
         solve, given = self._solver.solve, (points, graph.anchors, graph.poses, components)
         poses = self.reference.solve(*given, lambda held: solve(replace(graph, **held._asdict())))
         self.cost = self._solver.cost
         return poses
 
     def expand(self, closures: Closures, extra: Closures) -> Graph:
-        """Graph of every keyframe and the endpoints of `extra` closures, odometry and the given closures."""
+        """Return the graph of every keyframe and the endpoints of `extra` closures, odometry and the given closures."""
         return self._graph(self._stamps(extra, every_keyframe=True), closures, self.components)[1]
 
     def _stamps(self, closures: Closures, every_keyframe: bool = False) -> list[Stamps]:
-        """Stamps of the first or of every keyframe of each session, and of the endpoints of closures."""
+        """Return stamps of the first or of every keyframe of each session, and of the endpoints of closures."""
         ends = [closures["match"], closures["query"]]
         return [
             np.unique(
@@ -152,7 +152,7 @@ class Sessions:
         ]
 
     def covariance(self, point: PathPoints) -> Array:
-        """(6, 6) marginal covariance of the pose at a point (1,) after the last solved one, in its tangent space."""
+        """Return the (6, 6) marginal covariance of a point (1,) after the last solved pose, in its tangent space."""
         session = int(point["session"][0])
         path = self.solved[session]
         last = self._solver.marginal((session, int(path.points["stamp"][-1])))
@@ -164,7 +164,7 @@ class Sessions:
     def _graph(
         self, stamps: list[Stamps], closures: Closures, components: list[int], moves: Array | None = None
     ) -> tuple[PathPoints, Graph]:
-        """The graph of stamps of each session, odometry between and closures; its poses moved by (S, 4, 4) `moves`."""
+        """Return the graph of each session's stamps, odometry and closures, with poses moved by (S, 4, 4) `moves`."""
         known = [chain.at(own) for chain, own in zip(self.chains, stamps, strict=True) if len(own)]
         points = np.concatenate([np.empty(0, POINT), *known])
         vertices = list(zip(points["session"].tolist(), points["stamp"].tolist(), strict=True))
@@ -188,7 +188,7 @@ class Sessions:
         return points, Graph(vertices, poses, anchors, keys, edges)
 
     def _join(self, closures: Closures) -> tuple[list[int], Array]:
-        """The component of each session, and how each moves (S, 4, 4) to its component's gauge, newly joined or not."""
+        """Return the component of each session, and the transforms (S, 4, 4) of each to its component's gauge."""
         components = list(range(len(self.chains)))
         moves = np.tile(np.eye(4), (len(components), 1, 1))
         for closure in closures[closures["match"]["session"] != closures["query"]["session"]][:, None]:
@@ -210,7 +210,7 @@ class Sessions:
 
 
 def _paths_through(points: PathPoints, poses: Array) -> dict[int, CorrectedPath]:
-    """The paths of sessions through solved poses."""
+    """Return the paths of sessions through solved poses."""
     rows = {session: points["session"] == session for session in np.unique(points["session"]).tolist()}
     return {session: CorrectedPath(points[own], poses[own]) for session, own in rows.items()}
 
@@ -230,7 +230,7 @@ class RelativeCovariances:
         edges, size = sessions.solution.edges, len(self._poses)
         low, high = np.sort([edges["first"], edges["second"]], axis=0)
         lengths = _length(edges["covariance"])
-        # of parallel edges the shortest counts: a sparse matrix would add them up
+        # only the shortest of parallel edges: a sparse matrix would add them up
         order = np.argsort(lengths, kind="stable")
         self._keys, best = np.unique((low * size + high)[order], return_index=True)
         rows = order[best]
@@ -240,7 +240,7 @@ class RelativeCovariances:
         self._noise = propagate(carry, edges["covariance"][rows])
 
     def bounds(self, match: PathPoints, query: PathPoints) -> tuple[Array, NDArray[np.bool_]]:
-        """(N, 6, 6) bounds of `match_T_query` in GTSAM's order, tangent space of the query, and (N,) whether known.
+        """Return (N, 6, 6) bounds of `match_T_query`, GTSAM order, tangent space of the query, and (N,) whether known.
 
         Where no path joins the points, bounds are infinite on the diagonal.
         """
@@ -257,14 +257,14 @@ class RelativeCovariances:
     def _shorten(
         self, match: PathPoints, query: PathPoints, poses: Array, rows: Rows, covariances: Array, lengths: Array
     ) -> None:
-        """Replace the bounds of some pairs, which are those along the odometry, by those of shorter paths."""
+        """Replace the bounds of some pairs, given along the odometry, by those of shorter paths."""
         ends = []
         for point in (match, query):
             beside = self._nearest(point)
             turn = adjoint(invert(poses) @ self._sessions.at(point) @ invert(point["pose"]))
             walked = propagate(turn, noise_between(point, self._vertices[beside]))
             ends.append((beside, self._variance_scale * walked))
-        # a path is the same from either end: trees grow from where there are fewer roots
+        # paths are symmetric: trees grow from the side with fewer roots
         (starts, leave), (stops, enter) = sorted(ends, key=lambda one: len(np.unique(one[0])))
         sources, of_source = np.unique(starts, return_inverse=True)
         found, before = dijkstra(
@@ -279,7 +279,7 @@ class RelativeCovariances:
         lengths[rows[shorter]] = totals[shorter]
 
     def _along(self, before: NDArray[np.int32], here: Rows) -> Array:
-        """(M, 6, 6) noise along paths, from the (M, V) vertices before each and the (M,) vertices where they end."""
+        """Return (M, 6, 6) noise along paths, from the (M, V) predecessors of vertices and the (M,) last vertices."""
         sums, running = np.zeros((len(here), 6, 6)), np.arange(len(here))
         while len(running):  # one step of every path that is not yet at its source
             there = before[running, here].astype(np.int64)
@@ -291,7 +291,7 @@ class RelativeCovariances:
         return sums
 
     def _nearest(self, points: PathPoints) -> Rows:
-        """(N,) the solved vertices of the points' sessions that are nearest to them by odometry."""
+        """Return the solved vertices (N,) of the points' sessions that are nearest to them by odometry."""
         nearest = np.empty(len(points), np.int64)
         for session in np.unique(points["session"]):
             rows, solved = points["session"] == session, np.flatnonzero(self._vertices["session"] == session)
@@ -303,6 +303,6 @@ class RelativeCovariances:
 
 
 def _length(covariances: Array) -> Array:
-    """Length of a path, m^2; never zero, which a sparse matrix would read as no edge."""
+    """Return the length of a path, m^2; never zero, which means no edge in a sparse matrix."""
     diagonal = np.diagonal(covariances, axis1=-2, axis2=-1)
     return diagonal[..., 3:].sum(axis=-1) + _LEVER_M**2 * diagonal[..., :3].sum(axis=-1) + 1e-12

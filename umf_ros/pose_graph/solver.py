@@ -18,8 +18,8 @@ EDGE = np.dtype([("first", "i8"), ("second", "i8"), ("pose", "f8", (4, 4)), ("co
 """Fields of an array of edges; see `Edge`."""
 _ANCHOR = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
 _MOST_STEPS = 30
-# radians and metres: a step this small leaves an error of less than a micrometre, so that a map that is solved at
-# once, as after a restart, is the one that was solved closure by closure
+# radians and metres: a step this small leaves an error below a micrometre, so that a map solved at once, as after a
+# restart, equals the one solved closure by closure
 _SMALL = 1e-4
 _FEW_VERTICES = 300
 
@@ -41,7 +41,7 @@ class Edge(NamedTuple):
 
 
 def between(edge: Edge) -> gtsam.BetweenFactorPose3:
-    """The GTSAM factor of an edge."""
+    """Return the GTSAM factor of an edge."""
     noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (edge.covariance + edge.covariance.T))
     return gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.pose), noise)
 
@@ -51,12 +51,12 @@ class Graph:
     """A graph of N vertices and M edges.
 
     Attributes:
-        vertices: N lasting keys, each hashable.
-        poses: (N, 4, 4) to start from, or solved.
-        anchors: the vertices 0..N-1 that stay where they are, one per connected part.
-        keys: M lasting keys of the edges.
+        vertices: N persistent keys, each hashable.
+        poses: (N, 4, 4), initial or solved.
+        anchors: fixed vertices of 0..N-1, one per connected part.
+        keys: M persistent keys of the edges.
         edges: (M,) of `EDGE`, between vertices 0..N-1.
-        absolute: measurements of single vertices, each with what makes its factor.
+        absolute: measurements of single vertices, each with the function that makes its factor.
         loose: noise of anchors that such measurements move.
     """
 
@@ -70,7 +70,7 @@ class Graph:
 
 
 class GraphSolver:
-    """Solve graphs, most of whose edges are those of the graph before; keeps the last solution for its marginals.
+    """Incremental solver of graphs that share most edges with the previous one; keeps the solution for marginals.
 
     An edge whose measurement or covariance changes needs another key, or another solver. `cost` is half the sum of
     squared, normalised errors of the last solution.
@@ -83,13 +83,13 @@ class GraphSolver:
         self.cost = 0.0
 
     def solve(self, graph: Graph) -> Array:
-        """(N, 4, 4) poses of the vertices at the minimum near the initial poses.
+        """Return (N, 4, 4) poses of the vertices at the minimum near the initial poses.
 
         Raises:
             GraphError: the system is indeterminate or does not converge to finite poses.
         """
-        if not graph.anchors:  # QR would not notice
-            raise GraphError("the pose graph cannot be solved: no vertex stays where it is")
+        if not graph.anchors:  # QR would not detect it
+            raise GraphError("the pose graph cannot be solved: no vertex is fixed")
         numbers = [self._numbers.setdefault(key, len(self._numbers)) for key in graph.vertices]
         values, factors = gtsam.Values(), gtsam.NonlinearFactorGraph()
         for number, pose in zip(numbers, graph.poses, strict=True):
@@ -118,7 +118,7 @@ class GraphSolver:
         return poses
 
     def marginal(self, vertex: Hashable) -> Array | None:
-        """(6, 6) covariance of a vertex of the last solved graph in its tangent space; None where it is unknown."""
+        """Return the (6, 6) covariance of a vertex of the last graph in its tangent space; None where it is unknown."""
         try:
             return None if self._tree is None else self._tree.marginalCovariance(self._numbers[vertex])
         except (RuntimeError, IndexError, KeyError):
@@ -133,14 +133,14 @@ class GraphSolver:
 
 
 def _ordering(factors: gtsam.NonlinearFactorGraph, anchors: list[int], numbers: list[int]) -> gtsam.Ordering:
-    """The order of elimination: of many vertices a nested dissection by METIS, which keeps the factorisation sparse.
+    """Return the order of elimination: for many vertices a nested dissection by METIS, for a sparse factorisation.
 
-    The last vertex is eliminated last, so that its covariance is at hand.
+    The last vertex is eliminated last, so that its covariance is available.
     """
     if len(numbers) < _FEW_VERTICES:
         return gtsam.Ordering.ColamdNonlinearFactorGraph(factors)
     joined = factors.clone()
-    for one, other in pairwise(anchors):  # METIS may not end on a graph in parts
+    for one, other in pairwise(anchors):  # METIS may not terminate on a disconnected graph
         joined.add(gtsam.BetweenFactorPose3(one, other, gtsam.Pose3(), _ANCHOR))
     dissection, ordering = gtsam.Ordering.MetisNonlinearFactorGraph(joined), gtsam.Ordering()
     keys = (dissection.at(place) for place in range(dissection.size()))
@@ -152,7 +152,7 @@ def _ordering(factors: gtsam.NonlinearFactorGraph, anchors: list[int], numbers: 
 def _descend(
     factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering
 ) -> tuple[gtsam.GaussianBayesTree | None, gtsam.Values]:
-    """Gauss-Newton; Levenberg-Marquardt takes over when a large step raises the error.
+    """Solve by Gauss-Newton, or by Levenberg-Marquardt when a large step raises the error.
 
     Returns:
         The factorised system before the last step (None where only QR solves it), and the poses.
@@ -174,12 +174,12 @@ def _descend(
 def _step(
     factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering
 ) -> tuple[gtsam.GaussianBayesTree | None, gtsam.Values, gtsam.VectorValues]:
-    """One step of Gauss-Newton: the factorised system, where it leads, and the step."""
+    """Return one Gauss-Newton step: the factorised system, the new values, and the step."""
     try:
         tree = factors.linearize(values).eliminateMultifrontal(ordering)
         delta = tree.optimize()
         return tree, values.retract(delta), delta
-    except RuntimeError:  # Cholesky finds a long straight chain indeterminate, which QR does not
+    except RuntimeError:  # Cholesky rejects a long straight chain as indeterminate, QR does not
         optimizer = gtsam.GaussNewtonOptimizer(factors, values, _by_qr(gtsam.GaussNewtonParams()))
         optimizer.iterate()
         return None, optimizer.values(), values.localCoordinates(optimizer.values())
