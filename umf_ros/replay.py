@@ -147,7 +147,7 @@ class Replay:
             raise UmfError(f"{self.faults} frames skipped after internal errors: please report {log}")
 
     def graph_counts(self) -> dict[str, int]:
-        """Number of closures by state so far; none without odometry."""
+        """Return the number of closures by state so far; none without odometry."""
         if self._localizer is not None:
             counts = self._localizer.counts
             return {"accepted": counts["agreed"], "rejected": counts["contradicted"], "pending": counts["searching"]}
@@ -191,7 +191,7 @@ class Replay:
             OutputError: the folder cannot be written.
         """
         if self._detector.inter_robot is not None:
-            for inter_closure in self._detector.inter_robot.rest(FLEET_PATIENCE_S):
+            for inter_closure in self._detector.inter_robot.finish(FLEET_PATIENCE_S):
                 self._recorder.record_inter_robot(inter_closure)
         if self._localizer is not None:
             has_trajectory = self._write_localization()

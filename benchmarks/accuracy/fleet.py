@@ -104,7 +104,7 @@ class Rover:
 
     def finish(self) -> None:
         """Wait until the server has everything, and has answered everything."""
-        for inter_closure in self.inter_robot.rest(600):
+        for inter_closure in self.inter_robot.finish(600):
             self._note(inter_closure)
 
     def _note(self, inter_closure: InterRobotClosure) -> None:

@@ -82,7 +82,7 @@ def test_a_map_that_was_cut_off_while_it_compared_goes_on(made: tuple[Path, Ende
 def wrong_calls(tmp_path: Path) -> Iterator[tuple[list[Path], str]]:
     (tmp_path / "empty").mkdir()
     yield [tmp_path / "missing.mcap"], "there is no recording"
-    yield [tmp_path / "empty"], "holds no recording"
+    yield [tmp_path / "empty"], "is not a recording"
     (tmp_path / "notes.txt").write_text("these are notes\n")
     yield [tmp_path / "notes.txt"], "notes.txt is no recording"
 
@@ -128,7 +128,7 @@ def test_the_map_is_a_point_cloud_too(made: tuple[Path, Ended]) -> None:
 
 @pytest.mark.parametrize(
     ("options", "told"),
-    [(["--mode", "localization"], "needs a map"), (["--map", "nowhere"], "holds no map"), (["--mode", "x"], "mode")],
+    [(["--mode", "localization"], "needs a map"), (["--map", "nowhere"], "is not a map"), (["--mode", "x"], "mode")],
 )
 def test_a_map_that_is_not_there_is_one_line(mini_bag: Path, tmp_path: Path, options: list[str], told: str) -> None:
     assert told in only_line(umf("replay", mini_bag, "--out", tmp_path / "out", *options))

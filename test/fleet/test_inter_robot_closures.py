@@ -42,7 +42,7 @@ def drive(server: PostgresServer, rover: str) -> list[InterRobotClosure]:
     inter_robot = InterRobotMatcher(Settings(database=settings(server, rover)), places.store, IDENTITY)
     for place, pose in enumerate(poses_of(rover)):
         inter_robot.link.enqueue(places.add(seen(pose, 10.0 * place, place, 10.0 * place)))
-    found = list(inter_robot.rest(60))
+    found = list(inter_robot.finish(60))
     inter_robot.close()
     places.close()
     return found

@@ -29,8 +29,8 @@ def test_a_map_is_read_back_and_recognises_its_recordings(tmp_path: Path) -> Non
     folder = MapFolder.open(tmp_path / "map")
     assert folder.sessions == made.sessions
     moved = folder.sessions[1].recording | {"path": "elsewhere.mcap"}
-    assert folder.knows(moved) == folder.sessions[1]
-    assert folder.knows(moved | {"messages": {"a": 7}}) is None
+    assert folder.find(moved) == folder.sessions[1]
+    assert folder.find(moved | {"messages": {"a": 7}}) is None
     assert folder.free_name(Path("c.mcap")) == "c" and folder.free_name(Path("x/a.mcap")) == "a_2"
 
 
@@ -41,7 +41,7 @@ def test_settings_of_the_first_recording_stay(tmp_path: Path) -> None:
 
 
 def test_other_folders_are_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UmfError, match="holds no map"):
+    with pytest.raises(UmfError, match="is not a map"):
         MapFolder.open(tmp_path)
     (tmp_path / "map.json").write_text("{")
     with pytest.raises(UmfError, match="damaged"):

@@ -57,7 +57,7 @@ def test_odometry_is_read_back_as_it_was(folder: MapFolder, put: list[StoredOdom
 
 def test_odometry_of_an_earlier_release_is_refused(folder: MapFolder) -> None:
     (folder.folder_of("a") / "odometry.npz").write_bytes(b"")
-    with pytest.raises(UmfError, match="build the map again from its recordings"):
+    with pytest.raises(UmfError, match="rebuild the map from its recordings"):
         folder.odometry_of("a")
 
 

@@ -86,7 +86,7 @@ def command(
 
 
 def _new_ones(target: MapFolder, recordings: list[Path], console: Console) -> dict[str, Path]:
-    """The recordings that are not in the map yet, by the names of their sessions to be."""
+    """Return the recordings that are not in the map yet, by the names of their sessions to be."""
     from umf_ros.bags.reader import open_bag
     from umf_ros.runs.reader import describe_recording
 
@@ -94,7 +94,7 @@ def _new_ones(target: MapFolder, recordings: list[Path], console: Console) -> di
     described = []
     for recording in recordings:
         about = describe_recording(open_bag(recording)) | {"path": ""}
-        known = target.knows(about)
+        known = target.find(about)
         if known is not None or about in described:
             as_name = f", as {known.name}" if known else ""
             console.print(f"{recording}: in the map already{as_name}", markup=False, soft_wrap=True)

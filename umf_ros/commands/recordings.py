@@ -53,7 +53,7 @@ def check_files(bag: Path, *others: Path | None) -> None:
 def check_map(folder: Path | None) -> None:
     """Check that a folder, if one is given, holds a map."""
     if folder is not None and not (folder / "map.json").is_file():
-        raise UmfError(f"{folder} holds no map: map.json is missing (umf map makes one)")
+        raise UmfError(f"{folder} is not a map: map.json is missing; make one with umf map")
 
 
 def open_recording(

@@ -17,15 +17,15 @@ from umf_ros.places.store import KeyframeStore
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 
 APART_M = 8.0
-"""Closures nearer to each other show one place and may share one error (*by hand*)."""
+"""Closures nearer to each other count as one place and may share an error (*by hand*)."""
 REACH_M = 150.0
-"""Longest path by which odometry confirms a closure: beyond, its own error fits anything (*by hand*)."""
+"""Longest path over which odometry confirms a closure; beyond, its own error is too large (*by hand*)."""
 SLACK_M, SLACK_RAD = 1.0, 0.12
-"""Error allowed to a closure itself (*by hand*: three times the error of accepted ones)."""
+"""Tolerance of a closure itself (*by hand*: three times the error of accepted ones)."""
 DRIFT_RAD_PER_M = 0.003
 """Drift of the heading of odometry (*by hand*)."""
 KEPT = 200
-"""Pending and confirmed closures that are kept of each rover."""
+"""Pending and confirmed closures kept per rover."""
 InterRobotPair = tuple[Keyframe, Keyframe, LoopClosure]
 """Query, match and the closure between them."""
 
@@ -50,7 +50,7 @@ class InterRobotClosure:
 
 
 class FleetConsensus:
-    """Keeps a closure between two rovers pending until one of another place agrees with it.
+    """Consensus between rovers: a closure is pending until one of another place agrees with it.
 
     Within one rover the pose graph rejects wrong closures. Two rovers have no common graph on board, so the loop
     through two closures and both odometries has to close.
@@ -65,7 +65,7 @@ class FleetConsensus:
         self._confirmed: list[InterRobotPair] = []
 
     def confirm(self, pair: InterRobotPair) -> list[InterRobotPair]:
-        """Take a closure; returns the closures that are confirmed by it, itself included."""
+        """Add a closure; return the closures that it confirms, itself included."""
         agrees = [self.agree(pair, other) for other in self._pending]
         if not any(agrees) and not any(self.agree(pair, other) for other in self._confirmed):
             self._pending = [*self._pending[-KEPT + 1 :], pair]
@@ -76,7 +76,7 @@ class FleetConsensus:
         return new
 
     def agree(self, one: InterRobotPair, other: InterRobotPair) -> bool:
-        """Whether the loop through two closures of different places and both odometries closes."""
+        """Return whether the loop through two closures of different places and both odometries closes."""
         steps, path_m = [], 0.0
         for a, b in zip(one[:2], other[:2], strict=True):
             if a.session != b.session or a.odom_T_body is None or b.odom_T_body is None:
@@ -92,7 +92,7 @@ class FleetConsensus:
 
 
 class InterRobotMatcher:
-    """Verifies the candidates of a fleet's server, with a verifier for each rover: their histories must not mix.
+    """Verification of a fleet server's candidates, with one verifier per rover: their histories must not mix.
 
     Args:
         settings: all settings.
@@ -127,8 +127,8 @@ class InterRobotMatcher:
                     verdict.reason = RejectReason.UNCONFIRMED
         return InterRobotClosure(keyframe, self.link.robot, robot, verdicts, closures)
 
-    def rest(self, timeout_s: float) -> Iterator[InterRobotClosure]:
-        """Finish pushing and asking within a time limit, and verify all answers."""
+    def finish(self, timeout_s: float) -> Iterator[InterRobotClosure]:
+        """Finish all pushes and queries within a time limit, and verify all answers."""
         end = time.monotonic() + timeout_s
         while True:
             done = self.link.drain(0.1) or time.monotonic() > end

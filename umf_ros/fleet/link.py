@@ -28,12 +28,12 @@ RETRY_S = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 
 Answer = tuple[Keyframe, str, list[tuple[Candidate, Keyframe]]]
-"""A keyframe of this rover, the name of another, and candidates of one of the other's sessions with their keyframes,
+"""A keyframe of this rover, the name of another rover, and candidates of one of its sessions with their keyframes,
 whose sessions have negative numbers here."""
 
 
 class FleetLink:
-    """Pushes the store's outbox in order, and queries every keyframe of this run.
+    """Link to the fleet's server: pushes the store's outbox in order, and queries every keyframe of this run.
 
     No call waits for the server: while it is disconnected the outbox grows, and the thread reconnects.
 
@@ -75,11 +75,11 @@ class FleetLink:
         return self._answers.popleft()
 
     def waiting(self) -> int:
-        """Number of places that are not pushed yet."""
+        """Return the number of places that are not pushed yet."""
         return self._store.waiting()
 
     def drain(self, timeout_s: float) -> bool:
-        """Wait until all is pushed and queried; returns whether it is. Answers have to be taken meanwhile."""
+        """Wait until all is pushed and queried; return whether it is. Answers have to be taken meanwhile."""
         end = time.monotonic() + timeout_s
         while self._asks or self._asking or self._store.waiting():
             if time.monotonic() > end:
@@ -99,7 +99,7 @@ class FleetLink:
             try:
                 busy = self._step()
                 failures = 0
-            except Exception as error:  # a thread that ended would lose places unnoticed
+            except Exception as error:  # without the thread, places would be lost silently
                 self._lose(error)
                 self._end.wait(RETRY_S[min(failures, len(RETRY_S) - 1)])
                 failures += 1
@@ -111,7 +111,7 @@ class FleetLink:
             self._server.close()
 
     def _step(self) -> bool:
-        """Push or query once; returns whether there was anything to do."""
+        """Push or query once; return whether there was anything to do."""
         if self._server is None:
             self._server = FleetServer(self._settings.server, self._store.store_id, self._identity)
             self.robot, self.connected, self.trouble = self._server.robot, True, ""
@@ -150,7 +150,7 @@ class FleetLink:
                 return None
             try:
                 keyframe = unpack(data)
-            except Exception as error:  # another rover may write any bytes
+            except Exception as error:  # another rover's bytes may be damaged
                 logger.warning("%s of %s cannot be read: %s", key.stamp_ns, key.robot, error)
                 return None
             # sessions and stamps of two rovers may coincide

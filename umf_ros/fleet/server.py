@@ -21,9 +21,9 @@ from umf_ros.places.store import pack
 ROVERS = "umf_rover"
 """Role of all rovers: its members read every row and add rows of their own name."""
 SEARCHED = 100
-"""Places that the search in the server's graph keeps (`hnsw.ef_search`): recall against time."""
+"""Candidate list of the search in the server's graph (`hnsw.ef_search`): recall against time."""
 TIMEOUT_S = 5.0
-"""A server that has not answered by then counts as disconnected."""
+"""Time after which a server without an answer counts as disconnected."""
 _KEY = "robot text, store uuid, session integer, stamp_ns bigint"
 _KEY_NAMES = "robot, store, session, stamp_ns"
 MIGRATIONS = (
@@ -58,17 +58,17 @@ _DATA = "SELECT data FROM place_data WHERE robot = %s AND store = %s AND session
 
 
 def migrate(connection: Connection, embedder: str, dimension: int) -> tuple[int, int]:
-    """Bring the tables up to date in one transaction; returns the version before and after.
+    """Bring the tables up to date in one transaction; return the version before and after.
 
-    The connection is of a user who may create roles and tables; new tables are for descriptors of this embedder with
-    so many numbers. Tables made by a later version of umf_ros raise an `UmfError`.
+    The user of the connection may create roles and tables; new tables are for descriptors of this embedder and
+    dimension. Tables made by a later version of umf_ros raise an `UmfError`.
     """
     with connection.transaction():
-        # a second administrator waits here, and finds nothing to do
+        # a concurrent set-up waits here
         connection.execute("SELECT pg_advisory_xact_lock(7215)")
         before = _version(connection)
         if before > len(MIGRATIONS):
-            raise UmfError(f"the server has tables of version {before}, this umf_ros knows {len(MIGRATIONS)}")
+            raise UmfError(f"the server has tables of version {before}, this umf_ros supports {len(MIGRATIONS)}")
         if not before:
             if not connection.execute("SELECT 1 FROM pg_roles WHERE rolname = %s", (ROVERS,)).fetchone():
                 connection.execute(sql.SQL("CREATE ROLE {} NOLOGIN").format(sql.Identifier(ROVERS)))
@@ -83,7 +83,7 @@ def migrate(connection: Connection, embedder: str, dimension: int) -> tuple[int,
 
 
 def add_rover(connection: Connection, name: str, password: str) -> None:
-    """Add a rover, its role and its name for rows, or change its password; the server gets the verifier only."""
+    """Add a rover's role, or change its password; the server gets the password's verifier only."""
     verifier = connection.pgconn.encrypt_password(password.encode(), name.encode(), b"scram-sha-256").decode()
     known = connection.execute("SELECT 1 FROM pg_roles WHERE rolname = %s", (name,)).fetchone()
     verb = sql.SQL("ALTER ROLE" if known else "CREATE ROLE")
@@ -107,7 +107,7 @@ class FleetKey(NamedTuple):
 
 
 class FleetServer:
-    """A rover's connection to the server; every call ends within seconds, with a `LinkError` if the server is gone.
+    """A rover's connection to the server; calls time out within seconds, with a `LinkError`.
 
     Args:
         address: `postgresql://ROVER@HOST/DATABASE?sslmode=verify-full`; libpq takes the password from a `.pgpass` file
@@ -120,7 +120,7 @@ class FleetServer:
 
     Raises:
         LinkError: the server cannot be reached.
-        UmfError: it has no tables of this version, or those of another network.
+        UmfError: its tables are of another version or another network.
     """
 
     def __init__(self, address: str, store: UUID, identity: tuple[str, int]) -> None:
@@ -157,14 +157,14 @@ class FleetServer:
             cursor.executemany(_INSERT_DATA, data)
 
     def nearest(self, descriptor: NDArray[np.float32], count: int) -> list[tuple[FleetKey, float]]:
-        """The most similar places of other rovers with their similarity, best first."""
+        """Return the most similar places of other rovers with their similarity, best first."""
         vector = HalfVector(descriptor)
         with _link():
             rows = self._connection.execute(_NEAREST, (vector, vector, count)).fetchall()
         return [(FleetKey(*key), float(similarity)) for *key, similarity in rows]
 
     def data(self, key: FleetKey) -> bytes | None:
-        """A packed keyframe; None where there is none."""
+        """Return a packed keyframe; None where there is none."""
         with _link():
             row = self._connection.execute(_DATA, key, binary=True).fetchone()
         return row[0] if row else None
@@ -177,10 +177,10 @@ class FleetServer:
         version = _version(self._connection)
         if version != len(MIGRATIONS):
             found = f"tables of version {version}, not {len(MIGRATIONS)}" if version else "no tables of a fleet"
-            raise UmfError(f"the fleet's server has {found}; its administrator runs umf fleet setup")
+            raise UmfError(f"the fleet's server has {found}; the administrator has to run umf fleet setup")
         known = self._connection.execute("SELECT embedder, dimension FROM fleet").fetchone()
         if known != identity:
-            raise UmfError(f"the fleet's places are of {known}, not of {identity}")
+            raise UmfError(f"the fleet's places were made with {known}, not with {identity}")
         register_vector(self._connection)
         self._connection.execute("SELECT set_config('hnsw.ef_search', %s, false)", (str(SEARCHED),))
         self._connection.execute("SET hnsw.iterative_scan = strict_order")
@@ -189,7 +189,7 @@ class FleetServer:
 
 
 def _version(connection: Connection) -> int:
-    """Version of the server's tables; 0 where there are none."""
+    """Return the version of the server's tables; 0 where there are none."""
     if connection.execute("SELECT to_regclass('fleet_version')").fetchone() == (None,):
         return 0
     row = connection.execute("SELECT max(version) FROM fleet_version").fetchone()
@@ -198,10 +198,10 @@ def _version(connection: Connection) -> int:
 
 @contextmanager
 def _link() -> Iterator[None]:
-    """Report errors of the server in one line; neither libpq nor this line contains a password."""
+    """Report server errors in one line; neither libpq nor this line contains a password."""
     try:
         yield
     except psycopg.errors.InsufficientPrivilege as error:
-        raise UmfError(f"the fleet's server refuses: {one_line(error)}") from None
+        raise UmfError(f"the fleet's server refuses the request: {one_line(error)}") from None
     except psycopg.Error as error:
         raise LinkError(f"the fleet's server cannot be reached: {one_line(error)}") from None

@@ -55,7 +55,7 @@ class JointMap:
     between: list[ClosureVerdict]
 
     def accepted_between(self) -> list[LoopClosure]:
-        """Accepted closures between recordings."""
+        """Return accepted closures between recordings."""
         return [verdict.closure for verdict in self.between if verdict.state is State.ACCEPTED]
 
 
@@ -90,7 +90,7 @@ def solve(folder: MapFolder) -> JointMap:
 
 
 def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, own: Trajectory) -> JointSession:
-    """A recording with the poses of its keyframes in the solved map."""
+    """Return a session with the poses of its keyframes in the solved map."""
     stamps = read_keyframes(folder.folder_of(session.name) / "keyframes.csv")["stamp_ns"]
     poses, known = graph.poses_at(stamps + session.shift_ns)
     odometry, _ = own.at(stamps[known])
@@ -98,12 +98,12 @@ def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, own: Traje
 
 
 def _trajectory(odometry: list[StoredOdometry]) -> Trajectory:
-    """The poses in the order of their stamps, the first one of each stamp."""
+    """Return the poses in the order of their stamps, the first one of each stamp."""
     stamps, first = np.unique(np.array([one.stamp_ns for one in odometry], np.int64), return_index=True)
     return Trajectory(stamps, np.array([odometry[row].odom_T_body for row in first]).reshape(-1, 4, 4))
 
 
 def _shifted(closure: LoopClosure, shift_ns: int) -> LoopClosure:
-    """A closure within a recording, on the map's clock."""
+    """Return a closure within a recording, on the map's clock."""
     query_ns, match_ns = closure.query_stamp_ns + shift_ns, closure.match_stamp_ns + shift_ns
     return replace(closure, query_stamp_ns=query_ns, match_stamp_ns=match_ns)

@@ -22,7 +22,7 @@ SCHEMA_VERSION = 1
 BETWEEN = "closures_between.csv"
 _DAY_NS = 86_400 * 10**9
 APART_NS = 60 * 10**9
-"""Least gap between sessions on the map's clock: longer than odometry is ever interpolated."""
+"""Least gap between sessions on the map's clock: longer than any interpolated gap of odometry."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class MapSession:
     Attributes:
         name: of the session and its folder.
         recording: its description, as in the summary of a run.
-        shift_ns: from its own clock to the map's, on which no two recordings overlap.
+        shift_ns: offset from its own clock to the map's, on which recordings do not overlap.
         first_ns, last_ns: the time it covers, own clock.
         first_place, places: its rows in the place database.
         first_number, numbers: its sessions in the place database: one, or more where its odometry restarted.
@@ -51,7 +51,7 @@ class MapSession:
     odometry: bool
 
     def covers(self, map_ns: int) -> bool:
-        """Whether the recording covers a stamp of the map's clock."""
+        """Return whether the recording covers a stamp of the map's clock."""
         return self.first_ns <= map_ns - self.shift_ns <= self.last_ns
 
 
@@ -71,12 +71,12 @@ class MapFolder:
     def open(cls, path: Path) -> MapFolder:
         """Open an existing map."""
         if not (path / "map.json").is_file():
-            raise UmfError(f"{path} holds no map: map.json is missing (umf map makes one)")
+            raise UmfError(f"{path} is not a map: map.json is missing; make one with umf map")
         folder = cls(path)
         try:
             content = json.loads((path / "map.json").read_text(encoding="utf-8"))
             if content["schema"] != SCHEMA_VERSION:
-                raise UmfError(f"{path} is of another version of umf_ros; build the map again from its recordings")
+                raise UmfError(f"{path} is from another version of umf_ros; rebuild the map from its recordings")
             folder.sessions = [MapSession(**session) for session in content["sessions"]]
         except (OSError, ValueError, KeyError, TypeError):
             raise UmfError(f"{path / 'map.json'} is damaged") from None
@@ -109,25 +109,25 @@ class MapFolder:
         return self.path / "sessions" / name
 
     def odometry_of(self, name: str) -> list[StoredOdometry]:
-        """Odometry of a recording, stamped by its own clock."""
+        """Return the odometry of a recording, stamped by its own clock."""
         if (self.folder_of(name) / "odometry.npz").is_file():
-            raise UmfError(f"{self.path} is of an earlier version of umf_ros; build the map again from its recordings")
+            raise UmfError(f"{self.path} is from an earlier version of umf_ros; rebuild the map from its recordings")
         with closing(RunFile(self.folder_of(name), read_only=True)) as file:
             return list(file.odometry())
 
     def session_at(self, map_ns: int) -> MapSession | None:
-        """The recording that covers a stamp of the map's clock."""
+        """Return the recording that covers a stamp of the map's clock."""
         return next((session for session in self.sessions if session.covers(map_ns)), None)
 
-    def knows(self, recording: dict[str, Any]) -> MapSession | None:
-        """The session of a recording, whatever the path of its file."""
+    def find(self, recording: dict[str, Any]) -> MapSession | None:
+        """Return the session of a recording, independent of the path of its file."""
         keys = "start_ns", "end_ns", "messages"
         same = (one for one in self.sessions if all(one.recording[key] == recording[key] for key in keys))
         return next(same, None)
 
-    def free_name(self, path: Path, promised: Collection[str] = ()) -> str:
-        """A session name for a recording that is neither taken nor promised."""
-        taken = {session.name for session in self.sessions} | set(promised)
+    def free_name(self, path: Path, reserved: Collection[str] = ()) -> str:
+        """Return a session name for a recording that is neither taken nor reserved."""
+        taken = {session.name for session in self.sessions} | set(reserved)
         names = (path.stem if number == 1 else f"{path.stem}_{number}" for number in range(1, len(taken) + 2))
         return next(name for name in names if name not in taken)
 

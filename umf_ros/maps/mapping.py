@@ -40,14 +40,14 @@ from umf_ros.runs.writer import PLACES, count_drops
 from umf_ros.verification import Hypothesis, Verifier
 
 OnFrame = Callable[[float, Detection], None]
-"""Called for every frame with the share of the recording that is done, 0 to 1, and the detection."""
+"""Called for every frame with the processed share of the recording, 0 to 1, and the detection."""
 _UNKNOWN = np.diag([np.inf] * 6)
 RECORDINGS = (".mcap", ".db3", ".bag")
 
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """Options of `umf replay` that recordings are opened with.
+    """Options that recordings are opened with, as in `umf replay`.
 
     Attributes:
         odometry: folder of TUM files named like the recordings, `NAME.tum` or `NAME.odometry.tum`; None: none.
@@ -62,12 +62,12 @@ class Opening:
     odometry_frame: str = "body"
 
     def settings(self, bag: Bag) -> Settings:
-        """Settings for a recording."""
+        """Return settings for a recording."""
         overrides = {"embedding__method": self.embedder, "embedding__weights": self.weights}
         return settings_for(bag, self.config, self.dataset, mode="mapping", **overrides)
 
     def odometry_of(self, recording: Path, settings: Settings) -> Trajectory | None:
-        """The odometry of a recording from its TUM file; None where there is none."""
+        """Return the odometry of a recording from its TUM file; None where there is none."""
         if self.odometry is None:
             return None
         for ending in (".tum", ".odometry.tum"):
@@ -78,14 +78,14 @@ class Opening:
 
 
 def find_recordings(paths: list[Path]) -> list[Path]:
-    """The recordings among files and folders, those of a folder sorted by name; each path must hold one."""
+    """Return the recordings among files and folders, those of a folder sorted by name; each path must have one."""
     found = []
     for path in paths:
         if not path.exists():
             raise BagError(f"there is no recording {path}")
         inside = [path] if path.is_file() or _is_recording(path) else sorted(filter(_is_recording, path.iterdir()))
         if not inside:
-            raise BagError(f"{path} holds no recording ({', '.join(RECORDINGS)}, or a folder with metadata.yaml)")
+            raise BagError(f"{path} is not a recording ({', '.join(RECORDINGS)}, or a folder with metadata.yaml)")
         found += inside
     return list(dict.fromkeys(path.resolve() for path in found))
 
@@ -140,7 +140,7 @@ def _track(folder: Path, settings: Settings) -> None:
 def track(keyframes: Iterable[Keyframe], settings: Verification) -> tuple[list[StoredOdometry], list[Keyframe]]:
     """Track a recording without odometry by closures between consecutive keyframes.
 
-    Where two consecutive keyframes have no closure, a new session begins, which other closures have to connect.
+    Two consecutive keyframes without a closure begin a new session, which other closures have to connect.
 
     Args:
         keyframes: of one recording, in order, without odometry.
@@ -174,7 +174,7 @@ def _closure(before: Keyframe, keyframe: Keyframe, settings: Verification) -> Lo
 
 
 def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
-    """Add the run folder of a recording to the map: its places move to the map's store, on the map's clock.
+    """Add the run folder of a recording to the map: its places move to the map's database, on the map's clock.
 
     Places that a killed process left behind are removed first. All recordings must be embedded by one network.
     """
@@ -212,9 +212,9 @@ def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
 
 
 def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Hypothesis]]:
-    """Match a recording against the earlier ones; yields the verdicts of every keyframe, accepted ones first.
+    """Match a recording against the earlier ones; yield the verdicts of every keyframe, accepted ones first.
 
-    Writes `closures_between.csv`, complete or not at all. The map's store is only read: several sessions may be
+    Writes `closures_between.csv` atomically. The map's database is only read: several sessions may be
     matched at once.
     """
     settings = target.settings
@@ -235,18 +235,18 @@ def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Hypot
 
 
 def replay_task(task: tuple[Path, Opening, Path]) -> None:
-    """`replay_session` as a task of another process."""
+    """Run `replay_session` as a task of another process."""
     replay_session(*task)
 
 
 def match_task(task: tuple[Path, MapSession]) -> None:
-    """`match_session` as a task of another process, given the folder of the map."""
+    """Run `match_session` as a task of another process, given the folder of the map."""
     for _ in match_session(MapFolder.open(task[0]), task[1]):
         pass
 
 
 def unmatched(target: MapFolder) -> list[MapSession]:
-    """Sessions that were added and are not matched completely against the earlier ones."""
+    """Return the added sessions that are not matched completely against the earlier ones."""
     return [session for session in target.sessions if not (target.folder_of(session.name) / BETWEEN).is_file()]
 
 

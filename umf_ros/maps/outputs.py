@@ -26,7 +26,7 @@ from umf_ros.runs.report import plot_trajectories, render
 
 
 def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
-    """Write all results of a solved map; returns the summary."""
+    """Write all results of a solved map; return the summary."""
     path = folder.path
     _write_poses(path / POSES, joint)
     trajectories = path / "trajectories"
@@ -46,7 +46,7 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
 
 
 def summarise(joint: JointMap) -> dict[str, Any]:
-    """Contents of `summary.json`."""
+    """Return the contents of `summary.json`."""
     ties = Counter(
         one.session.name
         for closure in joint.accepted_between()
@@ -63,13 +63,13 @@ def summarise(joint: JointMap) -> dict[str, Any]:
 
 
 def sentence(summary: dict[str, Any]) -> str:
-    """Joined sessions and closures between them, in one sentence."""
+    """Return a sentence on joined sessions and closures between them."""
     between, joined = summary["closures_between"], f"{summary['joined']} of {len(summary['sessions'])} sessions"
     return f"{joined} in one frame; closures between them: {between['accepted']} of {between['found']} accepted"
 
 
 def crispness(summary: dict[str, Any]) -> str:
-    """Thickness of surfaces in a sentence; empty where no two sessions overlap."""
+    """Return a sentence on the thickness of surfaces; empty where no sessions overlap."""
     thickness = summary["thickness_m"]
     if thickness["after"] is None:
         return ""

@@ -47,7 +47,7 @@ class MapCloud:
         return MapCloud(self.points[first], self.sessions[first])
 
     def thickness(self) -> float:
-        """Median thickness in m of the surfaces that at least two recordings saw; thinner surfaces: a crisper map.
+        """Return the median thickness in m of surfaces seen by at least two recordings; thinner means a crisper map.
 
         The standard deviation across the plane through the neighbours within half a metre of points all over the map
         [after the mean plane variance of Razlaw 2015]; NaN where no two recordings overlap.
@@ -63,7 +63,7 @@ class MapCloud:
 
 
 def gather(folder: MapFolder, joint: JointMap, optimised: bool = True) -> MapCloud:
-    """The scans of all joined recordings at their poses in the map, or at those of their odometry alone."""
+    """Return the scans of all joined recordings at their poses in the map, or at those of their odometry alone."""
     points, sessions = [np.empty((0, 3), np.float32)], [np.empty(0, np.uint8)]
     with closing(PlaceDatabase.of_map(folder.path, *stored_identity(folder.places))) as places:
         for number, one in enumerate(joint.sessions):
