@@ -148,7 +148,7 @@ def test_bytes_that_are_no_message_are_skipped_and_counted(tmp_path: Path) -> No
     frames = list(reader)
     garbled = reader.counters["cloud"].dropped["undecodable"]
     assert garbled > 2 and len(frames) == SCANS - garbled
-    assert len(told) == 1 and "not what its type" in told[0]
+    assert len(told) == 1 and "does not match its type" in told[0]
     with pytest.raises(BagError, match=f"{path}: {CLOUD}: message does not match its type"):
         list(open_bag(path).messages())
 

@@ -63,7 +63,7 @@ def test_revisits_of_which_none_was_closed_are_not_green(tmp_path: Path) -> None
 def test_nothing_to_find_is_green(tmp_path: Path) -> None:
     tested = [candidate(50, 10, RejectReason.NO_POSE)]
     mark, status, sentence = verdict(examined(tmp_path, candidates=tested, truth=trajectory()))
-    assert (mark, status) == ("good", 0) and sentence.startswith("No place was seen twice. 0 true and 0 false")
+    assert (mark, status) == ("good", 0) and sentence.startswith("No place was revisited. 0 true and 0 false")
 
 
 def test_nothing_found_without_a_truth_is_not_green(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_nothing_found_without_a_truth_is_not_green(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"frames": 0, "pairs": 0, "keyframes": 0, "keyframe_rows": []}, "No keyframe came of 0 frames"),
+        ({"frames": 0, "pairs": 0, "keyframes": 0, "keyframe_rows": []}, "None of 0 frames became a keyframe"),
         (
             {"pairs": 0, "inputs": {name: {"received": 9, "used": 9, "dropped": {}} for name in ("left", "cloud")}},
             "None of 90 scans has an image within 0.05 s of it",
@@ -111,7 +111,7 @@ def test_a_truth_of_another_clock_is_named_and_judges_nothing(tmp_path: Path) ->
     whole = trajectory()
     late = Trajectory(whole.stamps_ns + 10**13, whole.poses)
     mark, _, sentence = verdict(examined(tmp_path, [closure(50, 10)], verdict=accepted(), truth=late))
-    assert mark == "bad" and sentence.startswith("The ground truth is of another clock: it covers none of the 40 key")
+    assert mark == "bad" and sentence.startswith("The ground truth has another clock: it covers none of the 40 key")
     assert "+10000.0 s from start to start" in sentence and "true and" not in sentence
 
 

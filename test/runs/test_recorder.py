@@ -146,7 +146,7 @@ def test_a_keyframe_that_was_asked_and_found_nothing_is_no_query(tmp_path: Path)
 @pytest.mark.parametrize("content", ["", "[1, 2]", '{"frames": 3}', '{"closures_published": '])
 def test_a_foreign_summary_is_one_clear_line(tmp_path: Path, content: str) -> None:
     (tmp_path / "summary.json").write_text(content)
-    with pytest.raises(UmfError, match=r"summary\.json is not the summary of a run"):
+    with pytest.raises(UmfError, match=r"summary\.json is not a summary of a run"):
         read_summary(tmp_path)
 
 

@@ -28,7 +28,7 @@ def test_the_run_that_was_interrupted_is_found(tmp_path: Path) -> None:
 def test_another_recording_or_other_settings_are_not_resumed(tmp_path: Path) -> None:
     cut = begun(tmp_path, Settings())
     assert unfinished_folder(tmp_path, Path("other.mcap"), Settings()) is None
-    with pytest.raises(UmfError, match=f"{cut.name} was begun with other settings"):
+    with pytest.raises(UmfError, match=f"{cut.name} was started with other settings"):
         unfinished_folder(tmp_path, BAG, load_settings(loop__top_k=3))
 
 

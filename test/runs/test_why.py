@@ -43,7 +43,7 @@ def test_a_place_that_was_not_returned_comes_with_its_rank(tmp_path: Path) -> No
     about = examined(tmp_path, candidates=[candidate(50, 30, RejectReason.IMPROBABLE)], truth=trajectory())
     found = why(about, 50)
     assert found.gate == "retrieval" and found.match_stamp_ns == stamp(10) and found.distance_m == 0
-    assert found.what.startswith("the database returned 1 candidates, none of them the place 0.0 m away, which is num")
+    assert found.what.startswith("the database returned 1 candidates, none of them the place 0.0 m away, which has ra")
     assert found.parameter.startswith("loop.top_k: ")
 
 

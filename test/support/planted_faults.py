@@ -95,7 +95,7 @@ def faults(settings: Settings) -> list[Planted]:
         Planted("empty right image", ("right images are empty",), empty_right),
         Planted("wrong baseline", ("baseline is wrong",), long_baseline, calibration=_long),
         Planted("all closures pending", ("all closures are pending",), options=_short_odometry),
-        Planted("truth of another clock", ("ground truth is of another clock",), options=_other_clock),
+        Planted("truth of another clock", ("ground truth has another clock",), options=_other_clock),
     ]
 
 

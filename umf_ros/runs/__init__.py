@@ -1,1 +1,1 @@
-"""The folder a run leaves behind."""
+"""Folder of a run: writing, reading, judging and reporting."""

@@ -28,13 +28,13 @@ class ClosureDiagnosis:
 
     Attributes:
         stamp_ns: the keyframe.
-        gate: what stopped it.
-        what: that in a sentence, with by how much.
-        parameter: what would let it through, and what that costs; empty where no parameter would.
-        match_stamp_ns: the place it is about: the right one, where the truth knows it and it was returned, else the
-            most promising; None where nothing was returned.
-        distance_m: of the two in truth, infinite where it is unknown.
-        contributions: log-odds that each criterion adds, where a pose was judged; "bias" is what has to be overcome.
+        gate: the stage that rejected it.
+        what: the reason in a sentence, with its margin.
+        parameter: parameter that would accept it, and the cost of that; empty without one.
+        match_stamp_ns: the matched place: the right one, if the truth covers it and it was returned, else the
+            most promising; None if none was returned.
+        distance_m: true distance of both, infinite where it is unknown.
+        contributions: log-odds of each criterion, where a pose was judged; "bias" is the constant term.
     """
 
     stamp_ns: int
@@ -47,7 +47,7 @@ class ClosureDiagnosis:
 
 
 def explain(about: JudgedRun, row: int) -> ClosureDiagnosis:
-    """Why the keyframe at this place among all found nothing, or that it did."""
+    """Return the diagnosis of the keyframe in this row, also of one with a closure."""
     stamp = int(about.run.stamps[row])
     allowed, tested = np.flatnonzero(about.admissible(row)), about.tested[stamp]
     if not len(allowed) and not tested:
@@ -62,7 +62,7 @@ def explain(about: JudgedRun, row: int) -> ClosureDiagnosis:
 
 
 def contributions(about: JudgedRun, candidate: Hypothesis) -> dict[str, float]:
-    """Log-odds of each criterion, where a pose was judged by the fitted decision."""
+    """Return log-odds of each criterion, where a pose was judged by the fitted decision."""
     if not candidate.kind:
         return {}
     acceptance = _acceptance(about.run.settings.verification.calibration)
@@ -70,7 +70,7 @@ def contributions(about: JudgedRun, candidate: Hypothesis) -> dict[str, float]:
 
 
 def missing(about: JudgedRun, candidate: Hypothesis) -> dict[str, float]:
-    """Log-odds that each criterion could have added and did not, the most first."""
+    """Return log-odds that each criterion could have added and did not, the most first."""
     if not candidate.kind:
         return {}
     lost = _acceptance(about.run.settings.verification.calibration).lost(candidate.measurements)
@@ -78,13 +78,13 @@ def missing(about: JudgedRun, candidate: Hypothesis) -> dict[str, float]:
 
 
 def most_probable(about: JudgedRun, stamp_ns: int) -> Hypothesis | None:
-    """The candidate of a keyframe that nothing but its probability keeps from being a closure, if it does."""
+    """Return the candidate of a keyframe that only its probability keeps from being a closure, if there is one."""
     tested = [one for one in about.tested[stamp_ns] if one.reason in (None, RejectReason.IMPROBABLE)]
     return max(tested, key=lambda one: one.probability or 0, default=None)
 
 
 def _at_threshold(about: JudgedRun, threshold: float) -> tuple[int, int]:
-    """Closures that would be published from this probability on, and how many of them join no same place."""
+    """Return the numbers of closures published from this probability on, and of those between different places."""
     best = filter(None, (most_probable(about, stamp) for stamp in about.tested))
     published = [one for one in best if (one.probability or 0) >= threshold]
     return len(published), sum(about.is_same_place(*one.endpoints) is False for one in published)
@@ -96,7 +96,7 @@ def _gaps(about: JudgedRun, row: int, stamp: int) -> ClosureDiagnosis:
         f"the gap rules allow no match: none of {row} earlier keyframes is {rules.min_time_gap_s:g} s older and "
         f"{rules.min_travel_m:g} m back; the first is {(stamp - int(about.run.stamps[0])) * 1e-9:.1f} s older"
     )
-    parameter = "loop.min_time_gap_s and loop.min_travel_m: smaller ones match a place with what was just seen"
+    parameter = "loop.min_time_gap_s and loop.min_travel_m: smaller ones match a place with recent keyframes"
     return ClosureDiagnosis(stamp, "gap rules", what, parameter)
 
 
@@ -109,7 +109,7 @@ def _retrieval(about: JudgedRun, row: int, allowed: np.ndarray, right: np.ndarra
     distance = float(about.distances(row)[match])
     what += f", none of them the place {distance:.1f} m away"
     if rank:
-        what += f", which is number {rank} of {len(allowed)} by its similarity of {similarity:.2f}"
+        what += f", which has rank {rank} of {len(allowed)} by its similarity of {similarity:.2f}"
         parameter = f"loop.top_k: {rank} (now {rules.top_k}); each candidate is reranked once more"
     if similarity < rules.min_similarity:
         parameter = f"loop.min_similarity: {similarity:.2f} (now {rules.min_similarity:g})"
@@ -119,7 +119,7 @@ def _retrieval(about: JudgedRun, row: int, allowed: np.ndarray, right: np.ndarra
 def _best_rank(
     descriptors: np.ndarray | None, row: int, allowed: np.ndarray, right: np.ndarray
 ) -> tuple[int, float, int]:
-    """Rank, similarity and row of the most similar right place; rank 0 without descriptors."""
+    """Return the rank, similarity and row of the most similar right place; rank 0 without descriptors."""
     if descriptors is None:
         return 0, nan, int(right[0])
     similarities = descriptors @ descriptors[row]
@@ -128,7 +128,7 @@ def _best_rank(
 
 
 def _decision(about: JudgedRun, best: Hypothesis) -> tuple[Gate, str, str]:
-    """Gate, sentence and parameter of a candidate that was tested."""
+    """Return the gate, sentence and parameter of a candidate that was tested."""
     match best.reason:
         case None:
             return "found", f"a loop closure was published, probability {best.probability or 0:.3f}", ""
@@ -148,7 +148,7 @@ def _decision(about: JudgedRun, best: Hypothesis) -> tuple[Gate, str, str]:
 
 
 def _probability(about: JudgedRun, best: Hypothesis) -> tuple[str, str]:
-    """Sentence and parameter of a candidate that was too improbable."""
+    """Return the sentence and parameter of a candidate that was too improbable."""
     least, probability = about.run.settings.verification.min_probability, best.probability or 0.0
     short = float(np.diff(logit(np.clip([probability, least], 1e-9, 1 - 1e-9)))[0])
     lacking = [f"{name.replace('_', ' ')} {lost:.1f}" for name, lost in list(missing(about, best).items())[:3]]

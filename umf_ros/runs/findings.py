@@ -1,4 +1,4 @@
-"""Findings about a run, worst first, and the verdict that they add up to."""
+"""Findings about a run, worst first, and the verdict."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from umf_ros.runs.diagnosis import ClosureDiagnosis, explain
 from umf_ros.runs.truth import JudgedRun, in_words
 
 REFUSED = ("size", "encoding", "step", "truncated", "compressed", "fields", "datatype", "unusable", "stamp")
-"""Reasons why a message is of no use by itself, whatever the others are."""
+"""Reasons for which a message is unusable by itself."""
 MUCH_MISSED, MUCH_REJECTED, WELL_COVERED = 0.3, 0.2, 0.5
-"""Shares, by hand: of revisits, of closures, of keyframes."""
+"""Shares worth a finding, by hand: of revisits, of closures, of keyframes."""
 FEW_VIEWS, BIAS_PX = 5, 0.35
-"""Closures by images whose bias of the disparities is worth a word, and least bias, by hand."""
+"""Least number of closures by images for a bias of the disparities, and least bias, by hand."""
 SLOW = 1.0
-"""Recorded time by the time it took, below which a rover runs ahead of the detector."""
+"""Recorded time over processing time, below which a rover outruns the detector."""
 SHARES = 4
 """A match may be a quarter of the run back, and without odometry a quarter has as many keyframes: by hand."""
 MOST_EXPLAINED = 200
-"""Missed revisits that are looked into; more change no advice."""
+"""Most missed revisits that are explained; more do not change the advice."""
 
 
 def explain_missed(about: JudgedRun) -> list[ClosureDiagnosis]:
-    """Why each missed revisit was missed, of `MOST_EXPLAINED` at most."""
+    """Return the diagnoses of missed revisits, `MOST_EXPLAINED` at most."""
     chosen = about.missed[:: max(1, len(about.missed) // MOST_EXPLAINED)]
     rows = [about.row(stamp) for stamp in chosen]
     return [explain(about, row) for row in rows if row is not None]
 
 
 def _states(about: JudgedRun) -> Counter[str]:
-    """How many closures the graph left in which state."""
+    """Return the number of closures by their state in the graph."""
     return Counter(verdict.state for verdict in about.run.verdicts.values())
 
 
@@ -61,11 +61,11 @@ def _truth(about: JudgedRun) -> Iterator[Advice]:
     if not known:
         off_s = (int(run.truth.stamps_ns[0]) - int(run.stamps[0])) * 1e-9
         clocks = f"{spans[0]} against {spans[1]}, {off_s:+.1f} s from start to start"
-        what = f"the ground truth is of another clock: it covers none of the {total} keyframes ({clocks})"
+        what = f"the ground truth has another clock: it covers none of the {total} keyframes ({clocks})"
         yield Advice("fault", what, "shift its stamps to those of the sensors; nothing was judged")
     elif known < WELL_COVERED * total:
         what = f"the ground truth covers {known} of {total} keyframes ({spans[0]} against {spans[1]})"
-        yield Advice("warning", what, "closures outside of it are not judged")
+        yield Advice("warning", what, "closures outside are not judged")
 
 
 def _pairs(about: JudgedRun) -> Iterator[Advice]:
@@ -78,8 +78,8 @@ def _pairs(about: JudgedRun) -> Iterator[Advice]:
         what = f"none of {summary['frames']} scans has an image within {settings.sync.slop_s:g} s of it"
         yield Advice("fault", what, "the clocks of camera and LiDAR differ, or sync.slop_s is too small")
     if not summary["keyframes"]:
-        what = f"no keyframe came of {summary['frames']} frames"
-        yield Advice("fault", what, "umf inspect lists what the recording holds")
+        what = f"none of {summary['frames']} frames became a keyframe"
+        yield Advice("fault", what, "umf inspect lists the contents of the recording")
 
 
 def _gaps(about: JudgedRun) -> Iterator[Advice]:
@@ -90,13 +90,13 @@ def _gaps(about: JudgedRun) -> Iterator[Advice]:
         return
     seconds = (int(about.run.stamps[-1]) - int(about.run.stamps[0])) * 1e-9
     metres = np.nanmax(about.run.keyframes["path_length_m"], initial=0.0)
-    asked = f"a match must be {rules.min_time_gap_s:g} s older and {rules.min_travel_m:g} m back"
-    what = f"the gap rules exclude every pair: {asked}, and the run lasts {seconds:.0f} s and {metres:.0f} m"
+    rule = f"a match must be {rules.min_time_gap_s:g} s older and {rules.min_travel_m:g} m back"
+    what = f"the gap rules exclude every pair: {rule}, and the run lasts {seconds:.0f} s and {metres:.0f} m"
     yield Advice("fault", what, gap_remedy(seconds, float(metres), about.run.settings))
 
 
 def gap_remedy(seconds: float, metres: float | None, settings: Settings) -> str:
-    """Settings with which a run of this duration has matches that the gap rules allow.
+    """Return settings with which a run of this duration has matches that the gap rules allow.
 
     Args:
         seconds: duration.
@@ -105,7 +105,7 @@ def gap_remedy(seconds: float, metres: float | None, settings: Settings) -> str:
     """
     changes = {"loop.min_time_gap_s": (settings.loop.min_time_gap_s, seconds / SHARES)}
     if metres == 0:
-        # time alone selects keyframes, too
+        # keyframes are selected by time, too
         for name in ("untracked_period_s", "min_period_s"):
             changes[f"keyframe.{name}"] = getattr(settings.keyframe, name), seconds / (SHARES * SHARES)
     else:
@@ -113,7 +113,7 @@ def gap_remedy(seconds: float, metres: float | None, settings: Settings) -> str:
     text = ", ".join(f"{name}: {new:.2g}" for name, (old, new) in changes.items() if new < old)
     if metres is None:
         text += ", loop.min_travel_m: a quarter of the path length"
-    return text + (" (or give odometry: --odometry FILE.tum)" if metres == 0 else "")
+    return text + (" (or supply odometry: --odometry FILE.tum)" if metres == 0 else "")
 
 
 def _graph(about: JudgedRun) -> Iterator[Advice]:
@@ -123,13 +123,13 @@ def _graph(about: JudgedRun) -> Iterator[Advice]:
     reasons = Counter(one.reason for one in verdicts if one.state != State.ACCEPTED).most_common(1)
     if pending and not states[State.ACCEPTED]:
         what = f"all closures are pending: the graph used none of {total} ({reasons[0][0]})"
-        remedy = "the odometry must reach the keyframes of the closures; pending is not rejected"
+        remedy = "the odometry must cover the keyframes of the closures; pending is not rejected"
         yield Advice("fault", f"{what}, so the optimised trajectory is the odometry", remedy)
     elif rejected > MUCH_REJECTED * total:
         sigma = np.nanmedian([one.residual for one in verdicts if one.state == State.REJECTED] or [np.nan])
         what = f"the graph rejected {rejected} of {total} closures ({reasons[0][0]}, {sigma:.1f} sigma in the median)"
         settings = "pose_graph.odometry_sigma_m and odometry_sigma_deg"
-        yield Advice("warning", what, f"odometry worse than {settings} say, or wrong closures: click some")
+        yield Advice("warning", what, f"odometry worse than {settings} state, or wrong closures: inspect some")
 
 
 def _absolute(about: JudgedRun) -> Iterator[Advice]:
@@ -167,7 +167,7 @@ def _closures(about: JudgedRun) -> Iterator[Advice]:
 
 
 def _unjudged(about: JudgedRun) -> Iterator[Advice]:
-    """Nothing was found, and without a truth it is unknown whether there was anything to find."""
+    """Report runs without closures and without a truth, which would show whether there were revisits."""
     run = about.run
     if run.closures or run.truth is not None or not run.candidates:
         return
@@ -182,7 +182,7 @@ def _disparity(about: JudgedRun) -> Iterator[Advice]:
     known = np.array([bias for bias in found if np.isfinite(bias)])
     if len(known) >= FEW_VIEWS and abs(median := float(np.median(known))) > BIAS_PX:
         more, less = ("too little", "far") if median > 0 else ("too much", "near")
-        what = f"stereo measures {abs(median):.1f} px {more} disparity: distant features seem too {less}"
+        what = f"stereo measures {abs(median):.1f} px {more} disparity: distant features appear too {less}"
         yield Advice("warning", what, "rectification of the calibration, or R and P of both camera_info")
 
 
@@ -199,24 +199,24 @@ def _map(about: JudgedRun) -> Iterator[Advice]:
     before, after = about.ate_odometry_m, about.ate_optimized_m
     if before is not None and after is not None and after > 1.1 * before:
         what = f"the optimised trajectory is worse than the odometry: {after:.2f} m against {before:.2f} m"
-        remedy = "colour the closures by the graph's verdict; wrong ones pull, pose_graph.odometry_sigma_* weigh"
+        remedy = "colour the closures by the graph's verdict, look for wrong ones, check pose_graph.odometry_sigma_*"
         yield Advice("warning", what, remedy)
 
 
 def _speed(about: JudgedRun) -> Iterator[Advice]:
     summary, costs = about.run.summary, "verification.refine_best and loop.top_k cost the most"
     if summary["drops"].get("worker"):
-        what = f"{summary['drops']['worker']} frames were dropped because the machine was late"
-        yield Advice("warning", what, f"{costs}, keyframe.* how often")
+        what = f"{summary['drops']['worker']} frames were dropped because the machine was too slow"
+        yield Advice("warning", what, f"{costs}, keyframe.* sets their number")
     factor = summary.get("realtime_factor", SLOW)
     if summary["keyframes"] and 0 < factor < SLOW:
         what = f"slower than the recording: {factor:.2f} of its speed"
-        yield Advice("note", what, f"{costs}, keyframe.min_translation_m how often")
+        yield Advice("note", what, f"{costs}, keyframe.min_translation_m sets their number")
 
 
 def _end(about: JudgedRun) -> Iterator[Advice]:
     if about.run.summary.get("interrupted"):
-        yield Advice("note", "the run was interrupted: it covers what was done until then")
+        yield Advice("note", "the run was interrupted: results cover the part before")
 
 
 _CAUSES = (_truth, _gaps, lambda about: about_sensors(about.sensors), _disparity, _pairs, _inputs)
@@ -224,7 +224,7 @@ _EFFECTS = (_graph, _absolute, _closures, _unjudged, _map, _stated_errors, _spee
 
 
 def look_first(about: JudgedRun) -> list[Advice]:
-    """Every finding: causes before what they bring about, of either kind the worst first, and notes at the end."""
+    """Return every finding: causes before their effects, the worst of each kind first, and notes at the end."""
     kinds = [[finding for rule in rules for finding in rule(about)] for rules in (_CAUSES, _EFFECTS)]
     worst_first = [one for found in kinds for one in sorted(found, key=lambda one: SEVERITIES.index(one.severity))]
     return sorted(worst_first, key=lambda one: one.severity == "note")
@@ -232,12 +232,12 @@ def look_first(about: JudgedRun) -> list[Advice]:
 
 Mark = Literal["good", "warn", "bad"]
 USELESS = 3
-"""Exit status of a run that ended well on inputs that could not give anything."""
+"""Exit status of a complete run whose inputs could not give any result."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunVerdict:
-    """A sentence for a person, its mark in the style sheet, and the exit code of the command."""
+    """Sentence for the user, its mark in the style sheet, and the exit status of the command."""
 
     sentence: str
     mark: Mark
@@ -245,7 +245,7 @@ class RunVerdict:
 
 
 def conclude(about: JudgedRun, findings: list[Advice]) -> RunVerdict:
-    """Green only when something was found, or when there was nothing to find."""
+    """Return the verdict: green only with a closure found, or without any revisit."""
     sentence = ", ".join(filter(None, (_found(about), _used(about)))) + _errors(about) + "."
     warnings = [finding for finding in findings if finding.severity != "note"]
     if any(finding.severity == "fault" for finding in warnings):
@@ -254,7 +254,7 @@ def conclude(about: JudgedRun, findings: list[Advice]) -> RunVerdict:
         return RunVerdict(sentence, "good")
     nothing_to_find = about.covered[0] and not about.revisits
     if not about.run.closures and nothing_to_find:
-        return RunVerdict(f"No place was seen twice. {sentence}", "good" if not warnings else "warn")
+        return RunVerdict(f"No place was revisited. {sentence}", "good" if not warnings else "warn")
     if warnings:
         return RunVerdict(f"{_capital(warnings[0].what)}. {sentence}", "warn")
     return RunVerdict(sentence, "warn")
@@ -262,14 +262,14 @@ def conclude(about: JudgedRun, findings: list[Advice]) -> RunVerdict:
 
 def _found(about: JudgedRun) -> str:
     if about.run.truth is None or (about.covered[1] and not about.covered[0]):
-        reason = "there is no ground truth" if about.run.truth is None else "no ground truth of this time"
+        reason = "there is no ground truth" if about.run.truth is None else "no ground truth covers this time"
         return f"{len(about.run.closures)} loop closures; {reason} to judge them by"
     true = int(about.closures.is_true.sum())
     return f"{true} true and {len(about.closures) - true} false loop closures at {about.revisits} revisits"
 
 
 def _used(about: JudgedRun) -> str:
-    """How many closures the graph used, and the states of the others."""
+    """Return the number of closures that the graph used, and the states of the others."""
     states = _states(about)
     total, accepted, pending = states.total(), states[State.ACCEPTED], states[State.PENDING]
     if not total:

@@ -29,7 +29,7 @@ class HeightMap:
     """
 
     def __init__(self, path: Array) -> None:
-        """A map around the (N, 2) places of a path, N > 0."""
+        """Make an empty map around the (N, 2) positions of a path, N > 0."""
         self.lower = path.min(axis=0) - MAP_REACH_M
         span = path.max(axis=0) + MAP_REACH_M - self.lower
         self._cell = max(0.1, float(span.max()) / MAP_CELLS)
@@ -38,14 +38,14 @@ class HeightMap:
         self.upper = self.lower + np.array(self._shape) * self._cell
 
     def add(self, points: Array) -> None:
-        """Lay (N, 3) points of the map's frame into it."""
+        """Add (N, 3) points in the map's frame."""
         column, row = np.floor((points[:, :2] - self.lower) / self._cell).astype(int).T
         inside = (column >= 0) & (row >= 0) & (column < self._shape[0]) & (row < self._shape[1])
         np.add.at(self._sum, (column[inside], row[inside]), points[inside, 2])
         np.add.at(self._count, (column[inside], row[inside]), 1)
 
     def png(self) -> bytes | None:
-        """Heights as colours, relief as light from the north-west, nothing where nothing was seen; None without any."""
+        """Return heights as colours and relief as light from the north-west, blank where unknown; None if empty."""
         seen = self._count > 0
         if not seen.any():
             return None
@@ -78,7 +78,7 @@ class Gallery:
     heights: HeightMap | None = None
 
     def image(self, stamp_ns: int) -> Image | None:
-        """The left image (H, W) of a keyframe in its size, without the detail that was reduced."""
+        """Return the left image (H, W) of a keyframe in its size, without the detail that was reduced."""
         picture = self.pictures.get(stamp_ns)
         if picture is None or not picture.jpeg:
             return None
@@ -86,13 +86,13 @@ class Gallery:
         return cv2.resize(reduced, (picture.width, picture.height), interpolation=cv2.INTER_CUBIC)
 
     def scan(self, stamp_ns: int) -> str:
-        """Some points of a keyframe's scan as base64 of little-endian int16 triples in `SCAN_UNIT_M`, body frame."""
+        """Return some points of a keyframe's scan: base64, little-endian int16 triples in `SCAN_UNIT_M`, body frame."""
         scan = self.pictures[stamp_ns].scan
         chosen = scan[np.linspace(0, len(scan) - 1, min(len(scan), SHOWN_POINTS)).astype(int)]
         return base64.b64encode(chosen.astype("<i2").tobytes()).decode("ascii")
 
     def map_picture(self) -> dict[str, Any] | None:
-        """The map: `data:` address, (x, y) in m of `lower` left and `upper` right corner; None if empty."""
+        """Return the map: `data:` address, (x, y) in m of `lower` left and `upper` right corner; None if empty."""
         png = self.heights.png() if self.heights is not None else None
         if self.heights is None or png is None:
             return None
@@ -106,7 +106,7 @@ def read_gallery(folder: Path, shown: Container[int], drawn: Trajectory | None) 
     Args:
         folder: of the run.
         shown: stamps of the keyframes whose pictures are kept.
-        drawn: trajectory along which the scans are laid into a map from above; None: no map.
+        drawn: trajectory along which the scans are drawn into a map from above; None: no map.
     """
     gallery = Gallery(heights=HeightMap(drawn.poses[:, :2, 3]) if drawn is not None and len(drawn) else None)
     if not (folder / NAME).is_file():  # of an earlier release
@@ -125,5 +125,5 @@ def read_gallery(folder: Path, shown: Container[int], drawn: Trajectory | None) 
 
 
 def data_address(kind: str, content: bytes) -> str:
-    """Content inside an address."""
+    """Return the content inside an address."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

@@ -22,21 +22,21 @@ from umf_ros.runs.writer import read_summary, write_summary
 from umf_ros.verification.hypothesis import Hypothesis
 
 CLOCK_SLACK_NS = 5_000_000_000
-"""Stamps of sensors may lie this far from the times of recording."""
+"""Largest difference of stamps of sensors from the times of recording."""
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """Files that the nodes or the replay have left in a run folder, and the truth.
+    """Files of the nodes or the replay in a run folder, and the truth.
 
     Attributes:
         folder: of the run.
-        summary: what `summary.json` holds.
+        summary: contents of `summary.json`.
         settings: those that the run was made with.
         closures: that were published; a closure's number is its place in this list, from 1.
         keyframes: (N,) `stamp_ns`, `session` and `path_length_m`, NaN without odometry, in the order of their stamps.
-        candidates: everything that was tested.
-        verdicts: what the graph did with the closures in the end, by stamps of query and match; none without a graph.
+        candidates: all tested candidates.
+        verdicts: final verdicts of the graph on the closures, by stamps of query and match; empty without a graph.
         odometry, optimized: trajectories, or None where they were not written.
         truth: or None.
     """
@@ -66,7 +66,7 @@ class FinishedRun:
 
     @cached_property
     def latencies_ms(self) -> dict[int, float]:
-        """Milliseconds that a keyframe took, by its stamp."""
+        """Latency of each keyframe in ms, by its stamp."""
         path = self.folder / "latencies.csv"
         if not path.is_file():
             return {}
@@ -77,7 +77,7 @@ def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = N
     """Read a run folder, and the truth from a file or from the recording.
 
     Raises:
-        UmfError: the folder holds no run, a file is damaged, or the recording is not the one of the run.
+        UmfError: the folder holds no run, a file is damaged, or the run was made on another recording.
     """
     closures = run_file.read_closures(folder / "closures.csv")
     run = FinishedRun(
@@ -98,7 +98,7 @@ def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = N
 
 
 def describe_recording(bag: Bag) -> dict[str, Any]:
-    """The `recording` entry of a summary: its path, start, end and message counts."""
+    """Return the `recording` entry of a summary: its path, start, end and message counts."""
     return {
         "path": str(bag.path.resolve()),
         "start_ns": bag.start_ns,
@@ -108,7 +108,7 @@ def describe_recording(bag: Bag) -> dict[str, Any]:
 
 
 def remember_recording(folder: Path, bag: Bag, **more: Any) -> None:
-    """Write into the summary of a run which recording it was made on, and what else is known of it."""
+    """Write the recording of a run, and further entries, into its summary."""
     write_summary(folder, read_summary(folder) | {"recording": describe_recording(bag)} | more)
 
 
@@ -116,13 +116,13 @@ def _check_recording(run: FinishedRun, bag: Bag) -> None:
     """Refuse to judge a run by another recording."""
     known = run.summary.get("recording")
     if known and (known["start_ns"], known["messages"]) != (bag.start_ns, describe_recording(bag)["messages"]):
-        raise UmfError(f"{run.folder} was made on another recording, {known['path']}: nothing was written")
+        raise UmfError(f"{run.folder} was made on another recording, {known['path']}; nothing was written")
     first, last = bag.start_ns - CLOCK_SLACK_NS, bag.end_ns + CLOCK_SLACK_NS
     outside = run.stamps[(run.stamps < first) | (run.stamps > last)]
     if len(outside):
         raise UmfError(
             f"{run.folder} was made on another recording than {bag.path}: {len(outside)} of {len(run.keyframes)} "
-            f"keyframes are not of its time, the first at {outside[0]} ns; nothing was written"
+            f"keyframes are outside its time, the first at {outside[0]} ns; nothing was written"
         )
 
 

@@ -43,7 +43,7 @@ from umf_ros.runs.writer import write_summary
 
 
 def render(template: str, **values: Any) -> str:
-    """A page from one of `runs/templates`; a value that it names and that is not given is an error."""
+    """Return a page from one of `runs/templates`; a missing value of the template is an error."""
     environment = Environment(
         loader=PackageLoader("umf_ros.runs"),
         autoescape=True,
@@ -69,7 +69,7 @@ def plot_trajectories(
         path: PNG to write.
         curves: name, colour and (N, 3) positions in metres, all in one frame; drawn in this order.
         closures: (K, 2, 3) positions of both ends of every closure.
-        verdicts: K times true, false, or None when there is no truth.
+        verdicts: K of true, false, or None without a truth.
     """
     figure = Figure(figsize=(9, 7), layout="constrained")
     axes = figure.subplots()
@@ -82,7 +82,7 @@ def plot_trajectories(
     for verdict, colour, name in ((True, RIGHT, "true"), (False, WRONG, "false"), (None, UNJUDGED, "found")):
         chosen = [i for i, found in enumerate(verdicts) if found is verdict]
         if chosen:
-            # lines as wide as closures are short would hide the trajectories
+            # wide lines of short closures would hide the trajectories
             axes.add_collection(
                 LineCollection(closures[chosen, :, :2].tolist(), colors=colour, linewidths=1.0, alpha=0.8)
             )
@@ -98,7 +98,7 @@ def plot_trajectories(
 
 
 def draw_match(query: Image, match: Image, inliers: Array, caption: str) -> Image:
-    """Query (left) and match (right) side by side below a caption, with lines for some of the inliers.
+    """Draw query (left) and match (right) side by side below a caption, with lines for some of the inliers.
 
     Args:
         query: (H, W) uint8.
@@ -128,7 +128,7 @@ def draw_match(query: Image, match: Image, inliers: Array, caption: str) -> Imag
 
 MAX_PICTURES = 40
 MOST_LINES = 8
-"""Of closures and of findings in the terminal; the page has all."""
+"""Most lines of closures and of findings in the terminal; the page has all."""
 COLOURS = {"good": "green", "warn": "yellow", "bad": "red", "fault": "red", "warning": "yellow", "note": "dim"}
 
 Summary = Mapping[str, Any]
@@ -157,9 +157,9 @@ def write_page(about: JudgedRun, verdict: RunVerdict, findings: Sequence[Advice]
 
 
 def print_summary(
-    console: Console, about: JudgedRun, verdict: RunVerdict, findings: Sequence[Advice], told: frozenset[str]
+    console: Console, about: JudgedRun, verdict: RunVerdict, findings: Sequence[Advice], printed: frozenset[str]
 ) -> None:
-    """Print figures, closures that were not accepted, findings that were not `told` before, and the verdict."""
+    """Print figures, closures that were not accepted, findings that are not `printed` yet, and the verdict."""
     plain: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
     grid = Grid(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in _facts(about.run.summary):
@@ -167,7 +167,7 @@ def print_summary(
     console.print(grid)
     for line in final_verdicts(about):
         console.print(line, **plain)
-    shown = [finding for finding in findings if finding.line not in told and finding.severity != "note"]
+    shown = [finding for finding in findings if finding.line not in printed and finding.severity != "note"]
     for finding in shown[:MOST_LINES]:
         console.print(f"{finding.severity}: {finding.line}", style=COLOURS[finding.severity], **plain)
     console.print(verdict.sentence, style=COLOURS[verdict.mark], markup=False, highlight=False)
@@ -175,7 +175,7 @@ def print_summary(
 
 
 def final_verdicts(about: JudgedRun) -> list[str]:
-    """A line for each closure, by its number, that the graph did not accept in the end."""
+    """Return one line per closure that the graph did not accept in the end, with its number."""
     lines = []
     for number, closure in enumerate(about.run.closures, 1):
         verdict = about.run.verdicts.get(closure.endpoints)
@@ -188,7 +188,7 @@ def final_verdicts(about: JudgedRun) -> list[str]:
 
 
 def describe(closure: LoopClosure, inliers: int, judged: Judged | None) -> str:
-    """One line for the picture of a closure."""
+    """Return the caption of the picture of a closure."""
     shift_m, turn_deg = size_of(closure.match_T_query)
     text = f"{shift_m:.2f} m, {turn_deg:.1f} deg apart   p {closure.probability:.3f}   {inliers} image inliers"
     if judged is None:
@@ -197,7 +197,7 @@ def describe(closure: LoopClosure, inliers: int, judged: Judged | None) -> str:
 
 
 def closure_rows(about: JudgedRun) -> list[list[str]]:
-    """The page's table: seconds since the first keyframe, figures, the graph's verdict and the truth's."""
+    """Return the page's table: seconds since the first keyframe, figures, the graph's verdict and the truth's."""
     rows, start = [], int(about.run.stamps[0]) if len(about.run.stamps) else 0
     for number, closure in enumerate(about.run.closures, 1):
         at_s, back_s = ((closure.query_stamp_ns - other) * 1e-9 for other in (start, closure.match_stamp_ns))
@@ -213,7 +213,7 @@ def closure_rows(about: JudgedRun) -> list[list[str]]:
 
 
 def _inside_a_script(scene: Mapping[str, Any]) -> str:
-    """The scene as JSON that no parser of HTML takes for the end of its script."""
+    """Return the scene as JSON that cannot end its script element in HTML."""
     text = json.dumps(scene, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
@@ -238,7 +238,7 @@ def _facts(summary: Summary) -> list[tuple[str, str]]:
 
 
 def _revisits(truth: Summary) -> str:
-    """How often a place was seen again, and how many of those times found it; older runs do not say the latter."""
+    """Return the numbers of revisits and of those with a closure; older runs lack the latter."""
     again, closed = truth.get("revisits_any_heading"), truth.get("closed_any_heading")
     if not again or closed is None:
         return str(truth["revisits"])
@@ -246,7 +246,7 @@ def _revisits(truth: Summary) -> str:
 
 
 def _consistency(truth: Summary) -> str:
-    """How the covariances of the closures compare with their errors; older runs do not say."""
+    """Return a comparison of the closures' covariances with their errors; older runs lack it."""
     median, inside = truth.get("nees_median"), truth.get("inside_95")
     if median is None or inside is None:
         return "not judged: no closure, or a truth without orientations"
@@ -257,7 +257,7 @@ def _consistency(truth: Summary) -> str:
 
 
 MAX_SHOWN = 400
-"""Keyframes that are photographed; the page shows as many as find room."""
+"""Most pairs of keyframes with pictures; the page shows as many as fit."""
 
 
 def finish_run(
@@ -265,7 +265,7 @@ def finish_run(
     bag: Bag,
     console: Console,
     ground_truth: Path | None = None,
-    told: frozenset[str] = frozenset(),
+    printed: frozenset[str] = frozenset(),
     check: SensorCheck | None = None,
 ) -> RunVerdict:
     """Judge a run, write its pictures and its report, print its summary, and return the verdict.
@@ -275,8 +275,8 @@ def finish_run(
         bag: the recording the run was made on; with another one an `UmfError` is raised and nothing is written.
         console: where the summary is printed.
         ground_truth: RTKLIB .pos or TUM file; None takes that of the recording, if there is one.
-        told: lines that were printed before the run, and are not repeated.
-        check: that has seen the frames of the recording; None: it is read for one.
+        printed: lines that were printed before the run, and are not repeated.
+        check: sensor check fed with the recording's frames; None: the recording is read for one.
     """
     run = read_run(folder, bag, ground_truth)
     with console.status("Judging, drawing and writing the report"):
@@ -294,22 +294,22 @@ def finish_run(
         findings = look_first(about)
         verdict = conclude(about, findings)
         write_page(about, verdict, findings, build_scene(about, pairs, gallery, inliers))
-    print_summary(console, about, verdict, findings, told)
+    print_summary(console, about, verdict, findings, printed)
     return verdict
 
 
 def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> JudgedRun:
-    """Hold the run against the truth, if there is one, and fill in the `ground_truth` of its summary, to keep or not.
+    """Judge the run by the truth, if there is one; `keep` writes the `ground_truth` entry into its summary.
 
-    A truth that covers nothing of a run that was judged before raises an `UmfError`.
+    A truth that covers no part of a run that was judged before raises an `UmfError`.
     """
     judged = judge_run(run, bag)
     if run.truth is not None:
         covered, total = judged.covered
         if not covered and total and run.summary["ground_truth"]:
             raise UmfError(
-                f"the ground truth is of another clock: it covers none of the {total} keyframes; {run.folder} was "
-                "judged before, nothing was written"
+                f"the ground truth has another clock: it covers none of the {total} keyframes; {run.folder} was "
+                "judged before; nothing was written"
             )
         run.summary["ground_truth"] = judged.summary() if covered or not total else None
     if keep:
@@ -352,22 +352,22 @@ def _draw_matches(
 
 
 def _report_sensors(run: FinishedRun, bag: Bag, check: SensorCheck | None) -> SensorReport:
-    """Hold the frames that were checked, or else those of the recording, against the odometry."""
+    """Compare the checked frames, or else those of the recording, with the odometry."""
     if check is not None:
         return check.report(read_odometry_of(run.folder) or run.odometry)
     check, stamps, poses = SensorCheck(), [-1], list[Array]([np.eye(4)])
     for item in FrameReader(bag, run.settings, _odometry_file(run), warn=lambda _: None).stream():
         if isinstance(item, Frame):
             check.take(item)
-        elif item.stamp_ns > stamps[-1]:  # as far as its stamps grow
+        elif item.stamp_ns > stamps[-1]:  # while its stamps increase
             stamps.append(item.stamp_ns)
             poses.append(item.odom_T_body)
-    heard = Trajectory(np.array(stamps[1:], np.int64), np.stack(poses)[1:]) if len(stamps) > 1 else run.odometry
-    return check.report(heard)
+    odometry = Trajectory(np.array(stamps[1:], np.int64), np.stack(poses)[1:]) if len(stamps) > 1 else run.odometry
+    return check.report(odometry)
 
 
 def _odometry_file(run: FinishedRun) -> Trajectory | None:
-    """The odometry that the run took from a file, as far as the file is still there."""
+    """Return the odometry that the run took from a file, if the file still exists."""
     named = run.summary.get("odometry_file")
     if not named or not Path(named["path"]).is_file():
         return None

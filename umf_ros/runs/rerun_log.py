@@ -1,4 +1,4 @@
-"""A run as a recording for the Rerun viewer: what was seen, where the rover was, and which places it knew again."""
+"""A run as a recording for the Rerun viewer: images, scans, poses and loop closures."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 GREY, BLUE, GREEN = (150, 150, 150), (60, 120, 216), (40, 160, 60)
 MOST_POINTS = 5000
-"""Of a scan that is logged; a viewer shows thousands of scans together."""
+"""Most points of a logged scan; a viewer shows thousands of scans together."""
 
 
 class RerunLog:
-    """Writes an .rrd file while a run goes on.
+    """Writer of an .rrd file during a run.
 
-    Images and scans are those of the keyframes, in the odometry's frame; without odometry nothing has a place in
-    space, and only images and numbers are logged.
+    Images and scans are those of the keyframes, in the odometry's frame; without odometry there are no poses,
+    and only images and numbers are logged.
 
     Args:
         path: the file to write.
@@ -48,14 +48,14 @@ class RerunLog:
         self._places: dict[int, Array] = {}
 
     def watch(self, stream: Iterable[Item]) -> Iterator[Item]:
-        """The same stream; the latest frame of it is remembered until its detection is shown."""
+        """Yield the same stream; its latest frame is kept until its detection is logged."""
         for item in stream:
             if isinstance(item, Frame):
                 self._frame = item
             yield item
 
     def show(self, detection: Detection) -> None:
-        """Log what became of the latest frame; nothing unless it became a keyframe."""
+        """Log the detection of the latest frame, if it became a keyframe."""
         keyframe, rerun = detection.keyframe, self._rerun
         if keyframe is None:
             return
@@ -68,7 +68,7 @@ class RerunLog:
         self._show_in_space(keyframe, detection)
 
     def finish(self, folder: Path) -> None:
-        """Log both trajectories of a run folder, where it has them, and write the end of the file."""
+        """Log both trajectories of a run folder, if there are any, and finish the file."""
         paths = (("odometry", GREY), ("optimized", BLUE))
         for name, colour in paths:
             path = folder / f"trajectory_{name}.tum"

@@ -41,15 +41,15 @@ COLUMNS = {
     "closures_between": ["match_robot", *CLOSURES],
     "localization": ["stamp_ns", *POSE, *SIGMA, "probability"],
 }
-"""Columns of each table, which is exported as `<name>.csv`."""
+"""Columns of each table, exported as `<name>.csv`."""
 ALWAYS = ("keyframes", "latencies", "candidates", "closures", "inliers")
-"""Tables that are exported without rows too."""
+"""Tables that are also exported without rows."""
 KEYFRAME = np.dtype([("stamp_ns", np.int64), ("session", np.int64), ("path_length_m", float)])
 SCHEMA = Schema(
     "run",
     migrations=(
         (
-            # the text of the CSV file is kept in its columns
+            # the columns hold the text of the CSV file
             *(f"CREATE TABLE {name} ({', '.join(columns)})" for name, columns in COLUMNS.items()),
             # odometry messages that came before the closure
             "ALTER TABLE closures ADD COLUMN odometry_before INTEGER",
@@ -106,11 +106,11 @@ class Picture(NamedTuple):
 
 
 GraphInput = LoopClosure | StoredOdometry | AbsoluteMeasurement
-"""Input of a pose graph."""
+"""Inputs of a pose graph."""
 
 
 class RunFile:
-    """The file of a run. Rows of a transaction are kept together or not at all, also when the process is killed.
+    """File of a run. A transaction is stored completely or not at all, also when the process is killed.
 
     Args:
         folder: of the run.
@@ -132,7 +132,7 @@ class RunFile:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """One transaction; the odometry that came since the last one is written with it."""
+        """Open a transaction, which also writes the odometry received since the last one."""
         with self._file.writing() as connection:
             connection.executemany("INSERT OR IGNORE INTO odometry VALUES (?, ?, ?, ?)", self._odometry)
             connection.executemany("INSERT OR IGNORE INTO absolute VALUES (?, ?, ?, ?)", self._absolute)
@@ -172,22 +172,22 @@ class RunFile:
         self._file.connection.executemany("INSERT OR REPLACE INTO about VALUES (?, ?)", values.items())
 
     def facts(self) -> dict[str, Any]:
-        """Facts about the run by name."""
+        """Return facts about the run by name."""
         with self._file.reading() as connection:
             return dict(connection.execute("SELECT name, value FROM about"))
 
     def rows(self, table: str) -> list[tuple[Any, ...]]:
-        """Rows of a table in the columns of its CSV file, in the order in which they came."""
+        """Return the rows of a table in the columns of its CSV file, in the order of their arrival."""
         with self._file.reading() as connection:
             return connection.execute(f"SELECT {', '.join(COLUMNS[table])} FROM {table} ORDER BY rowid").fetchall()
 
     def closures(self) -> list[LoopClosure]:
-        """The closures of the run."""
+        """Return the closures of the run."""
         with self._file.reading():
             return [parse_closure(dict(zip(CLOSURES, row, strict=True))) for row in self.rows("closures")]
 
     def odometry(self) -> list[StoredOdometry]:
-        """The odometry of the run in the order in which it came."""
+        """Return the odometry of the run in the order of arrival."""
         found = []
         with self._file.reading() as connection:
             # files of an earlier release have no column of covariances
@@ -199,7 +199,7 @@ class RunFile:
         return found
 
     def graph_inputs(self) -> Iterator[GraphInput]:
-        """Odometry, closures and absolute measurements in the order in which the graph got them."""
+        """Yield the odometry, closures and absolute measurements in the order in which the graph received them."""
         inputs: list[tuple[int, GraphInput]] = []
         with self._file.reading() as connection:
             before = connection.execute("SELECT odometry_before FROM closures ORDER BY rowid").fetchall()
@@ -216,27 +216,27 @@ class RunFile:
         yield from (item for _, item in waiting)
 
     def descriptors(self) -> dict[int, Points]:
-        """Descriptors (D,) float32 of the keyframes by their stamps, in order."""
+        """Return the descriptors (D,) float32 of the keyframes by stamp, in order."""
         with self._file.reading() as connection:
             rows = connection.execute("SELECT stamp_ns, data FROM descriptor ORDER BY rowid")
             return {int(stamp): np.frombuffer(data, np.float16).astype(np.float32) for stamp, data in rows}
 
     def pictures(self) -> Iterator[Picture]:
-        """The pictures of the keyframes; none in files of an earlier release."""
+        """Yield the pictures of the keyframes; none in files of an earlier release."""
         with self._file.reading() as connection:
             if connection.execute("SELECT name FROM sqlite_master WHERE name = 'picture'").fetchone():
                 for stamp_ns, jpeg, width, height, scan in connection.execute("SELECT * FROM picture ORDER BY rowid"):
                     yield Picture(stamp_ns, jpeg, width, height, np.frombuffer(scan, "<i2").reshape(-1, 3))
 
     def export(self, localizing: bool = False) -> None:
-        """Write the CSV tables; that of the poses in a map also without rows where the run is localising."""
+        """Write the CSV tables; that of poses in a map also without rows if the run is localising."""
         for name, columns in COLUMNS.items():
             rows = self.rows(name)
             if rows or name in ALWAYS or (localizing and name == "localization"):
                 write_table(self._folder / f"{name}.csv", columns, rows)
 
     def close(self) -> None:
-        """Write the odometry in hand, and close the file."""
+        """Write the remaining odometry, and close the file."""
         if self._odometry or self._absolute:
             with self.writing():
                 pass
@@ -250,14 +250,14 @@ class RunFile:
 
 
 def _set_aside(folder: Path) -> None:
-    """Rename the tables that an earlier release left, before the tables of a new run take their names."""
+    """Rename the tables of an earlier release, which a new run would overwrite."""
     for path in [found for name in COLUMNS if (found := folder / f"{name}.csv").exists()]:
         with writing(path):
             path.rename(next(name for i in count(1) if not (name := path.with_suffix(f".{i}.csv")).exists()))
 
 
 def read_descriptors(folder: Path) -> dict[int, Points]:
-    """Descriptors (D,) float32 of the keyframes of a run by their stamps, in order; none of an older release's."""
+    """Return the descriptors (D,) float32 of the keyframes of a run by stamp, in order; empty for an older release."""
     if not (folder / NAME).is_file():
         return {}
     with closing(RunFile(folder, read_only=True)) as file:
@@ -265,7 +265,7 @@ def read_descriptors(folder: Path) -> dict[int, Points]:
 
 
 def read_odometry_of(folder: Path) -> Trajectory | None:
-    """The odometry messages that a run has recorded, as far as their stamps grow; None without any."""
+    """Return the recorded odometry messages of a run with increasing stamps; None without any."""
     with closing(RunFile(folder, read_only=True)) as file:
         messages = [one for one in file.odometry() if one.covariance is None]
     if not messages:
@@ -276,9 +276,9 @@ def read_odometry_of(folder: Path) -> Trajectory | None:
 
 
 def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:
-    """Row of `closures.csv`: `match_T_query`, one sigma per axis of the match body, probability, covariance.
+    """Return the row of `closures.csv`: `match_T_query`, one sigma per axis of the match body, probability, covariance.
 
-    Of the covariance the upper triangle is written, row by row, 21 numbers in one cell.
+    The upper triangle of the covariance is written row by row, 21 numbers in one cell.
     """
     numbers = [*pose_numbers(closure.match_T_query, closure.covariance), closure.probability, similarity]
     triangle = " ".join(f"{value:.9g}" for value in closure.covariance[np.triu_indices(6)])
@@ -286,12 +286,12 @@ def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:
 
 
 def pose_numbers(pose: Array, covariance: Array) -> list[float]:
-    """The values of `POSE` and `SIGMA`: of a pose (4, 4), and the roots of the diagonal of its covariance (6, 6)."""
+    """Return the values of `POSE` and `SIGMA` of a pose (4, 4) and its covariance (6, 6): roots of the diagonal."""
     return [*pose[:3, 3], *to_quaternion(pose), *np.sqrt(np.diag(covariance))]
 
 
 def candidate_row(hypothesis: Hypothesis) -> list[Any]:
-    """Row of `candidates.csv`: the reason with its figures, and all measurements as JSON."""
+    """Return the row of `candidates.csv`: the reason with its figures, and all measurements as JSON."""
     numbers = json.dumps({name: float(f"{value:.6g}") for name, value in hypothesis.numbers.items()})
     reason = hypothesis.reason.value if hypothesis.reason else ACCEPTED
     similarity = f"{hypothesis.candidate.similarity:.6f}"
@@ -299,7 +299,7 @@ def candidate_row(hypothesis: Hypothesis) -> list[Any]:
 
 
 def inlier_rows(hypothesis: Hypothesis) -> list[list[Any]]:
-    """Rows of `inliers.csv`: pixels of both left images that see the same point."""
+    """Return the rows of `inliers.csv`: pixels of the same point in both left images."""
     pixels = hypothesis.inlier_pixels.tolist()
     return [[*hypothesis.endpoints, *(f"{value:.1f}" for value in one)] for one in pixels]
 
@@ -317,7 +317,7 @@ def read_table(path: Path, parse: Callable[[dict[str, str]], Row]) -> list[Row]:
 
 
 def parse_candidate(row: dict[str, str]) -> Hypothesis:
-    """The hypothesis in a row of `candidates.csv`; a reason of another version is kept as its detail."""
+    """Return the hypothesis in a row of `candidates.csv`; a reason of another version is kept as its detail."""
     numbers = {name: float(value) for name, value in json.loads(row["numbers"]).items()}
     candidate = Candidate(-1, int(row["match_stamp_ns"]), float(row["similarity"]))
     probability, measurements = numbers.pop("probability", None), {"similarity": candidate.similarity} | numbers
@@ -331,7 +331,7 @@ def parse_candidate(row: dict[str, str]) -> Hypothesis:
 
 
 def read_verdicts(path: Path, closures: Iterable[LoopClosure]) -> dict[Endpoints, ClosureVerdict]:
-    """The graph's verdicts on closures of a run by their endpoints; none without a graph."""
+    """Return the graph's verdicts on closures of a run by their endpoints; empty without a graph."""
     known = {one.endpoints: one for one in closures}
 
     def parse(row: dict[str, str]) -> ClosureVerdict | None:
@@ -345,13 +345,13 @@ def read_verdicts(path: Path, closures: Iterable[LoopClosure]) -> dict[Endpoints
 
 
 def read_keyframes(path: Path) -> NDArray[np.void]:
-    """The keyframes in the order of their stamps: (N,) `stamp_ns`, `session`, and `path_length_m`, NaN if unknown."""
+    """Return the keyframes by stamp: (N,) `stamp_ns`, `session`, and `path_length_m`, NaN if unknown."""
     rows = read_table(path, lambda row: (int(row["stamp_ns"]), int(row["session"]), float(row["travelled_m"])))
     return np.array(rows, KEYFRAME)
 
 
 def read_inliers(path: Path) -> dict[Endpoints, Array]:
-    """Pixels (K, 4) of the inliers of every closure, in its query and its match."""
+    """Return the pixels (K, 4) of the inliers of every closure, in its query and its match."""
     query, match, *pixels = COLUMNS["inliers"]
     lines: dict[Endpoints, list[list[float]]] = defaultdict(list)
 
@@ -363,12 +363,12 @@ def read_inliers(path: Path) -> dict[Endpoints, Array]:
 
 
 def read_closures(path: Path) -> list[LoopClosure]:
-    """The closures of a `closures.csv`; with a diagonal covariance where an older version wrote no other."""
+    """Return the closures of a `closures.csv`; with a diagonal covariance from an older version."""
     return read_table(path, parse_closure)
 
 
 def parse_closure(row: Mapping[str, Any]) -> LoopClosure:
-    """The closure in a row of `closures.csv`."""
+    """Return the closure in a row of `closures.csv`."""
     numbers = [float(row[name]) for name in CLOSURES[2:16]]
     covariance = np.diag(np.square(numbers[7:13]))
     if triangle := (row.get("covariance") or "").split():

@@ -21,9 +21,9 @@ from umf_ros.runs.truth import JudgedRun, pose_in_truth, positions_in_truth
 from umf_ros.verification.hypothesis import Hypothesis
 
 ORDER = ("false", "missed", "rejected", "pending", "tested", "accepted")
-"""Kinds of pairs: the pictures of the first ones come first where not all find room."""
+"""Kinds of pairs, in order of priority where not all pictures fit."""
 MOST = {"missed": 60, "tested": 20, "accepted": 400}
-"""Pairs of a kind that are explained in full."""
+"""Most pairs of a kind that are explained in full."""
 Photograph = tuple[str, int, int]
 """A reduced image: a `data:` address, and width and height in pixels of the image that it was made from."""
 Pairs = dict[Endpoints, dict[str, Any]]
@@ -31,7 +31,7 @@ Pairs = dict[Endpoints, dict[str, Any]]
 
 
 def pairs_of(about: JudgedRun) -> Pairs:
-    """Every closure, the missed revisits, and the most promising of what was rejected before it became one."""
+    """Return every closure, the missed revisits, and the most promising rejected candidates."""
     closures = enumerate((one.endpoints for one in about.run.closures), 1)
     pairs = {key: _describe(about, key, _kind(about, key), number) for number, key in closures}
     for why in explain_missed(about):
@@ -52,11 +52,11 @@ def pairs_of(about: JudgedRun) -> Pairs:
 
 
 def by_need(pairs: Pairs) -> list[Endpoints]:
-    """The pairs whose details are worth their room, the most telling first, spread over the run."""
+    """Return the pairs that are shown in detail, the most informative first, spread over the run."""
     chosen: list[Endpoints] = []
     for kind in ORDER:
-        mine = [key for key, pair in pairs.items() if pair["kind"] == kind]
-        chosen += [mine[i] for i in _spread(len(mine), MOST.get(kind, len(mine)))]
+        own = [key for key, pair in pairs.items() if pair["kind"] == kind]
+        chosen += [own[i] for i in _spread(len(own), MOST.get(kind, len(own)))]
     return chosen
 
 
@@ -68,7 +68,7 @@ def _spread(count: int, most: int) -> Iterable[int]:
 
 
 def _kind(about: JudgedRun, key: Endpoints) -> str:
-    """The kind of a closure."""
+    """Return the kind of a closure."""
     judged, verdict = about.by_endpoints.get(key), about.run.verdicts.get(key)
     if judged is not None and not judged.is_true:
         return "false"
@@ -84,41 +84,41 @@ def _candidate(about: JudgedRun, key: Endpoints) -> Hypothesis | None:
 def _describe(
     about: JudgedRun, key: Endpoints, kind: str, number: int = 0, why: ClosureDiagnosis | None = None
 ) -> dict[str, Any]:
-    """The entry of a pair; `number` is that of its closure, 0 without one."""
+    """Return the entry of a pair; `number` is that of its closure, 0 without one."""
     candidate, verdict = _candidate(about, key), about.run.verdicts.get(key)
     known = about.run.closures[number - 1] if number else candidate
-    told = {
+    entry = {
         "kind": kind,
         "number": number,
         "q": about.row(key[0]),
         "m": about.row(key[1]),
-        "stamps": [str(stamp) for stamp in key],  # no number of a browser holds nanoseconds
+        "stamps": [str(stamp) for stamp in key],  # browser numbers cannot hold nanoseconds
         "p": _number(known.probability if known else None),
         "s": _number(candidate.candidate.similarity if candidate else None),
         "graph": f"{verdict.state}: {verdict.reason}{verdict.figures}" if verdict else "",
         "truth": _truth_words(about, key),
     }
-    return told if why is None else told | {"why": why.what, "parameter": why.parameter}
+    return entry if why is None else entry | {"why": why.what, "parameter": why.parameter}
 
 
 def _details(about: JudgedRun, key: Endpoints, number: int) -> dict[str, Any]:
-    """The bars of a pair's log-odds, and its pose."""
-    told: dict[str, Any] = {}
+    """Return the bars of a pair's log-odds, and its pose."""
+    entry: dict[str, Any] = {}
     if (candidate := _candidate(about, key)) is not None:
         given, lost = contributions(about, candidate), missing(about, candidate)
         names = sorted({*given, *lost} - {"bias"}, key=lambda name: -(given.get(name, 0) + lost.get(name, 0)))
-        told["bars"] = [[name, round(given.get(name, 0), 2), round(lost.get(name, 0), 2)] for name in names]
-        told["bias"] = round(given.get("bias", 0), 2)
+        entry["bars"] = [[name, round(given.get(name, 0), 2), round(lost.get(name, 0), 2)] for name in names]
+        entry["bias"] = round(given.get("bias", 0), 2)
     pose, source = (about.run.closures[number - 1].match_T_query, "the closure") if number else _pose(about, key)
     if pose is not None:
-        told["pose"] = [round(float(value), 4) for value in pose[:3].ravel()]
+        entry["pose"] = [round(float(value), 4) for value in pose[:3].ravel()]
         shift_m, turn_deg = size_of(pose)
-        told |= {"pose_source": source, "shift_m": round(shift_m, 2), "turn_deg": round(turn_deg, 1)}
-    return told
+        entry |= {"pose_source": source, "shift_m": round(shift_m, 2), "turn_deg": round(turn_deg, 1)}
+    return entry
 
 
 def _pose(about: JudgedRun, key: Endpoints) -> tuple[Array | None, str]:
-    """Where the two stood by the truth, else by the optimised trajectory: the run keeps no pose of what it rejected."""
+    """Return the relative pose by the truth, else by the optimised trajectory: rejected candidates have none."""
     run = about.run
     with_turns = run.truth if run.truth is not None and run.truth.has_orientation else None
     for source, trajectory in (("the truth", with_turns), ("the optimised trajectory", run.optimized)):
@@ -131,12 +131,12 @@ def _pose(about: JudgedRun, key: Endpoints) -> tuple[Array | None, str]:
 
 
 def size_of(pose: Array) -> tuple[float, float]:
-    """Metres and degrees of a pose (4, 4)."""
+    """Return metres and degrees of a pose (4, 4)."""
     return float(np.linalg.norm(pose[:3, 3])), float(np.degrees(rotation_angle(pose)))
 
 
 def _truth_words(about: JudgedRun, key: Endpoints) -> str:
-    """Error of a closure, or distance of two keyframes in truth; empty where it is unknown."""
+    """Return the error of a closure, or distance of two keyframes in truth; empty where it is unknown."""
     judged = about.by_endpoints.get(key)
     if judged is None:
         distance_m = about.distance(*key)
@@ -146,21 +146,21 @@ def _truth_words(about: JudgedRun, key: Endpoints) -> str:
 
 
 def _number(value: float | None) -> float | None:
-    """A number for the page; None where it is unknown."""
+    """Return a number for the page; None where it is unknown."""
     return None if value is None or not np.isfinite(value) else round(float(value), 4)
 
 
 MAX_POINTS = 3000
-"""Of a curve."""
+"""Most points of a curve."""
 MAX_SIDE = 300
 """Rows and columns of the matrix of similarities."""
 MEDIA_BYTES = 3_600_000
-"""Of all photographs and scans: with the drawing library a page of less than 10 MB."""
+"""Most bytes of all photographs and scans: with the drawing library a page of less than 10 MB."""
 MAX_INLIERS = 60
 
 
 def drawn_trajectory(about: JudgedRun) -> Trajectory | None:
-    """The best trajectory that a run has, in the frame that everything is drawn in."""
+    """Return the best trajectory of a run, in the frame of the drawing."""
     run = about.run
     best = run.optimized or run.odometry
     if best is None:
@@ -169,7 +169,7 @@ def drawn_trajectory(about: JudgedRun) -> Trajectory | None:
 
 
 def build_scene(about: JudgedRun, pairs: Pairs, gallery: Gallery, inliers: Mapping[Endpoints, Array]) -> dict[str, Any]:
-    """The scene: curves, keyframes, pairs with their pictures, matrix, threshold, errors and map."""
+    """Return the scene: curves, keyframes, pairs with their pictures, matrix, threshold, errors and map."""
     chosen = by_need(pairs)
     photographs, scans = _media(chosen, gallery)
     for key in chosen:
@@ -194,7 +194,7 @@ def build_scene(about: JudgedRun, pairs: Pairs, gallery: Gallery, inliers: Mappi
 
 
 def _media(pairs: Iterable[Endpoints], gallery: Gallery) -> tuple[dict[str, Photograph], dict[str, str]]:
-    """Photographs and scans by stamp, of the most telling pairs first, as many as find room."""
+    """Return the photographs and scans by stamp, of the most informative pairs first, as many as fit."""
     room = MEDIA_BYTES
     photographs: dict[str, Photograph] = {}
     scans: dict[str, str] = {}
@@ -212,7 +212,7 @@ def _media(pairs: Iterable[Endpoints], gallery: Gallery) -> tuple[dict[str, Phot
 
 
 def named_curves(run: FinishedRun) -> dict[str, Array]:
-    """Positions (N, 3) of truth, odometry and optimised trajectory, as far as there are, in the frame of the truth."""
+    """Return positions (N, 3) of truth, odometry and optimised trajectory, if available, in the truth's frame."""
     known = {"ground truth": run.truth, "odometry": run.odometry, "optimised": run.optimized}
     return {name: positions_in_truth(one, run.truth) for name, one in known.items() if one is not None}
 
@@ -231,14 +231,14 @@ def _keyframes(about: JudgedRun) -> dict[str, Any]:
 
 
 def _positions(about: JudgedRun) -> Array:
-    """(N, 2) of the keyframes where they are drawn; on a circle where their poses are unknown."""
+    """Return (N, 2) of the keyframes where they are drawn; on a circle where their poses are unknown."""
     stamps, drawn = about.run.stamps, drawn_trajectory(about)
     if drawn is not None:
         poses, known = drawn.at(stamps)
         if known.any():
             rows = np.flatnonzero(known)
             xy: Array = poses[:, :2, 3]
-            for axis in range(2):  # what lies before the first known pose is drawn there
+            for axis in range(2):  # keyframes before the first known pose are drawn there
                 xy[:, axis] = np.interp(np.arange(len(stamps)), rows, xy[rows, axis])
             return xy
     angle = np.linspace(0, 2 * np.pi, max(len(stamps), 1), endpoint=False)
@@ -271,8 +271,8 @@ def _sweep(about: JudgedRun) -> list[list[float | int]]:
 
 
 def error_curves(run: FinishedRun) -> dict[str, list[list[float]]]:
-    """Path length in m and distance from the truth in m, of odometry and optimised trajectory as far as there are."""
-    told: dict[str, list[list[float]]] = {}
+    """Return path length and distance from the truth in m, of odometry and optimised trajectory, if available."""
+    curves: dict[str, list[list[float]]] = {}
     for name, trajectory in (("odometry", run.odometry), ("optimised", run.optimized)):
         if trajectory is None or run.truth is None:
             continue
@@ -282,11 +282,11 @@ def error_curves(run: FinishedRun) -> dict[str, list[list[float]]]:
         true = poses[known, :3, 3]
         path_m = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
         error_m = np.linalg.norm(positions_in_truth(trajectory, run.truth)[known] - true, axis=1)
-        told[name] = _thin(np.column_stack([path_m, error_m])).T.tolist()
-    return told
+        curves[name] = _thin(np.column_stack([path_m, error_m])).T.tolist()
+    return curves
 
 
 def _thin(rows: Array) -> Array:
-    """Some of the rows (N, C), to a millimetre."""
+    """Return some of the rows (N, C), rounded to a millimetre."""
     kept = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_POINTS)).astype(int))]
     return np.asarray(np.round(kept, 3))

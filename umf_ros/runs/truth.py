@@ -27,13 +27,13 @@ from umf_ros.verification.hypothesis import Hypothesis
 
 CONFIDENCE = 0.95
 MEDIAN_EXPECTED = float(chdtri(6, 0.5))
-"""Half of consistent normalised errors squared are less than this, 5.35: chi square with six degrees of freedom."""
+"""Median of consistent normalised errors squared, 5.35: chi square with six degrees of freedom."""
 CONSISTENT_MEDIAN = (3.0, 8.0)
 CONSISTENT_INSIDE = 0.9
 
 
 def pose_error(estimated: Array, true: Array) -> Array:
-    """Error (..., 6) of poses (..., 4, 4) `match_T_query` in ROS order, about the axes of the match.
+    """Return the error (..., 6) of poses (..., 4, 4) `match_T_query` in ROS order, about the axes of the match.
 
     The estimate is the truth, turned by the last three about the query's origin and shifted by the first three.
     """
@@ -42,7 +42,7 @@ def pose_error(estimated: Array, true: Array) -> Array:
 
 
 def normalised_errors(errors: Array, covariances: Array) -> Array:
-    """Normalised errors squared (...) of errors (..., 6) under their covariances (..., 6, 6), both in ROS order."""
+    """Return the normalised errors squared (...) of errors (..., 6) under covariances (..., 6, 6), ROS order."""
     weighed = np.linalg.solve(covariances, errors[..., None])[..., 0]
     found: Array = np.einsum("...i,...i->...", errors, weighed)
     return found
@@ -54,7 +54,7 @@ def share_inside(squared: Array, confidence: float = CONFIDENCE) -> float:
 
 
 def in_words(nees_median: float, inside_95: float) -> str:
-    """Say in a plain word how stated errors compare with true ones."""
+    """Return a phrase that compares stated errors with true ones."""
     low, high = CONSISTENT_MEDIAN
     factor = (nees_median / MEDIAN_EXPECTED) ** 0.5
     if nees_median > high:
@@ -73,7 +73,7 @@ Stamps = NDArray[np.int64]
 
 
 Judged = Any
-"""(K,) closures held against the truth, or one of them: a `numpy.recarray` or `numpy.record` of `JUDGED`."""
+"""(K,) closures judged by the truth, or one of them: a `numpy.recarray` or `numpy.record` of `JUDGED`."""
 JUDGED = np.dtype(
     [
         ("query_stamp_ns", np.int64),
@@ -93,19 +93,19 @@ translation is that of its length, and those of rotation and normalised error ar
 
 @dataclass(frozen=True)
 class JudgedRun:
-    """A run held against the truth, as far as there is one, with all else that is known about it.
+    """A run judged by the truth, if there is one, with its other data.
 
     Attributes:
         run: files of the run.
         closures: those whose endpoints the truth covers.
-        revisits: keyframes that saw an earlier place again, in about the same direction.
+        revisits: keyframes that revisited an earlier place, in about the same direction.
         ate_odometry_m: error of the odometry, or None without odometry.
         ate_optimized_m: error of the optimised trajectory, or None.
-        any_heading: keyframes that were near an earlier place again, and those of them with a true closure.
-        covered: keyframes whose pose the truth knows, and keyframes in all.
-        missed: stamps of keyframes that saw a place again and have no closure.
+        any_heading: numbers of keyframes near an earlier place, and of those with a true closure.
+        covered: numbers of keyframes that the truth covers, and of all keyframes.
+        missed: stamps of keyframes that revisited a place and have no closure.
         bag: the recording, or None.
-        sensors: what the recording's measurements say of each other.
+        sensors: consistency of the recording's measurements.
     """
 
     run: FinishedRun
@@ -120,7 +120,7 @@ class JudgedRun:
     sensors: SensorReport = field(default_factory=SensorReport)
 
     def summary(self) -> dict[str, Any]:
-        """The `ground_truth` entry of `summary.json`."""
+        """Return the `ground_truth` entry of `summary.json`."""
         true = int(self.closures.is_true.sum())
         squared = self.closures.nees[np.isfinite(self.closures.nees)]
         return {
@@ -132,14 +132,14 @@ class JudgedRun:
             "keyframes_covered": self.covered[0],
             "ate_odometry_m": _rounded(self.ate_odometry_m),
             "ate_optimized_m": _rounded(self.ate_optimized_m),
-            # none where no closure could be judged by the whole pose
+            # empty if no closure was judged by its whole pose
             "nees_median": _rounded(float(np.median(squared)) if len(squared) else None),
             "inside_95": _rounded(share_inside(squared) if len(squared) else None),
         }
 
     @cached_property
     def by_endpoints(self) -> dict[Endpoints, Judged]:
-        """The judged closures, to be found by the stamps of query and match."""
+        """The judged closures by the stamps of query and match."""
         return {(int(one.query_stamp_ns), int(one.match_stamp_ns)): one for one in self.closures}
 
     @cached_property
@@ -161,41 +161,41 @@ class JudgedRun:
         return {stamp: row for row, stamp in enumerate(self.run.stamps.tolist())}
 
     def row(self, stamp_ns: int) -> int | None:
-        """Place of a keyframe among all; None where there is none of this stamp."""
+        """Return the row of a keyframe; None where there is none of this stamp."""
         return self._rows.get(stamp_ns)
 
     def admissible(self, row: int) -> NDArray[np.bool_]:
-        """(row,) which earlier keyframes the gap rules allow."""
+        """Return (row,) whether the gap rules allow earlier keyframes."""
         now, past = self.run.keyframes[row], self.run.keyframes[:row]
         ages, path_m = now["stamp_ns"] - past["stamp_ns"], now["path_length_m"] - past["path_length_m"]
         return is_past(ages, path_m, self.run.settings.loop, past["session"] == now["session"])
 
     def distances(self, row: int) -> NDArray[np.float64]:
-        """(N,) metres in truth to every keyframe, infinite where it is unknown."""
+        """Return (N,) metres in truth to every keyframe, infinite where it is unknown."""
         poses, known = self._true_poses
         apart = np.linalg.norm(poses[:, :3, 3] - poses[row, :3, 3], axis=1)
         return np.where(known & known[row], apart, np.inf)
 
     def distance(self, query_ns: int, match_ns: int) -> float:
-        """Metres in truth between two keyframes, infinite where it is unknown."""
+        """Return metres in truth between two keyframes, infinite where it is unknown."""
         query, match = self.row(query_ns), self.row(match_ns)
         return inf if query is None or match is None else float(self.distances(query)[match])
 
     def same_places(self, row: int) -> NDArray[np.int64]:
-        """Earlier keyframes that are the same place and may be matched, the nearest first."""
+        """Return earlier keyframes that are the same place and may be matched, the nearest first."""
         distances, same_view = self.distances(row)[:row], bool(self.run.truth and self.run.truth.has_orientation)
         near = np.isfinite(distances) & _near(self._true_poses[0], row, same_view)
         rows = np.flatnonzero(self.admissible(row) & near)
         return rows[np.argsort(distances[rows])]
 
     def is_same_place(self, query_ns: int, match_ns: int) -> bool | None:
-        """Whether the two are within 12 m in truth, whatever their headings; None where that is unknown."""
+        """Return whether two keyframes are within 12 m in truth, at any headings; None where that is unknown."""
         distance_m = self.distance(query_ns, match_ns)
         return distance_m <= PLACE_RADIUS_M if isfinite(distance_m) else None
 
 
 def judge_run(run: FinishedRun, bag: Bag | None = None) -> JudgedRun:
-    """Hold closures, odometry and optimised trajectory of a run against the truth, as far as there is one."""
+    """Judge closures, odometry and optimised trajectory of a run by the truth, if there is one."""
     truth, rules = run.truth, run.settings.loop
     if truth is None:
         return JudgedRun(run, bag=bag)
@@ -224,9 +224,9 @@ def judge_run(run: FinishedRun, bag: Bag | None = None) -> JudgedRun:
 def judge_closures(
     closures: Sequence[LoopClosure], world_T_query: Array, world_T_match: Array, has_orientation: bool = True
 ) -> Judged:
-    """Hold closures (K,) against true poses (K, 4, 4) of their keyframes.
+    """Judge closures (K,) by the true poses (K, 4, 4) of their keyframes.
 
-    True means: both keyframes within 12 m of each other [UMF 5.1.2], whatever their headings, and the published
+    True means: both keyframes within 12 m of each other [UMF 5.1.2], at any headings, and the published
     relative pose within 0.5 m and 5 deg. A truth of positions alone (RTKLIB) checks distances only.
     """
     found: Judged = np.zeros(len(closures), JUDGED).view(np.recarray)
@@ -252,21 +252,21 @@ def judge_closures(
 def judge_closure(
     closure: LoopClosure, world_T_query: Array, world_T_match: Array, has_orientation: bool = True
 ) -> Judged:
-    """The same of one closure and the true poses (4, 4) of its keyframes."""
+    """Judge one closure by the true poses (4, 4) of its keyframes."""
     return judge_closures([closure], world_T_query[None], world_T_match[None], has_orientation)[0]
 
 
 def find_revisits(
     stamps: Stamps, world_T_body: Array, path_length_m: Array, rules: Loop, same_view: bool = True
 ) -> NDArray[np.bool_]:
-    """Which keyframes (N,) saw a place again: an admissible earlier keyframe within 12 m, and 30 deg of heading.
+    """Return (N,) whether keyframes are revisits, within 12 m and 30 deg of heading of an admissible earlier keyframe.
 
     Args:
         stamps: (N,) ns, ascending.
         world_T_body: (N, 4, 4) true poses.
         path_length_m: (N,) path length, NaN where unknown.
-        rules: which earlier keyframes are admissible.
-        same_view: whether headings count; without, a place may be seen again from any side.
+        rules: gap rules that earlier keyframes must meet.
+        same_view: whether headings count; otherwise a place may be revisited at any heading.
     """
     revisits = np.zeros(len(stamps), bool)
     for row in range(len(stamps)):
@@ -276,7 +276,7 @@ def find_revisits(
 
 
 def _near(world_T_body: Array, row: int, same_view: bool) -> NDArray[np.bool_]:
-    """Which earlier poses (row,) of (N, 4, 4) are the same place as one of them."""
+    """Return (row,) whether earlier poses of (N, 4, 4) are the same place as the one in this row."""
     there, here = world_T_body[:row], world_T_body[row]
     near = np.linalg.norm(there[:, :3, 3] - here[:3, 3], axis=1) <= PLACE_RADIUS_M
     if same_view:
@@ -285,7 +285,7 @@ def _near(world_T_body: Array, row: int, same_view: bool) -> NDArray[np.bool_]:
 
 
 def trajectory_error(estimate: Trajectory | None, truth: Trajectory) -> float | None:
-    """ATE in metres where the truth covers the estimate; None when it covers fewer than three poses."""
+    """Return ATE in metres where the truth covers the estimate; None when it covers fewer than three poses."""
     if estimate is None:
         return None
     poses, known = truth.at(estimate.stamps_ns)
@@ -295,15 +295,15 @@ def trajectory_error(estimate: Trajectory | None, truth: Trajectory) -> float | 
 
 
 def absolute_trajectory_error(estimate: Array, truth: Array) -> float:
-    """Root mean square distance in metres of (N, 3) positions after rigid alignment [Sturm 2012]."""
+    """Return the root mean square distance in metres of (N, 3) positions after rigid alignment [Sturm 2012]."""
     aligned = transform(align(estimate, truth)[0], estimate)
     return float(np.sqrt(np.mean(np.sum((aligned - truth) ** 2, axis=1))))
 
 
 def pose_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Array:
-    """Pose (4, 4) of a trajectory's frame in that of the truth, to be drawn there.
+    """Return the pose (4, 4) of a trajectory's frame in that of the truth, for drawing.
 
-    They are joined at the first pose that the truth covers, or laid best over a truth without headings. It is the
+    They coincide at the first pose that the truth covers, or are aligned to a truth without headings. It is the
     identity without a truth, or where it covers fewer than three poses.
     """
     if truth is None or trajectory is truth:
@@ -318,7 +318,7 @@ def pose_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Array:
 
 
 def positions_in_truth(trajectory: Trajectory, truth: Trajectory | None) -> Array:
-    """Positions (N, 3) in metres, to be drawn in the frame of the truth."""
+    """Return positions (N, 3) in metres in the frame of the truth, for drawing."""
     return transform(pose_in_truth(trajectory, truth), trajectory.poses[:, :3, 3])
 
 

@@ -1,4 +1,4 @@
-"""Write the folder of a run while it goes.
+"""Write the folder of a run as it goes.
 
 A folder or file that cannot be written raises an `OutputError`.
 """
@@ -46,8 +46,8 @@ if TYPE_CHECKING:
 
 
 PLACES = "places.sqlite"
-"""Store of places of a replay whose settings name none, until it is finished."""
-PHOTO_WIDTH, PHOTO_QUALITY, SCAN_POINTS = 360, 60, 3000  # by hand: rocks are still rocks, at some 30 kB a keyframe
+"""Place database of an unfinished replay whose settings name none."""
+PHOTO_WIDTH, PHOTO_QUALITY, SCAN_POINTS = 360, 60, 3000  # by hand: rocks stay recognisable, at some 30 kB per keyframe
 
 
 def create_folder(out: Path, bag: Path) -> Path:
@@ -60,10 +60,10 @@ def create_folder(out: Path, bag: Path) -> Path:
 def unfinished_folder(out: Path, bag: Path, settings: Settings) -> Path | None:
     """Find the newest folder inside `out` of an unfinished replay of `bag`; None where there is none.
 
-    A replay that was begun with other settings raises an `UmfError`.
+    A replay that was started with other settings raises an `UmfError`.
     """
-    begun = [path.parent for path in sorted(out.glob(f"*/{NAME}"), reverse=True) if not path.parent.is_symlink()]
-    for path in begun:
+    unfinished = [path.parent for path in sorted(out.glob(f"*/{NAME}"), reverse=True) if not path.parent.is_symlink()]
+    for path in unfinished:
         facts: dict[str, Any] = {}
         with suppress(UmfError), closing(RunFile(path, read_only=True)) as file:
             facts = file.facts()
@@ -71,20 +71,20 @@ def unfinished_folder(out: Path, bag: Path, settings: Settings) -> Path | None:
             continue
         # without settings, the process was killed before its first row
         if (path / "config.yaml").exists() and load_settings(path / "config.yaml") != settings:
-            raise UmfError(f"{path} was begun with other settings; leave out --resume, or give the same options")
-        (path / "summary.json").unlink(missing_ok=True)  # of a run that was interrupted by Ctrl-C
+            raise UmfError(f"{path} was started with other settings; leave out --resume, or pass the same options")
+        (path / "summary.json").unlink(missing_ok=True)  # of a run interrupted by Ctrl-C
         return path
     return None
 
 
 def with_places(settings: Settings, folder: Path) -> Settings:
-    """The settings, with a store of places in the folder of a replay where they name none."""
+    """Return the settings, with a place database in the folder of a replay if they name none."""
     places = settings.database.path or str(folder / PLACES)
     return settings.model_copy(update={"database": settings.database.model_copy(update={"path": places})})
 
 
 def finish_folder(folder: Path) -> None:
-    """Mark a replay as finished, and delete its store of places."""
+    """Mark a replay as finished, and delete its place database."""
     for path in folder.glob(f"{PLACES}*"):
         path.unlink(missing_ok=True)
     _note(folder, finished=True)
@@ -96,16 +96,16 @@ def _note(folder: Path, **values: Any) -> None:
 
 
 class RunRecorder:
-    """Writes a run: `config.yaml` at once, `run.sqlite` keyframe by keyframe, CSV tables and `summary.json` at the end.
+    """Writer of a run: `config.yaml` at once, `run.sqlite` keyframe by keyframe, CSV tables and `summary.json` last.
 
-    A folder that an earlier process has begun is continued: rows and counts of both are kept, and a keyframe that is
-    there already, as when a recording is played again, is not written twice.
+    A folder of an earlier process is continued: rows and counts of both are kept, and a stored
+    keyframe, as of a recording that is played again, is not written twice.
 
     Args:
         folder: an existing, writable folder.
         settings: the effective settings.
         weights: name of the network's weights, for the summary.
-        resume: all frames of the recording pass again, and are counted again.
+        resume: all frames of the recording are processed and counted again.
 
     Attributes:
         recorded: stamps and sessions of the keyframes in the folder.
@@ -134,7 +134,7 @@ class RunRecorder:
         self._last_stamp_ns: int | None = None
 
     def record(self, frame: Frame, detection: Detection) -> None:
-        """Write the results of one frame, all of them or none."""
+        """Write the results of one frame in one transaction."""
         self.count(frame)
         if self._last_stamp_ns is not None:
             self._recorded_ns += max(0, frame.stamp_ns - self._last_stamp_ns)
@@ -187,12 +187,12 @@ class RunRecorder:
             self._file.append("localization", [[stamp_ns, *(f"{number:.6g}" for number in numbers)]])
 
     def count(self, frame: Frame) -> None:
-        """Count a frame, also one that was processed before."""
+        """Count a frame, including frames processed before."""
         self._counts["frames"] += 1
         self._counts["pairs"] += frame.left is not None and frame.points is not None
 
     def summary(self, drops: Mapping[str, int]) -> dict[str, Any]:
-        """Contents of `summary.json`; `ground_truth` is filled in by the report."""
+        """Return the contents of `summary.json`; `ground_truth` is filled in by the report."""
         elapsed_s = time.monotonic() - self._started
         return {
             **self._counts,
@@ -220,12 +220,12 @@ class RunRecorder:
             self._file.close()
 
     def _facts(self) -> dict[str, Any]:
-        """The facts about a run that `umf report` takes from the file of a process that was killed."""
+        """Return the facts about a run that `umf report` reads from the file of a killed process."""
         counts = {name: self._counts[name] for name in ("frames", "pairs")}
         return counts | {"weights": self._weights, "exported": False}
 
     def _earlier_counts(self, resume: bool) -> dict[str, int]:
-        """Count the rows in the file; all frames of a recording that is resumed pass again."""
+        """Count the rows in the file; all frames of a resumed recording are counted again."""
         facts = self._file.facts() if not resume else {}
         candidates = self._file.rows("candidates")
         return {
@@ -239,7 +239,7 @@ class RunRecorder:
 
 
 def picture_of(frame: Frame, keyframe: Keyframe) -> Picture:
-    """Reduce the left image and the scan of a keyframe to what the report shows."""
+    """Reduce the left image and the scan of a keyframe to the size in the report."""
     points = keyframe.points[
         np.linspace(0, len(keyframe.points) - 1, min(len(keyframe.points), SCAN_POINTS)).astype(int)
     ]
@@ -254,7 +254,7 @@ def picture_of(frame: Frame, keyframe: Keyframe) -> Picture:
 
 
 def count_drops(counters: Mapping[Input, InputCounter], worker: int = 0) -> dict[str, int]:
-    """The `drops` entry of the summary: messages lost for a reason that should not happen, by input."""
+    """Return the `drops` entry of the summary: messages lost for a reason that should not happen, by input."""
     lost = {name: counters[name].lost for name in ("cloud", "odometry")}
     return {"image": counters["left"].lost + counters["right"].lost, **lost, "worker": worker}
 
@@ -265,7 +265,7 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> None:
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """Read the folder's `summary.json`; an `UmfError` where it is missing, or not what a run writes."""
+    """Read the folder's `summary.json`; raise an `UmfError` if it is missing or not from a run."""
     path = folder / "summary.json"
     if not path.is_file():
         raise UmfError(f"{folder} holds no finished run: summary.json is missing")
@@ -274,7 +274,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
     except ValueError:
         content = None
     if not isinstance(content, dict) or "closures_published" not in content:
-        raise UmfError(f"{path} is not the summary of a run")
+        raise UmfError(f"{path} is not a summary of a run")
     return content
 
 

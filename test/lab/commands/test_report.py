@@ -235,9 +235,9 @@ def test_a_run_without_closures_and_trajectories(bag: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("summary.json", '{"frames": 3, ', "summary.json is not the summary of a run"),
-        ("summary.json", "[]", "summary.json is not the summary of a run"),
-        ("summary.json", '{"hello": 1}', "summary.json is not the summary of a run"),
+        ("summary.json", '{"frames": 3, ', "summary.json is not a summary of a run"),
+        ("summary.json", "[]", "summary.json is not a summary of a run"),
+        ("summary.json", '{"hello": 1}', "summary.json is not a summary of a run"),
         ("closures.csv", None, "cannot read"),
         ("closures.csv", "query_stamp_ns,match_stamp_ns\n1,2\n", "closures.csv, line 2: not a row of this table"),
         ("keyframes.csv", "stamp_ns,session,travelled_m\n5,0,1.5\n6,0\n", "keyframes.csv, line 3: not a row"),
@@ -265,14 +265,14 @@ def test_another_recording_changes_nothing(run: Path, bag: Path, tmp_path: Path)
     before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
     late = write_mcap(tmp_path / "late.mcap", [(topic, at + 10**12, message) for topic, at, message in traverse(0.5)])
     line = only_line(umf("report", run, late))
-    assert line.startswith(f"{run} was made on another recording than {late}: 18 of 18 keyframes are not of its time")
+    assert line.startswith(f"{run} was made on another recording than {late}: 18 of 18 keyframes are outside its time")
     assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
 
 
 def test_a_run_knows_its_recording_from_one_of_the_same_time(run: Path, bag: Path, tmp_path: Path) -> None:
     remember_recording(run, open_bag(bag))
     other = write_mcap(tmp_path / "other.mcap", [entry for entry in traverse(4.0) if entry[0] != LEFT])
-    assert only_line(umf("report", run, other)) == (f"{run} was made on another recording, {bag}: nothing was written")
+    assert only_line(umf("report", run, other)) == (f"{run} was made on another recording, {bag}; nothing was written")
     report(run, bag)
 
 
@@ -282,5 +282,5 @@ def test_a_truth_of_another_clock_does_not_unjudge_a_run(run: Path, bag: Path, t
     stamps = START_NS - 10**18 + np.arange(40, dtype=np.int64) * 10**8
     write_tum(tmp_path / "other.tum", Trajectory(stamps, np.tile(np.eye(4), (40, 1, 1))))
     line = only_line(umf("report", run, bag, "--ground-truth", tmp_path / "other.tum"))
-    assert line.startswith("the ground truth is of another clock: it covers none of the 18 keyframes")
+    assert line.startswith("the ground truth has another clock: it covers none of the 18 keyframes")
     assert ((run / "summary.json").read_bytes(), (run / "report.html").read_bytes()) == before
