@@ -49,7 +49,7 @@ def test_a_graph_that_was_killed_is_taken_up_as_it_was(world: GraphWorld, tmp_pa
     drive(whole, world, 0, len(world.truth))
     for first, last in ((0, 120), (120, 220), (220, len(world.truth))):
         graph = made(path)
-        assert graph.changed == 0 and graph.taken_up == len([c for c in world.closures if c[1] < first])
+        assert graph.changed == 0 and graph.recovered == len([c for c in world.closures if c[1] < first])
         drive(graph, world, first, last)
         os.close(graph._file._lock)  # as a kill does: nothing else is closed
     last_one = made(path)
@@ -191,7 +191,7 @@ def test_ending_a_graph_keeps_a_journal_that_somebody_reads(world: GraphWorld, t
     graph.close()
     reader.close()
     assert kept is not None
-    assert made(tmp_path / JOURNAL).taken_up == 0
+    assert made(tmp_path / JOURNAL).recovered == 0
     again = made(kept)
     assert states(again) == before and again.graph.counts["odometry"] == 231
 
@@ -205,7 +205,7 @@ def test_a_resumed_graph_goes_on_and_keeps_revocations(world: GraphWorld, tmp_pa
     before = graph.graph.verdict_counts()
     graph.close()
     again = made(path)
-    assert again.changed == 0 and again.graph.verdict_counts() == before and again.taken_up == sum(before.values())
+    assert again.changed == 0 and again.graph.verdict_counts() == before and again.recovered == sum(before.values())
     drive(again, world, 270, len(world.truth))
     assert states(again) == states(whole)
     np.testing.assert_allclose(again.graph.trajectory()[1], whole.graph.trajectory()[1], atol=1e-6)

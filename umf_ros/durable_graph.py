@@ -36,7 +36,7 @@ _NUMBERS |= dict.fromkeys(_ABSOLUTE, 15)
 _EVENT = "INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)"
 _EVENTS = "SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"
 JOURNAL = "pose_graph.sqlite"
-"""Name of the file in a folder of results."""
+"""Name of the log in a folder of results."""
 
 
 def feed(graph: PoseGraph, inputs: Iterable[GraphInput], splitter: OdometrySessionSplitter | None = None) -> bool:
@@ -44,8 +44,8 @@ def feed(graph: PoseGraph, inputs: Iterable[GraphInput], splitter: OdometrySessi
 
     Args:
         graph: to be filled.
-        inputs: in the order in which they came.
-        splitter: of the messages into the graph's sessions; None: one of its own.
+        inputs: in the order of arrival.
+        splitter: splits odometry into the graph's sessions; None: a new one.
 
     Returns:
         Whether there was odometry.
@@ -72,25 +72,25 @@ def feed(graph: PoseGraph, inputs: Iterable[GraphInput], splitter: OdometrySessi
 class DurableGraph:
     """A pose graph with a write-ahead log, and its odometry split into sessions.
 
-    Every event is written when it comes: a process that is killed loses none. One process at a time writes the log.
+    Every event is written on arrival: a killed process loses none. One process at a time writes the log.
     After a restart the closures get their logged verdicts, and the map is solved once; with other settings they are
-    decided anew. When the disk is full, the graph goes on without its log, and `on_fault` is called with the error.
+    decided again. When the disk is full, the graph continues without its log, and `on_fault` is called with the error.
 
     Args:
         settings: of the graph.
         path: of the log, opened when it exists; None: no log.
         on_fault: takes the error when the log cannot be written.
-        make: makes an empty graph.
+        make: returns an empty graph.
 
     Attributes:
         graph: the graph.
         feed: splits odometry into sessions and passes it to the graph.
-        taken_up: number of closures that were found in the log.
-        changed: number of these that now have another verdict than was written.
-        unsettled: whether the process before had no time to settle the graph at its end.
+        recovered: number of closures that were found in the log.
+        changed: number of these whose verdict differs from the log.
+        unsettled: whether the previous process had no time to settle the graph at its end.
 
     Raises:
-        UmfError: the log is something else, is damaged, or another process writes it.
+        UmfError: the file is not a log, is damaged, or is written by another process.
         OutputError: the log cannot be written.
     """
 
@@ -104,30 +104,30 @@ class DurableGraph:
         self._settings, self._path, self._on_fault = settings, path, on_fault
         self._make = make or partial(PoseGraph, settings)
         self._file = SqliteFile(path, _SCHEMA) if path is not None else None
-        self.taken_up = self.changed = 0
+        self.recovered = self.changed = 0
         self.unsettled = False
         self._begin()
         if self._file is not None:
             self._resume(self._file)
 
     def take_odometry(self, stamp_ns: int, odom_T_body: Array) -> Reset | None:
-        """Take one message; returns why a new session has begun with it."""
+        """Add an odometry message; return the reset of a session that begins with it, else None."""
         self._log(ODOMETRY, stamp_ns, 0, odom_T_body)
         return self.feed.take(stamp_ns, odom_T_body)
 
     def take_absolute(self, measurement: AbsoluteMeasurement) -> None:
-        """Take one absolute measurement; `update` decides about it."""
+        """Add an absolute measurement; `update` decides about it."""
         self._log(measurement.source.value, measurement.stamp_ns, 0, measurement.numbers)
         self.graph.add_absolute(measurement)
 
     def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
-        """Take one closure; returns every verdict that it brought about or changed."""
+        """Add a closure; return every verdict that it caused or changed."""
         numbers = np.hstack([closure.match_T_query.ravel(), closure.covariance.ravel(), closure.probability])
         self._log(CLOSURE, closure.match_stamp_ns, closure.query_stamp_ns, numbers)
         return self._logged(self.graph.add_closure(closure))
 
     def revoke(self, match_ns: int, query_ns: int) -> list[ClosureVerdict]:
-        """Take every closure between two keyframes out for good.
+        """Revoke every closure between two keyframes for good.
 
         Raises:
             GraphError: there is no such closure, or the graph cannot be solved without it.
@@ -137,11 +137,11 @@ class DurableGraph:
         return self._logged(verdicts)
 
     def update(self) -> list[ClosureVerdict]:
-        """Decide about closures that waited for odometry; returns new verdicts."""
+        """Decide about closures whose odometry has arrived; return new verdicts."""
         return self._logged(self.graph.update())
 
     def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
-        """Settle the graph and write its results; a graph that is not settled in time is marked so in the log.
+        """Settle the graph and write its results; mark a graph that is not settled in time in the log.
 
         Raises:
             OutputError: the folder cannot be written.
@@ -153,7 +153,7 @@ class DurableGraph:
         return settled
 
     def end(self) -> Path | None:
-        """End this graph and begin another; returns the new name of the old log."""
+        """End this graph and begin another; return the new name of the old log."""
         self._begin()
         if self._path is None or self._file is None:
             return None
@@ -161,7 +161,7 @@ class DurableGraph:
         self._file.close()
         try:
             with writing(self._path):
-                # while another process reads it, its newest part lies in a file that belongs to its name
+                # while another process reads it, its newest part is in a file of that name
                 for part in (f"{self._path}-wal", str(self._path)):
                     if Path(part).exists():
                         Path(part).rename(part.replace(self._path.name, old.name))
@@ -207,12 +207,12 @@ class DurableGraph:
             self._log(STARTED)
         self._write(f"PRAGMA user_version = {self._mark}")
         found = self.graph.closures()
-        self.taken_up = len(found)
+        self.recovered = len(found)
         states = {(v.closure.match_stamp_ns, v.closure.query_stamp_ns): v.state for v in found}
         self.changed = sum(states.get(pair) != state for pair, (state, *_) in verdicts.items())
 
     def _inputs(self, events: Iterable[tuple[Any, ...]], revoked: list[tuple[int, int]]) -> Iterator[GraphInput]:
-        """Inputs of logged events; adds pairs of keyframes whose closures were revoked."""
+        """Yield the inputs of logged events; append pairs of keyframes whose closures were revoked."""
         for kind, first_ns, second_ns, data in events:
             numbers = np.frombuffer(data, np.float64)
             if len(numbers) != _NUMBERS.get(kind, -1):
@@ -255,6 +255,6 @@ class DurableGraph:
 
 
 def _decision(state: str, reason: str, *numbers: float | None) -> Decision:
-    """A logged decision; SQLite has no NaN."""
+    """Return a logged decision; SQLite stores NaN as NULL."""
     sigmas, metres = (float("nan") if number is None else float(number) for number in numbers)
     return State(state), ClosureReason(reason), sigmas, metres

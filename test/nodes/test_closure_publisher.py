@@ -123,7 +123,7 @@ def test_a_closure_with_another_rover_names_both(talk: Talk) -> None:
     closure = found.closure
     assert closure is not None
     keyframe = at(QUERY_NS, 4.0, 2.0)
-    talk.announcer.announce_encounter(InterRobotClosure(keyframe, "ada", "bea", [found, waiting], [closure]))
+    talk.announcer.publish_inter_robot(InterRobotClosure(keyframe, "ada", "bea", [found, waiting], [closure]))
     (message,) = talk.hear("/loop_closures")
     assert message.header.frame_id == f"keyframe/bea/{MATCH_NS}"
     assert message.child_frame_id == f"keyframe/ada/{QUERY_NS}"

@@ -59,7 +59,7 @@ def test_a_topic_that_talks_is_fine_and_has_its_rate(node: Node, clock: Clock) -
     watch = InputWatch(node, "left_image", TOPIC, Image)
     clock.now_s += 2
     for i in range(9):
-        watch.saw(10**18 + i)
+        watch.count(10**18 + i)
     line = watch.status()
     assert (line.level, line.name, line.message) == (DiagnosticStatus.OK, "input left_image", "4.5 Hz")
     assert values_of(line) == {
@@ -79,7 +79,7 @@ def test_the_rate_is_that_since_the_last_look(node: Node, clock: Clock) -> None:
     for count in (5, 0, 20):
         clock.now_s += 1
         for _ in range(count):
-            watch.saw(1)
+            watch.count(1)
         rates.append(values_of(watch.status())["rate_hz"])
     assert rates == ["5", "0", "20"]
 
@@ -91,11 +91,11 @@ def test_an_input_of_which_everything_is_refused_is_a_warning_while_it_is_so(nod
     for refused in (0, 3, 4):
         clock.now_s += 1
         for _ in range(4):
-            watch.saw(1)
+            watch.count(1)
         watch.refused += refused
         levels.append((watch.status().level, watch.warning))
     assert levels[:2] == [(DiagnosticStatus.OK, "")] * 2
-    assert levels[2] == (DiagnosticStatus.WARN, f"odometry: 4.0 Hz on {TOPIC}, and all are refused")
+    assert levels[2] == (DiagnosticStatus.WARN, f"odometry: 4.0 Hz on {TOPIC}, all refused")
 
 
 def test_without_a_publisher_the_topic_is_named(node: Node, clock: Clock) -> None:
@@ -129,13 +129,13 @@ def test_publishers_that_are_not_heard_are_shown_with_their_qos(
 def test_a_topic_that_falls_silent_is_a_warning_until_it_speaks_again(node: Node, clock: Clock) -> None:
     watch = InputWatch(node, "cloud", TOPIC, Image)
     publish_on(node, 1)
-    watch.saw(7)
+    watch.count(7)
     clock.now_s += 4.5
     assert watch.status().level == DiagnosticStatus.OK
     clock.now_s += 7.5
     assert watch.status().message == f"silent for 12 s: 1 publisher(s) on {TOPIC}"
     assert watch.warning == f"cloud: silent for 12 s: 1 publisher(s) on {TOPIC}"
-    watch.saw(8)
+    watch.count(8)
     assert watch.status().level == DiagnosticStatus.OK and watch.warning == ""
 
 

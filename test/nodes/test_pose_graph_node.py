@@ -239,7 +239,7 @@ def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Pat
     rig.values.clear()
     again = Process(MODULE, tmp_path / "two.log", *parameters)
     again.wait_for("ready")
-    assert f"taken up: {odometry_before} odometry messages" in again.output and "differ" not in again.output
+    assert f"recovered: {odometry_before} odometry messages" in again.output and "differ" not in again.output
     rig.until(lambda: rig.values.get("accepted") == before)
     second = Process(MODULE, tmp_path / "three.log", *parameters)
     wait_until(lambda: second.exit_code is not None, 120.0)
@@ -285,7 +285,7 @@ def test_without_autostart_it_waits_for_its_life_cycle(rig: Rig, tmp_path: Path)
 
 def test_without_a_clock_it_says_so(rig: Rig, tmp_path: Path) -> None:
     process = Process(MODULE, tmp_path / "node.log", "use_sim_time:=true")
-    process.wait_for("nothing comes on /clock")
+    process.wait_for("/clock is silent")
     rig.until(lambda: "pose_graph_node: pose graph" in rig.inputs)
     process.kill()
 

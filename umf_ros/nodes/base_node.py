@@ -1,4 +1,4 @@
-"""Base of both nodes: life cycle, parameters, watched inputs, diagnostics, faults that never end the node."""
+"""Base of both nodes: life cycle, parameters, watched inputs, diagnostics, and faults that do not end the node."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.tf import PATIENCE_S, TOPIC, BodyFrames, StaticTransforms
 
 STATIC_QOS = latched(100)
-"""Every broadcaster of static transforms has its own part of the tree."""
+"""Deep enough for several broadcasters, each with a part of the tree."""
 WATCH_S = 1.0
 HEARTBEAT_S = 0.05
 CLOCK_PATIENCE_S = 30.0
-"""A player that starts beside the node, and waits for the other one, takes so long at most on a busy machine."""
-SIM_TIME_SILENT = "use_sim_time is set, but nothing comes on /clock: stamps of messages count, the pose's age does not"
+"""Longest start of a bag player beside the nodes, for which it waits, on a busy machine."""
+SIM_TIME_SILENT = "use_sim_time is set, but /clock is silent: message stamps are used, the age of the pose is unknown"
 
 
 class BaseNode(LifecycleNode, ABC):
@@ -44,7 +44,7 @@ class BaseNode(LifecycleNode, ABC):
 
     Nodes set up their work in `_open` and end it in `_finish`. With `autostart`, the default, they are configured and
     activated at once; without, they wait for the services of the life cycle. An inactive node takes no messages.
-    No exception in a callback ends a node: every one is counted, logged, and shows in the diagnostics.
+    No exception in a callback ends a node: each is counted, logged, and reported in the diagnostics.
 
     Raises:
         ConfigError: a parameter is unknown, of the wrong type or out of range.
@@ -67,7 +67,7 @@ class BaseNode(LifecycleNode, ABC):
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._use_parameters)
         self._wall = Clock(clock_type=ClockType.STEADY_TIME)
-        # the machine's clock: a watch that stands still with /clock watches nothing
+        # the machine's clock: the watch has to run while /clock is silent
         self._stall_ms, self._beat_s = 0.0, math.inf
         self.create_timer(HEARTBEAT_S, self._beat, clock=self._wall)
         self.create_timer(WATCH_S, self._guarded("watch", lambda: self._watch()), clock=self._wall)
@@ -78,40 +78,40 @@ class BaseNode(LifecycleNode, ABC):
             self.get_logger().info("ready")
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Make everything; a fault of the user is one line and a failure."""
+        """Configure the node; an error of the user is one line and a failure."""
         if not self._opened:
             try:
                 self._configure()
             except UmfError as error:
                 self.get_logger().error(str(error))
-                self._let_go()
+                self._release()
                 return TransitionCallbackReturn.FAILURE
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take messages."""
+        """Start taking messages."""
         if not self._opened:
-            self.get_logger().error("its results could not be written: clean it up again, then configure it")
+            self.get_logger().error("the results could not be written: call cleanup again, then configure")
             return TransitionCallbackReturn.FAILURE
         self._active = True
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take no messages; what is in hand is finished."""
+        """Stop taking messages, and finish those in hand."""
         self._active = False
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Write the results and let go of everything."""
+        """Write the results and release everything."""
         result = super().on_cleanup(state)
         try:
             self._close()
-        except Exception as error:  # rclpy would drop it without a word
+        except Exception as error:  # rclpy would drop it silently
             self._unwritten = error
             if not self._leaving:
                 self.get_logger().error(f"{type(error).__name__}: {error}")
             return TransitionCallbackReturn.FAILURE
-        self._let_go()
+        self._release()
         return result
 
     on_shutdown = on_cleanup
@@ -124,7 +124,7 @@ class BaseNode(LifecycleNode, ABC):
         """
         self._leaving = True
         if self._opened and rclpy.ok(context=self.context):
-            self.trigger_shutdown()  # listeners hear when the last messages begin and when they are out
+            self.trigger_shutdown()  # reports the start and the end of the last messages
         self._close()
         error, self._unwritten = self._unwritten, None
         if error is not None:
@@ -138,24 +138,24 @@ class BaseNode(LifecycleNode, ABC):
                 self._finish()
 
     def ready_to_close(self) -> bool:
-        """Whether nothing more is to be waited for after Ctrl-C."""
+        """Return whether the node can close after Ctrl-C."""
         return True
 
     @abstractmethod
     def _open(self) -> None:
-        """Make everything that the node needs."""
+        """Create everything that the node needs."""
 
     @abstractmethod
     def _finish(self) -> None:
-        """Finish the work in hand, write the results, let go of everything."""
+        """Finish the work in hand, write the results, release everything."""
 
     @abstractmethod
     def _retune(self, settings: Settings) -> None:
-        """Take over settings that may change while the node runs."""
+        """Apply settings that may change while the node runs."""
 
     @abstractmethod
     def _tick(self) -> None:
-        """Once per second of the machine's clock."""
+        """Work once per second of the machine's clock."""
 
     def _configure(self) -> None:
         if self._results:
@@ -165,7 +165,7 @@ class BaseNode(LifecycleNode, ABC):
             with watchdog.watching(watchdog.PATIENT_S):
                 self._open()
             self._opened = True
-            # all that is there now stays: a garbage collection of it blocked the executor for .3 s
+            # permanent objects: their garbage collection blocked the executor for .3 s
             gc.collect()
             gc.freeze()
         finally:
@@ -174,8 +174,8 @@ class BaseNode(LifecycleNode, ABC):
     def _entities(self) -> list[Any]:
         return [*self.publishers, *self.subscriptions, *self.services]
 
-    def _let_go(self) -> None:
-        """Take off the graph what `_open` made, and nothing else: `/clock` is heard in every state."""
+    def _release(self) -> None:
+        """Destroy the entities that `_open` made; `/clock` is subscribed in every state."""
         gc.unfreeze()
         for entity in self._own:
             self.destroy_publisher(entity) or self.destroy_subscription(entity) or self.destroy_service(entity)
@@ -187,7 +187,7 @@ class BaseNode(LifecycleNode, ABC):
             return
         self._clockless_s = self._clockless_s + WATCH_S if self._lacks_clock() else 0.0
         for watch in self._watches if 0 < self._clockless_s < CLOCK_PATIENCE_S else ():
-            watch.begin()  # the player is still starting: its topics are silent for that reason alone
+            watch.begin()  # the player is still starting: silence is expected
         self._tick()
         for watch in self._watches:
             if watch.warning and self._is_due(f"input {watch.name}", 30.0):
@@ -196,13 +196,13 @@ class BaseNode(LifecycleNode, ABC):
             self.get_logger().warning(SIM_TIME_SILENT)
 
     def _beat(self) -> None:
-        """Measure how late the executor is at most, ms."""
+        """Measure the longest delay of the executor, ms."""
         now_s = time.monotonic()
         self._stall_ms = max(self._stall_ms, 1e3 * (now_s - self._beat_s - HEARTBEAT_S))
         self._beat_s = now_s
 
     def _is_due(self, line: str, every_s: float) -> bool:
-        """Rate-limit log lines: whether this one is due again."""
+        """Rate-limit log lines: return whether this one is due again."""
         now_s = time.monotonic()
         if now_s - self._logged_s.get(line, -math.inf) < every_s:
             return False
@@ -213,19 +213,19 @@ class BaseNode(LifecycleNode, ABC):
         return bool(self.get_parameter("use_sim_time").value) and self.get_clock().now().nanoseconds == 0
 
     def _own_topic(self, name: str, topics: Topics) -> str:
-        """The name to subscribe to: that of a data set is relative, so that a namespace is a robot."""
+        """Return the name to subscribe to: that of a data set is relative, so that a namespace is a robot."""
         topic = str(getattr(topics, name))
         named = getattr(self._settings.topics, name) != getattr(Topics(), name)
         return topic if named else topic.removeprefix("/")
 
     def _guarded(self, what: str, take: Callable[..., Any]) -> Callable[..., Any]:
-        """`take`, so that no exception leaves it."""
+        """Return `take` with every exception caught."""
 
         def call(*arguments: Any) -> Any:
             try:
                 return take(*arguments)
             except Exception as error:
-                self._complain(error, what)
+                self._report_fault(error, what)
                 return None
 
         return call
@@ -233,10 +233,10 @@ class BaseNode(LifecycleNode, ABC):
     def _subscribe(
         self, name: str, kind: type, topic: str, take: Callable[[Any], None], qos: QoSProfile, rare: bool = False
     ) -> None:
-        """Hear an input of messages with a header, and watch it; `rare` ones may be silent."""
+        """Subscribe to an input of messages with a header, and watch it; `rare` ones may be silent."""
 
         def receive(message: Any) -> None:
-            watch.saw(from_time(message.header.stamp))
+            watch.count(from_time(message.header.stamp))
             if not self._active:
                 return
             try:
@@ -253,8 +253,8 @@ class BaseNode(LifecycleNode, ABC):
         watch = InputWatch(self, name, subscription.topic_name, kind, rare)
         self._watches.append(watch)
 
-    def _hear_transforms(self, calibration: Calibration | None = None) -> BodyFrames:
-        """Hear `/tf_static`, which moves odometry and a calibration's sensors; Jazzy from PyPI lacks its tf2_msgs."""
+    def _subscribe_transforms(self, calibration: Calibration | None = None) -> BodyFrames:
+        """Subscribe to `/tf_static` for extrinsics and the odometry's frame; Jazzy from PyPI lacks tf2_msgs."""
         transforms, warn = StaticTransforms(), self.get_logger().warning
         try:
             from tf2_msgs.msg import TFMessage
@@ -266,21 +266,21 @@ class BaseNode(LifecycleNode, ABC):
         return BodyFrames(self._settings.frames, transforms, warn, PATIENCE_S, calibration)
 
     def _offer(self, kind: type, name: str, action: Callable[[Any], str]) -> None:
-        """Offer a service that answers what `action` makes of the request; any fault is a refusal."""
+        """Offer a service that answers with the text of `action`; any fault is a failure."""
 
         def answer(request: Any, response: Any) -> Any:
             try:
                 response.success, response.message = True, action(request)
             except Exception as error:
                 if not isinstance(error, UmfError):
-                    self._complain(error, name)
+                    self._report_fault(error, name)
                 response.success, response.message = False, str(error)
             return response
 
         self.create_service(kind, name, answer)
 
     def _diagnose(self, own: DiagnosticStatus) -> None:
-        """Publish the node's own health and that of its inputs."""
+        """Publish the health of the node and its inputs."""
         if self._lacks_clock():
             own.level, own.message = max(own.level, WARN), f"{own.message}; {SIM_TIME_SILENT}"
         report = DiagnosticArray(status=[own, *(watch.status() for watch in self._watches)])
@@ -292,7 +292,7 @@ class BaseNode(LifecycleNode, ABC):
         self._diagnostics.publish(report)
 
     def _judge(self, own: DiagnosticStatus) -> DiagnosticStatus:
-        """The node's own status, worse where an input is silent or a fault came lately."""
+        """Return the node's own status, degraded by silent inputs and recent faults."""
         troubles = [watch.warning for watch in self._watches if watch.warning]
         troubles += [f"last fault: {self._last_fault}"] if self._last_fault else []
         if troubles or not self._active:
@@ -300,8 +300,8 @@ class BaseNode(LifecycleNode, ABC):
             own.message = "; ".join([own.message, *troubles]) if self._active else "inactive"
         return own
 
-    def _complain(self, error: Exception, what: str = "") -> None:
-        """Count a fault; log the first of each kind at once and later ones at a limited rate."""
+    def _report_fault(self, error: Exception, what: str = "") -> None:
+        """Count a fault; log the first of each kind at once, later ones at a limited rate."""
         kind = error.kind if isinstance(error, MessageError) else type(error).__name__
         self._faults[kind] += 1
         where = f"{what}: " if what else ""

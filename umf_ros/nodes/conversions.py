@@ -23,19 +23,19 @@ from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose
 
 
 def latched(depth: int) -> QoSProfile:
-    """Profile of a topic whose last messages reach late subscribers too (REP-2003)."""
+    """Return the profile of a topic whose last messages also reach late subscribers (REP-2003)."""
     return QoSProfile(
         depth=depth, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
     )
 
 
 CLOSURES_QOS = latched(5000)
-"""With their history: a SLAM system that joins late gets every closure and verdict of the run."""
+"""With history: a SLAM system that joins late gets every closure and verdict of the run."""
 LATCHED_QOS = latched(1)
 
 
 def sensor_qos(settings: Qos, min_depth: int = 1) -> QoSProfile:
-    """Profile of a sensor subscription: best effort unless the settings say otherwise."""
+    """Return the profile of a sensor subscription: best effort unless set otherwise."""
     reliable = settings.reliability == "reliable"
     policy = QoSReliabilityPolicy.RELIABLE if reliable else QoSReliabilityPolicy.BEST_EFFORT
     return QoSProfile(depth=max(settings.depth, min_depth), reliability=policy)
@@ -48,28 +48,28 @@ KEYFRAME_FRAME = re.compile(r"keyframe/([0-9]{1,19})")
 
 
 def to_time(stamp_ns: int) -> Time:
-    """Stamp as a message."""
+    """Return the stamp as a message."""
     return Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
 
 
 def from_time(stamp: Time) -> int:
-    """Nanoseconds of a stamp."""
+    """Return nanoseconds of a stamp."""
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def to_point(position: Array) -> Point:
-    """(3,) metres as a message."""
+    """Return (3,) metres as a message."""
     x, y, z = (float(number) for number in position)
     return Point(x=x, y=y, z=z)
 
 
 def to_pose(pose: Array) -> Pose:
-    """(4, 4) pose as a message."""
+    """Return (4, 4) pose as a message."""
     return to_poses(pose[None])[0]
 
 
 def to_poses(poses: Array) -> list[Pose]:
-    """(N, 4, 4) poses as messages."""
+    """Return (N, 4, 4) poses as messages."""
     both = zip(poses[:, :3, 3], to_quaternion(poses).tolist(), strict=True)
     return [
         Pose(position=to_point(position), orientation=Quaternion(x=x, y=y, z=z, w=w)) for position, (x, y, z, w) in both
@@ -77,12 +77,12 @@ def to_poses(poses: Array) -> list[Pose]:
 
 
 def to_header(stamp_ns: int, frame: str) -> Header:
-    """Stamp and frame of a message."""
+    """Return the stamp and frame of a message."""
     return Header(stamp=to_time(stamp_ns), frame_id=frame)
 
 
 def to_markers(accepted: Iterable[Array], rejected: Iterable[Array], header: Header) -> MarkerArray:
-    """Closures as lines (2, 3) m from match to query, the newest last: accepted green, the others red."""
+    """Return closures as lines (2, 3) m from match to query, the newest last: accepted green, the others red."""
     array = MarkerArray()
     for number, (name, colour, lines) in enumerate((("accepted", GREEN, accepted), ("rejected", RED, rejected))):
         marker = Marker(header=header, ns=name, id=number, type=Marker.LINE_LIST, action=Marker.ADD, color=colour)
@@ -94,12 +94,12 @@ def to_markers(accepted: Iterable[Array], rejected: Iterable[Array], header: Hea
 
 
 def keyframe_frame(stamp_ns: int, robot: str = "") -> str:
-    """Frame name of a keyframe: its key is its sensor stamp, and in a fleet the rover's name before it."""
+    """Return the frame name of a keyframe: its sensor stamp, preceded by the rover's name in a fleet."""
     return f"keyframe/{robot}/{stamp_ns}" if robot else f"keyframe/{stamp_ns}"
 
 
 def closure_to_message(closure: LoopClosure, query_robot: str = "", match_robot: str = "") -> Odometry:
-    """A loop closure as odometry between two keyframes that are not consecutive.
+    """Return a loop closure as odometry between two keyframes that are not consecutive.
 
     `header.frame_id` is the match, `child_frame_id` the query, `pose` is `match_T_query`, its
     covariance is in ROS order about the axes of the match body. `twist.covariance[0] = -1` marks the twist as unused;
@@ -116,15 +116,15 @@ def closure_to_message(closure: LoopClosure, query_robot: str = "", match_robot:
 
 
 def is_between_rovers(message: Odometry) -> bool:
-    """Whether the frames of a message of `loop_closures` name rovers: what one rover's graph has no poses for."""
+    """Return whether the frames of a message of `loop_closures` name rovers, without poses in one rover's graph."""
     return all(BETWEEN_FRAME.fullmatch(frame) for frame in (message.header.frame_id, message.child_frame_id))
 
 
 def closure_from_message(message: Odometry) -> LoopClosure:
-    """The loop closure in a message of `loop_closures`; without a probability where the sender gives none.
+    """Return the loop closure in a message of `loop_closures`; without a probability if the sender gives none.
 
     Raises:
-        MessageError: the frames name no keyframes, or the pose is no pose.
+        MessageError: the frames name no keyframes, or the pose is invalid.
     """
     probability = float(message.twist.covariance[1])
     return LoopClosure(
@@ -137,10 +137,10 @@ def closure_from_message(message: Odometry) -> LoopClosure:
 
 
 def parse_pair(text: str) -> tuple[int, int]:
-    """Stamps of match and query in `keyframe/<match ns> keyframe/<query ns>`.
+    """Return stamps of match and query in `keyframe/<match ns> keyframe/<query ns>`.
 
     Raises:
-        MessageError: of kind "reject_edge" when it names no keyframes.
+        MessageError: of kind "reject_edge" when the text names no keyframes.
     """
     frames = text.split() if len(text) < 200 else []
     stamps = [stamp for stamp in map(_stamp_in, frames) if stamp is not None]
@@ -151,7 +151,7 @@ def parse_pair(text: str) -> tuple[int, int]:
 
 
 def _stamp_in(frame: str) -> int | None:
-    """The stamp, as far as there is one that a message can carry."""
+    """Return the stamp; None where there is none that fits a message."""
     found = KEYFRAME_FRAME.fullmatch(frame)
     stamp_ns = int(found[1]) if found is not None else -1
     return stamp_ns if 0 <= stamp_ns < LAST_STAMP_NS else None
@@ -165,11 +165,11 @@ def _keyframe_stamp(frame: str) -> int:
 
 
 MAX_POSES, MAX_LINES = 2000, 500
-"""RViz draws no more of a path and redraws every line; messages stay small on long drives."""
+"""Most poses of a path: RViz redraws every line; messages stay small on long drives."""
 
 
 def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: FrameIds) -> Path:
-    """The trajectory as a path, evenly thinned to at most `MAX_POSES` poses."""
+    """Return the trajectory as a path, evenly thinned to at most `MAX_POSES` poses."""
     if not len(stamps_ns):
         return Path(header=Header(frame_id=frames.map))
     rows = np.unique(np.linspace(0, len(stamps_ns) - 1, MAX_POSES).astype(int))
@@ -179,7 +179,7 @@ def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: FrameIds) -> P
 
 
 def pose(stamp_ns: int, map_T_body: Array, covariance: Array, frames: FrameIds) -> PoseWithCovarianceStamped:
-    """A pose in the map with its (6, 6) covariance in ROS order."""
+    """Return a pose in the map with its (6, 6) covariance in ROS order."""
     message = PoseWithCovarianceStamped(header=to_header(stamp_ns, frames.map))
     message.pose.pose = to_pose(map_T_body)
     message.pose.covariance = covariance.ravel()
@@ -187,7 +187,7 @@ def pose(stamp_ns: int, map_T_body: Array, covariance: Array, frames: FrameIds) 
 
 
 def transform(stamp_ns: int, map_T_odom: Array, frames: FrameIds) -> TransformStamped:
-    """`map_T_odom` as a transform."""
+    """Return `map_T_odom` as a transform."""
     message = TransformStamped(header=to_header(stamp_ns, frames.map), child_frame_id=frames.odom)
     rigid = to_pose(map_T_odom)
     message.transform.translation = Vector3(x=rigid.position.x, y=rigid.position.y, z=rigid.position.z)

@@ -1,4 +1,4 @@
-"""Health of a node and of its inputs; as a program: whether DDS works on this machine."""
+"""Health of a node and of its inputs; as a program: a test of DDS on this machine."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from sensor_msgs.msg import Image
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 SILENT_S = 5.0
-"""Longest silence of an input without a warning, by the machine's clock."""
+"""Silence of an input that is reported, by the machine's clock."""
 
 
 def status(level: bytes, name: str, message: str, values: Mapping[str, object]) -> DiagnosticStatus:
-    """One line of a DiagnosticArray."""
+    """Return one entry of a DiagnosticArray."""
     texts = {key: f"{value:.6g}" if isinstance(value, float) else str(value) for key, value in values.items()}
     pairs = [KeyValue(key=key, value=text) for key, text in texts.items()]
     return DiagnosticStatus(level=level, name=name, message=message, values=pairs)
 
 
 def memory_mb() -> float:
-    """Resident memory of this process now."""
+    """Return the current resident memory of this process."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 2**20
 
 
 class InputWatch:
-    """Counts the messages of one input topic and explains why none arrive.
+    """Watch of one input topic: counts its messages and explains their absence.
 
     Args:
-        node: knows the graph of topics.
+        node: gives access to the graph of topics.
         name: of the input.
-        topic: as it is subscribed, after remapping.
+        topic: subscribed name, after remapping.
         kind: message class.
-        rare: its silence is no fault as long as there is a publisher.
+        rare: silence is no fault as long as there is a publisher.
     """
 
     def __init__(self, node: Node, name: str, topic: str, kind: type, rare: bool = False) -> None:
@@ -55,21 +55,21 @@ class InputWatch:
         self.received = self.refused = self.lost = 0
         self.last_stamp_ns: int | None = None
         self._last_seen_s: float | None = None
-        self._born_s = time.monotonic()  # not the bag's clock: silence is silence even when /clock stands still
+        self._born_s = time.monotonic()  # not the bag's clock: silence counts while /clock is silent, too
         self._window: tuple[float, int, int] = (self._born_s, 0, 0)
 
     def begin(self) -> None:
-        """Wait for the first message from now on."""
+        """Restart the wait for the first message."""
         self._born_s = time.monotonic()
 
-    def saw(self, stamp_ns: int) -> None:
+    def count(self, stamp_ns: int) -> None:
         """Count one message."""
         self.received += 1
         self.last_stamp_ns = stamp_ns
         self._last_seen_s = time.monotonic()
 
     def status(self) -> DiagnosticStatus:
-        """Rate since the last call, and the reason when the topic is silent."""
+        """Return the rate since the last call, and the reason when the topic is silent."""
         now_s = time.monotonic()
         since_s, count, refused = self._window
         rate = (self.received - count) / max(now_s - since_s, 1e-9)
@@ -86,7 +86,7 @@ class InputWatch:
         silent_s = None if self._last_seen_s is None else now_s - self._last_seen_s
         self.warning = ""
         if all_refused:
-            self.warning = f"{self.name}: {rate:.1f} Hz on {self.topic}, and all are refused"
+            self.warning = f"{self.name}: {rate:.1f} Hz on {self.topic}, all refused"
             return status(WARN, f"input {self.name}", f"{rate:.1f} Hz, all refused", values)
         if silent_s is not None and silent_s < SILENT_S:
             return status(OK, f"input {self.name}", f"{rate:.1f} Hz", values)
@@ -116,7 +116,7 @@ class InputWatch:
         return f"silent for {silent_s:.0f} s: {len(publishers)} publisher(s) on {self.topic}"
 
     def _others(self) -> list[str]:
-        """Topics of the same type that somebody publishes: the sensor may be there under another name."""
+        """Return the topics of the same type that are published: the sensor may have another topic."""
         names = [name for name, types in self._node.get_topic_names_and_types() if self._type in types]
         # closures have the type of odometry
         fit = [name for name in names if name != self.topic and name.rpartition("/")[2] != "loop_closures"]
@@ -127,7 +127,7 @@ DDS_TIMEOUT_S, DDS_TOPIC = 15.0, "umf_dds_check"
 
 
 def exchange() -> str:
-    """Send images from one DDS participant to another until one arrives; returns what went wrong, or nothing."""
+    """Send images from one DDS participant to another until one arrives; return the fault, empty without one."""
     contexts = Context(), Context()
     for context in contexts:
         rclpy.init(context=context)
@@ -154,7 +154,7 @@ def exchange() -> str:
 
 
 def main() -> None:
-    """One line on stdout and 0 when an image arrived, on stderr and 1 when none did."""
+    """Print one line, on stdout with status 0 when an image arrived, else on stderr with status 1."""
     started = time.monotonic()
     fault = exchange()
     if fault:

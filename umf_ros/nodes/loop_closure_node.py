@@ -55,10 +55,10 @@ MESSAGE_TYPES |= dict.fromkeys(("left_info", "right_info"), CameraInfo)
 
 
 class LoopClosureNode(BaseNode):
-    """Subscribes to the sensors, detects loop closures in a thread of its own, publishes them.
+    """Front-end node: detects loop closures from sensor topics in a thread of its own and publishes them.
 
     Executor callbacks only enqueue. One thread decodes and synchronises, another embeds and verifies;
-    when the latter is late the oldest frames are dropped and counted.
+    when the latter is too slow, the oldest frames are dropped and counted.
     """
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ class LoopClosureNode(BaseNode):
         calibration, topics = calibration_of(settings), topics_of(settings)
         self._detector = LoopDetector(settings, embedder)
         self._synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(topics), warn)
-        self._body_frames = self._hear_transforms(calibration if settings.uses_transforms else None)
+        self._body_frames = self._subscribe_transforms(calibration if settings.uses_transforms else None)
         self._router = MessageRouter(self._synchronizer, topics, warn, frames=self._body_frames)
         self._recorder = RunRecorder(Path(self._results), settings, embedder.name) if self._results else None
         self._publisher = ClosurePublisher(self, settings.frames)
@@ -79,9 +79,9 @@ class LoopClosureNode(BaseNode):
         self._wanted: Settings | None = None
         self._closures = self._between = 0
         self._last: Detection | None = None
-        self._worker: Worker[Frame] = Worker(self._detect, self._complain, settings.worker.queue_size)
-        self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._complain, 1)
-        self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._complain, INTAKE_QUEUE)
+        self._worker: Worker[Frame] = Worker(self._detect, self._report_fault, settings.worker.queue_size)
+        self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._report_fault, 1)
+        self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._report_fault, INTAKE_QUEUE)
         for name, topic in topics.model_dump().items():
             if topic:
                 take = partial(self._enqueue, topic)
@@ -98,7 +98,7 @@ class LoopClosureNode(BaseNode):
             self._worker.submit(frame)
         self._worker.close(timeout_s=30.0)
         self._writer.close()
-        self._publisher.wait_until_heard()
+        self._publisher.wait_for_subscribers()
         try:
             self._write_summary()
             if self._recorder is not None:
@@ -107,7 +107,7 @@ class LoopClosureNode(BaseNode):
             self._detector.close()
 
     def _retune(self, settings: Settings) -> None:
-        self._wanted = settings  # the executor does not wait for the keyframe in hand
+        self._wanted = settings  # the executor must not wait for the current keyframe
 
     def _enqueue(self, topic: str, message: Any) -> None:
         if not self._paused:
@@ -124,7 +124,7 @@ class LoopClosureNode(BaseNode):
             if wanted is not None:
                 self._detector.retune(wanted)
             detection = self._detector.process(frame)
-            # before the database forgets them
+            # before the database drops them
             matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
         self._last = detection
         self._publisher.odom = self._body_frames.odom
@@ -133,13 +133,13 @@ class LoopClosureNode(BaseNode):
             self._closures += 1
             self.get_logger().info(describe(self._closures, closure))
         if detection.fault is not None:
-            self._complain(detection.fault)
+            self._report_fault(detection.fault)
         if self._recorder is not None:
             self._recorder.record(frame, detection)
         with self._lock:
             inter_closure = self._detector.next_inter_robot_closure()
         if inter_closure is not None:
-            self._publisher.announce_encounter(inter_closure)
+            self._publisher.publish_inter_robot(inter_closure)
             self._between += len(inter_closure.closures)
             if self._recorder is not None:
                 self._recorder.record_inter_robot(inter_closure)
@@ -150,7 +150,7 @@ class LoopClosureNode(BaseNode):
     def _tick(self) -> None:
         own = self._own_status()
         self._diagnose(own if self._paused else self._judge(own))
-        self._writer.submit(None)  # a slow disk is no matter of the executor
+        self._writer.submit(None)  # a slow disk must not block the executor
 
     def _write_summary(self) -> None:
         if self._recorder is not None:
@@ -183,7 +183,7 @@ class LoopClosureNode(BaseNode):
         return status(level, "detector", text, values)
 
     def _fleet(self) -> dict[str, Any]:
-        """State of the link to the fleet's server, where there is one."""
+        """Return the state of the link to the fleet's server, if there is one."""
         if self._detector.inter_robot is None:
             return {}
         link = self._detector.inter_robot.link
@@ -198,7 +198,7 @@ class LoopClosureNode(BaseNode):
     def _reset(self, _: Any) -> str:
         with self._lock:
             self._detector.end_session()
-        return "a new session begins with the next frame; all places are kept (umf places deletes)"
+        return "a new session begins with the next frame; all places are kept (umf places deletes them)"
 
     def _pause(self, request: Any) -> str:
         self._paused = request.data
@@ -206,9 +206,9 @@ class LoopClosureNode(BaseNode):
 
 
 class ClosurePublisher:
-    """Loop closures, keyframes, tested candidates and markers of one node.
+    """Publisher of loop closures, keyframes, tested candidates and markers.
 
-    `loop_closures` carries verified closures only; `~/candidates` everything that was tested.
+    `loop_closures` carries verified closures only, `~/candidates` all tested candidates.
 
     Attributes:
         odom: name of the odometry's frame.
@@ -240,13 +240,13 @@ class ClosurePublisher:
             self._report(keyframe, detection.verdicts)
             self._draw(keyframe, detection.verdicts, matches)
 
-    def announce_encounter(self, inter_closure: InterRobotClosure) -> None:
-        """Publish closures with another rover's places: like any other, with the names of both rovers."""
+    def publish_inter_robot(self, inter_closure: InterRobotClosure) -> None:
+        """Publish closures with another rover's places, with the names of both rovers."""
         for closure in inter_closure.closures:
             self._closures.publish(closure_to_message(closure, inter_closure.own, inter_closure.robot))
         self._report(inter_closure.keyframe, inter_closure.verdicts, inter_closure.robot)
 
-    def wait_until_heard(self) -> None:
+    def wait_for_subscribers(self) -> None:
         """Wait for subscribers to acknowledge the last closures, a second at most."""
         self._closures.wait_for_all_acked(Duration(seconds=1))
 
@@ -274,7 +274,7 @@ class ClosurePublisher:
 
 
 def describe(number: int, closure: LoopClosure) -> str:
-    """One line about a closure for a person."""
+    """Return one line about a closure for the log."""
     shift_m = float(np.linalg.norm(closure.match_T_query[:3, 3]))
     turn_deg = float(np.degrees(rotation_angle(closure.match_T_query)))
     seconds = (closure.query_stamp_ns - closure.match_stamp_ns) * 1e-9
@@ -283,17 +283,17 @@ def describe(number: int, closure: LoopClosure) -> str:
 
 
 def _counts(synchronizer: Synchronizer) -> dict[str, int]:
-    """Every input's messages by fate, as `left_used` or `cloud_dropped_no_image`."""
+    """Return counts of every input's messages, such as `left_used` or `cloud_dropped_no_image`."""
     counts: dict[str, int] = {}
     for name, counter in synchronizer.counters.items():
         counts |= {f"{name}_received": counter.received, f"{name}_used": counter.used}
-        dropped = dict(counter.dropped)  # the decoder adds reasons meanwhile
+        dropped = dict(counter.dropped)  # another thread adds reasons meanwhile
         counts |= {f"{name}_dropped_{reason.replace(' ', '_')}": count for reason, count in dropped.items()}
     return counts
 
 
 def main() -> None:
-    """Entry point of `ros2 run umf_ros loop_closure_node`."""
+    """Run `ros2 run umf_ros loop_closure_node`."""
     leave(run(LoopClosureNode))
 
 

@@ -1,4 +1,4 @@
-"""Every setting as a ROS parameter, declared with description and range, and checked by the same model."""
+"""Settings as ROS parameters, declared with description and range, and checked by the same model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 from umf_ros.core.config import Settings, nest, parse_settings
 from umf_ros.core.errors import ConfigError
 
-# parameters rclpy itself brings along
+# parameters of rclpy itself
 BUILT_IN = ("use_sim_time", "qos_overrides", "start_type_description_service")
 AUTOSTART = "configure and activate at once; false: wait for the services of the life cycle"
 SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
@@ -32,20 +32,20 @@ CHANGEABLE = (
     "pose_graph.min_support",
     "pose_graph.patience_m",
 )
-"""Settings that may change while a node runs: they take effect with the next keyframe or closure."""
+"""Settings that may change while a node runs; they take effect with the next keyframe or closure."""
 
 
 def declare(node: Node, results: str) -> tuple[Settings, str]:
     """Declare all settings, `results_dir` and `autostart` on `node`, with the overrides of files and arguments.
 
-    The node must have been made with `automatically_declare_parameters_from_overrides=True`: only so can an unknown
-    name be told from a known one. Whole numbers are taken where a float is declared. `results` describes the folder
+    The node must have been made with `automatically_declare_parameters_from_overrides=True`: otherwise unknown
+    names cannot be detected. Whole numbers are taken where a float is declared. `results` describes the folder
     `results_dir`. Returns the settings and that folder.
 
     Raises:
         ConfigError: a parameter is unknown, of the wrong type or out of range.
     """
-    # rclpy annotates plain values here, but hands out Parameter objects
+    # rclpy annotates plain values here, but returns Parameter objects
     overrides: dict[str, Any] = dict(node.get_parameters_by_prefix(""))
     given = {name: one.value for name, one in overrides.items() if not name.startswith(BUILT_IN)}
     for name in given:
@@ -66,7 +66,7 @@ def declare(node: Node, results: str) -> tuple[Settings, str]:
 
 
 def changed_settings(settings: Settings, parameters: Sequence[Parameter]) -> Settings:
-    """The settings with some parameters changed; parameters that are no settings are left to ROS.
+    """Return the settings with some parameters changed; other parameters are left to ROS.
 
     Raises:
         ConfigError: a value is out of range.
@@ -80,7 +80,7 @@ def changed_settings(settings: Settings, parameters: Sequence[Parameter]) -> Set
 
 
 def describe(name: str, field: FieldInfo) -> ParameterDescriptor:
-    """Description, range and choices of a setting."""
+    """Return the description, range and choices of a setting."""
     descriptor = ParameterDescriptor(description=field.description or "", read_only=not name.startswith(CHANGEABLE))
     if get_origin(field.annotation) is Literal:
         descriptor.additional_constraints = f"one of: {', '.join(map(str, get_args(field.annotation)))}"
@@ -99,7 +99,7 @@ def describe(name: str, field: FieldInfo) -> ParameterDescriptor:
 
 
 def _leaves(group: BaseModel, prefix: str = "") -> Iterator[tuple[str, FieldInfo, Any]]:
-    """Every single setting: dotted name, its field, its value."""
+    """Yield every single setting: dotted name, its field, its value."""
     for name, field in type(group).model_fields.items():
         value = getattr(group, name)
         if isinstance(value, BaseModel):

@@ -1,4 +1,4 @@
-"""The live back-end: odometry and loop closures in, map pose and path out. Thin: every decision is the core's."""
+"""The live back-end: odometry and loop closures in, map pose and path out. All decisions are the core's."""
 
 from __future__ import annotations
 
@@ -47,20 +47,20 @@ from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import OdometrySample, decode_odometry, stamp_ns
 
 ODOMETRY_DEPTH = 200
-# minutes of fast odometry: nothing is lost while the optimiser works
+# minutes of fast odometry: none is lost while the optimiser works
 QUEUE = 100_000
 FRONT_END = "loop_closure_node"
 SETTLE_S, PREPARE_S = 1.0, 0.2
-"""Longest time to settle the graph at the end, and to work ahead for that once per second."""
-UNSETTLED = "no time to settle the graph: results as they stand; they are settled when this folder is used next"
+"""Longest time to settle the graph at the end, and to prepare for it once per second."""
+UNSETTLED = "no time to settle the graph: its current results were written; the next start with this folder settles it"
 DRAWING = 20.0
-"""Path and markers are published again after this many times the time that they took: long paths are large."""
+"""Least pause between publications of path and markers, as a multiple of their duration: long paths are large."""
 GRACE_S = 0.5
-"""Time within which a front-end that shuts down together with this node reports it."""
+"""Time within which a front-end that shuts down with this node reports it."""
 
 
 class PoseGraphNode(BaseNode):
-    """Keeps a pose graph in a thread of its own and publishes the pose in the map at the odometry's rate."""
+    """Back-end node: a pose graph in a thread of its own, and the pose in the map at the odometry's rate."""
 
     def __init__(self) -> None:
         self._front_end_busy = False
@@ -72,32 +72,32 @@ class PoseGraphNode(BaseNode):
         self._frames = settings.frames
         journal = Path(self._results) / JOURNAL if self._results and not settings.localizing else None
         make = partial(MapFollower, settings) if settings.localizing else None
-        self._durable = DurableGraph(settings.pose_graph, journal, self._complain, make)
-        # None: in a map that is there, the rover may be anywhere
+        self._durable = DurableGraph(settings.pose_graph, journal, self._report_fault, make)
+        # None: in a fixed map, the rover may be anywhere
         self._map_T_odom: Array | None = None if settings.localizing else np.eye(4)
         self._covariance: Array = np.zeros((6, 6))
-        # newest odometry that path and markers show; None: other verdicts than they show
+        # newest odometry in path and markers; None: verdicts have changed since
         self._drawn_ns: int | None = None
         self._draws_again_s = 0.0
-        self._keeps_up = False
+        self._update_queued = False
         self._absolute: dict[str, object] = {}
         self._make_publishers()
-        if self._durable.taken_up or self._durable.feed.newest_ns >= 0:
-            self.get_logger().info(_taken_up(self._durable))
+        if self._durable.recovered or self._durable.feed.newest_ns >= 0:
+            self.get_logger().info(_recovered(self._durable))
             self._announce(self._durable.graph.closures())
-        self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._complain, QUEUE)
+        self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._report_fault, QUEUE)
         if self._durable.unsettled:
-            self._worker.submit(lambda: self._settle_left())
+            self._worker.submit(lambda: self._settle_previous())
         topics = topics_of(settings)
-        self._odometry_frames = self._hear_transforms()
+        self._odometry_frames = self._subscribe_transforms()
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
             self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
         self._subscribe("closures", Odometry, "loop_closures", self._on_closure, CLOSURES_QOS, rare=True)
-        self._hear_absolute()
+        self._subscribe_absolute()
         self.create_subscription(String, "~/reject_edge", self._guarded("reject_edge", self._on_reject), 10)
-        hear = self._guarded("front-end", self._on_front_end)
-        self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", hear, 10)
+        handler = self._guarded("front-end", self._on_front_end)
+        self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", handler, 10)
         self._offer_in_turn("~/reject_last", self._reject_last)
         self._offer_in_turn("~/save", self._save)
         self._offer_in_turn("~/reset", self._reset)
@@ -112,7 +112,7 @@ class PoseGraphNode(BaseNode):
             self._durable.close()
 
     def ready_to_close(self) -> bool:
-        """Whether a front-end that shuts down as well has published its last closures."""
+        """Return whether a front-end that also shuts down has published its last closures."""
         now_s = time.monotonic()
         if self._asked_s is None:
             self._asked_s = now_s
@@ -120,8 +120,8 @@ class PoseGraphNode(BaseNode):
             return True
         return not self._front_end_busy and now_s - self._asked_s > GRACE_S
 
-    def _settle_left(self) -> None:
-        """Settle the graph of the process before."""
+    def _settle_previous(self) -> None:
+        """Settle the graph of the previous process."""
         with watchdog.task("settling the graph", watchdog.PATIENT_S):
             self._durable.write_results(Path(self._results))
         self._announce(self._durable.graph.closures())
@@ -130,7 +130,7 @@ class PoseGraphNode(BaseNode):
         self._worker.submit(lambda: self._durable.graph.retune(settings.pose_graph))
 
     def _offer_in_turn(self, name: str, action: Callable[[], str]) -> None:
-        """Offer a service whose action the worker does when it is its turn: poses go out meanwhile."""
+        """Offer a service whose action is queued for the worker; poses are published meanwhile."""
 
         def act(answered: Future) -> None:
             try:
@@ -138,7 +138,7 @@ class PoseGraphNode(BaseNode):
                     answered.set_result((True, action()))
             except Exception as error:
                 if not isinstance(error, UmfError):
-                    self._complain(error, name)
+                    self._report_fault(error, name)
                 answered.set_result((False, str(error)))
 
         async def answer(_: Any, response: Any) -> Any:
@@ -147,14 +147,14 @@ class PoseGraphNode(BaseNode):
             response.success, response.message = await answered
             return response
 
-        # a group of its own: those in one group wait for each other, the timers too
+        # a group of its own: callbacks in one group, and timers, wait for each other
         self.create_service(Trigger, name, answer, callback_group=ReentrantCallbackGroup())
 
     def _on_front_end(self, event: TransitionEvent) -> None:
         self._front_end_busy = event.goal_state.label == "shuttingdown"
 
-    def _hear_absolute(self) -> None:
-        """Hear GNSS and IMU where their topics are named."""
+    def _subscribe_absolute(self) -> None:
+        """Subscribe to GNSS and IMU where their topics are named."""
         topics, qos = self._settings.absolute, sensor_qos(self._settings.qos, ODOMETRY_DEPTH)
         if not topics.gnss and not topics.imu:
             return
@@ -184,7 +184,7 @@ class PoseGraphNode(BaseNode):
         if self._odometry_frames.odom != self._frames.odom:
             self._frames = self._frames.model_copy(update={"odom": self._odometry_frames.odom})
         self._worker.submit(lambda: self._add_odometry(sample))
-        # the newest correction, not the next: the pose never waits for the optimiser
+        # the latest correction: the pose never waits for the optimiser
         map_T_odom = self._map_T_odom
         if map_T_odom is None:
             return
@@ -230,7 +230,7 @@ class PoseGraphNode(BaseNode):
         self._covariance = self._durable.graph.covariance()
 
     def _show(self) -> None:
-        """Publish path and markers where they have changed and have subscribers; later ones get the last (latched)."""
+        """Publish path and markers if they have changed and have subscribers; late ones get the last (latched)."""
         listeners = self._path_publisher.get_subscription_count() + self._marker_publisher.get_subscription_count()
         newest_ns = self._durable.feed.newest_ns
         if listeners and self._drawn_ns != newest_ns and time.monotonic() >= self._draws_again_s:
@@ -247,14 +247,14 @@ class PoseGraphNode(BaseNode):
         self._marker_publisher.publish(messages.to_markers(lines[accepted], lines[~accepted], header))
 
     def _tick(self) -> None:
-        if not self._keeps_up:  # once is enough, however long the worker is at something else
-            self._keeps_up = True
-            self._worker.submit(self._keep_up)
+        if not self._update_queued:  # queued at most once, however long the worker is busy
+            self._update_queued = True
+            self._worker.submit(self._update)
         self._diagnose(self._judge(self._own_status()))
 
-    def _keep_up(self) -> None:
-        """Decide about closures that waited for odometry, and publish the new path."""
-        self._keeps_up = False
+    def _update(self) -> None:
+        """Decide about closures whose odometry has arrived, and publish the new path."""
+        self._update_queued = False
         self._announce(self._durable.update())
         self._absolute = self._durable.graph.reference.report()
         self._durable.graph.prepare(PREPARE_S)
@@ -275,9 +275,9 @@ class PoseGraphNode(BaseNode):
         text = f"{values.get('accepted', 0)} closures accepted"
         if isinstance(graph, MapFollower):
             values["probability"] = graph.probability
-            text = "in the map" if self._map_T_odom is not None else "the rover is not found in the map yet"
+            text = "in the map" if self._map_T_odom is not None else "not localised in the map yet"
         if values.get("pending") and self._durable.feed.newest_ns < 0:
-            trouble, text = True, f"{values['pending']} closures wait for odometry, of which none has come"
+            trouble, text = True, f"{values['pending']} closures pending: no odometry received"
         level = ERROR if self._cannot_write else WARN if trouble or self._faults else OK
         return status(level, "pose graph", text, values)
 
@@ -302,21 +302,21 @@ class PoseGraphNode(BaseNode):
 
 
 def describe(verdict: ClosureVerdict) -> str:
-    """One line about a verdict for a person."""
+    """Return one line about a verdict for the log."""
     seconds = (verdict.closure.query_stamp_ns - verdict.closure.match_stamp_ns) * 1e-9
     return f"graph: closure {seconds:.1f} s back {verdict.state.value}: {verdict.reason}{verdict.figures}"
 
 
 def _numbered(results: Path) -> Path:
-    """A new folder for the results of a graph that was ended."""
+    """Return a new folder for the results of an ended graph."""
     return next(folder for i in count(1) if not (folder := results / f"graph_{i}").exists())
 
 
-def _taken_up(durable: DurableGraph) -> str:
+def _recovered(durable: DurableGraph) -> str:
     counts = durable.graph.verdict_counts()
     verdicts = ", ".join(f"{number} {state.value}" for state, number in sorted(counts.items()))
     differing = f"; {durable.changed} verdicts differ from before" if durable.changed else ""
-    return f"taken up: {durable.graph.counts['odometry']} odometry messages, closures: {verdicts or 'none'}{differing}"
+    return f"recovered: {durable.graph.counts['odometry']} odometry messages, closures: {verdicts or 'none'}{differing}"
 
 
 def _as_status(verdict: ClosureVerdict) -> DiagnosticStatus:
@@ -333,13 +333,13 @@ def _broadcaster(node: Node) -> Callable[[TransformStamped], None] | None:
     try:
         from tf2_ros import TransformBroadcaster
     except ImportError:
-        node.get_logger().warning("tf2_ros is not installed: map -> odom goes out on ~/map_to_odom only")
+        node.get_logger().warning("tf2_ros is not installed: map -> odom is published on ~/map_to_odom only")
         return None
     return TransformBroadcaster(node).sendTransform
 
 
 def main() -> None:
-    """Entry point of `ros2 run umf_ros pose_graph_node`."""
+    """Run `ros2 run umf_ros pose_graph_node`."""
     leave(run(PoseGraphNode))
 
 

@@ -26,7 +26,7 @@ Item = TypeVar("Item")
 
 
 class Worker(Generic[Item]):
-    """Runs `work(item)` in a thread of its own, so that `submit` never waits.
+    """Worker thread that runs `work(item)`, so that `submit` never waits.
 
     When the queue is full the oldest waiting item is dropped and counted. Exceptions of `work` go to `on_error`.
     """
@@ -41,7 +41,7 @@ class Worker(Generic[Item]):
         self._thread.start()
 
     def submit(self, item: Item) -> None:
-        """Queue an item; returns at once."""
+        """Queue an item without waiting."""
         with self._wake:
             if self._closing:
                 return
@@ -53,11 +53,11 @@ class Worker(Generic[Item]):
 
     @property
     def waiting(self) -> int:
-        """Items submitted and not yet done."""
+        """Number of items submitted and not yet done."""
         return len(self._queue) + self._busy
 
     def close(self, timeout_s: float = 10.0) -> None:
-        """Finish what is queued, then end the thread; what is left after `timeout_s` is dropped."""
+        """Finish the queued items, then end the thread; items left after `timeout_s` are dropped."""
         with self._wake:
             self._wake.wait_for(lambda: not self._queue and not self._busy, timeout_s)
             self._closing = True
@@ -84,29 +84,29 @@ class Worker(Generic[Item]):
 
 
 LONGEST_WAIT_S = 60.0
-"""So long a node that was asked to end may wait for those that it hears."""
+"""Longest time that an interrupted node waits for the nodes it subscribes to."""
 
 SWITCH_S = 0.0005
 M_ARENA_MAX = -8
-"""Of glibc's mallopt."""
+"""Option of glibc's mallopt."""
 
 
 def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> int:
-    """Spin one node until Ctrl-C, then let it finish; returns the exit status.
+    """Spin one node until Ctrl-C, then let it finish; return the exit status.
 
     A `UmfError` while the node starts or finishes is one line on stderr and status 1. The first SIGINT or
     SIGTERM ends the spinning, as soon as the node is ready to close; a second one ends it at once. While the node
     writes its results further ones are ignored.
     """
-    # a thread that comes back from a library waits this long for another that computes in Python: it comes back often
+    # threads return from libraries often, and wait this long for a thread that computes in Python
     sys.setswitchinterval(SWITCH_S)
     with suppress(OSError, AttributeError):
-        # two heaps for all threads: glibc gives each its own, and memory that one frees another cannot use
+        # two heaps for all threads: by default each has its own, and memory freed by one is unavailable to others
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
-    asked: list[int] = []
-    # before anything else: rclpy's handlers would shut the context down before the node's last words
+    signals: list[int] = []
+    # first of all: rclpy's handlers would shut the context down before the node's last messages
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: asked.append(number))
+        signal.signal(number, lambda number, _: signals.append(number))
     try:
         with watchdog.watching(watchdog.PATIENT_S):
             init(arguments)
@@ -120,11 +120,11 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     status = 0
     try:
         with watchdog.watching():
-            while not asked and rclpy.ok():
+            while not signals and rclpy.ok():
                 _spin_once(node, executor, 0.2)
             ready: Callable[[], bool] = getattr(node, "ready_to_close", lambda: True)
-            deadline, first = time.monotonic() + LONGEST_WAIT_S, len(asked)
-            while not ready() and len(asked) == first and time.monotonic() < deadline and rclpy.ok():
+            deadline, first = time.monotonic() + LONGEST_WAIT_S, len(signals)
+            while not ready() and len(signals) == first and time.monotonic() < deadline and rclpy.ok():
                 _spin_once(node, executor, 0.05)
     except ExternalShutdownException:
         pass
@@ -135,7 +135,7 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
         except UmfError as error:
             complain(error)
             status = 1
-        executor.shutdown()  # it must not outlive what it waits for
+        executor.shutdown()  # it must not outlive the entities that it waits for
         node.destroy_node()
         rclpy.try_shutdown()
     return status
@@ -145,18 +145,18 @@ def init(arguments: list[str] | None = None) -> None:
     """`rclpy.init` without its signal handlers.
 
     Raises:
-        ConfigError: ROS cannot read the arguments, or a parameter file that they name.
+        ConfigError: ROS cannot parse the arguments, or a parameter file in them.
     """
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
-        # its text ends with places in the source of rcl
+        # its text ends with locations in the source of rcl
         text = " ".join(str(error).partition(", at /")[0].split())
         raise ConfigError(f"ROS cannot read its arguments: {text}") from None
 
 
 def leave(status: int) -> NoReturn:
-    """End the process, whose results are written, at once: to take all libraries apart takes Python seconds."""
+    """End the process at once, after its results are written: Python takes seconds to unload all libraries."""
     logging.shutdown()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -164,7 +164,7 @@ def leave(status: int) -> NoReturn:
 
 
 def _spin_once(node: Node, executor: SingleThreadedExecutor, timeout_s: float) -> None:
-    """Let the executor work; no exception of a callback, the library's own included, ends the node."""
+    """Spin the executor once; no exception of a callback, or of the library, ends the node."""
     watchdog.feed()
     try:
         executor.spin_once(timeout_sec=timeout_s)

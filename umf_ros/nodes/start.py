@@ -19,12 +19,12 @@ from umf_ros.core.resources import check_packages
 
 
 def start(module: str) -> None:
-    """Load the module of a node and run its `main`; a signal that comes meanwhile ends the process with status 0.
+    """Load the module of a node and run its `main`; a signal during that ends the process with status 0.
 
-    To load the libraries takes seconds. A missing package is one line on stderr and status 1.
+    Loading the libraries takes seconds. A missing package is one line on stderr and status 1.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: os._exit(0))  # nothing is made yet that could be lost
+        signal.signal(number, lambda *_: os._exit(0))  # there is nothing to lose yet
     try:
         check_packages()
         main = import_module(module).main
@@ -36,12 +36,12 @@ def start(module: str) -> None:
 
 
 def loop_closure_node() -> None:
-    """Entry point of `ros2 run umf_ros loop_closure_node`."""
+    """Run `ros2 run umf_ros loop_closure_node`."""
     start("umf_ros.nodes.loop_closure_node")
 
 
 def pose_graph_node() -> None:
-    """Entry point of `ros2 run umf_ros pose_graph_node`."""
+    """Run `ros2 run umf_ros pose_graph_node`."""
     start("umf_ros.nodes.pose_graph_node")
 
 
@@ -52,7 +52,7 @@ def check_parameter_file(path: Path, nodes: Sequence[str]) -> None:
     """Check that a parameter file has a section for one of the nodes (full names): ROS ignores all others.
 
     Raises:
-        ConfigError: there is no such file, it is no YAML, or nothing in it is for any of the nodes.
+        ConfigError: there is no such file, it is not YAML, or it has no section for any of the nodes.
     """
     from umf_ros.core.io import read_yaml
 
@@ -65,7 +65,7 @@ def check_parameter_file(path: Path, nodes: Sequence[str]) -> None:
 
 
 def is_true(name: str, text: str) -> bool:
-    """The value of an argument that is true or false.
+    """Return the value of a boolean argument.
 
     Raises:
         ConfigError: it is neither.
@@ -77,12 +77,12 @@ def is_true(name: str, text: str) -> bool:
 
 
 def full_name(namespace: str, node: str) -> str:
-    """The name of a node in a namespace, as the graph has it."""
+    """Return the full name of a node in a namespace."""
     return "/".join(["", *(part for part in namespace.split("/") if part), node])
 
 
 def _sections(content: Any, prefix: str = "") -> Iterator[str]:
-    """Names that stand above `ros__parameters`, those of nested namespaces joined."""
+    """Yield names above `ros__parameters`, those of nested namespaces joined."""
     if not isinstance(content, dict):
         return
     for key, inner in content.items():
@@ -93,7 +93,7 @@ def _sections(content: Any, prefix: str = "") -> Iterator[str]:
 
 
 def _matches(key: str, node: str) -> bool:
-    """Whether a name that may hold the wildcards of ROS, `*` for one part and `**` for any number, is a node's."""
+    """Return whether a name, perhaps with ROS wildcards (`*`: one part, `**`: any number), matches a node."""
     parts = {"/**": "(/[^/]+)*", "/*": "/[^/]+"}
     pattern = "".join(parts.get(part, re.escape(part)) for part in re.findall(r"/[^/]*", key))
     return re.fullmatch(pattern, node) is not None
