@@ -171,7 +171,7 @@ def test_what_is_imported_is_required(wing: str, lists: list[str]) -> None:
 @pytest.mark.parametrize(
     ("module", "advice"),
     [
-        ("open3d", "the lab needs it: pip install 'umf_ros[lab]'"),
+        ("open3d", "the lab needs it: run pip install 'umf_ros[lab]'"),
         # it is the lab that asks, but its extra would not bring this one
         ("cv2", "run umf doctor for a remedy"),
     ],

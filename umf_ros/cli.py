@@ -1,4 +1,4 @@
-"""The `umf` command: a list of its subcommands, and one clear line for every error a user can cause."""
+"""The `umf` command: a list of its subcommands, and one line for every error that a user can cause."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ Version = Annotated[bool, typer.Option("--version", callback=_print_version, is_
 
 @cache
 def umf() -> typer.Typer:
-    """The command with its subcommands."""
+    """Return the command with its subcommands."""
     app = typer.Typer(
         name="umf",
         help="Multimodal place recognition and loop closure for rovers with a camera and a LiDAR.",
@@ -75,15 +75,15 @@ def umf() -> typer.Typer:
 
 
 def _options(version: Version = False) -> None:
-    """Options of `umf` itself."""
+    """Take the options of `umf` itself."""
 
 
-def _what_helps(package: str) -> str:
-    """Where a missing package comes from."""
+def _remedy(package: str) -> str:
+    """Return the source of a missing package."""
     if package in LAB_PACKAGES:
-        return "the lab needs it: pip install 'umf_ros[lab]'"
+        return "the lab needs it: run pip install 'umf_ros[lab]'"
     if package in FLEET_PACKAGES:
-        return "pip install 'umf_ros[fleet]' brings it"
+        return "run pip install 'umf_ros[fleet]'"
     return "run umf doctor for a remedy"
 
 
@@ -99,13 +99,13 @@ def main() -> NoReturn:
         typer.echo(f"umf: {error}", err=True)
         sys.exit(1)
     except ModuleNotFoundError as error:
-        typer.echo(f"umf: {error.name} is not installed; {_what_helps(str(error.name).split('.')[0])}", err=True)
+        typer.echo(f"umf: {error.name} is not installed; {_remedy(str(error.name).split('.')[0])}", err=True)
         sys.exit(1)
     except MemoryError:
         typer.echo("umf: out of memory", err=True)
         sys.exit(1)
     except BrokenPipeError:
-        # the reader of our output went away, as with `umf ... | head`
+        # the reader of the output closed the pipe, as with `umf ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except OSError as error:  # a name that is too long, a folder that may not be looked into, a disk that is full

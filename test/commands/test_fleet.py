@@ -27,8 +27,8 @@ def secret(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_administrator_sets_a_server_up_and_lets_a_rover_in(
     server: PostgresServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert umf("fleet", "setup", server.address()).out == "the tables are of version 1, were of 0\n"
-    assert umf("fleet", "setup", server.address()).out == "the tables are of version 1, as before\n"
+    assert umf("fleet", "setup", server.address()).out == "the tables have version 1, before 0\n"
+    assert umf("fleet", "setup", server.address()).out == "the tables have version 1, as before\n"
     for said in ("first word\n", "second word\n"):
         monkeypatch.setattr(sys, "stdin", io.StringIO(said))
         assert umf("fleet", "add", server.address(), "ada").status == 0
@@ -40,9 +40,9 @@ def test_an_administrator_sets_a_server_up_and_lets_a_rover_in(
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("add", "", "a b"), "no name for a rover"),
+        (("add", "", "a b"), "not a valid name of a rover"),
         (("add", "", "bea"), "needs a password"),
-        (("setup", f"postgresql://x@127.0.0.1:{free_port()}/y"), "the server cannot do that"),
+        (("setup", f"postgresql://x@127.0.0.1:{free_port()}/y"), "the server refuses the request"),
         (("setup", "postgresql://x:hidden@h/y"), "the password belongs into"),
     ],
 )

@@ -100,7 +100,7 @@ def test_a_rover_finds_itself_in_the_map_which_stays_as_it_is(
     before = {path: path.read_bytes() for path in (out / "places.sqlite", out / "poses.npz", out / "map.json")}
     ended = umf("replay", mini_bag, "--config", mini_config, "--map", out, "--out", tmp_path)
     assert ended.status == 0, ended.text
-    assert "found after" in ended.text
+    assert "localised after" in ended.text
     summary = json.loads((tmp_path / "latest" / "summary.json").read_text())
     about = summary["localization"]
     assert about["keyframes_until_found"] <= 20 and about["relocalised"] == 1 and about["contradicted"] <= 1

@@ -208,7 +208,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["{bag}", "--odometry", "{early}"], "the odometry file covers none of the recording"),
         (
             ["{bag}", "--odometry-frame", "camera"],
-            "--odometry-frame says whose poses an --odometry file holds, and ther",
+            "--odometry-frame is the frame of the poses in an --odometry file: gi",
         ),
         (["{bag}", "--odometry", "{early}", "--odometry-frame", "wheel"], "unknown frame 'wheel' of the odometry"),
         (["{bag}", "--ground-truth", "nowhere.pos"], "cannot read nowhere.pos"),

@@ -1,4 +1,4 @@
-"""The console of a replay: progress, how warnings look, and an orderly end on Ctrl-C or SIGTERM."""
+"""Console of a replay: progress, style of warnings, and a clean end on Ctrl-C or SIGTERM."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from umf_ros.detector import Detection
 Handler = Callable[[int, FrameType | None], Any] | int | signal.Handlers | None
 
 WARNING: dict[str, Any] = {"style": "yellow", "markup": False, "highlight": False, "soft_wrap": True}
-"""How a console prints a warning: names of files keep their brackets, and lines their length."""
+"""Options for printing a warning: file names keep their brackets, lines are not wrapped."""
 
 
 class FrameProgress(Progress):
-    """A bar over the recording, with the numbers of places and closures, and of closures by the graph's state."""
+    """Progress of a replay, with the numbers of places and closures, and of closures by state in the graph."""
 
     def __init__(self, console: Console, graph_counts: Callable[[], Mapping[str, int]] = dict) -> None:
         found = TextColumn("{task.fields[found]}")
@@ -33,7 +33,7 @@ class FrameProgress(Progress):
         self._graph = ""
 
     def show(self, done: float, detection: Detection) -> None:
-        """Advance to the part of the recording that is done, 0 to 1."""
+        """Advance to the processed share of the recording, 0 to 1."""
         self._places += detection.keyframe is not None
         if detection.closures:
             self._closures += len(detection.closures)
@@ -43,25 +43,25 @@ class FrameProgress(Progress):
 
 
 def _in_graph(counts: Mapping[str, int]) -> str:
-    """As " (30 in the graph, 4 pending)"."""
+    """Return counts such as " (30 in the graph, 4 pending)"."""
     rejected = counts.get("rejected", 0) + counts.get("refused", 0)
     pending = sum(counts.values()) - counts.get("accepted", 0) - rejected
     words = {"in the graph": counts.get("accepted", 0), "pending": pending, "rejected": rejected}
-    told = ", ".join(f"{count} {word}" for word, count in words.items() if count)
-    return f" ({told})" if told else ""
+    text = ", ".join(f"{count} {word}" for word, count in words.items() if count)
+    return f" ({text})" if text else ""
 
 
 @contextmanager
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Yield a function that says whether Ctrl-C was pressed, or SIGTERM came; a second one ends at once, as usual."""
-    asked: list[int] = []
+    """Yield a function that returns whether Ctrl-C or SIGTERM came; a second one ends the process as usual."""
+    signals: list[int] = []
 
     def remember(number: int, _: FrameType | None) -> None:
-        asked.append(number)
+        signals.append(number)
         _restore(before)
 
     with _handled_by(remember) as before:
-        yield lambda: bool(asked)
+        yield lambda: bool(signals)
 
 
 def undisturbed() -> AbstractContextManager[object]:
@@ -71,7 +71,7 @@ def undisturbed() -> AbstractContextManager[object]:
 
 @contextmanager
 def _handled_by(handler: Handler) -> Iterator[dict[signal.Signals, Handler]]:
-    """Give both signals to a handler; yields their handlers of before, which they get again at the end."""
+    """Set a handler of both signals; yield their previous handlers, which are restored at the end."""
     before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield before

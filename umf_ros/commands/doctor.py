@@ -47,9 +47,9 @@ class Finding:
 
     Attributes:
         name: what was checked.
-        fine: whether everything works.
-        found: what is there.
-        advice: what helps, where it does not.
+        fine: whether the check passed.
+        found: result of the check.
+        advice: remedy, if it failed.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Finding:
 
 
 def command() -> None:
-    """Check this machine: packages, ROS 2, DDS, weights; names a remedy for every fault."""
+    """Check this machine: packages, ROS 2, DDS, weights; name a remedy for every fault."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -84,7 +84,7 @@ def command() -> None:
 
 
 def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
-    """All checks by name, to be run one by one."""
+    """Yield all checks by name."""
     yield "Python", check_python
     for module, (distribution, minimum) in _PACKAGES.items():
         yield distribution, partial(check_package, module, distribution, minimum)
@@ -100,15 +100,15 @@ def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
 
 
 def check_python() -> Finding:
-    """Jazzy's Python is 3.12; its packages on PyPI also exist for 3.11."""
+    """Check the version of Python: Jazzy's is 3.12; its packages on PyPI also exist for 3.11."""
     found = ".".join(str(part) for part in sys.version_info[:3])
     return Finding("Python", sys.version_info[:2] in ((3, 11), (3, 12)), found, "use Python 3.11 or 3.12")
 
 
 def check_package(module: str, distribution: str, minimum: str, without: str = "") -> Finding:
-    """Import a package in a process of its own: a broken one may take the process with it.
+    """Import a package in a process of its own: a broken one may crash it.
 
-    One that a rover can do without, as `without` says, may be missing; where it is there it has to work.
+    An optional package, with the consequence `without`, may be missing; an installed one has to work.
     """
     advice = f"pip install '{distribution}>={minimum}', or make install"
     if importlib.util.find_spec(module) is None:
@@ -123,7 +123,7 @@ def check_package(module: str, distribution: str, minimum: str, without: str = "
 
 
 def check_rclpy() -> Finding:
-    """The ROS client library of Jazzy."""
+    """Check the ROS client library of Jazzy."""
     advice = "source /opt/ros/jazzy/setup.bash, or pip install 'ros-rclpy[fastrtps]==7.1.6'"
     status, output = _run("-c", "import rclpy; print(rclpy.get_rmw_implementation_identifier())")
     if status != 0:
@@ -134,14 +134,14 @@ def check_rclpy() -> Finding:
 
 
 def check_messages() -> Finding:
-    """The message packages of common_interfaces."""
+    """Check the message packages of common_interfaces."""
     missing = [name for name in _MESSAGE_PACKAGES if importlib.util.find_spec(name) is None]
     advice = "pip install ros-common-interfaces==5.3.6, or sudo apt install ros-jazzy-common-interfaces"
     return Finding("ROS 2 messages", not missing, f"missing: {', '.join(missing)}" if missing else "all there", advice)
 
 
 def check_dds() -> Finding:
-    """A publisher and a subscriber find each other and exchange an image."""
+    """Check that a publisher and a subscriber find each other and exchange an image."""
     status, output = _run("-m", "umf_ros.nodes.diagnostics")
     advice = "check ROS_DOMAIN_ID, RMW_IMPLEMENTATION, and that a firewall lets UDP multicast pass on loopback"
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
@@ -149,7 +149,7 @@ def check_dds() -> Finding:
 
 
 def check_shared_memory() -> Finding:
-    """Fast DDS hands images over through /dev/shm."""
+    """Check /dev/shm, through which Fast DDS passes images."""
     if not os.path.isdir("/dev/shm"):
         return Finding("shared memory", False, "there is no /dev/shm", "mount it, or images go through the network")
     free_mb = shutil.disk_usage("/dev/shm").free / 1e6
@@ -158,7 +158,7 @@ def check_shared_memory() -> Finding:
 
 
 def check_weights() -> Finding:
-    """The shipped weights load into the network."""
+    """Check that the shipped weights load into the network."""
     advice = "reinstall the package, or name a file with the parameter embedding.weights"
     try:
         from umf_ros.core.config import EmbeddingSettings
@@ -171,7 +171,7 @@ def check_weights() -> Finding:
 
 
 def check_processor() -> Finding:
-    """Processor and graphics card that the network can use."""
+    """Check the processor, and the graphics card that the network can use."""
     cores = len(os.sched_getaffinity(0))
     found = f"{cores} {'core' if cores == 1 else 'cores'}"
     status, output = _run("-c", "import torch as t; print(t.cuda.get_device_name() if t.cuda.is_available() else '')")

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from umf_ros.maps.mapping import Opening
 
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.")]
-Workers = Annotated[int, typer.Option(min=1, max=256, help="Processes that replay and compare recordings.")]
+Workers = Annotated[int, typer.Option(min=1, max=256, help="Number of processes that replay and match recordings.")]
 RayAddress = Annotated[
-    str | None, typer.Option("--ray", help="Spread them by Ray: address of a cluster that sees these files, or local.")
+    str | None, typer.Option("--ray", help="Distribute by Ray: address of a cluster that has these files, or local.")
 ]
 MapPath = Annotated[Path, typer.Option("--out", help="Folder of the map, new or one to add to.")]
 OdometryFolder = Annotated[
@@ -52,7 +52,7 @@ def command(
     """Make one map of many recordings, or add recordings to one.
 
     Every recording is a session with its own odometry; closures within and between them make one pose graph.
-    Recordings that the map has already are passed over, so that a new one costs itself alone.
+    Recordings that are in the map already are skipped, so only new ones take time.
     """
     check_files(recordings[0], config, odometry)
     odometry_frame = check_odometry_options(odometry, odometry_frame)
@@ -72,7 +72,7 @@ def command(
     opening = Opening(config, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
     found = find_recordings(recordings)
     target = MapFolder.open_or_create(out, opening.settings(open_bag(found[0])))
-    new = _new_ones(target, found, console)
+    new = _new_recordings(target, found, console)
     if ray is None and workers == 1:
         for name, recording in new.items():
             _add(target, name, recording, opening, console)
@@ -82,11 +82,11 @@ def command(
         _match(target, session, console)
     with console.status("Solving the joint graph"):
         summary = write_results(target, solve(target))
-    _tell(out, summary, console)
+    _print_summary(out, summary, console)
 
 
-def _new_ones(target: MapFolder, recordings: list[Path], console: Console) -> dict[str, Path]:
-    """Return the recordings that are not in the map yet, by the names of their sessions to be."""
+def _new_recordings(target: MapFolder, recordings: list[Path], console: Console) -> dict[str, Path]:
+    """Return the recordings that are not in the map yet, by the names of their future sessions."""
     from umf_ros.bags.reader import open_bag
     from umf_ros.runs.reader import describe_recording
 
@@ -107,7 +107,7 @@ def _new_ones(target: MapFolder, recordings: list[Path], console: Console) -> di
 def _add_all(
     target: MapFolder, new: dict[str, Path], opening: Opening, spread: Callable[..., None], console: Console
 ) -> None:
-    """Replay all recordings at once, then compare all with those before them; the same map as one after the other."""
+    """Replay all recordings in parallel, then match each with the earlier ones; the map is the same as in sequence."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     from umf_ros.maps.mapping import add_session, match_task, replay_task, unmatched
@@ -122,11 +122,11 @@ def _add_all(
         run("Replaying", replay_task, [(recording, opening, target.folder_of(name)) for name, recording in new.items()])
         for name, recording in new.items():
             add_session(target, name, recording)
-        run("Comparing with the map", match_task, [(target.path, session) for session in unmatched(target)])
+        run("Matching with the map", match_task, [(target.path, session) for session in unmatched(target)])
 
 
 def _add(target: MapFolder, name: str, recording: Path, opening: Opening, console: Console) -> None:
-    """Replay a recording into the map, and compare it with those before it."""
+    """Replay a recording into the map, and match it with the earlier ones."""
     from umf_ros.commands.console import FrameProgress
     from umf_ros.maps.mapping import add_session, replay_session
 
@@ -137,25 +137,25 @@ def _add(target: MapFolder, name: str, recording: Path, opening: Opening, consol
 
 
 def _match(target: MapFolder, session: MapSession, console: Console) -> None:
-    """Compare a session with those before it."""
+    """Match a session with the earlier ones."""
     from rich.progress import track
 
     from umf_ros.maps.mapping import match_session
 
-    title = f"Comparing {session.name} with the map"
+    title = f"Matching {session.name} with the map"
     for _ in track(match_session(target, session), title, session.places, console=console, transient=True):
         pass
 
 
-def _tell(out: Path, summary: dict[str, Any], console: Console) -> None:
+def _print_summary(out: Path, summary: dict[str, Any], console: Console) -> None:
     from umf_ros.maps.outputs import crispness, sentence
 
     for one in summary["sessions"]:
         tied = f"{one['closures_between']} ends of closures with others"
-        joined = f"joined by {tied}" if one["joined"] else "not joined: nothing ties it to the map yet"
-        way = f"{one['places']} places, {one['length_m']:.0f} m" + ("" if one["odometry"] else ", no odometry")
-        console.print(f"  {one['name']}: {way}; {joined}", markup=False, soft_wrap=True)
+        joined = f"joined by {tied}" if one["joined"] else "not joined: no accepted closure with the map yet"
+        size = f"{one['places']} places, {one['length_m']:.0f} m" + ("" if one["odometry"] else ", no odometry")
+        console.print(f"  {one['name']}: {size}; {joined}", markup=False, soft_wrap=True)
     console.print(f"{out}: {sentence(summary)}", markup=False, soft_wrap=True)
-    if told := crispness(summary):
-        console.print(told)
+    if line := crispness(summary):
+        console.print(line)
     console.print(f"{out / 'report.html'}", markup=False, soft_wrap=True)

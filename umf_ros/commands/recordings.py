@@ -1,4 +1,4 @@
-"""Options of the commands that read a recording, and how it is opened with them.
+"""Options of the commands that read a recording, and functions that open it.
 
 A file that is missing raises a `BagError`, a `ConfigError` or an `UmfError` before anything that takes time to import.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 BagPath = Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")]
 ConfigPath = Annotated[Path | None, typer.Option("--config", help="Parameter file (YAML).")]
 DatasetName = Annotated[str, typer.Option("--dataset", help=f"{either(['auto', *dataset_names()])}.")]
-EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"How places are embedded: {choices()}.")]
+EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"Embedding method: {choices()}.")]
 WeightsPath = Annotated[Path | None, typer.Option("--weights", help="Weights file; default: umf_scene.")]
 OdometryPath = Annotated[
     Path | None, typer.Option("--odometry", help="Odometry as a TUM file, where the recording has none.")
@@ -38,7 +38,7 @@ OdometryFrame = Annotated[
     ),
 ]
 TruthPath = Annotated[Path | None, typer.Option("--ground-truth", help="Truth as RTKLIB .pos or TUM file.")]
-RunsFolder = Annotated[Path, typer.Option("--out", help="Where results/<timestamp> goes.")]
+RunsFolder = Annotated[Path, typer.Option("--out", help="Parent folder of results/<timestamp>.")]
 
 
 def check_files(bag: Path, *others: Path | None) -> None:
@@ -76,16 +76,16 @@ def open_recording(
 
 
 def check_odometry_options(odometry: Path | None, odometry_frame: str) -> str:
-    """Return the frame of the odometry file; an error where only the frame is given."""
+    """Return the frame of the odometry file; raise a `ConfigError` if only the frame is given."""
     if odometry_frame and odometry is None:
-        raise ConfigError("--odometry-frame says whose poses an --odometry file holds, and there is none")
+        raise ConfigError("--odometry-frame is the frame of the poses in an --odometry file: give both")
     return odometry_frame or "body"
 
 
 def open_frames(
     recording: Bag, settings: Settings, warn: Callable[[str], None], odometry: Path | None, odometry_frame: str
 ) -> FrameReader:
-    """Read the frames of a recording, with the odometry of a file where one is named; `warn` gets the faults."""
+    """Read the frames of a recording, with the odometry of a file if one is given; `warn` takes the faults."""
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.trajectories import read_odometry
 

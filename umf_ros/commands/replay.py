@@ -32,17 +32,15 @@ if TYPE_CHECKING:
     from umf_ros.localizer import Localization
 
 MinProbability = Annotated[
-    float | None, typer.Option("--min-probability", min=0, max=1, help="Publish closures from here on.")
+    float | None, typer.Option("--min-probability", min=0, max=1, help="Least probability of a published closure.")
 ]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Continue the newest interrupted replay of this recording in --out.")
 ]
-RerunPath = Annotated[
-    Path | None, typer.Option("--rerun", help="Also write the run for the Rerun viewer: an .rrd file.")
-]
+RerunPath = Annotated[Path | None, typer.Option("--rerun", help="Also log the run for the Rerun viewer: an .rrd file.")]
 Mode = Annotated[str | None, typer.Option("--mode", help="mapping, or localization in the map that --map names.")]
 MapPath = Annotated[
-    Path | None, typer.Option("--map", help="Map of umf map to find the rover in; implies --mode localization.")
+    Path | None, typer.Option("--map", help="Map made by umf map to localise in; implies --mode localization.")
 ]
 
 
@@ -65,8 +63,8 @@ def command(
     """Find loop closures in a recording as fast as the machine goes.
 
     Needs no ROS. Writes closures, trajectories, the pose graph and a report to a new folder.
-    Ctrl-C ends the run early and keeps its results; --resume continues it, also after a crash. Ends with 3 where the
-    inputs could give nothing.
+    Ctrl-C ends the run early and keeps its results; --resume continues it, also after a crash. Exit status 3: the
+    inputs could not give any result.
     """
     check_files(bag, config, odometry, ground_truth)
     check_map(map_folder)
@@ -98,20 +96,20 @@ def command(
     )
     warnings: list[str] = []
     reader = open_frames(recording, settings, partial(_warn, console, warnings), odometry, odometry_frame)
-    read_ground_truth(None, ground_truth)  # its errors are reported now, not after the run
+    read_ground_truth(None, ground_truth)  # reports its errors before the run
     if settings.localizing and rerun:
-        raise ConfigError("--rerun shows a run that maps: leave it out with --map")
+        raise ConfigError("--rerun is for mapping runs: leave it out with --map")
     network = make_detector_embedder(settings)
     viewer = RerunLog(rerun) if rerun else None
-    # a store or a map that cannot be used is reported before there is a folder
+    # an unusable database or map is reported before the folder is made
     detector = LoopDetector(settings, network) if settings.database.path or settings.localizing else None
-    begun = unfinished_folder(out, bag, settings) if resume and not settings.localizing else None
-    folder = begun or create_folder(out, bag)
+    unfinished = unfinished_folder(out, bag, settings) if resume and not settings.localizing else None
+    folder = unfinished or create_folder(out, bag)
     detector = detector or LoopDetector(with_places(settings, folder), network)
     absent = [one.line for one in absent_inputs(recording, settings, odometry is not None)]
     for line in absent:
         console.print(line, **WARNING)
-    replay = Replay(folder, settings, detector, begun is not None)
+    replay = Replay(folder, settings, detector, unfinished is not None)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
         stream = reader.graph_stream()
         for detection in replay.run(viewer.watch(stream) if viewer else stream):
@@ -156,14 +154,14 @@ def _warn(console: Console, warnings: list[str], text: str) -> None:
 
 
 def _report_localization(console: Console, folder: Path, counts: dict[str, Any], newest: Localization | None) -> int:
-    """Print the result of a localising run; 3 where the rover was not found in the map."""
-    text = "not found in the map"
+    """Print the result of a localising run; return 3 if the rover was not localised."""
+    text = "not localised in the map"
     if counts["located"]:
         located = f"{counts['located']} of {counts['keyframes']}"
-        text = f"found after {counts['keyframes_until_found']} keyframes, known at {located}"
+        text = f"localised after {counts['keyframes_until_found']} keyframes, pose known at {located}"
     if newest is not None:
         x, y, z = newest.map_T_body[:3, 3]
         sigma_m = float(newest.covariance[:2, :2].trace() ** 0.5)
-        text += f"; at last at ({x:.1f}, {y:.1f}, {z:.1f}) m, +- {sigma_m:.2f} m, p = {newest.probability:.4f}"
+        text += f"; last pose ({x:.1f}, {y:.1f}, {z:.1f}) m, +- {sigma_m:.2f} m, p = {newest.probability:.4f}"
     console.print(f"{text}\n{folder}", markup=False, highlight=False, soft_wrap=True)
     return 0 if counts["located"] else 3

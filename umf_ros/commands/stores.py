@@ -15,7 +15,7 @@ from umf_ros.core.errors import UmfError
 if TYPE_CHECKING:
     from psycopg import Connection
 
-places = typer.Typer(help="Look at a store of places (parameter database.path), or delete sessions of it.")
+places = typer.Typer(help="List or delete sessions of a place database (parameter database.path).")
 fleet = typer.Typer(help="Set up the server of a fleet (parameter database.backend: postgres); for its administrator.")
 
 StorePath = Annotated[Path, typer.Argument(help="File of the parameter database.path.")]
@@ -23,7 +23,7 @@ StorePath = Annotated[Path, typer.Argument(help="File of the parameter database.
 
 @places.command("list")
 def list_sessions(store: StorePath) -> None:
-    """List the sessions of a store: number, keyframes, and when."""
+    """List the sessions of a place database: number, keyframes and time."""
     from datetime import UTC, datetime
 
     from umf_ros.places.store import stored_sessions
@@ -40,7 +40,7 @@ def delete(
     session: Annotated[list[int], typer.Option("--session", help="Number of a session; may be given repeatedly.")],
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
-    """Delete sessions of a store for good, after a confirmation."""
+    """Delete sessions of a place database for good, after a confirmation."""
     from umf_ros.places.store import check_sessions, delete_sessions
 
     check_sessions(store, session)
@@ -58,22 +58,22 @@ Address = Annotated[
 @fleet.command("setup")
 def set_up(
     server: Address,
-    embedder: Annotated[str, typer.Option(help="Network of all rovers, as umf doctor names it.")] = "umf_scene",
-    dimension: Annotated[int, typer.Option(min=1, max=4000, help="Numbers per descriptor of it.")] = 768,
+    embedder: Annotated[str, typer.Option(help="Network of all rovers, as listed by umf doctor.")] = "umf_scene",
+    dimension: Annotated[int, typer.Option(min=1, max=4000, help="Its descriptor dimension.")] = 768,
 ) -> None:
-    """Make the tables of a fleet, or bring them up to date; PostgreSQL 15 and pgvector 0.8 or later."""
+    """Create or update the tables of a fleet; PostgreSQL 15 and pgvector 0.8 or later."""
     with _connected(server) as connection:
         from umf_ros.fleet.server import migrate
 
         before, after = migrate(connection, embedder, dimension)
-    typer.echo(f"the tables are of version {after}" + (", as before" if before == after else f", were of {before}"))
+    typer.echo(f"the tables have version {after}" + (", as before" if before == after else f", before {before}"))
 
 
 @fleet.command("add")
 def add_rover(server: Address, rover: Annotated[str, typer.Argument(help="Name of the rover.")]) -> None:
-    """Let a rover in, or give it a new password; the password is read from the terminal or from standard input."""
+    """Add a rover, or change its password; the password is read from the terminal or from standard input."""
     if not rover.replace("_", "").isalnum() or len(rover) > 63:
-        raise UmfError(f"{rover!r} is no name for a rover: letters, digits and _, 63 at most")
+        raise UmfError(f"{rover!r} is not a valid name of a rover: letters, digits and _, 63 at most")
     secret = typer.prompt("password", hide_input=True) if sys.stdin.isatty() else sys.stdin.readline().rstrip("\n")
     if not secret:
         raise UmfError("a rover needs a password")
@@ -81,12 +81,12 @@ def add_rover(server: Address, rover: Annotated[str, typer.Argument(help="Name o
         from umf_ros.fleet import server as fleet_server
 
         fleet_server.add_rover(connection, rover, secret)
-    typer.echo(f"{rover} may come in; database.server: postgresql://{rover}@...")
+    typer.echo(f"{rover} can connect; database.server: postgresql://{rover}@...")
 
 
 @contextmanager
 def _connected(server: str) -> Iterator[Connection]:
-    """A connection whose faults are one line."""
+    """Yield a connection; report its faults in one line."""
     import psycopg
 
     from umf_ros.core.config import without_password
@@ -99,4 +99,4 @@ def _connected(server: str) -> Iterator[Connection]:
         with psycopg.connect(server, autocommit=True, connect_timeout=10) as connection:
             yield connection
     except psycopg.Error as error:
-        raise UmfError(f"the server cannot do that: {' '.join(str(error).split())[:300]}") from None
+        raise UmfError(f"the server refuses the request: {' '.join(str(error).split())[:300]}") from None
