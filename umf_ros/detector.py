@@ -1,4 +1,4 @@
-"""From synchronised frames to verified loop closures: the method of the thesis on one screen."""
+"""Loop detector: from synchronised frames to verified loop closures."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Other = TypeVar("Other")
 """Items of a stream beside frames, such as odometry."""
 NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
 COUNTED_STEP_M = 0.05
-"""Motion counts from this distance on: odometry noise of a parked rover must not add up to metres (*by hand*)."""
+"""Least motion that counts: odometry noise of a parked rover must not add up to metres (*by hand*)."""
 _NOT_EMBEDDED = Embedding(np.empty(0, np.float32))
 
 
@@ -45,10 +45,10 @@ class Detection:
 
     Attributes:
         frame_stamp_ns: key of the frame.
-        keyframe: the keyframe it became, or None when it was passed over.
+        keyframe: the keyframe made of it, or None when it was not selected.
         verdicts: one for every candidate that was tested, best first.
         latency_ms: milliseconds of embed, query, verify and submaps, and of their total.
-        fault: why the keyframe could not be remembered (a full disk); what was found stands.
+        fault: error of storing the keyframe (a full disk); the closures are valid.
     """
 
     frame_stamp_ns: int
@@ -64,9 +64,9 @@ class Detection:
 
 
 class KeyframeSelector:
-    """Chooses frames by distance, angle and time, and counts the metres driven, of each session by itself.
+    """Selection of keyframes by distance, angle and time, with the path length in each session.
 
-    With odometry a frame is kept after enough motion; one that is merely late (`max_period_s`) is
+    With odometry a frame is kept after enough motion; after `max_period_s` it is
     kept only if the rover moved at all, so that a parked rover does not fill the database. Without
     odometry frames are kept every `untracked_period_s`.
     """
@@ -76,17 +76,17 @@ class KeyframeSelector:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past, as at the start of a session."""
+        """Reset, as at the start of a session."""
         self._last: Frame | None = None
         self._counted: Array | None = None
         self._path_length_m = 0.0
 
     def path_length_m(self, frame: Frame) -> float:
-        """Metres driven from the start of the session to `frame`; NaN without odometry."""
+        """Return the metres driven from the start of the session to `frame`; NaN without odometry."""
         return self._path_length_m if frame.odom_T_body is not None else math.nan
 
     def select(self, frame: Frame) -> bool:
-        """Whether `frame` becomes a keyframe; call once per frame, in order of stamps within a session."""
+        """Return whether `frame` becomes a keyframe; call once per frame, in order of stamps within a session."""
         if self._last is not None and frame.session != self._last.session:
             self.reset()
         self._count_metres(frame)
@@ -122,7 +122,7 @@ class KeyframeSelector:
 
 @dataclass(slots=True)
 class _Upcoming:
-    """A frame that is known before it is processed, and the embedding that was begun for it."""
+    """A prefetched frame, and its embedding in progress."""
 
     frame: Frame
     is_keyframe: bool
@@ -131,10 +131,10 @@ class _Upcoming:
 
 
 class LoopDetector:
-    """Finds loop closures in a stream of frames; the same class in the live node, the replay and the evaluation.
+    """Loop detector on a stream of frames; the same in the live node, the replay and the evaluation.
 
     `process` takes a frame through all stages: `select`, `embed`, `query`, `verify`, `match_submaps`, `remember`.
-    The last one is skipped while localising in a map that stays as it is.
+    The last one is skipped when localising in a fixed map.
 
     Args:
         settings: all settings.
@@ -142,7 +142,7 @@ class LoopDetector:
 
     Attributes:
         database: the rover's places.
-        inter_robot: closures with other rovers of a fleet; None of a rover on its own.
+        inter_robot: closures with other rovers of a fleet; None without a fleet.
         embed_ms: milliseconds that the last embedding took, prefetched or not.
 
     Raises:
@@ -150,7 +150,7 @@ class LoopDetector:
     """
 
     def __init__(self, settings: Settings, embedder: Embedder) -> None:
-        small_gicp.PointCloud(np.eye(3))  # its binding initialises itself once, before there are other threads
+        small_gicp.PointCloud(np.eye(3))  # its binding must be initialised before there are other threads
         self._rules = settings.loop
         self._selector = KeyframeSelector(settings.keyframe)
         self._embedder = embedder
@@ -169,7 +169,7 @@ class LoopDetector:
         self._current: _Upcoming | None = None
 
     def retune(self, settings: Settings) -> None:
-        """Search and verify by other settings from the next frame on."""
+        """Search and verify with other settings from the next frame on."""
         self._rules = settings.loop
         self._verifier.retune(settings.verification)
         self._submaps.retune(settings.verification, settings.loop)
@@ -180,14 +180,14 @@ class LoopDetector:
         return self._embedder.name
 
     def process(self, frame: Frame) -> Detection:
-        """Take one frame, in order of stamps within a session."""
+        """Process one frame, in order of stamps within a session."""
         if not self.select(frame):
             return Detection(frame.stamp_ns)
         keyframe = self.embed(frame)
         latency = {"embed": self.embed_ms}
         known = self.database.find_duplicate(keyframe) if self._map is None else None
         if known is not None:
-            keyframe = self._go_on_from(known)
+            keyframe = self._continue_from(known)
         with _timed(latency, "query"):
             candidates = self.query(keyframe)
         with _timed(latency, "verify"):
@@ -207,7 +207,7 @@ class LoopDetector:
     def prefetch(
         self, stream: Iterable[Frame | Other], wanted: Callable[[], bool] = lambda: True
     ) -> Iterator[Frame | Other]:
-        """Yield a recording's stream unchanged, each keyframe after the network has begun to embed the next one.
+        """Yield a recording's stream unchanged, each keyframe after the embedding of the next one has started.
 
         Args:
             stream: frames and odometry of a recording, in the order in which they are processed.
@@ -226,7 +226,7 @@ class LoopDetector:
         yield from held
 
     def select(self, frame: Frame) -> bool:
-        """Whether the frame becomes a keyframe; call once per frame, in order of stamps within a session."""
+        """Return whether the frame becomes a keyframe; call once per frame, in order of stamps within a session."""
         while self._queue and self._queue[0].frame is not frame:
             self._queue.popleft()
         self._current = self._queue.popleft() if self._queue else self._decide(frame)
@@ -237,12 +237,12 @@ class LoopDetector:
     def embed(self, frame: Frame) -> Keyframe:
         """Return the keyframe of the frame that `select` was called with last, prefetched or not."""
         if self._current is None or self._current.frame is not frame:
-            raise ValueError("select has to be called with this frame first")
+            raise ValueError("call select with this frame first")
         coming = self._begin(self._current)
         path_length_m = self._current.path_length_m + self._ahead_m
         keyframe = _assemble(frame, _NOT_EMBEDDED, path_length_m, self._stored_session)
         if not coming.done() and len(self.database):
-            self._verifier.prefetch(keyframe)  # beside the network
+            self._verifier.prefetch(keyframe)  # in parallel with the network
         embedding, self.embed_ms = coming.result()
         return replace(keyframe, embedding=embedding)
 
@@ -261,7 +261,7 @@ class LoopDetector:
         return embedding, 1e3 * (time.perf_counter() - start)
 
     def query(self, keyframe: Keyframe) -> list[Candidate]:
-        """Remembered places that look like a keyframe, best first."""
+        """Return the stored places most similar to a keyframe, best first."""
         return self.database.query(keyframe, self._rules, self._map)
 
     def verify(self, keyframe: Keyframe, candidates: Sequence[Candidate]) -> list[Hypothesis]:
@@ -271,11 +271,11 @@ class LoopDetector:
         return verdicts
 
     def match_submaps(self, keyframe: Keyframe, verdicts: list[Hypothesis]) -> list[Hypothesis]:
-        """The verdicts, accepted ones first, with those about submaps where the scans have found nothing."""
+        """Return the verdicts, accepted ones first, with those of submaps where the scans gave no closure."""
         return sorted(self._submaps.find(keyframe, verdicts), key=lambda verdict: verdict.closure is None)
 
     def remember(self, keyframe: Keyframe, stored: bool = False) -> None:
-        """Make a keyframe, unless it is stored already, a place that later ones may find.
+        """Store a keyframe as a place, unless it is stored already.
 
         Raises:
             OutputError: the disk is full.
@@ -287,16 +287,16 @@ class LoopDetector:
         self._submaps.remember(keyframe)
 
     def resume(self, frame: Frame) -> bool:
-        """Record a frame that an earlier run over the same store has processed, without a search.
+        """Record a frame that an earlier run with the same database has processed, without a search.
 
         Returns:
-            Whether it had become a keyframe.
+            Whether it is a keyframe.
         """
         if not self.select(frame):
             return False
         known = self.database.newest_at(frame.stamp_ns)
         if known is not None:
-            self._submaps.remember(self._go_on_from(known))
+            self._submaps.remember(self._continue_from(known))
         return True
 
     def next_inter_robot_closure(self) -> InterRobotClosure | None:
@@ -304,25 +304,25 @@ class LoopDetector:
         return self.inter_robot.next() if self.inter_robot is not None else None
 
     def close(self) -> None:
-        """Leave the fleet's server, and release the database."""
+        """Disconnect from the fleet's server, and release the database."""
         self._network.shutdown(cancel_futures=True)
         if self.inter_robot is not None:
             self.inter_robot.close()
         self.database.close()
 
     def end_session(self) -> None:
-        """End the session: the next frame begins a new one; every place is kept."""
+        """End the session: the next frame begins a new one; all places are kept."""
         self._session = None
         self._selector.reset()
 
     def _warn_without_depth(self, verdicts: Sequence[Hypothesis]) -> None:
-        """Warn once that candidates stay without a metric pose: one camera without a LiDAR measures no depth."""
+        """Warn once that candidates have no metric pose: one camera without a LiDAR measures no depth."""
         if not self._warned_without_depth and any(verdict.reason is RejectReason.NO_DEPTH for verdict in verdicts):
             self._warned_without_depth = True
             logger.warning("%s: %s", NOTHING_METRIC, RejectReason.NO_DEPTH.value)
 
     def _start_session(self, frame: Frame) -> None:
-        """Begin a session; where the clock was set back, keyframes with later stamps are not found until then."""
+        """Begin a session; if the clock was set back, keyframes with later stamps are not searched until then."""
         self._session = frame.session
         self._stored_session, self._ahead_m = self.database.next_session, 0.0
         if len(self.database) and self._map is None:
@@ -330,8 +330,8 @@ class LoopDetector:
         self._verifier.reset()
         self._submaps.reset()
 
-    def _go_on_from(self, known: int) -> Keyframe:
-        """Return the stored keyframe of a frame that was processed before, and continue its session and path length."""
+    def _continue_from(self, known: int) -> Keyframe:
+        """Return the stored keyframe of a frame processed before, and continue its session and path length."""
         keyframe = self.database[known]
         self._stored_session = keyframe.session
         ahead_m = keyframe.path_length_m - self._current.path_length_m if self._current else math.nan
@@ -340,14 +340,14 @@ class LoopDetector:
 
 
 def _open_places(settings: Settings, embedder: Embedder) -> PlaceDatabase:
-    """The store of the settings, or that of the map to localise in."""
+    """Return the place database of the settings, or of the map to localise in."""
     if settings.localizing:
         return PlaceDatabase.of_map(Path(settings.map), embedder.name, embedder.dimension)
     return PlaceDatabase(settings.database, embedder.name, embedder.dimension)
 
 
 def make_keyframe(frame: Frame, embedder: Embedder, path_length_m: float = float("nan")) -> Keyframe:
-    """The keyframe that a frame becomes: embedded, its features lifted to 3-D, its scan thinned.
+    """Return the keyframe of a frame: embedded, its features lifted to 3-D, its scan thinned.
 
     Args:
         frame: synchronised measurements.
@@ -358,7 +358,7 @@ def make_keyframe(frame: Frame, embedder: Embedder, path_length_m: float = float
 
 
 def _assemble(frame: Frame, embedding: Embedding, path_length_m: float, session: int = 0) -> Keyframe:
-    """The keyframe of a frame whose embedding is known, its scan thinned."""
+    """Return the keyframe of a frame whose embedding is known, its scan thinned."""
     points, motion = thin_frame(frame)
     return Keyframe(
         stamp_ns=frame.stamp_ns,
@@ -375,7 +375,7 @@ def _assemble(frame: Frame, embedding: Embedding, path_length_m: float, session:
 
 
 def _connect_fleet(settings: Settings, database: PlaceDatabase, embedder: Embedder) -> InterRobotMatcher | None:
-    """Connect to the places of a fleet; its packages are imported only then.
+    """Connect to the server of a fleet; its packages are imported only then.
 
     Raises:
         ConfigError: the settings name no server.
@@ -393,7 +393,7 @@ def _connect_fleet(settings: Settings, database: PlaceDatabase, embedder: Embedd
 
 
 def make_detector_embedder(settings: Settings) -> Embedder:
-    """The embedder the settings name, with the features that verification asks for.
+    """Return the embedder of the settings, with the features that verification needs.
 
     Raises:
         ConfigError: unknown method, runtime or device.

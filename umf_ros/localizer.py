@@ -32,11 +32,11 @@ from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State, check_closure, check_pose
 
 ACCEPTED_ODDS = log(0.999 / 0.001)
-"""A pose is reported from these odds on, nats (*by hand*: one wrong in a thousand)."""
+"""Least odds of a reported pose, nats (*by hand*: one wrong in a thousand)."""
 POSES = "poses.npz"
 """In the folder of a map, its places with a pose: `stamps` (N,) on the map's clock, `poses` (N, 4, 4) `map_T_body`."""
 _MOST_PER_CLOSURE = log(0.99 / 0.01)
-# neighbouring places are mistaken for the same wrong place: consecutive closures count by the path length between them
+# neighbouring places look like the same wrong place: consecutive closures count by the path length between them
 _NATS_PER_M = 1.0
 _MOST_ODDS, _LEAST_ODDS = 12.0, -3.0
 _MOST_HYPOTHESES = 8
@@ -91,11 +91,11 @@ class _PoseHypothesis:
 
 
 class Localizer:
-    """Tracks pose hypotheses in a fixed map, from closures and odometry.
+    """Localisation in a fixed map by pose hypotheses from closures and odometry.
 
     A closure that agrees with no hypothesis adds one. Later closures agree with a hypothesis or contradict it, within
     the covariances of closure and odometry, and change its odds by the path length between them. The pose is that of
-    the accepted hypothesis until another one is accepted, so a rover that was moved is relocalised.
+    the accepted hypothesis until another one is accepted, so a kidnapped rover is relocalised.
 
     Args:
         poses: of the map's keyframes, by the stamps that closures name as their match.
@@ -114,14 +114,14 @@ class Localizer:
         self.begin_session()
 
     def begin_session(self) -> None:
-        """Forget every pose: the odometry starts again, at any place."""
+        """Delete all hypotheses: the odometry restarts at any place."""
         self._samples: deque[_Sample] = deque(maxlen=_KEPT_MESSAGES)
         self._pending: deque[LoopClosure] = deque(maxlen=50)
         self._hypotheses: list[_PoseHypothesis] = []
         self._accepted: _PoseHypothesis | None = None
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> bool:
-        """Take one message; returns whether it could be used."""
+        """Add an odometry message; return whether it was usable."""
         try:
             check_pose(odom_T_body)
         except GraphError:
@@ -131,7 +131,7 @@ class Localizer:
             last = self._samples[-1]
             if stamp_ns <= last.stamp_ns:
                 return False
-            # a rover that stands gathers no evidence, however long
+            # a stationary rover gathers no evidence
             path_m = last.path_m + float(self._noise.path_lengths(last.pose[None], odom_T_body[None], np.zeros(1))[0])
         self._samples.append(_Sample(stamp_ns, np.asarray(odom_T_body, float), path_m))
         for _ in range(len(self._pending)):
@@ -139,7 +139,7 @@ class Localizer:
         return True
 
     def add_closure(self, closure: LoopClosure) -> Localization | None:
-        """Take a closure with a keyframe of the map; returns the pose at the query, None while it is unknown."""
+        """Add a closure with a keyframe of the map; return the pose at the query, None while it is unknown."""
         if self._samples and closure.query_stamp_ns > self._samples[-1].stamp_ns:
             self._pending.append(closure)
             return None
@@ -155,18 +155,18 @@ class Localizer:
         return None if self._accepted is None else self._localization(self._accepted, at)
 
     def estimate(self) -> Localization | None:
-        """The pose at the newest odometry; None while it is unknown."""
+        """Return the pose at the newest odometry; None while it is unknown."""
         if self._accepted is None or not self._samples:
             return None
         return self._localization(self._accepted, self._samples[-1])
 
     def map_T_odom(self) -> Array | None:
-        """(4, 4) pose of the odometry's frame in the map; None while it is unknown."""
+        """Return (4, 4) pose of the odometry's frame in the map; None while it is unknown."""
         known = self._accepted
         return None if known is None else known.pose @ invert(known.at.pose)
 
     def _update(self, at: _Sample, pose: Array, covariance: Array, probability: float) -> None:
-        """Compare a measured pose with every hypothesis, and add one where none agrees."""
+        """Compare a measured pose with every hypothesis, and add one if none agrees."""
         gain = trust = min(_logit(probability), _MOST_PER_CLOSURE)
         agreed = [one for one in self._hypotheses if self._correct(one, at, pose, covariance)]
         for one in agreed:
@@ -181,7 +181,7 @@ class Localizer:
         self._choose()
 
     def _choose(self) -> None:
-        """Keep the likeliest hypotheses, one of each pose, and accept the best where its odds suffice."""
+        """Keep the likeliest hypotheses, one per pose, and accept the best if its odds suffice."""
         kept: list[_PoseHypothesis] = []
         for one in sorted(self._hypotheses, key=lambda one: -one.odds):
             if one.odds > _LEAST_ODDS and not any(self._same(one, other) for other in kept):
@@ -195,7 +195,7 @@ class Localizer:
             self._accepted = None
 
     def _correct(self, one: _PoseHypothesis, at: _Sample, pose: Array, covariance: Array) -> bool:
-        """Correct a hypothesis by a measured pose that agrees with it (Kalman update); returns whether it does."""
+        """Correct a hypothesis by a measured pose that agrees with it (Kalman update); return whether it agrees."""
         expected, spread = self._propagated(one, at)
         miss = logmap(relative(expected, pose)[None])[0]
         if not float(miss @ np.linalg.solve(spread + covariance, miss)) <= self._settings.gate_chi2:
@@ -207,11 +207,11 @@ class Localizer:
         return True
 
     def _propagated(self, one: _PoseHypothesis, at: _Sample) -> tuple[Array, Array]:
-        """Pose and covariance of a hypothesis, propagated by odometry to another sample."""
+        """Return the pose and covariance of a hypothesis, propagated by odometry to another sample."""
         step = relative(one.at.pose, at.pose)
         path_m = abs(at.path_m - one.at.path_m)
         noise = self._noise.covariances(np.array([path_m]))[0]
-        # an error of heading made on the path is a translation at its end
+        # an error of heading along the path is a translation at its end
         noise[3:, 3:] += noise[:3, :3] * path_m**2 / 3
         return one.pose @ step, propagate(adjoint(invert(step)), one.covariance) + noise
 
@@ -225,7 +225,7 @@ class Localizer:
         return Localization(at.stamp_ns, pose, gtsam_to_ros_covariance(covariance, pose), probability)
 
     def _sample(self, stamp_ns: int) -> _Sample | None:
-        """The odometry at a stamp; None before the first message, or in a gap."""
+        """Return the odometry at a stamp; None before the first message, or in a gap."""
         stamps = np.array([one.stamp_ns for one in self._samples], np.int64)
         odometry = Trajectory(stamps, np.array([one.pose for one in self._samples]).reshape(-1, 4, 4))
         pose, known = odometry.at(np.array([stamp_ns], np.int64))
@@ -236,18 +236,18 @@ class Localizer:
 
 
 def _logit(probability: float) -> float:
-    """Odds in nats; an unknown probability counts as 0.9, that of a closure that is just accepted."""
+    """Return the odds in nats; an unknown probability counts as 0.9, the threshold of acceptance."""
     known = min(max(probability, 0.5), 0.9999) if np.isfinite(probability) else 0.9
     return log(known / (1 - known))
 
 
 def read_poses(path: Path) -> Trajectory:
-    """Read the poses of a map's places, on the map's clock; an `UmfError` where the map has not been solved."""
+    """Read the poses of a map's places, on the map's clock; raise an `UmfError` if the map has not been solved."""
     try:
         with np.load(path / POSES) as stored:
             return Trajectory(stored["stamps"], stored["poses"])
     except (OSError, ValueError, KeyError):
-        raise UmfError(f"{path / POSES} cannot be read: umf map writes it when a map is solved") from None
+        raise UmfError(f"{path / POSES} cannot be read: run umf map to solve the map") from None
 
 
 _STATES = {
@@ -256,11 +256,11 @@ _STATES = {
     "searching": (State.PENDING, ClosureReason.POSE_UNKNOWN),
     "unusable": (State.REFUSED, ClosureReason.NOT_OF_MAP),
 }
-"""State of a closure by what the localizer counted it as."""
+"""State of a closure by the localizer's count."""
 
 
 class MapFollower(PoseGraph):
-    """Localisation in a map as a pose graph for `pose_graph_node`; closures are counted by their state and not kept."""
+    """Localisation in a map with the interface of a pose graph; closures are counted by state and not kept."""
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings.pose_graph)
@@ -275,11 +275,11 @@ class MapFollower(PoseGraph):
         return 0.0 if found is None else found.probability
 
     def begin_session(self) -> None:
-        """Forget the pose: the rover may be anywhere."""
+        """Delete the pose: the rover may be anywhere."""
         self._localizer.begin_session()
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
-        """Take one message; returns whether it could be used."""
+        """Add an odometry message; return whether it was usable."""
         usable, found = self._localizer.add_odometry(stamp_ns, odom_T_body), self._localizer.estimate()
         if found is not None:
             last = self._poses[-1].map_T_body[:3, 3] if self._poses else np.full(3, np.inf)
@@ -292,7 +292,7 @@ class MapFollower(PoseGraph):
         self.counts["absolute measurements unused"] += 1
 
     def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
-        """Take a closure with the map; returns its verdict."""
+        """Add a closure with the map; return its verdict."""
         before = Counter(self._localizer.counts)
         self._localizer.add_closure(closure)
         change = Counter(self._localizer.counts) - before
@@ -301,29 +301,29 @@ class MapFollower(PoseGraph):
         return [ClosureVerdict(closure, state, reason)]
 
     def map_T_odom(self) -> Array | None:
-        """(4, 4) pose of the odometry frame in the map; None while it is unknown."""
+        """Return (4, 4) pose of the odometry frame in the map; None while it is unknown."""
         return self._localizer.map_T_odom()
 
     def covariance(self) -> Array:
-        """(6, 6) of the newest pose in ROS order; zero while it is unknown."""
+        """Return (6, 6) of the newest pose in ROS order; zero while it is unknown."""
         found = self._localizer.estimate()
         return np.zeros((6, 6)) if found is None else found.covariance
 
     def trajectory(self, optimized: bool = True) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (N,) in ns and `map_T_body` (N, 4, 4) since the rover was localised, 0.25 m apart."""
+        """Return stamps (N,) in ns and `map_T_body` (N, 4, 4) since the rover was localised, 0.25 m apart."""
         stamps = np.array([one.stamp_ns for one in self._poses], np.int64)
         return stamps, np.array([one.map_T_body for one in self._poses]).reshape(-1, 4, 4)
 
     def verdict_counts(self) -> Counter[State]:
-        """Number of closures by state."""
+        """Return the number of closures by state."""
         return Counter(self._states)
 
     def revoke(self, match_stamp_ns: int, query_stamp_ns: int) -> list[ClosureVerdict]:
-        """Raise a `GraphError`: there is nothing to revoke."""
+        """Raise a `GraphError`: closures are not kept."""
         raise GraphError("localisation in a fixed map keeps no closures to reject")
 
     def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
-        """Write the trajectory, `trajectory_in_map.tum`; returns true, there is nothing to settle before."""
+        """Write the trajectory, `trajectory_in_map.tum`; return true, as there is nothing to settle."""
         with writing(f"to {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
         write_tum(folder / "trajectory_in_map.tum", Trajectory(*self.trajectory()))

@@ -1,4 +1,4 @@
-"""A recording through the same stages as on the rover, mapping or localising in a map."""
+"""Replay of a recording through the same stages as on the rover, mapping or localising in a map."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 FAULTS = "faults.log"
 WARM_UP = 12
-"""Keyframes before an interruption that are processed again: twice the number that verification remembers."""
+"""Keyframes before an interruption that are processed again: twice the history of the verification."""
 FRAMES_AHEAD = 20
-"""Frames that the check of the sensors may lag behind; bounds the memory."""
+"""Most frames that the sensor check may lag behind; bounds the memory."""
 FLEET_PATIENCE_S = 30.0
-"""Time that a replay waits at its end for a fleet's server; the next run sends the places that are still waiting."""
+"""Time that a replay waits at its end for a fleet's server; the next run sends the remaining places."""
 
 
 class Replay:
-    """Feed frames to the detector, odometry and closures to the pose graph, and fill a run folder.
+    """Replay: feeds frames to the detector, odometry and closures to the pose graph, and writes a run folder.
 
     The graph gets the inputs of the live back-end: every odometry message, and one closure after the other. With
     settings of mode localization, a localizer in the map takes the place of the graph.
@@ -42,11 +42,11 @@ class Replay:
     Args:
         folder: run folder.
         settings: all settings.
-        detector: made with these settings, or over the store of the run that is resumed.
+        detector: made with these settings, or with the database of the run that is resumed.
         resume: continue an earlier replay of the same recording into this folder.
 
     Attributes:
-        sensor_check: has seen every frame.
+        sensor_check: check of the sensors, fed with every frame.
         faults: frames that were skipped after internal errors; `faults.log` in the folder has the tracebacks.
         counts: of a localising run, as in its summary: `keyframes`, those up to the first known pose (None while there
             is none), those with a known pose, how often a pose was found or another one than before, and closures that
@@ -66,7 +66,7 @@ class Replay:
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometrySessionSplitter(self._localizer or self._graph)
         self.sensor_check = SensorCheck()
-        self._checking = ThreadPoolExecutor(1, "sensor-check")  # OpenCV and small_gicp hold no interpreter lock
+        self._checking = ThreadPoolExecutor(1, "sensor-check")  # OpenCV and small_gicp release the interpreter lock
         self._unchecked: deque[Future[None]] = deque()
         self.faults = 0
         self.counts: dict[str, Any] = {"keyframes": 0, "keyframes_until_found": None, "located": 0}
@@ -160,7 +160,7 @@ class Replay:
         return self._localizer.estimate() if self._localizer is not None else None
 
     def _skip_known(self, frame: Frame) -> Detection:
-        """Restore the state after a frame that was processed before, with its closures."""
+        """Restore the state after a frame processed before, with its closures."""
         self._recorder.count(frame)
         if self._detector.resume(frame):
             self._done -= 1
@@ -177,7 +177,7 @@ class Replay:
             return
         counts["located"] += 1
         counts["keyframes_until_found"] = counts["keyframes_until_found"] or counts["keyframes"]
-        if not self._found or found.stamp_ns > self._found[-1].stamp_ns:  # else its clock was set back
+        if not self._found or found.stamp_ns > self._found[-1].stamp_ns:  # else the clock was set back
             self._found.append(found)
             self._recorder.record_pose(*found)
 
@@ -185,7 +185,7 @@ class Replay:
         """Export the files of the run.
 
         Returns:
-            Whether there is a trajectory: of the graph, where there was odometry, or in the map.
+            Whether there is a trajectory, of the graph or in the map.
 
         Raises:
             OutputError: the folder cannot be written.
