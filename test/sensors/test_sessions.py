@@ -59,11 +59,11 @@ def test_what_comes_late_from_before_a_reset_is_stale() -> None:
 def test_what_is_still_held_at_the_end_was_wrong() -> None:
     clock = heard(("left", 5.0), ("odometry", 5.0), ("left", 1.0))
     clock.take(StampedInput("odometry", ns(5.1), make_pose(np.eye(3), [50, 0, 0])))
-    assert [(one.name, one.fault) for one in clock.give_up()] == [
+    assert [(one.name, one.fault) for one in clock.drop_held()] == [
         ("left", "clock jump"),
         ("odometry", "position jump"),
     ]
-    assert clock.give_up() == [] and clock.session == 0
+    assert clock.drop_held() == [] and clock.session == 0
 
 
 def test_an_odometry_reset_leaves_the_other_inputs_in_line() -> None:

@@ -64,7 +64,7 @@ class TopicInfo:
 
 @dataclass(frozen=True, slots=True)
 class RawMessage:
-    """A message recorded at `log_ns`, its data as ROS 2 serialises them (CDR), whatever the format of the recording."""
+    """A message recorded at `log_ns`, its data as ROS 2 serialises them (CDR), for all formats of recordings."""
 
     topic: str
     log_ns: int
@@ -122,11 +122,11 @@ class McapFile:
         try:
             self._read_index()
         except (*_DAMAGE, OSError):  # too short to seek in
-            self._read_through()
+            self._scan()
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield messages of some topics in the order of their recording."""
-        return _in_order(self._by_index(topics) if self._chunks else self._up_to_the_end(topics))
+        return _in_order(self._by_index(topics) if self._chunks else self._read_sequentially(topics))
 
     def _read_index(self) -> None:
         with self._path.open("rb") as stream:
@@ -148,7 +148,7 @@ class McapFile:
         self.start_ns, self.end_ns = summary.statistics.message_start_time, summary.statistics.message_end_time
         self._chunks = sorted(summary.chunk_indexes, key=lambda one: (one.message_start_time, one.chunk_start_offset))
 
-    def _read_through(self) -> None:
+    def _scan(self) -> None:
         self.start_ns, self.end_ns = 2**63, 0
         for message in self._stream():
             self.types[message.topic] = message.type
@@ -172,7 +172,7 @@ class McapFile:
                         message = RawMessage(topic, record.log_time, kind, record.data)
                         yield index.message_start_time, (index.chunk_start_offset, number), message
 
-    def _up_to_the_end(self, topics: Collection[str]) -> Iterator[PlacedMessage]:
+    def _read_sequentially(self, topics: Collection[str]) -> Iterator[PlacedMessage]:
         for number, message in enumerate(self._stream()):
             if message.topic in topics:
                 yield message.log_ns - SORTING_WINDOW_NS, (0, number), message

@@ -101,7 +101,7 @@ class KeyframePolicy(Group):
 
 
 class EmbeddingSettings(Group):
-    """The network that turns a frame into a descriptor and local features."""
+    """Network for descriptors and local features of frames."""
 
     method: str = Field("umf", description="embedder by name: umf, or another of docs/benchmarks.md")
     weights: str = Field(
@@ -161,7 +161,7 @@ class PoseGraphSettings(Group):
     gate_chi2: float = Field(
         27.9, gt=0, description="largest squared Mahalanobis distance to the map (6 degrees of freedom)"
     )
-    pair_chi2: float = Field(33.6, gt=0, description="the same between two consistent closures")
+    pair_chi2: float = Field(33.6, gt=0, description="largest squared Mahalanobis distance between consistent closures")
     alias_radius_m: float = Field(15.0, gt=0, description="radius of wrong closures to similar places, m")
     max_chance: float = Field(
         0.02, gt=0, le=1, description="largest false-alarm probability of a closure accepted at once"
@@ -340,7 +340,7 @@ def _set(values: dict[str, Any], path: list[str], value: Any) -> None:
 
 
 def _node_parameters(content: dict[str, Any], path: str | Path) -> dict[str, Any]:
-    """Take the settings out of a ROS parameter file; a plain file is its own settings."""
+    """Return the settings in a ROS parameter file; a plain file is returned as it is."""
     blocks = [block for block in content.values() if isinstance(block, dict) and "ros__parameters" in block]
     if not blocks:
         return content

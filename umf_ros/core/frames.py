@@ -189,7 +189,7 @@ class Keyframe:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A keyframe of the database that looks like the query.
+    """A keyframe of the database that is similar to the query.
 
     Attributes:
         index: row in the database.

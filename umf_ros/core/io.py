@@ -189,7 +189,7 @@ class SqliteFile:
 
     @contextmanager
     def writing(self) -> Iterator[sqlite3.Connection]:
-        """One transaction: all statements of the block are kept, or none.
+        """Open a transaction: all statements of the block are kept, or none.
 
         Raises:
             OutputError: the file cannot be written.

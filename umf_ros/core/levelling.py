@@ -42,9 +42,9 @@ def level(points: Points, keep_slope: bool = False) -> Array:
     small_gicp.estimate_normals(cloud, num_neighbors=NEIGHBOURS, num_threads=1)
     normals = np.asarray(cloud.normals())[:, :3]
     turn, trust = _upright(normals)
-    stands = np.asarray(cloud.points())[:, :3] @ turn.T
-    flat = (np.abs(normals @ turn[2]) > GROUND_COS) & (np.hypot(stands[:, 0], stands[:, 1]) < GROUND_M)
-    height = float(np.quantile(stands[flat, 2], GROUND_SHARE)) if flat.sum() >= MIN_GROUND_POINTS else 0.0
+    levelled = np.asarray(cloud.points())[:, :3] @ turn.T
+    flat = (np.abs(normals @ turn[2]) > GROUND_COS) & (np.hypot(levelled[:, 0], levelled[:, 1]) < GROUND_M)
+    height = float(np.quantile(levelled[flat, 2], GROUND_SHARE)) if flat.sum() >= MIN_GROUND_POINTS else 0.0
     return make_pose(_of_mount(turn) if keep_slope else turn, [0.0, 0.0, -trust * height])
 
 

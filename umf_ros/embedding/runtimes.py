@@ -37,7 +37,7 @@ FACTS = "umf_ros"
 
 
 class Runtime(Protocol):
-    """Runs a network.
+    """Protocol of an inference runtime.
 
     Attributes:
         precision: "float32" or "int8".
@@ -84,7 +84,7 @@ class OpenVinoRuntime:
         self._model = openvino_core().compile_model(model, "CPU", options)
 
     def run(self, inputs: Arrays) -> Outputs:
-        """See `Runtime`."""
+        """Return the outputs of a batch of one; see `Runtime`."""
         found = self._model(list(inputs))
         return {port.any_name: found[port][0].astype(np.float32) for port in self._model.outputs}
 

@@ -82,7 +82,7 @@ class TorchRuntime:
             raise ConfigError(f"embedding.device: cannot use {device!r}: {str(error).splitlines()[0]}") from None
 
     def run(self, inputs: Sequence[NDArray[Any]]) -> dict[str, NDArray[np.float32]]:
-        """See `runtimes.Runtime`."""
+        """Return the outputs of a batch of one; see `runtimes.Runtime`."""
         with torch.inference_mode():
             found = self._network(*(torch.from_numpy(array).to(self._device) for array in inputs))
         values = (value[0].float().cpu().numpy() for value in found)

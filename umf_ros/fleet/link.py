@@ -100,7 +100,7 @@ class FleetLink:
                 busy = self._step()
                 failures = 0
             except Exception as error:  # without the thread, places would be lost silently
-                self._lose(error)
+                self._disconnect(error)
                 self._end.wait(RETRY_S[min(failures, len(RETRY_S) - 1)])
                 failures += 1
                 continue
@@ -162,7 +162,7 @@ class FleetLink:
         self._cache.move_to_end(key)
         return self._cache[key]
 
-    def _lose(self, error: Exception) -> None:
+    def _disconnect(self, error: Exception) -> None:
         """Disconnect after an error, and log it when it is new."""
         if str(error) != self.trouble:
             logger.warning("%s; %d places are not pushed yet", error, self._store.waiting())

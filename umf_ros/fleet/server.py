@@ -94,7 +94,7 @@ def add_rover(connection: Connection, name: str, password: str) -> None:
 
 
 class LinkError(UmfError):
-    """The server is unreachable or disconnected; the request has to be repeated later."""
+    """Failed contact with the server; the request has to be repeated later."""
 
 
 class FleetKey(NamedTuple):

@@ -231,27 +231,27 @@ class Fusion(nn.Module):
             cloud_present: (B,) bool.
             scene: (B, S) scene descriptors or None; their length is their weight beside the image half.
         """
-        seen, felt = self.pool(image, cloud)
-        return self.describe(seen, felt, image_present, cloud_present, scene)
+        pooled = self.pool(image, cloud)
+        return self.describe(*pooled, image_present, cloud_present, scene)
 
     def pool(self, image: Tokens, cloud: Tokens) -> tuple[Tensor, Tensor]:
         """Return the pooled tokens (B, C) of the image and of the cloud, the input of the heads."""
         for layer in self.layers:
             image, cloud = layer(image, cloud)
-        seen = self.image_pool(Tokens(self.image_norm(image.values), image.mask))
-        felt = self.cloud_pool(Tokens(self.cloud_norm(cloud.values), cloud.mask))
-        return seen, felt
+        pooled_image = self.image_pool(Tokens(self.image_norm(image.values), image.mask))
+        pooled_cloud = self.cloud_pool(Tokens(self.cloud_norm(cloud.values), cloud.mask))
+        return pooled_image, pooled_cloud
 
     def describe(
-        self, seen: Tensor, felt: Tensor, image_present: Tensor, cloud_present: Tensor, scene: Tensor | None = None
+        self, image: Tensor, cloud: Tensor, image_present: Tensor, cloud_present: Tensor, scene: Tensor | None = None
     ) -> Fused:
         """Return the descriptors of pooled tokens; the other arguments as in `forward`."""
-        with torch.autocast(seen.device.type, enabled=False):
-            image_half = nn.functional.normalize(self.image_head(seen.float()), dim=-1)
+        with torch.autocast(image.device.type, enabled=False):
+            image_half = nn.functional.normalize(self.image_head(image.float()), dim=-1)
             if scene is not None:
                 image_half = nn.functional.normalize(torch.cat([image_half, scene.float()], dim=-1), dim=-1)
-            cloud_half = nn.functional.normalize(self.cloud_head(felt.float()), dim=-1)
-            scores = self.weigh(torch.cat([seen, felt], dim=-1).float())
+            cloud_half = nn.functional.normalize(self.cloud_head(cloud.float()), dim=-1)
+            scores = self.weigh(torch.cat([image, cloud], dim=-1).float())
             present = torch.stack([image_present, cloud_present], dim=-1)
             # without any modality both weights stay, as the descriptor must be finite
             present = present | ~present.any(dim=-1, keepdim=True)

@@ -55,12 +55,12 @@ class InputWatch:
         self.received = self.refused = self.lost = 0
         self.last_stamp_ns: int | None = None
         self._last_seen_s: float | None = None
-        self._born_s = time.monotonic()  # not the bag's clock: silence counts while /clock is silent, too
-        self._window: tuple[float, int, int] = (self._born_s, 0, 0)
+        self._started_s = time.monotonic()  # not the bag's clock: silence counts while /clock is silent, too
+        self._window: tuple[float, int, int] = (self._started_s, 0, 0)
 
     def begin(self) -> None:
         """Restart the wait for the first message."""
-        self._born_s = time.monotonic()
+        self._started_s = time.monotonic()
 
     def count(self, stamp_ns: int) -> None:
         """Count one message."""
@@ -99,7 +99,7 @@ class InputWatch:
         if self._rare and any(info.topic_type == self._type for info in publishers):
             return status(OK, f"input {self.name}", f"{self.received} received", values)
         reason = self._reason(publishers, silent_s)
-        if now_s - self._born_s > SILENT_S:
+        if now_s - self._started_s > SILENT_S:
             self.warning = f"{self.name}: {reason}"
         return status(WARN, f"input {self.name}", reason, values)
 

@@ -64,7 +64,7 @@ class PoseGraphNode(BaseNode):
 
     def __init__(self) -> None:
         self._front_end_busy = False
-        self._asked_s: float | None = None
+        self._interrupted_s: float | None = None
         super().__init__("pose_graph_node", "folder for trajectories, graph and verdicts; empty: none")
 
     def _open(self) -> None:
@@ -78,7 +78,7 @@ class PoseGraphNode(BaseNode):
         self._covariance: Array = np.zeros((6, 6))
         # newest odometry in path and markers; None: verdicts have changed since
         self._drawn_ns: int | None = None
-        self._draws_again_s = 0.0
+        self._next_draw_s = 0.0
         self._update_queued = False
         self._absolute: dict[str, object] = {}
         self._make_publishers()
@@ -114,11 +114,11 @@ class PoseGraphNode(BaseNode):
     def ready_to_close(self) -> bool:
         """Return whether a front-end that also shuts down has published its last closures."""
         now_s = time.monotonic()
-        if self._asked_s is None:
-            self._asked_s = now_s
+        if self._interrupted_s is None:
+            self._interrupted_s = now_s
         if not self._opened or not self.count_publishers("loop_closures"):
             return True
-        return not self._front_end_busy and now_s - self._asked_s > GRACE_S
+        return not self._front_end_busy and now_s - self._interrupted_s > GRACE_S
 
     def _settle_previous(self) -> None:
         """Settle the graph of the previous process."""
@@ -233,10 +233,10 @@ class PoseGraphNode(BaseNode):
         """Publish path and markers if they have changed and have subscribers; late ones get the last (latched)."""
         listeners = self._path_publisher.get_subscription_count() + self._marker_publisher.get_subscription_count()
         newest_ns = self._durable.feed.newest_ns
-        if listeners and self._drawn_ns != newest_ns and time.monotonic() >= self._draws_again_s:
+        if listeners and self._drawn_ns != newest_ns and time.monotonic() >= self._next_draw_s:
             started_s, self._drawn_ns = time.thread_time(), newest_ns
             self._draw()
-            self._draws_again_s = time.monotonic() + DRAWING * (time.thread_time() - started_s)
+            self._next_draw_s = time.monotonic() + DRAWING * (time.thread_time() - started_s)
 
     def _draw(self) -> None:
         stamps, poses = self._durable.graph.trajectory()

@@ -302,10 +302,10 @@ class PoseGraph:
         self._refresh()
         poses, known = np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps), bool)
         for chain in (self._sessions.chains[session] for session in self.sessions_of_map()):
-            mine = ~known & np.fromiter((chain.covers(stamp) for stamp in stamps.tolist()), bool, len(stamps))
-            if mine.any():
-                poses[mine] = self._sessions.at(chain.at(stamps[mine]))
-                known |= mine
+            covered = ~known & np.fromiter((chain.covers(stamp) for stamp in stamps.tolist()), bool, len(stamps))
+            if covered.any():
+                poses[covered] = self._sessions.at(chain.at(stamps[covered]))
+                known |= covered
         return poses, known
 
     def sessions_of_map(self) -> list[int]:

@@ -157,7 +157,7 @@ class ConsistencyGraph:
             if not any(other in self._inconsistent[member] for member in found):
                 found.append(other)
         linked, others, evidence = [row], found, 0.0
-        while others := self._elsewhere(others, linked[-1]):
+        while others := self._other_places(others, linked[-1]):
             ratio, nearest = min(
                 (min((self._consistent[other][k] for k in linked if k in self._consistent[other]), default=1.0), other)
                 for other in others
@@ -179,7 +179,7 @@ class ConsistencyGraph:
         """Return the number of places of closures."""
         count = 0
         while rows:
-            rows, count = self._elsewhere(rows, rows[0]), count + 1
+            rows, count = self._other_places(rows, rows[0]), count + 1
         return count
 
     def _compare(self, row: int) -> Loops:
@@ -210,7 +210,7 @@ class ConsistencyGraph:
         paths_m = paths_between(self.closures[np.array(rows, np.int64)], self.closures[other : other + 1])
         return np.isfinite(paths_m).all(axis=0) & (paths_m.min(axis=0) < self.settings.place_m)
 
-    def _elsewhere(self, rows: list[int], other: int) -> list[int]:
+    def _other_places(self, rows: list[int], other: int) -> list[int]:
         """Return the closures of other places than one closure."""
         return [row for row, same in zip(rows, self._same_place(rows, other), strict=True) if not same]
 
@@ -250,14 +250,14 @@ class NoiseScaleEstimator:
         best = int(np.argmax(merit) // len(_GRID)), int(np.argmax(merit) % len(_GRID))
         accepted = best[1] <= one or self._is_widely_better(best, plain)
         # closures about as stated are taken as stated, and odometry is estimated given that
-        row, column = best if accepted and _unless_small(_GRID[best[1]]) != 1 else plain
+        row, column = best if accepted and _significant(_GRID[best[1]]) != 1 else plain
         odometry_factor, closures_factor = float(_GRID[row]), float(_GRID[column])
         if one not in (row, column) and abs(np.log(odometry_factor / closures_factor)) < _SAME_UNITS:
             # a common factor of units is likelier than two errors: the ratio counts, and it is as stated
             odometry_factor = closures_factor = max(odometry_factor, closures_factor)
-        closures_factor = _unless_small(closures_factor)
+        closures_factor = _significant(closures_factor)
         least = _LEAST_ODOMETRY * min(closures_factor, 1.0)
-        return NoiseScale(max(_unless_small(odometry_factor), least), closures_factor)
+        return NoiseScale(max(_significant(odometry_factor), least), closures_factor)
 
     def _is_widely_better(self, one: tuple[int, int], other: tuple[int, int]) -> bool:
         """Return whether one choice is better even without the place that favours it most."""
@@ -265,7 +265,7 @@ class NoiseScaleEstimator:
         return bool(gains.sum() - gains.max() > _NATS_PER_FACTOR)
 
 
-def _unless_small(factor: float) -> float:
+def _significant(factor: float) -> float:
     return factor if abs(np.log(factor)) > _TOLERANCE else 1.0
 
 

@@ -231,8 +231,8 @@ class CorrectedPath:
         twists = np.zeros((len(points), 6))
         inside = (after > 0) & (after < len(self.points))
         if inside.any():
-            walked = points["noise"][inside] - self.points["noise"][lower[inside]]
-            twists[inside] = (walked @ self._multipliers[lower[inside]][..., None])[..., 0]
+            noise = points["noise"][inside] - self.points["noise"][lower[inside]]
+            twists[inside] = (noise @ self._multipliers[lower[inside]][..., None])[..., 0]
         start = self.poses[lower] @ invert(self.points["pose"][lower])
         return start @ expmap(twists) @ points["pose"]
 
@@ -240,7 +240,7 @@ class CorrectedPath:
     def _multipliers(self) -> Array:
         """(N-1, 6) correction from each solved pose to the next per noise: Lagrange multipliers of the solved poses."""
         here, there = self.points[:-1], self.points[1:]
-        walked = invert(here["pose"]) @ there["pose"]
-        misfits = logmap(invert(walked) @ invert(self.poses[:-1]) @ self.poses[1:])
+        step = invert(here["pose"]) @ there["pose"]
+        misfits = logmap(invert(step) @ invert(self.poses[:-1]) @ self.poses[1:])
         twists = adjoint(there["pose"]) @ misfits[..., None]
         return np.linalg.solve(there["noise"] - here["noise"], twists)[..., 0]

@@ -71,7 +71,7 @@ class OutlierRejection:
         self._map: RelativeCovariances | None = None
         self._ratios: list[float] = []  # likelihood of how closures fit the map if wrong over that if right
         self._joined: list[bool] = []  # whether the map joins both endpoints
-        self._brought_close: list[int] = []
+        self._near_map: list[int] = []
 
     @property
     def scale(self) -> NoiseScale:
@@ -109,7 +109,7 @@ class OutlierRejection:
         if self._rescale() or unsolved or (rows and begun):
             self.solve()
             rows = list(range(len(self.placed)))
-        self._decide({*rows, *self._brought_close})
+        self._decide({*rows, *self._near_map})
         return self._changed_since(before)
 
     def resume(self, decided: Sequence[tuple[PlacedClosure, Decision]]) -> None:
@@ -160,7 +160,7 @@ class OutlierRejection:
         for _ in range(_MOST_ROUNDS):
             if not self._decide(rows):
                 return
-            rows = self._brought_close
+            rows = self._near_map
 
     def _decide(self, rows: Iterable[int]) -> bool:
         """Decide about closures and solve the map with the accepted ones; return false without any."""
@@ -172,10 +172,10 @@ class OutlierRejection:
         # only without other accepted closures: the map moved by those may contradict these
         if not reasons:
             reasons = dict.fromkeys(self._unopposed(), ClosureReason.UNOPPOSED)
-        self._brought_close = []
+        self._near_map = []
         if self._accept(reasons):  # closures near the moved map that are not accepted are compared again
             rows = np.flatnonzero(~self._of(State.ACCEPTED) & ~self.revoked)
-            self._brought_close = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
+            self._near_map = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
         return bool(reasons)
 
     def _take(self, placed: PlacedClosure) -> int:
@@ -261,9 +261,9 @@ class OutlierRejection:
         """Revoke accepted closures for a contradicted set of more places than those; return the set."""
         accepted = self._of(State.ACCEPTED)
         for found in self._supported_sets(rows, State.REJECTED):
-            losers = sorted({loser for row in found for loser in self._consistency.opponents(row, accepted)})
-            if self._consistency.count_places(losers) < self._consistency.count_places(found):
-                for row in losers:
+            opponents = sorted({opponent for row in found for opponent in self._consistency.opponents(row, accepted)})
+            if self._consistency.count_places(opponents) < self._consistency.count_places(found):
+                for row in opponents:
                     self._reject(row, ClosureReason.OUTVOTED)
                 return found
         return []

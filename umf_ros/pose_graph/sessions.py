@@ -157,9 +157,9 @@ class Sessions:
         path = self.solved[session]
         last = self._solver.marginal((session, int(path.points["stamp"][-1])))
         back = invert(path.at(point)) @ path.poses[-1:]
-        walked = self.scale.odometry**2 * noise_between(path.points[-1:], point)
+        noise = self.scale.odometry**2 * noise_between(path.points[-1:], point)
         known = propagate(adjoint(back), np.zeros((6, 6)) if last is None else last)
-        return (known + propagate(adjoint(invert(point["pose"])), walked))[0]
+        return (known + propagate(adjoint(invert(point["pose"])), noise))[0]
 
     def _graph(
         self, stamps: list[Stamps], closures: Closures, components: list[int], moves: Array | None = None
@@ -175,8 +175,8 @@ class Sessions:
         back, there = invert(points["pose"]), points[steps + 1]
         along["first"], along["second"] = steps, steps + 1
         along["pose"] = back[steps] @ there["pose"]
-        walked = noise_between(points[steps], there)
-        along["covariance"] = self.scale.odometry**2 * propagate(adjoint(back[steps + 1]), walked)
+        noise = noise_between(points[steps], there)
+        along["covariance"] = self.scale.odometry**2 * propagate(adjoint(back[steps + 1]), noise)
         for column, end in (("first", closures["match"]), ("second", closures["query"])):
             both = zip(end["session"].tolist(), end["stamp"].tolist(), strict=True)
             between[column] = [row_of[vertex] for vertex in both]
@@ -262,8 +262,8 @@ class RelativeCovariances:
         for point in (match, query):
             beside = self._nearest(point)
             turn = adjoint(invert(poses) @ self._sessions.at(point) @ invert(point["pose"]))
-            walked = propagate(turn, noise_between(point, self._vertices[beside]))
-            ends.append((beside, self._variance_scale * walked))
+            noise = propagate(turn, noise_between(point, self._vertices[beside]))
+            ends.append((beside, self._variance_scale * noise))
         # paths are symmetric: trees grow from the side with fewer roots
         (starts, leave), (stops, enter) = sorted(ends, key=lambda one: len(np.unique(one[0])))
         sources, of_source = np.unique(starts, return_inverse=True)

@@ -61,7 +61,7 @@ def by_need(pairs: Pairs) -> list[Endpoints]:
 
 
 def _spread(count: int, most: int) -> Iterable[int]:
-    """Up to `most` of `count`, coarse before fine: the first ones cover the whole run."""
+    """Return up to `most` of `count` indices, coarse before fine: the first ones cover the whole run."""
     kept = np.linspace(0, count - 1, min(count, most)).astype(int).tolist() if count else []
     strides = [1 << power for power in range(len(kept).bit_length(), -1, -1)]
     return list(dict.fromkeys(kept[i] for stride in strides for i in range(0, len(kept), stride)))
@@ -254,7 +254,7 @@ def _similarity(descriptors: Points | None) -> dict[str, Any] | None:
 
 
 def _sweep(about: JudgedRun) -> list[list[float | int]]:
-    """Per keyframe with candidates: best probability, 1 or 0 for the same place or not and -1 for unknown, revisit."""
+    """Return per keyframe with candidates: best probability, same place (1, 0, or -1 for unknown), revisit."""
     rows: list[list[float | int]] = []
     right = dict(zip(about.closures.query_stamp_ns.tolist(), about.closures.is_true.tolist(), strict=True))
     for row, stamp in enumerate(map(int, about.run.stamps)):

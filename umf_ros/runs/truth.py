@@ -49,7 +49,7 @@ def normalised_errors(errors: Array, covariances: Array) -> Array:
 
 
 def share_inside(squared: Array, confidence: float = CONFIDENCE) -> float:
-    """Share of normalised errors squared that lie inside the confidence ellipsoid; NaN without any."""
+    """Return the share of normalised errors squared inside the confidence ellipsoid; NaN without any."""
     return float(np.mean(np.asarray(squared) < chdtri(6, 1 - confidence))) if len(squared) else nan
 
 

@@ -86,8 +86,8 @@ def scan_motion(moments_s: Array, span_ns: tuple[int, int], path: Trajectory, od
 
     `span_ns` are the stamps of the first and the last point, `path` the odometry over the scan, at least one pose.
     """
-    lasted_s = float(path.stamps_ns[-1] - path.stamps_ns[0]) * 1e-9
-    rates = twists(path.poses[[0, -1]])[0] / lasted_s if lasted_s > 0 else np.zeros(6)
+    duration_s = float(path.stamps_ns[-1] - path.stamps_ns[0]) * 1e-9
+    rates = twists(path.poses[[0, -1]])[0] / duration_s if duration_s > 0 else np.zeros(6)
     history = odometry.samples(span_ns[1] - HISTORY_NS, span_ns[1])
     return ScanMotion(moments_s.astype(np.float32), rates, odometry_noise(history, span_ns[1] - span_ns[0]))
 

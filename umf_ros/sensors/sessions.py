@@ -26,7 +26,7 @@ DROPPED = ("clock jump", "position jump")
 
 @dataclass(frozen=True, slots=True)
 class StampedInput:
-    """A message as it arrives; of the odometry the value is (4, 4) `odom_T_body`.
+    """A received message; the value of odometry is (4, 4) `odom_T_body`.
 
     Attributes:
         fault: why it does not continue its input's newest message ("duplicate", "out of order", "stale"), why it was
@@ -90,7 +90,7 @@ class SessionClock:
         """Number of messages that are not decided yet."""
         return len(self._held)
 
-    def give_up(self) -> list[StampedInput]:
+    def drop_held(self) -> list[StampedInput]:
         """Drop the messages that are still held, at the end of the stream."""
         return self._drop(set(self._held))
 
@@ -165,7 +165,7 @@ class OdometryTaker(Protocol):
         """Take one message; return whether it was usable."""
 
 
-GOES_ON_NS = 60_000_000_000
+MAX_INTERRUPTION_NS = 60_000_000_000
 """Longest interruption that odometry may continue its session after (*by hand*)."""
 SLACK_M = 2.0
 """Motion during an interruption beyond that at the latest speed (*by hand*)."""
@@ -223,11 +223,11 @@ class OdometrySessionSplitter:
             return None
         (first_ns, first), (last_ns, last) = self._recent[0], self._recent[-1]
         elapsed_s = (stamp_ns - last_ns) * 1e-9
-        if not 0 <= elapsed_s <= GOES_ON_NS * 1e-9:
+        if not 0 <= elapsed_s <= MAX_INTERRUPTION_NS * 1e-9:
             return Reset("the odometry before the restart is from another time", of_clock=elapsed_s < 0)
         speed = float(np.linalg.norm(last[:3, 3] - first[:3, 3])) / max((last_ns - first_ns) * 1e-9, 1.0)
         moved_m = float(np.linalg.norm(odom_T_body[:3, 3] - last[:3, 3]))
-        begins_anew = np.allclose(odom_T_body, np.eye(4), atol=1e-3) and not np.allclose(last, np.eye(4), atol=1e-3)
-        if begins_anew or moved_m > SLACK_M + 2 * speed * elapsed_s:
+        at_origin = np.allclose(odom_T_body, np.eye(4), atol=1e-3) and not np.allclose(last, np.eye(4), atol=1e-3)
+        if at_origin or moved_m > SLACK_M + 2 * speed * elapsed_s:
             return Reset("the odometry was reset during the interruption", of_clock=False)
         return None

@@ -186,7 +186,7 @@ class Synchronizer:
 
     def flush(self) -> list[Frame]:
         """Complete the waiting frames with the data at hand, at the end of the stream, and pop them."""
-        for one in self._clock.give_up():
+        for one in self._clock.drop_held():
             self.reject(one.name, one.fault)
         self._end_session()
         return self.pop()

@@ -42,9 +42,9 @@ class StaticTransforms:
 
     def find(self, frame: str, other: str) -> Array | None:
         """Return (4, 4) `frame_T_other`, or None where no chain of static transforms connects the two."""
-        ours, theirs = self._to_roots(frame.lstrip("/")), self._to_roots(other.lstrip("/"))
-        common = next((name for name in ours if name in theirs), None)
-        return None if common is None else invert(ours[common]) @ theirs[common]
+        frame_roots, other_roots = self._to_roots(frame.lstrip("/")), self._to_roots(other.lstrip("/"))
+        common = next((name for name in frame_roots if name in other_roots), None)
+        return None if common is None else invert(frame_roots[common]) @ other_roots[common]
 
     def _to_roots(self, frame: str) -> dict[str, Array]:
         """Return `ancestor_T_frame` of every ancestor, the nearest first."""
