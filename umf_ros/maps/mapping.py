@@ -85,7 +85,7 @@ def find_recordings(paths: list[Path]) -> list[Path]:
             raise BagError(f"there is no recording {path}")
         inside = [path] if path.is_file() or _is_recording(path) else sorted(filter(_is_recording, path.iterdir()))
         if not inside:
-            raise BagError(f"{path} is not a recording ({', '.join(RECORDINGS)}, or a folder with metadata.yaml)")
+            raise BagError(f"{path} holds no recording ({', '.join(RECORDINGS)}, or a folder with metadata.yaml)")
         found += inside
     return list(dict.fromkeys(path.resolve() for path in found))
 

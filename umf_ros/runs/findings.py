@@ -262,7 +262,7 @@ def conclude(about: JudgedRun, findings: list[Advice]) -> RunVerdict:
 
 def _found(about: JudgedRun) -> str:
     if about.run.truth is None or (about.covered[1] and not about.covered[0]):
-        reason = "there is no ground truth" if about.run.truth is None else "no ground truth covers this time"
+        reason = "there is no ground truth" if about.run.truth is None else "no ground truth for this time"
         return f"{len(about.run.closures)} loop closures; {reason} to judge them by"
     true = int(about.closures.is_true.sum())
     return f"{true} true and {len(about.closures) - true} false loop closures at {about.revisits} revisits"
