@@ -108,7 +108,7 @@ def main() -> NoReturn:
         # the reader of the output closed the pipe, as with `umf ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
-    except OSError as error:  # a name that is too long, a folder that may not be looked into, a disk that is full
+    except OSError as error:  # a name that is too long, a folder without permission, a disk that is full
         where = shortened(error.filename) if error.filename else "a file cannot be used"
         typer.echo(f"umf: {where}: {error.strerror or one_line(error)}", err=True)
         sys.exit(1)

@@ -44,7 +44,7 @@ def test_without_overrides_every_setting_is_declared_with_its_default() -> None:
     assert settings == Settings()
     assert node.get_parameter("loop.top_k").value == 20
     descriptor = node.describe_parameter("keyframe.min_translation_m")
-    assert "motion" in descriptor.description and descriptor.read_only
+    assert "translation" in descriptor.description and descriptor.read_only
     assert node.describe_parameter("qos.reliability").additional_constraints == "one of: best_effort, reliable"
     (limits,) = node.describe_parameter("loop.top_k").integer_range
     assert (limits.from_value, limits.to_value) == (1, 200)

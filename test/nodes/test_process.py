@@ -43,7 +43,7 @@ def test_an_error_at_the_start_is_one_line_and_status_1() -> None:
 
 def test_a_callback_that_fails_is_told_and_the_node_goes_on() -> None:
     ended = start("fail")
-    assert ended.stdout.count("ZeroDivisionError: a fault in the program; the node goes on") == 3, ended.stdout
+    assert ended.stdout.count("ZeroDivisionError: a fault in the program; the node continues") == 3, ended.stdout
     assert ended.stdout.splitlines()[-2:] == ["closed while publishing", "context shut down"]
     assert ended.returncode == 0 and "Traceback" not in ended.stderr
 

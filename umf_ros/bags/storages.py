@@ -178,7 +178,7 @@ class McapFile:
                 yield message.log_ns - SORTING_WINDOW_NS, (0, number), message
 
     def _stream(self) -> Iterator[RawMessage]:
-        """Yield messages as they lie in the file."""
+        """Yield the messages in the order of the file."""
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
         with self._path.open("rb") as stream:

@@ -117,7 +117,7 @@ class BaseNode(LifecycleNode, ABC):
     on_shutdown = on_cleanup
 
     def close(self) -> None:
-        """Finish what is in hand and write the results.
+        """Finish the work in hand and write the results.
 
         Raises:
             OutputError: they cannot be written.
@@ -312,7 +312,7 @@ class BaseNode(LifecycleNode, ABC):
         text = " ".join(str(error).split())[:300]
         self._last_fault = text if isinstance(error, OutputError) else f"{where}{kind}: {text}"
         if self._is_due(f"fault {what} {kind}", 10.0):
-            self.get_logger().error(f"{where}{kind}: {text} ({self._faults[kind]} so far); the node goes on")
+            self.get_logger().error(f"{where}{kind}: {text} ({self._faults[kind]} so far); the node continues")
 
     @property
     def _cannot_write(self) -> bool:

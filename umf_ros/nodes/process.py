@@ -171,7 +171,7 @@ def _spin_once(node: Node, executor: SingleThreadedExecutor, timeout_s: float) -
     except ExternalShutdownException:
         raise
     except Exception as error:
-        node.get_logger().error(f"{type(error).__name__}: {one_line(error)}; the node goes on")
+        node.get_logger().error(f"{type(error).__name__}: {one_line(error)}; the node continues")
 
 
 def complain(error: UmfError) -> None:

@@ -154,7 +154,7 @@ class PlaceDatabase:
         Args:
             keyframe: the query.
             rules: the places that may be candidates.
-            sessions: search the places of these sessions, whatever their age.
+            sessions: search the places of these sessions, of any age.
         """
 
         def admissible(rows: Rows | slice) -> Mask:

@@ -202,7 +202,7 @@ class OutlierRejection:
         at = np.array([row for row in rows if not closed[row]], np.int64)
         if not len(at):
             return []
-        # without outlier rejection, all that is not too far
+        # without outlier rejection, all closures within the limits
         gate, most = (
             (self.settings.gate_chi2, self.settings.max_chance) if self.settings.reject_outliers else (np.inf, 1)
         )

@@ -127,7 +127,7 @@ Cube-1's drops a quarter of a scan at most, one written for 0 to 4095 drops all 
 class ScanLimits:
     """Filter of weak returns and of returns far above or below the LiDAR.
 
-    A limit of the calibration is applied only while it spares enough of all that the sensor has seen so far: no scan is
+    A limit of the calibration is applied only while it keeps enough of all returns so far: no scan is
     lost because its intensities go from 0 to 1, or because its z axis is not the vertical, and one poor scan of the
     right sensor is filtered like the others. The same scans in the same order are filtered alike.
 

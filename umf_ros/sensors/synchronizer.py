@@ -101,7 +101,7 @@ class Synchronizer:
     Add measurements as they come, input by input in the order of their stamps, and `pop` complete frames: every input
     has passed them. Only stamps decide, never the time of arrival: as long as no input lags behind another by more than
     `max_wait_s`, the same measurements give the same frames however their arrivals interleave. A frame that has waited
-    longer is completed with the data at hand; an input silent for long is not waited for before its next message.
+    longer is completed with the data at hand; an input that is silent for long is ignored until its next message.
 
     When a new session begins (see `SessionClock`), the waiting frames are completed with the data at hand, and all that
     cannot be compared with later measurements is deleted. Not thread-safe.
