@@ -84,7 +84,7 @@ def wrong_calls(tmp_path: Path) -> Iterator[tuple[list[Path], str]]:
     yield [tmp_path / "missing.mcap"], "there is no recording"
     yield [tmp_path / "empty"], "holds no recording"
     (tmp_path / "notes.txt").write_text("these are notes\n")
-    yield [tmp_path / "notes.txt"], "notes.txt is no recording"
+    yield [tmp_path / "notes.txt"], "notes.txt is not a recording"
 
 
 def test_what_a_user_gets_wrong_is_one_line(tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def test_an_unreachable_server_is_one_line() -> None:
 
 
 def test_rovers_of_another_network_are_refused(server: PostgresServer) -> None:
-    with pytest.raises(UmfError, match=r"are of \('test', 16\), not of \('other', 16\)"):
+    with pytest.raises(UmfError, match=r"were made with \('test', 16\), not with \('other', 16\)"):
         FleetServer(server.address("ada"), STORE, ("other", 16))
 
 
