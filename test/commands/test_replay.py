@@ -192,7 +192,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("arguments", "message"),
     [
         (["nowhere.mcap"], "there is no recording nowhere.mcap"),
-        (["{notes}"], "notes.txt is no recording"),
+        (["{notes}"], "notes.txt is not a recording"),
         (["{odometry}"], "no topic of a known data set"),
         (["{bag}", "--config", "nowhere.yaml"], "cannot read nowhere.yaml"),
         (["{bag}", "--config", "{wrong}"], "unknown parameter loop.topk"),
