@@ -48,7 +48,6 @@ class SubmapHistory:
         """Begin a session."""
         self.drift, self.needed = DriftMeter(), False
         self._recent: list[Keyframe] = []
-        self._added = 0
 
     def add(self, keyframe: Keyframe) -> bool:
         """Take up the newest keyframe if it lies far enough from the one before; returns whether it did.
@@ -60,12 +59,10 @@ class SubmapHistory:
         before = self.scans_before(keyframe)
         if before and keyframe.path_length_m - before[0].path_length_m < const.MERGE_STEP_M:
             return False
-        if self.needed or self._added % const.NEED_ASKED_EVERY == 0:
-            self.needed = bool(needed_scans(keyframe, before))
+        self.needed = bool(needed_scans(keyframe, before))
         if self.needed:
             self.drift.add(keyframe, before)
         self._recent = [keyframe, *before]
-        self._added += 1
         anchor = _anchor_of(keyframe)
         if self.index_of(anchor) is not None and (not self.anchors or anchor[:2] > self.anchors[-1][:2]):
             self.anchors.append(anchor)
@@ -98,7 +95,7 @@ class SubmapHistory:
 
     def scans_before(self, keyframe: Keyframe, first_m: float = -np.inf) -> list[Keyframe]:
         """Keyframes on the last metres before the newest one, newest first, none of them before a place of the path."""
-        first_m = max(first_m, keyframe.path_length_m - const.SUBMAP_BEFORE_M)
+        first_m = max(first_m, keyframe.path_length_m - const.SUBMAP_REACH_M)
         recent = [one for one in self._recent if one.session == keyframe.session]
         return [one for one in recent if first_m <= one.path_length_m < keyframe.path_length_m]
 
@@ -118,17 +115,17 @@ class SubmapHistory:
         if not can_be_merged(keyframe):
             return None
         centre_m = keyframe.path_length_m
-        last_m = min(last_m, centre_m + const.SUBMAP_AFTER_M)
+        last_m = min(last_m, centre_m + const.SUBMAP_REACH_M)
         key = _anchor_of(keyframe), round(last_m)
         if key not in self._submaps:
-            rows = self.rows(keyframe.session, centre_m - const.SUBMAP_BEFORE_M, last_m)
+            rows = self.rows(keyframe.session, centre_m - const.SUBMAP_REACH_M, last_m)
             others = [row for row in rows.tolist() if self.anchors[row].stamp_ns != keyframe.stamp_ns]
             others.sort(key=lambda row: abs(self.anchors[row].path_length_m - centre_m))
             submap = submap_of(keyframe, [self._load(row) for row in others], self.drift)
             if submap is None:
                 return None
             self._submaps[key] = submap
-            while len(self._submaps) > const.SUBMAPS_KEPT:
+            while len(self._submaps) > const.SCANS_KEPT:
                 self._submaps.popitem(last=False)
         self._submaps.move_to_end(key)
         return self._submaps[key]

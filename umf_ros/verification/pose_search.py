@@ -72,7 +72,7 @@ def _pose_from_features(query: Keyframe, candidate: Candidate, match: Keyframe, 
             theirs.append(b[known])
     points = np.concatenate(ours), np.concatenate(theirs)
     consensus = fit_rigid(*points, const.POINT_THRESHOLD_M, settings.ransac_iterations, settings.seed)
-    return consensus.model if consensus is not None and consensus.count >= const.MIN_POINTS else None
+    return consensus.model if consensus is not None else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ class TemporalMemory:
         """The candidate nearest to where earlier closures and odometry put the rover, if there is one within 4 m."""
         distances = [self._expected_distance(query, keyframe) for _, keyframe in candidates]
         nearest = int(np.argmin(distances)) if distances else 0
-        return [candidates[nearest]] if distances and distances[nearest] < const.EXPECTED_M else []
+        return [candidates[nearest]] if distances and distances[nearest] < const.SAME_PLACE_M else []
 
     def _expected_distance(self, query: Keyframe, match: Keyframe) -> float:
         """Metres between a pair, as odometry carries it over from the latest accepted closure near it; or inf."""
@@ -118,7 +118,7 @@ class TemporalMemory:
 
         def agrees(finding: _Finding) -> bool:
             carried = _carried(finding, query, match)
-            return carried is not None and near(carried, match_T_query, const.AGREE_M, const.AGREE_RAD)
+            return carried is not None and near(carried, match_T_query, const.DISTINCT_M, const.DISTINCT_RAD)
 
         return float(sum(any(map(agrees, findings)) for findings in self._findings))
 

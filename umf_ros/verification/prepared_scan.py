@@ -175,7 +175,7 @@ class PreparedScan:
     @cached_property
     def terrain(self) -> GridMap:
         """Map of the relief out to 26 m, in cells in which rocks and ripples are seen at any range."""
-        return GridMap(self.upright_points, const.TERRAIN_CELL_M, const.TERRAIN_RADIUS)
+        return GridMap(self.upright_points, const.TERRAIN_CELL_M, 2 * const.MAP_RADIUS)
 
     @cached_property
     def range_images(self) -> list[RangeImage]:
@@ -270,7 +270,7 @@ class PreparedScan:
         poses = self._lidars_T_body[self._owner]
         seen = np.einsum("nij,nj->ni", poses[:, :3, :3], self.points) + poses[:, :3, 3]
         elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
-        odd = (np.floor(elevation / const.BAND_DEG) % 2).astype(bool)
+        odd = (np.floor(elevation / const.SIGHT_DEG) % 2).astype(bool)
         return Surfaces.of(self.points[~odd]), Surfaces.of(self.points[odd])
 
 

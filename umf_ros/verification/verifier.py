@@ -113,7 +113,7 @@ class Verifier:
         """The best hypotheses about some candidates, judged."""
         with self._timed("refine"):
             hypotheses = self._hypotheses(query, ranked, turned, guesses)[: const.MAX_REFINED]
-            return self._judge(hypotheses, min(const.HOPELESS, self._settings.min_probability))
+            return self._judge(hypotheses, self._settings.min_probability)
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -138,7 +138,7 @@ class Verifier:
             found += find_hypotheses(query, candidate, keyframe, turned, scan, self._settings, guess)
         return sorted(found, key=lambda one: -one.score)
 
-    def _judge(self, hypotheses: list[Hypothesis], hopeless: float) -> list[Hypothesis]:
+    def _judge(self, hypotheses: list[Hypothesis], least: float) -> list[Hypothesis]:
         """Align and measure hypotheses, and judge each beside the others about its candidate.
 
         The slow tests are left out where they cannot change the decision.
@@ -151,7 +151,7 @@ class Verifier:
             one.measurements |= measure(one) | known_only({"prior_sigmas": prior, "support": support})
         for one in aligned:
             one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
-            if one.scans and self._acceptance.at_best(one.measurements) >= hopeless:
+            if one.scans and self._acceptance.at_best(one.measurements) >= least:
                 assert one.alignment is not None
                 theirs, ours = one.scans
                 one.measurements |= ambiguity(theirs, ours, one.pose, one.alignment.information)
@@ -176,11 +176,10 @@ class Verifier:
         kept: list[Hypothesis] = []
         for one in hypotheses:
             ends = [other.pose for other in kept if other.candidate is one.candidate]
-            if any(near(one.pose, end, const.DISTINCT_M, const.DISTINCT_RAD) for end in ends):
-                continue
-            self._align(one)
-            if not any(near(one.pose, end, const.SAME_M, const.SAME_RAD) for end in ends):
-                kept.append(one)
+            if not _ends_at(one, ends):
+                self._align(one)
+                if not _ends_at(one, ends):
+                    kept.append(one)
         return kept
 
     def _align(self, hypothesis: Hypothesis) -> None:
@@ -239,3 +238,7 @@ class Verifier:
         if 0 < self._settings.max_shift_m < shift_m:
             return RejectReason.TOO_FAR, f"{shift_m:.1f} m > {self._settings.max_shift_m:g}"
         return None
+
+
+def _ends_at(hypothesis: Hypothesis, poses: list[Array]) -> bool:
+    return any(near(hypothesis.pose, pose, const.DISTINCT_M, const.DISTINCT_RAD) for pose in poses)

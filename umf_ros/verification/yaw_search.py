@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, heading, make_pose, transform
 from umf_ros.verification import constants as const
@@ -138,21 +137,12 @@ def _peaks(
 
 
 def _lifted(match: PreparedScan, query: PreparedScan, turn: float, shift: Array) -> Array:
-    """`match_T_query` of a planar fit, rad and (2,) m between the upright frames, with the height and tilt it needs."""
+    """`match_T_query` of a planar fit, rad and (2,) m between the upright frames, with the height of the ground."""
     theirs, ours = match.map(query.cell_m), query.map(query.cell_m)
     cos, sin = math.cos(turn), math.sin(turn)
     planar = make_pose(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), [*shift, 0.0])
-    moved = transform(planar, ours.cells)[:, :2]
-    offset = theirs.look_up(theirs.lowest, moved) - ours.lowest[ours.rows, ours.columns]
-    known = np.isfinite(offset)
-    if known.sum() < const.MIN_CELLS / 2:
-        return unlevelled(match, query, planar)
-    design, offset = np.column_stack([np.ones(int(known.sum())), moved[known]]), offset[known]
-    plane = np.array([np.median(offset), 0.0, 0.0])
-    for _ in range(3):  # the plane through the offsets of the ground, without what stands on one map alone
-        residual = np.abs(offset - design @ plane)
-        kept = residual <= const.SETTLE_MEDIANS * np.median(residual) + const.MIN_NOISE_M
-        plane = np.linalg.lstsq(design[kept], offset[kept], rcond=None)[0]
-    lift, slope_x, slope_y = plane
-    tilt = Rotation.from_rotvec(np.clip([slope_y, -slope_x, 0.0], -const.MAX_SLOPE, const.MAX_SLOPE)).as_matrix()
-    return unlevelled(match, query, make_pose(tilt, [0, 0, lift]) @ planar)
+    offset = theirs.look_up(theirs.lowest, transform(planar, ours.cells)) - ours.lowest[ours.rows, ours.columns]
+    known = offset[np.isfinite(offset)]
+    if len(known):
+        planar[2, 3] = np.median(known)
+    return unlevelled(match, query, planar)
