@@ -65,7 +65,7 @@ class SubmapFinder:
             return list(verdicts)
         expected = self._expected(query)
         candidates = self._candidates(query, verdicts, expected)
-        guesses = NO_GUESSES if expected is None else {self.history.anchors[expected[0]].stamp_ns: expected[1]}
+        guesses = NO_GUESSES if expected is None else {self.history.database[expected[0]].stamp_ns: expected[1]}
         compared = self.compare(query, candidates, guesses)
         self._note_closures(query, compared)
         known = {one.candidate.stamp_ns for one in compared}
@@ -87,7 +87,7 @@ class SubmapFinder:
             if match.session == query.session:  # scans that both submaps hold are alike for no other reason
                 last_m = (match.path_length_m + query.path_length_m) / 2
                 first_m = max(first_m, last_m)
-            pairs.append((candidate, self.history.around(match, last_m) or match))
+            pairs.append((candidate, self.history.around(candidate.index, last_m) or match))
         submap = self.history.before(query, first_m) if pairs else None
         return [] if submap is None else self._verifier.verify(submap, pairs, guesses)
 
@@ -103,10 +103,9 @@ class SubmapFinder:
         return bool(closures)
 
     def _expected(self, query: Keyframe) -> tuple[int, Array] | None:
-        """Row of the nearest anchor where odometry puts the rover, and `match_T_query` there; None without one."""
+        """Row of the nearest keyframe where odometry puts the rover, and `match_T_query` there; None without one."""
         for session, odom_T_query, first_m, last_m in self._predictions(query):
-            rows = self.history.rows(session, first_m, last_m)
-            rows = rows[self.history.past(query, rows, self._rules)]
+            rows = self.history.past(query, self.history.rows(session, first_m, last_m), self._rules)
             poses = [relative(self.history.odometry(row), odom_T_query) for row in rows.tolist()]
             away = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
             if away and min(away) < const.SAME_PLACE_M:
@@ -142,9 +141,5 @@ class SubmapFinder:
         return list({candidate.index: candidate for candidate in found}.values())
 
     def _candidate(self, query: Keyframe, row: int) -> Candidate:
-        anchor = self.history.anchors[row]
-        index = self.history.index_of(anchor)
-        assert index is not None
-        match = self.history.database[index]
-        similarity = float(query.embedding.descriptor @ match.embedding.descriptor)
-        return Candidate(index, anchor.stamp_ns, similarity)
+        match = self.history.database[row]
+        return Candidate(row, match.stamp_ns, float(query.embedding.descriptor @ match.embedding.descriptor))

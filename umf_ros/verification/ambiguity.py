@@ -46,9 +46,8 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
 
 def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array:
     """(K,) mean misfit with a scan of the other's visible points at poses (K, 4, 4); the worst where few are."""
-    sample = other.sample[:: const.RIVAL_EVERY]
-    points = (sample @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
-    reach = np.tile(counterpart_reach(other.spacing[:: const.RIVAL_EVERY], common_blur(scan, other)), len(poses))
+    points = (other.scouts @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
+    reach = np.tile(counterpart_reach(other.spacing[:: const.SCOUT_EVERY], common_blur(scan, other)), len(poses))
     misfit = np.minimum(np.sqrt(scan.nearest(points)[1]) / reach, const.RIVAL_MISFIT)
     seen = visible(scan.look_at(points)).reshape(len(poses), -1)
     count = seen.sum(axis=1)
@@ -122,13 +121,21 @@ def _across(scan: PreparedScan, normals: Array) -> tuple[Array, Array]:
 
 
 def _surface_misfit(match: PreparedScan, query: PreparedScan, poses: Array) -> Array:
-    """(K,) logarithm of the mean misfit of both scans with each other at poses (K, 4, 4), the one in question first."""
-    misfits = _misfit_with(match, query, poses), _misfit_with(query, match, invert(poses))
-    found: Array = np.log(sum(misfits) / 2 + const.MISFIT_FLOOR)
+    """Logarithm of the mean misfit of both scans with each other at the first of poses (K, 4, 4), and at its rivals.
+
+    Some points tell which of the others are rivals.
+    """
+    few = _mutual_misfit(match, query, poses, const.SCOUT_EVERY)
+    rivals = np.argsort(few[1:])[: const.PEAKS] + 1
+    found: Array = np.log(_mutual_misfit(match, query, poses[np.append(0, rivals)]) + const.MISFIT_FLOOR)
     return found
 
 
-def _misfit_with(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array:
+def _mutual_misfit(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Array:
+    return (_misfit_with(match, query, poses, every) + _misfit_with(query, match, invert(poses), every)) / 2
+
+
+def _misfit_with(scan: PreparedScan, other: PreparedScan, poses: Array, every: int) -> Array:
     """(K,) mean misfit, 0 to 1, of the other scan's points with the scan's planes; 1 where far fewer can be compared.
 
     Points of every second band of elevations are compared with planes of the bands between: a ring never meets itself.
@@ -136,7 +143,7 @@ def _misfit_with(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array
     total, count = np.zeros(len(poses)), np.zeros(len(poses), int)
     for planes, others in zip(scan.surfaces, reversed(other.surfaces), strict=True):
         picks = np.linspace(0, len(others.points) - 1, min(const.PASSAGE_SAMPLE, len(others.points))).astype(np.intp)
-        points = (others.points[picks] @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
+        points = (others.points[picks[::every]] @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
         found, squared = planes.tree.batch_nearest_neighbor_search(points, num_threads=1)
         index = np.asarray(found, np.intp)
         away = np.einsum("ij,ij->i", points - planes.centres[index], planes.normals[index])

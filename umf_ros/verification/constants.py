@@ -31,14 +31,9 @@ MAX_REFINED = 3  # hypotheses per group of candidates that are aligned: bounds t
 VIEW_NOISE = {"xfeat": 0.0015, "umf": 0.006}
 DISPARITY_NOISE = 0.0005  # of the image's width, a third of a pixel; measured likewise
 DISPARITY_BIAS = 0.0007  # of the image's width, half a pixel: of a rectification that is not quite right, by hand
-VIEW_REACH = 4.0  # standard deviations: what agrees with a pose of RANSAC
 VIEW_SAMPLES = 300  # measured: three times as many find 3 % more, a third of them 3 % less
-VIEW_STEPS, VIEW_TOLERANCE = 8, 1e-4  # of Gauss-Newton; m and rad, far below what is known
-VIEW_KERNEL = 9.0  # squared standard deviations: three of them halve the pull of a feature
-VIEW_GATE, VIEW_NEAR = 11.3, 100.0  # likewise; 99 % of a chi-square of three, and what the refinement may draw in
-MIN_VIEW_SIGMAS = 0.5  # no pair of images is better than half the noise assumed
-UNMEASURED = 1e6  # pixels^2: the variance of a disparity that was not measured
-NEAREST_SEEN_M = 0.3  # nothing nearer than this is in front of a camera
+VIEW_STEPS = 8  # of Gauss-Newton
+VIEW_GATE = 11.3  # squared standard deviations, 99 % of a chi-square of three: what agrees, and the kernel
 NOMINAL_BASELINE_M = 0.2  # S3LI's: how well depths of a camera without a right one are taken to be known
 
 # grid maps: how well do relief and structure fit?
@@ -60,8 +55,8 @@ BARE_SPREAD = 0.1
 MIN_SECTOR_SHARE = 1e-3  # by hand: of all points; fewer are strays
 ALL_HEADINGS = np.radians(np.arange(0.0, 360.0, 6.0))  # geometry: half a step is within reach of the alignment
 SEARCHED_OVERLAP = 0.45  # by hand: a view of 70 deg is looked for within 38
-PEAKS, ALTERNATIVES = 4, 2  # by hand: of relief alone and with structure, at all headings and at one
-SCOUTS, SCOUT_STEPS = 300, 5  # by hand: points and steps of ICP that refine a peak
+PEAKS, ALTERNATIVES = 6, 2  # by hand: of relief alone and with structure, at all headings and at one
+SCOUT_EVERY, SCOUT_STEPS = 10, 5  # by hand: of the sample, and steps of ICP that refine a peak
 SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells; geometry: a peak is off by less than a cell and half a heading
 TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain in the open
 
@@ -72,7 +67,6 @@ NORMAL_NEIGHBOURS = 10  # small_gicp's own default
 NEIGHBOURS = 5  # by hand: they reach the next ring
 SAMPLE = 1500  # measured: points of the query that are aligned; a third of the scan is as good in half the time
 COARSE_REACH_M, COARSE_STEPS = 1.0, 10  # geometry: two cells of the maps
-COARSE_EVERY = 3  # of the sample; measured: all of it ends within a millimetre of the same poses
 FINE_REACH_M, FINE_STEPS = 0.4, 8  # by hand: the spacing of far returns is wider than the noise
 MIN_SCAN_POINTS = 100  # by hand: below, there is nothing to align
 SCANS_KEPT = 60  # scans and submaps in memory: bounds it, changes no result
@@ -99,7 +93,6 @@ MAX_MISFIT = 2.5  # measured: of 2,400 right poses one in 100 has more than 1.5,
 # ambiguity: would the scans fit as well elsewhere?
 RIVAL_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: beyond the error of a right pose, within a wrong one's
 RIVAL_FAR_M = np.concatenate([np.arange(-6.0, -0.9, 0.5), np.arange(1.0, 6.1, 0.5)])  # geometry: what repeats: doors
-RIVAL_EVERY = 10  # of the sample: bounds the time
 RIVAL_MISFIT, MISFIT_FLOOR = 3.0, 0.05  # by hand: the worst misfit, in counterparts' reach, and what counts as none
 MIN_RUNNER_UP = 0.1  # measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 86
 

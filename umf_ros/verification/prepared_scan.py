@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cached_property
+from zlib import crc32
 
 import numpy as np
 import small_gicp
@@ -130,7 +131,7 @@ class PreparedScan:
         """Make at once what a query's scan is asked for in every comparison."""
         if self.usable:
             self.map(self.cell_m)
-            for part in ("view", "terrain", "range_images", "spacing", "scouts_cloud", "coarse_cloud", "sample_cloud"):
+            for part in ("view", "terrain", "range_images", "spacing", "scouts_cloud", "sample_cloud"):
                 getattr(self, part)
 
     @property
@@ -216,13 +217,10 @@ class PreparedScan:
         """(M, 3) unit normals, zero where the neighbourhood is too small."""
         return np.asarray(self.cloud.normals())[:, :3]
 
-    def _pick(self, count: int) -> Indices:
-        return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(np.intp)
-
     @cached_property
     def picks(self) -> Indices:
         """(S,) indices of at most 1500 points, evenly taken."""
-        return self._pick(const.SAMPLE)
+        return np.linspace(0, len(self.points) - 1, min(const.SAMPLE, len(self.points))).astype(np.intp)
 
     @cached_property
     def sample(self) -> Array:
@@ -234,15 +232,10 @@ class PreparedScan:
         """The sample with covariances of its own."""
         return _cloud_of(self.sample)
 
-    @cached_property
-    def coarse_cloud(self) -> small_gicp.PointCloud:
-        """A third of the sample, likewise: enough for the far-sighted steps."""
-        return _cloud_of(self.sample[:: const.COARSE_EVERY])
-
-    @cached_property
+    @property
     def scouts(self) -> Array:
-        """(S, 3) m: a few hundred points, evenly taken."""
-        return self.points[self._pick(const.SCOUTS)]
+        """(S / 5, 3) m: every fifth of the sample, enough for the far-sighted steps."""
+        return self.sample[:: const.SCOUT_EVERY]
 
     @cached_property
     def scouts_cloud(self) -> small_gicp.PointCloud:
@@ -307,10 +300,11 @@ class ScanCache:
     """The most recently used scans; a cache, so it changes no result."""
 
     def __init__(self) -> None:
-        self._scans: OrderedDict[tuple[int, int], PreparedScan] = OrderedDict()
+        self._scans: OrderedDict[tuple[int, int, int], PreparedScan] = OrderedDict()
 
     def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
-        key = (keyframe.session, keyframe.stamp_ns)
+        # submaps of one keyframe differ by how far they reach
+        key = keyframe.session, keyframe.stamp_ns, crc32(keyframe.points.tobytes())
         scan = self._scans.pop(key, None) or PreparedScan.of(keyframe)
         self._scans[key] = scan
         if len(self._scans) > const.SCANS_KEPT:

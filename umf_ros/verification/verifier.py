@@ -17,8 +17,8 @@ from umf_ros.verification.acceptance import load_acceptance, refuted
 from umf_ros.verification.ambiguity import ambiguity, passage_rival
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
-from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses, prior_sigmas
-from umf_ros.verification.prepared_scan import ScanCache, views_decide
+from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses, paired_views, prior_sigmas
+from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans
 from umf_ros.verification.yaw_search import RotatedMaps
@@ -185,7 +185,7 @@ class Verifier:
     def _align(self, hypothesis: Hypothesis) -> None:
         query, match = hypothesis.keyframes
         scans = self._scans[match], self._scans[query]
-        if hypothesis.views is not None and views_decide(*scans):
+        if hypothesis.views is not None:
             hypothesis.alignment = hypothesis.views.align(hypothesis.pose)
         else:
             hypothesis.scans, hypothesis.alignment = scans, align_scans(*scans, hypothesis.pose)
@@ -213,8 +213,9 @@ class Verifier:
 
     def _decide(self, hypothesis: Hypothesis) -> None:
         """Set the closure, or the reason why there is none."""
-        if hypothesis.views is not None:
-            hypothesis.inlier_pixels = hypothesis.views.consistent_pixels(hypothesis.pose)
+        views = hypothesis.views or paired_views(*hypothesis.keyframes, self._settings)
+        if views is not None:
+            hypothesis.inlier_pixels = views.consistent_pixels(hypothesis.pose)
         if (objection := self._objection(hypothesis)) is not None:
             hypothesis.reject(*objection)
             return
