@@ -26,7 +26,7 @@ def path_of(trail: SubmapHistory, rows: Rows) -> list[float]:
 
 def test_keyframes_of_a_path_lie_apart(trail: SubmapHistory) -> None:
     steps = np.diff(path_of(trail, trail.rows(0, 0.0, np.inf)))
-    assert 0.5 * const.MERGE_STEP_M < steps.min() and steps.max() <= 2 * const.MERGE_STEP_M
+    assert steps.min() > 0.5 * const.MERGE_STEP_M and steps.max() <= 2 * const.MERGE_STEP_M
 
 
 def test_a_submap_knows_what_lies_behind_and_beside(trail: SubmapHistory, outing: Drive) -> None:

@@ -13,6 +13,7 @@ from umf_ros.core.frames import Candidate, Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, make_pose, near, relative, rotation_angle
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
+from umf_ros.verification import constants as const
 from umf_ros.verification.hypothesis import SCAN
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)

@@ -74,7 +74,7 @@ class SubmapHistory:
 
     def scans_before(self, keyframe: Keyframe, first_m: float = -np.inf) -> list[Keyframe]:
         """Keyframes on the last metres before the newest one, newest first, none of them before a place of the path."""
-        first_m = max(first_m, keyframe.path_length_m - const.SUBMAP_REACH_M)
+        first_m = max(first_m, keyframe.path_length_m - const.ODOMETRY_REACH_M)
         recent = [one for one in self._recent if one.session == keyframe.session]
         return [one for one in recent if first_m <= one.path_length_m < keyframe.path_length_m]
 
@@ -95,10 +95,10 @@ class SubmapHistory:
         if not can_be_merged(keyframe):
             return None
         centre_m = keyframe.path_length_m
-        last_m = min(last_m, centre_m + const.SUBMAP_REACH_M)
+        last_m = min(last_m, centre_m + const.ODOMETRY_REACH_M)
         key = row, round(last_m)
         if key not in self._submaps:
-            rows = self.rows(keyframe.session, centre_m - const.SUBMAP_REACH_M, last_m)
+            rows = self.rows(keyframe.session, centre_m - const.ODOMETRY_REACH_M, last_m)
             others = [one for one in (self.database[i] for i in rows.tolist() if i != row) if can_be_merged(one)]
             others.sort(key=lambda one: abs(one.path_length_m - centre_m))
             submap = submap_of(keyframe, others, self.drift)

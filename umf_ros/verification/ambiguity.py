@@ -143,7 +143,9 @@ def _misfit_with(scan: PreparedScan, other: PreparedScan, poses: Array, every: i
     total, count = np.zeros(len(poses)), np.zeros(len(poses), int)
     for planes, others in zip(scan.surfaces, reversed(other.surfaces), strict=True):
         picks = np.linspace(0, len(others.points) - 1, min(const.PASSAGE_SAMPLE, len(others.points))).astype(np.intp)
-        points = (others.points[picks[::every]] @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
+        points = (others.points[picks[::every]] @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(
+            -1, 3
+        )
         found, squared = planes.tree.batch_nearest_neighbor_search(points, num_threads=1)
         index = np.asarray(found, np.intp)
         away = np.einsum("ij,ij->i", points - planes.centres[index], planes.normals[index])

@@ -29,10 +29,8 @@ MAX_REFINED = 3  # hypotheses per group of candidates that are aligned: bounds t
 # standard deviation of a feature's place, of the image's width. XFeat's: a pixel in 688, measured on right pairs under
 # another sun; the network's own lie at the centres of cells of 1.8 %
 VIEW_NOISE = {"xfeat": 0.0015, "umf": 0.006}
-DISPARITY_NOISE = 0.0005  # of the image's width, a third of a pixel; measured likewise
 DISPARITY_BIAS = 0.0007  # of the image's width, half a pixel: of a rectification that is not quite right, by hand
 VIEW_SAMPLES = 300  # measured: three times as many find 3 % more, a third of them 3 % less
-VIEW_STEPS = 8  # of Gauss-Newton
 VIEW_GATE = 11.3  # squared standard deviations, 99 % of a chi-square of three: what agrees, and the kernel
 NOMINAL_BASELINE_M = 0.2  # S3LI's: how well depths of a camera without a right one are taken to be known
 
@@ -43,7 +41,6 @@ MAP_CELL_M = (0.25, 1.0)  # by hand: rooms, fields
 TERRAIN_CELL_M = 0.5  # by hand: rocks and ripples are seen
 PLANE_SIGMA_CELLS = 2.4  # by hand: relief is what rises above a plane about this wide
 MAX_RELIEF_CELLS = 0.4  # by hand: one boulder must not outvote a field
-MIN_CELLS = 50  # by hand: cells below which a fit means nothing
 KNOWN_NEIGHBOURHOOD = 0.3  # by hand: share of the cells around one that must be known, of a map or a range image
 TALL_LAYERS = 3  # by hand: cells of walls, trunks and boxes
 BARE_RELIEF_CELLS = 0.02  # measured on simulated drives: of bare, even ground .004, of the plainest of other places .06
@@ -52,28 +49,28 @@ BARE_ODDS = 10.0  # by hand: bare ground whose texture comes again elsewhere is 
 BARE_SPREAD = 0.1
 
 # search over all headings
-MIN_SECTOR_SHARE = 1e-3  # by hand: of all points; fewer are strays
 ALL_HEADINGS = np.radians(np.arange(0.0, 360.0, 6.0))  # geometry: half a step is within reach of the alignment
 SEARCHED_OVERLAP = 0.45  # by hand: a view of 70 deg is looked for within 38
-PEAKS, ALTERNATIVES = 6, 2  # by hand: of relief alone and with structure, at all headings and at one
-SCOUT_EVERY, SCOUT_STEPS = 10, 5  # by hand: of the sample, and steps of ICP that refine a peak
-SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells; geometry: a peak is off by less than a cell and half a heading
+PEAKS = 6  # by hand: of relief alone and with structure, at all headings
+SCOUT_EVERY = 10  # of the sample, by hand: points that refine a peak
+SCOUT_NEAR = 0.3  # cells; geometry: where a counterpart lies after some steps
 TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain in the open
 
 # registration
 THIN_CELL_M = 0.25  # by hand: a scan keeps some 4,500 of its returns
 MAX_RANGE_M = 40.0  # geometry: beyond, returns of a flat scan are metres apart
-NORMAL_NEIGHBOURS = 10  # small_gicp's own default
 NEIGHBOURS = 5  # by hand: they reach the next ring
+PLANE_NEIGHBOURS = 8  # measured: 12 leave next to no planes of sixteen rings
 SAMPLE = 1500  # measured: points of the query that are aligned; a third of the scan is as good in half the time
-COARSE_REACH_M, COARSE_STEPS = 1.0, 10  # geometry: two cells of the maps
-FINE_REACH_M, FINE_STEPS = 0.4, 8  # by hand: the spacing of far returns is wider than the noise
+COARSE_REACH_M = 1.0  # geometry: two cells of the maps
+FINE_REACH_M = 0.4  # by hand: the spacing of far returns is wider than the noise
+STEPS = 8  # by hand: of every refinement, of scans and of views
 MIN_SCAN_POINTS = 100  # by hand: below, there is nothing to align
 SCANS_KEPT = 60  # scans and submaps in memory: bounds it, changes no result
 
 # covariance
 SEARCH_M, SEARCH_RAD = 3.0, 0.35  # what the search itself knows, standard deviation: nothing is wider than this
-NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG = 20.0, 0.01, 0.05  # by hand: a yardstick independent of data
+NOMINAL_INFLATION = 20.0  # by hand: a yardstick independent of data
 MOMENTS = 6  # parts of a scan whose errors of motion are told apart; by hand: errors change little within a sixth
 MOTION_SHARE = 0.03  # by hand: of the motion during a scan that odometry gets wrong all along, as by its scale
 MIN_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanner is better
@@ -97,7 +94,7 @@ RIVAL_MISFIT, MISFIT_FLOOR = 3.0, 0.05  # by hand: the worst misfit, in counterp
 MIN_RUNNER_UP = 0.1  # measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 86
 
 # passages: corridors, tunnels, aisles, canyons, where a scan looks the same all along
-PLANE_NEIGHBOURS, PLANE_REACH_M = 8, 0.8  # measured: 12 neighbours leave next to no planes of sixteen rings
+PLANE_REACH_M = 0.8  # by hand: wider neighbourhoods are no surface
 PLANE_WIDTH_M, PLANE_ROUNDNESS = 0.1, 0.45  # by hand: narrower neighbourhoods lie on a single ring
 PLANE_THICKNESS_M = 0.04  # by hand: twice the noise of a range
 PLANE_SIGMA_M = 0.1  # measured: .05 and .2 m tell right poses from wrong ones less well
@@ -115,7 +112,7 @@ PASSAGE_RIVAL, SELF_RIVAL = 0.26, 0.77
 
 # temporal memory
 MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of keyframes
-ODOMETRY_REACH_M = 15.0  # by hand: odometry is trusted over this distance
+ODOMETRY_REACH_M = 20.0  # measured: path over which odometry is trusted, and scans are merged; 10 finds less
 PRIOR_M = 1.0  # by hand: standard deviation of what odometry predicts before any way is driven
 
 # submaps of narrow sensors, judged by their terrain
@@ -124,14 +121,10 @@ MIN_TERRAIN = 0.3  # by hand: correlation of the terrain without which submaps o
 NARROW_DEG = 270.0  # geometry: a sensor that sees more recognises a place from any side by its scans
 
 # submaps: what is seen on the metres around a keyframe
-SUBMAP_REACH_M = 20.0  # measured: path before and behind a keyframe; 10 finds less
 MERGE_STEP_M = 1.5  # measured: between the scans that are merged; 1 and 2 m are as good
 ENOUGH_SEEN, MOST_SEEN = 0.6, 0.85  # of what all these scans show nearby: one scan is enough, and where merging stops
 MERGED_POINTS = 12_000  # measured: 8,000 find less, 16,000 hardly more
-MAX_BLUR_M = (
-    0.3  # by hand: standard deviation by which a merged point may lie beside its place: half a cell of the maps
-)
+MAX_BLUR_M = 0.3  # by hand: half a cell of the maps: standard deviation by which a merged point may be off
 PROMISING = 0.05  # by hand: probability of a scan's hypothesis from which on submaps are compared
-# by hand: scans that the drift of odometry is judged by, at least and at most, and their overlap with those before
-DRIFT_KNOWN, DRIFT_STEPS, DRIFT_OVERLAP = 6, 24, 0.7
+DRIFT_KNOWN, DRIFT_STEPS = 6, 24  # by hand: scans that the drift of odometry is judged by, at least and at most
 ODOMETRY_ALONE_M = 80.0  # by hand: path over which odometry without a closure is worth a look

@@ -116,7 +116,7 @@ def terrain_fit(match: GridMap, query: GridMap, pose: Array) -> tuple[float, flo
     theirs = match.look_up(match.relief, transform(pose, query.cells))
     shared = np.isfinite(theirs) & np.isfinite(ours)
     ours, theirs = ours[shared].astype(float), theirs[shared]
-    if len(ours) < const.MIN_CELLS / 2:
+    if len(ours) < const.FEWEST_POINTS:
         return 0.0, 0.0, float(theirs.std()) if len(theirs) else 0.0
     norm = float(np.sqrt((ours**2).sum() * (theirs**2).sum()))
     correlation = float((ours * theirs).sum()) / max(norm, 1e-9)

@@ -270,7 +270,7 @@ class PreparedScan:
 def _cloud_of(points: Array, tree: small_gicp.KdTree | None = None) -> small_gicp.PointCloud:
     """Points (N, 3) with normals and covariances of their own."""
     cloud = small_gicp.PointCloud(points)
-    small_gicp.estimate_normals_covariances(cloud, tree, const.NORMAL_NEIGHBOURS, 1)
+    small_gicp.estimate_normals_covariances(cloud, tree, const.PLANE_NEIGHBOURS, 1)
     return cloud
 
 

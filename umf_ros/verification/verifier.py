@@ -213,7 +213,8 @@ class Verifier:
 
     def _decide(self, hypothesis: Hypothesis) -> None:
         """Set the closure, or the reason why there is none."""
-        views = hypothesis.views or paired_views(*hypothesis.keyframes, self._settings)
+        query, match = hypothesis.keyframes
+        views = hypothesis.views or paired_views(query, match, self._settings)
         if views is not None:
             hypothesis.inlier_pixels = views.consistent_pixels(hypothesis.pose)
         if (objection := self._objection(hypothesis)) is not None:

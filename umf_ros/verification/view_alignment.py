@@ -50,7 +50,7 @@ class CameraView:
         points = features.points[rows].astype(float)
         disparity = _disparity(keyframe.camera, keyframe.camera.project(points, keyframe.body_T_camera)[1])
         measured = np.column_stack([features.positions[rows].astype(float), disparity])
-        sides = keyframe.camera.width * np.array([noise, noise, max(const.DISPARITY_NOISE, noise / 3)])
+        sides = keyframe.camera.width * np.array([noise, noise, noise / 3])
         return cls(keyframe.camera, sides, keyframe.body_T_camera, points, measured)
 
     @cached_property
@@ -205,7 +205,7 @@ class PairedViews:
     def align(self, guess: Array) -> ViewAlignment:
         """Refine the pose `guess` by Gauss-Newton on reprojections, outliers weighted down."""
         pose = guess
-        for _ in range(const.VIEW_STEPS):
+        for _ in range(const.STEPS):
             step, _ = _solve(self._compare(pose))
             turn = Rotation.from_rotvec(step[3:]).as_matrix()
             pose = make_pose(turn @ pose[:3, :3], pose[:3, 3] + step[:3])

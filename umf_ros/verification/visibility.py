@@ -26,8 +26,7 @@ class FieldOfView:
         """Args: points (M, >= 2) m, upright, about the sensor."""
         bearing = np.arctan2(points[:, 1], points[:, 0])
         sector = np.floor((bearing + np.pi) * (_SECTORS / (2 * np.pi))).astype(int) % _SECTORS
-        count = np.bincount(sector, minlength=_SECTORS)
-        self.seen: Array = (count > const.MIN_SECTOR_SHARE * max(len(points), 1)).astype(float)
+        self.seen: Array = (np.bincount(sector, minlength=_SECTORS) > 0).astype(float)
 
     @property
     def width_deg(self) -> float:

@@ -71,7 +71,7 @@ def search(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
     overlap = match.view.overlap(turned.scan.view, const.ALL_HEADINGS)
     wanted = np.flatnonzero(overlap >= const.SEARCHED_OVERLAP)
     theirs, ours = match.map(turned.map.cell_m), turned.map
-    if not len(wanted) or min(len(theirs.rows), len(ours.rows)) < const.MIN_CELLS:
+    if not len(wanted) or min(len(theirs.rows), len(ours.rows)) < const.FEWEST_POINTS:
         return []
     fits = []
     for index, shift in _peaks(_correlate(theirs, turned.spectra(wanted)), wanted, const.PEAKS, ours.cell_m):
@@ -97,13 +97,12 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     volumes = _correlate(theirs, ours.turned_spectra(np.array([turn])))
     row, column = np.round(level[:2, 3] / query.cell_m).astype(int) + const.MAP_SHIFT
     volumes[:, :, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
-    peaks = _peaks(volumes, np.zeros(1, np.intp), const.ALTERNATIVES, query.cell_m)
+    peaks = _peaks(volumes, np.zeros(1, np.intp), const.MAX_REFINED, query.cell_m)
     return [_by_scouts(match, query, _lifted(match, query, turn, shift)) for _, shift in peaks]
 
 
 def _by_scouts(match: PreparedScan, query: PreparedScan, guess: Array) -> Array:
-    reach_m = const.SCOUT_REACH * query.cell_m
-    return run_gicp(match, query.scouts_cloud, guess, reach_m, const.SCOUT_STEPS)
+    return run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M)
 
 
 def _correlate(around: GridMap, turned: Spectra) -> NDArray[np.float32]:
