@@ -38,7 +38,8 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     across = np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1]
     way = np.append(across, 0.0)
     beside, along = (_shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
-    poses = np.stack([pose, *beside, *along, *_other_peaks(match, query, pose)])
+    peaks = [one for one in alternatives(match, query, pose) if not near(one, pose, const.DISTINCT_M, np.inf)]
+    poses = np.stack([pose, *beside, *along, *peaks])
     misfits = _point_misfit(match, query, poses), _point_misfit(query, match, invert(poses))
     fit, far = np.log(np.maximum(sum(misfits) / 2, const.MISFIT_FLOOR)), 1 + len(beside)
     return {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
@@ -55,11 +56,6 @@ def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Arra
     return np.where(count >= const.FEWEST_POINTS, mean, const.RIVAL_MISFIT)
 
 
-def _other_peaks(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
-    """Poses at the other peaks of the search at the heading of a pose."""
-    return [one for one in alternatives(match, query, pose) if not near(one, pose, const.DISTINCT_M, np.inf)]
-
-
 def _shifted(pose: Array, way: Array, shifts: Array) -> Array:
     """(K, 4, 4) the pose, shifted by each of (K,) metres along a direction (3,) of the match."""
     shifted = np.repeat(pose[None], len(shifts), axis=0)
@@ -71,9 +67,9 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
     """How much worse the surfaces of two scans fit at the best other pose along a passage.
 
     A place is a passage where surfaces across it outweigh those along it. Poses are shifted along the passage as far
-    as the scans overlap; the other peaks of the search at the same heading are rivals, too. Where bays repeat, a scan
-    fits every other one best at the smallest shift, at the identity even by the pattern of the sensor alone. There
-    each scan is also compared with itself, shifted likewise: where it fits itself elsewhere, it cannot tell the place.
+    as the scans overlap. Where bays repeat, a scan fits every other one best at the smallest shift, at the identity
+    even by the pattern of the sensor alone. There each scan is also compared with itself, shifted likewise: where it
+    fits itself elsewhere, it cannot tell the place.
 
     Args:
         match: the matched scan.
@@ -90,7 +86,7 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
     if way is None:
         return float("nan")
     shifted = _shifted(pose, way, np.concatenate([const.RIVAL_NEAR_M, const.PASSAGE_FAR_M]))
-    fits = _surface_misfit(match, query, np.stack([pose, *shifted, *_other_peaks(match, query, pose)]))
+    fits = _surface_misfit(match, query, np.concatenate([pose[None], shifted]))
     rival = float(fits[1:].min() - fits[0]) / const.PASSAGE_RIVAL
     if rival < 1.0 or np.linalg.norm(pose[:3, 3]) >= const.HALF_BAY_M:
         return rival

@@ -1,4 +1,4 @@
-"""Poses for a candidate: from maps, from local features, and from findings of earlier keyframes."""
+"""Poses for a candidate: from maps, from images where scans tell nothing, and from findings of earlier keyframes."""
 
 from __future__ import annotations
 

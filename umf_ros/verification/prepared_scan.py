@@ -149,6 +149,11 @@ class PreparedScan:
         """Rotation (3, 3) that sets the scan upright."""
         return upright(self.normals[self.picks])
 
+    @property
+    def upright_T_body(self) -> Array:
+        """The same as a pose (4, 4)."""
+        return make_pose(self.up, np.zeros(3))
+
     @cached_property
     def upright_points(self) -> Array:
         """(M, 3) m."""
@@ -270,19 +275,13 @@ class PreparedScan:
 def _cloud_of(points: Array, tree: small_gicp.KdTree | None = None) -> small_gicp.PointCloud:
     """Points (N, 3) with normals and covariances of their own."""
     cloud = small_gicp.PointCloud(points)
-    small_gicp.estimate_normals_covariances(cloud, tree, const.PLANE_NEIGHBOURS, 1)
+    small_gicp.estimate_normals_covariances(cloud, tree, 2 * const.NEIGHBOURS, 1)
     return cloud
 
 
 def levelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
     """The pose `match_T_query` (4, 4) between the upright frames of two scans."""
-    found: Array = make_pose(match.up, np.zeros(3)) @ pose @ make_pose(query.up.T, np.zeros(3))
-    return found
-
-
-def unlevelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
-    """The pose `match_T_query` (4, 4) that is this one between the upright frames of two scans."""
-    found: Array = make_pose(match.up.T, np.zeros(3)) @ pose @ make_pose(query.up, np.zeros(3))
+    found: Array = match.upright_T_body @ pose @ invert(query.upright_T_body)
     return found
 
 

@@ -96,7 +96,7 @@ class Alignment:
 
 def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Alignment:
     """Generalised ICP (Segal, RSS 2009) from the pose `guess`, first far-sighted, then near-sighted."""
-    pose = run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M)
+    pose = run_gicp(match, query.sample_cloud, guess, const.COARSE_REACH_M)
     pose = run_gicp(match, query.sample_cloud, pose, const.FINE_REACH_M)
     return inspect(match, query, pose)
 

@@ -29,10 +29,10 @@ NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 class Verifier:
     """Decides which candidates of a query are the same place, and where the rover stood.
 
-    Candidates are reranked by their local features; the best get hypotheses from maps and features; the best
-    hypotheses are aligned scan to scan and judged by one calibrated probability. Every step is seeded and runs on one
-    thread, so the verdicts do not depend on the machine. The only memory is of what the last few keyframes found
-    (`reset` forgets it); keyframes must come in order.
+    Candidates are reranked by their local features; the best get hypotheses from their maps, or from their images where
+    scans tell nothing; the best hypotheses are aligned and judged by one calibrated probability. Every step is seeded
+    and runs on one thread, so the verdicts do not depend on the machine. The only memory is of what the last few
+    keyframes found (`reset` forgets it); keyframes must come in order.
 
     Args:
         settings: the verification group of the settings.

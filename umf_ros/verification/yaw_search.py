@@ -15,10 +15,10 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from umf_ros.core.geometry import Array, heading, make_pose, transform
+from umf_ros.core.geometry import Array, heading, invert, make_pose, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import GridMap, Spectra, terrain_fit
-from umf_ros.verification.prepared_scan import PreparedScan, levelled, unlevelled
+from umf_ros.verification.prepared_scan import PreparedScan, levelled
 from umf_ros.verification.scan_alignment import run_gicp
 
 
@@ -97,7 +97,7 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     volumes = _correlate(theirs, ours.turned_spectra(np.array([turn])))
     row, column = np.round(level[:2, 3] / query.cell_m).astype(int) + const.MAP_SHIFT
     volumes[:, :, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
-    peaks = _peaks(volumes, np.zeros(1, np.intp), const.MAX_REFINED, query.cell_m)
+    peaks = _peaks(volumes, np.zeros(1, np.intp), const.PEAKS // 2, query.cell_m)
     return [_by_scouts(match, query, _lifted(match, query, turn, shift)) for _, shift in peaks]
 
 
@@ -144,4 +144,5 @@ def _lifted(match: PreparedScan, query: PreparedScan, turn: float, shift: Array)
     known = offset[np.isfinite(offset)]
     if len(known):
         planar[2, 3] = np.median(known)
-    return unlevelled(match, query, planar)
+    lifted: Array = invert(match.upright_T_body) @ planar @ query.upright_T_body
+    return lifted
