@@ -23,7 +23,7 @@ class SubmapFinder:
     Sixteen beams in the open hit little that another scan hits too, and a narrow sensor that comes back the other way
     shares nothing with its earlier scans; merged over some metres by odometry, they do. Submaps are verified as scans
     are: the candidates are those whose scans came near to a closure, the place where odometry puts the rover since the
-    latest closure, and now and then the one that looks most alike.
+    latest closure, or else the one that looks most alike.
 
     Keyframes must come in order. Without odometry, or with scans that show enough, nothing is done.
 
@@ -52,7 +52,6 @@ class SubmapFinder:
         self._latest: tuple[Keyframe, Keyframe, Array] | None = None
         self._verifier.reset()
         self.history.reset()
-        self._asked_m = -np.inf
 
     def find(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> list[Hypothesis]:
         """The verdicts about the candidates of a keyframe, with those about submaps where scans found nothing.
@@ -135,9 +134,8 @@ class SubmapFinder:
         found = [one.candidate for one in verdicts if (one.probability or 0.0) >= const.PROMISING]
         if expected is not None:
             found.append(self._candidate(query, expected[0]))
-        elif query.path_length_m - self._asked_m >= const.MERGE_STEP_M:
-            self._asked_m = query.path_length_m
-            found += [verdicts[0].candidate] if verdicts else []
+        elif verdicts:
+            found.append(verdicts[0].candidate)
         return list({candidate.index: candidate for candidate in found}.values())
 
     def _candidate(self, query: Keyframe, row: int) -> Candidate:
