@@ -26,7 +26,8 @@ class FieldOfView:
         """Args: points (M, >= 2) m, upright, about the sensor."""
         bearing = np.arctan2(points[:, 1], points[:, 0])
         sector = np.floor((bearing + np.pi) * (_SECTORS / (2 * np.pi))).astype(int) % _SECTORS
-        self.seen: Array = (np.bincount(sector, minlength=_SECTORS) > 0).astype(float)
+        # fewer points in a sector are strays
+        self.seen: Array = (np.bincount(sector, minlength=_SECTORS) >= const.NEIGHBOURS).astype(float)
 
     @property
     def width_deg(self) -> float:
