@@ -11,7 +11,6 @@ from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, relative
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps.history import SubmapHistory
-from umf_ros.submaps.lookalikes import Lookalikes
 from umf_ros.verification import Hypothesis, Verifier
 from umf_ros.verification import constants as const
 
@@ -24,7 +23,7 @@ class SubmapFinder:
     Sixteen beams in the open hit little that another scan hits too, and a narrow sensor that comes back the other way
     shares nothing with its earlier scans; merged over some metres by odometry, they do. Submaps are verified as scans
     are: the candidates are those whose scans came near to a closure, the place where odometry puts the rover since the
-    latest closure, and now and then those whose relief has the same keypoints.
+    latest closure, or else the one that looks most alike.
 
     Keyframes must come in order. Without odometry, or with scans that show enough, nothing is done.
 
@@ -41,8 +40,6 @@ class SubmapFinder:
         self._rules = rules
         self._verifier = Verifier(settings)
         self.history = SubmapHistory(database)
-        self._lookalikes = Lookalikes()
-        self._next = self._stored = len(self.history.anchors)
         self.reset()
 
     def retune(self, settings: Verification, rules: Loop) -> None:
@@ -55,7 +52,6 @@ class SubmapFinder:
         self._latest: tuple[Keyframe, Keyframe, Array] | None = None
         self._verifier.reset()
         self.history.reset()
-        self._asked_m = -np.inf
 
     def find(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> list[Hypothesis]:
         """The verdicts about the candidates of a keyframe, with those about submaps where scans found nothing.
@@ -68,7 +64,7 @@ class SubmapFinder:
             return list(verdicts)
         expected = self._expected(query)
         candidates = self._candidates(query, verdicts, expected)
-        guesses = NO_GUESSES if expected is None else {self.history.anchors[expected[0]].stamp_ns: expected[1]}
+        guesses = NO_GUESSES if expected is None else {self.history.database[expected[0]].stamp_ns: expected[1]}
         compared = self.compare(query, candidates, guesses)
         self._note_closures(query, compared)
         known = {one.candidate.stamp_ns for one in compared}
@@ -90,14 +86,13 @@ class SubmapFinder:
             if match.session == query.session:  # scans that both submaps hold are alike for no other reason
                 last_m = (match.path_length_m + query.path_length_m) / 2
                 first_m = max(first_m, last_m)
-            pairs.append((candidate, self.history.around(match, last_m) or match))
+            pairs.append((candidate, self.history.around(candidate.index, last_m) or match))
         submap = self.history.before(query, first_m) if pairs else None
         return [] if submap is None else self._verifier.verify(submap, pairs, guesses)
 
     def remember(self, keyframe: Keyframe) -> None:
         """Take up a keyframe that was added to the database; one without a scan adds nothing to a submap."""
-        if self.history.add(keyframe) and self.history.needed:
-            self._describe()
+        self.history.add(keyframe)
 
     def _note_closures(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> bool:
         """Whether there are closures; odometry carries the last of them on to the next keyframes."""
@@ -107,13 +102,12 @@ class SubmapFinder:
         return bool(closures)
 
     def _expected(self, query: Keyframe) -> tuple[int, Array] | None:
-        """Row of the nearest anchor where odometry puts the rover, and `match_T_query` there; None without one."""
+        """Row of the nearest keyframe where odometry puts the rover, and `match_T_query` there; None without one."""
         for session, odom_T_query, first_m, last_m in self._predictions(query):
-            rows = self.history.rows(session, first_m, last_m)
-            rows = rows[self.history.past(query, rows, self._rules)]
+            rows = self.history.past(query, self.history.rows(session, first_m, last_m), self._rules)
             poses = [relative(self.history.odometry(row), odom_T_query) for row in rows.tolist()]
             away = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
-            if away and min(away) < const.SUBMAP_NEAR_M:
+            if away and min(away) < const.SAME_PLACE_M:
                 best = int(np.argmin(away))
                 return int(rows[best]), poses[best]
         return None
@@ -140,46 +134,10 @@ class SubmapFinder:
         found = [one.candidate for one in verdicts if (one.probability or 0.0) >= const.PROMISING]
         if expected is not None:
             found.append(self._candidate(query, expected[0]))
-        elif query.path_length_m - self._asked_m >= const.ASKED_EVERY_M:
-            self._asked_m = query.path_length_m
-            found += [verdicts[0].candidate] if verdicts else []
-            found += [self._candidate(query, row) for row in self._look_alike(query)]
+        elif verdicts:
+            found.append(verdicts[0].candidate)
         return list({candidate.index: candidate for candidate in found}.values())
 
     def _candidate(self, query: Keyframe, row: int) -> Candidate:
-        anchor = self.history.anchors[row]
-        index = self.history.index_of(anchor)
-        assert index is not None
-        match = self.history.database[index]
-        similarity = float(query.embedding.descriptor @ match.embedding.descriptor)
-        return Candidate(index, anchor.stamp_ns, similarity)
-
-    def _look_alike(self, query: Keyframe) -> list[int]:
-        """Rows of the anchors whose submaps look most like that of a keyframe."""
-        submap, rows = self.history.before(query), np.array(self._lookalikes.rows, np.intp)
-        if submap is None or not len(rows):
-            return []
-        # scans that both submaps hold are alike for no other reason
-        first_m = query.path_length_m - const.SUBMAP_BEFORE_M - const.SUBMAP_AFTER_M
-        anchors = [self.history.anchors[row] for row in rows]
-        apart = np.array([one.session != query.session or one.path_length_m < first_m for one in anchors])
-        return self._lookalikes.search(submap, apart & self.history.past(query, rows, self._rules))[: const.LOOKALIKES]
-
-    def _describe(self) -> None:
-        """Describe the anchors whose submaps are complete now, and one that was stored before, the latest first."""
-        anchors = self.history.anchors
-        while self._next < len(anchors):
-            complete_m = anchors[self._next].path_length_m + const.SUBMAP_AFTER_M
-            if anchors[self._next].session == anchors[-1].session and anchors[-1].path_length_m < complete_m:
-                break
-            self._describe_anchor(self._next)
-            self._next += const.DESCRIBED_ANCHORS
-        if self._stored > 0:
-            self._stored = max(self._stored - const.DESCRIBED_ANCHORS, 0)
-            self._describe_anchor(self._stored)
-
-    def _describe_anchor(self, row: int) -> None:
-        index = self.history.index_of(self.history.anchors[row])
-        submap = None if index is None else self.history.around(self.history.database[index])
-        if submap is not None:
-            self._lookalikes.add(row, submap)
+        match = self.history.database[row]
+        return Candidate(row, match.stamp_ns, float(query.embedding.descriptor @ match.embedding.descriptor))
