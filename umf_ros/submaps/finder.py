@@ -11,6 +11,7 @@ from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, relative
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps.history import SubmapHistory
+from umf_ros.submaps.lookalikes import Lookalikes
 from umf_ros.verification import Hypothesis, Verifier
 from umf_ros.verification import constants as const
 
@@ -23,7 +24,7 @@ class SubmapFinder:
     Sixteen beams in the open hit little that another scan hits too, and a narrow sensor that comes back the other way
     shares nothing with its earlier scans; merged over some metres by odometry, they do. Submaps are verified as scans
     are: the candidates are those whose scans came near to a closure, the place where odometry puts the rover since the
-    latest closure, or else the one that looks most alike.
+    latest closure, or else those that look most alike, to the network and by the keypoints of their relief.
 
     Keyframes must come in order. Without odometry, or with scans that show enough, nothing is done.
 
@@ -40,6 +41,10 @@ class SubmapFinder:
         self._rules = rules
         self._verifier = Verifier(settings)
         self.history = SubmapHistory(database)
+        self._lookalikes = Lookalikes()
+        sessions = np.unique(database.store.keys["session"]).tolist()
+        rows = [self.history.rows(session, 0.0, np.inf)[:: const.DESCRIBED_EVERY] for session in sessions]
+        self._stored: list[int] = np.concatenate([np.empty(0, np.intp), *rows]).tolist()
         self.reset()
 
     def retune(self, settings: Verification, rules: Loop) -> None:
@@ -50,6 +55,7 @@ class SubmapFinder:
     def reset(self) -> None:
         """Forget what was found lately; the places stay."""
         self._latest: tuple[Keyframe, Keyframe, Array] | None = None
+        self._described_m = 0.0
         self._verifier.reset()
         self.history.reset()
 
@@ -92,7 +98,20 @@ class SubmapFinder:
 
     def remember(self, keyframe: Keyframe) -> None:
         """Take up a keyframe that was added to the database; one without a scan adds nothing to a submap."""
-        self.history.add(keyframe)
+        if self.history.add(keyframe) and self.history.needed:
+            self._describe(keyframe)
+
+    def _describe(self, newest: Keyframe) -> None:
+        """Describe the submap that the newest keyframe completes, and one that was stored before, the latest first."""
+        complete_m = newest.path_length_m - const.ODOMETRY_REACH_M
+        rows = self.history.rows(newest.session, self._described_m, complete_m)[:1].tolist()
+        if rows:
+            described = self.history.database[rows[0]]
+            self._described_m = described.path_length_m + const.DESCRIBED_EVERY * const.MERGE_STEP_M
+        rows += [self._stored.pop()] if self._stored else []
+        for row in rows:
+            if (submap := self.history.around(row)) is not None:
+                self._lookalikes.add(row, submap)
 
     def _note_closures(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> bool:
         """Whether there are closures; odometry carries the last of them on to the next keyframes."""
@@ -134,10 +153,23 @@ class SubmapFinder:
         found = [one.candidate for one in verdicts if (one.probability or 0.0) >= const.PROMISING]
         if expected is not None:
             found.append(self._candidate(query, expected[0]))
-        elif verdicts:
-            found.append(verdicts[0].candidate)
+        else:
+            found += [verdicts[0].candidate] if verdicts else []
+            found += [self._candidate(query, row) for row in self._look_alike(query)]
         return list({candidate.index: candidate for candidate in found}.values())
 
     def _candidate(self, query: Keyframe, row: int) -> Candidate:
         match = self.history.database[row]
         return Candidate(row, match.stamp_ns, float(query.embedding.descriptor @ match.embedding.descriptor))
+
+    def _look_alike(self, query: Keyframe) -> list[int]:
+        """Rows of the database whose submaps share most keypoints with that of a keyframe."""
+        submap = self.history.before(query)
+        if submap is None:
+            return []
+        rows = self.history.past(query, np.array(self._lookalikes.rows, np.intp), self._rules)
+        keys = self.history.database.store.keys[rows]
+        # scans that both submaps hold are alike for no other reason
+        first_m = query.path_length_m - 2 * const.ODOMETRY_REACH_M
+        apart = (keys["session"] != query.session) | (keys["travelled_m"] < first_m)
+        return self._lookalikes.search(submap, rows[apart])[: const.LOOKALIKES]

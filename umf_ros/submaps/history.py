@@ -39,17 +39,18 @@ class SubmapHistory:
         self.drift, self.needed = DriftMeter(), False
         self._recent: list[Keyframe] = []
 
-    def add(self, keyframe: Keyframe) -> None:
-        """Take up the newest keyframe if it lies far enough from the one before."""
+    def add(self, keyframe: Keyframe) -> bool:
+        """Take up the newest keyframe if it lies far enough from the one before; returns whether it did."""
         if not can_be_merged(keyframe):
-            return
+            return False
         before = self.scans_before(keyframe)
         if before and keyframe.path_length_m - before[0].path_length_m < const.MERGE_STEP_M:
-            return
+            return False
         self.needed = bool(needed_scans(keyframe, before))
         if self.needed:
             self.drift.add(keyframe, before)
         self._recent = [keyframe, *before]
+        return True
 
     def rows(self, session: int, first_m: float, last_m: float) -> Rows:
         """Rows of the database on a part of a session's path, in its order, one of every 1.5 m."""

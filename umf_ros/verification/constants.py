@@ -128,3 +128,12 @@ MAX_BLUR_M = 0.3  # by hand: half a cell of the maps: standard deviation by whic
 PROMISING = 0.05  # by hand: probability of a scan's hypothesis from which on submaps are compared
 DRIFT_KNOWN, DRIFT_STEPS = 6, 24  # by hand: scans that the drift of odometry is judged by, at least and at most
 ODOMETRY_ALONE_M = 80.0  # by hand: path over which odometry without a closure is worth a look
+DESCRIBED_EVERY = 2  # of the keyframes that are merged; by hand: bounds the time
+LOOKALIKES, SUBMAPS_COMPARED = (
+    2,
+    10,
+)  # that get a pose; measured: of the most voted for, where four of five right ones are
+KEYPOINTS, KEYPOINT_CONTRAST = 120, 0.01  # measured: 80 and .02 find less
+MIN_KEYPOINTS = 4  # by hand: two of them make a motion, and two more confirm it
+KEYPOINT_SCALE = 0.1  # by hand: odometry that is off by a tenth is useless
+KEYPOINT_VOTES = 15  # measured: stored keypoints that each of the query's votes for

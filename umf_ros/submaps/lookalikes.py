@@ -1,0 +1,107 @@
+"""Search for submaps that look alike from above, whatever the heading: keypoints of their relief."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.core.frames import Keyframe
+from umf_ros.verification import constants as const
+from umf_ros.verification.grid_map import Grid
+from umf_ros.verification.prepared_scan import PreparedScan
+
+
+@dataclass(frozen=True, slots=True)
+class Keypoints:
+    """K keypoints, strongest first.
+
+    Attributes:
+        places: (K, 2) float32 m, upright body frame, seen from above.
+        descriptors: (K, 128) float32 unit vectors that do not depend on the heading.
+    """
+
+    places: NDArray[np.float32]
+    descriptors: NDArray[np.float32]
+
+
+def keypoints_of(submap: Keyframe) -> Keypoints:
+    """Keypoints of the relief of a submap."""
+    return find_keypoints(PreparedScan.of(submap).terrain.relief)
+
+
+def find_keypoints(relief: Grid) -> Keypoints:
+    """Keypoints of a map (R, C) of relief, m, NaN where it is unknown, in cells of `TERRAIN_CELL_M`."""
+    highest = const.MAX_RELIEF_CELLS * const.TERRAIN_CELL_M
+    picture = np.clip(128 + 127 / highest * np.nan_to_num(relief), 0, 255).astype(np.uint8)
+    # the border of the known ground is an edge that depends on where the rover looked
+    inner = cv2.erode(np.isfinite(relief).astype(np.uint8), np.ones((3, 3), np.uint8))
+    detector = cv2.SIFT.create(const.KEYPOINTS, 3, const.KEYPOINT_CONTRAST, 20, 1.0)
+    found, descriptors = detector.detectAndCompute(picture, inner)
+    if descriptors is None:
+        return Keypoints(np.empty((0, 2), np.float32), np.empty((0, 128), np.float32))
+    order = np.argsort([-one.response for one in found], kind="stable")[: const.KEYPOINTS]
+    pixels = np.array([found[i].pt[::-1] for i in order])
+    places = (pixels + 0.5 - np.array(relief.shape) / 2) * const.TERRAIN_CELL_M
+    share = descriptors[order] / np.maximum(descriptors[order].sum(axis=1, keepdims=True), 1e-6)
+    return Keypoints(places.astype(np.float32), np.sqrt(share).astype(np.float32))
+
+
+def common_keypoints(query: Keypoints, match: Keypoints) -> int:
+    """How many keypoints one planar motion takes from the query to the match; 0 without such a motion."""
+    similarity = query.descriptors @ match.descriptors.T
+    there = similarity.argmax(axis=1)
+    here = np.flatnonzero(similarity.argmax(axis=0)[there] == np.arange(len(there)))
+    if len(here) < const.MIN_KEYPOINTS:
+        return 0
+    cv2.setRNGSeed(0)
+    motion, inliers = cv2.estimateAffinePartial2D(
+        query.places[here], match.places[there[here]], ransacReprojThreshold=2 * const.TERRAIN_CELL_M, maxIters=300
+    )
+    if motion is None or abs(float(np.hypot(motion[0, 0], motion[1, 0])) - 1) > const.KEYPOINT_SCALE:
+        return 0
+    return int(inliers.sum())
+
+
+class Lookalikes:
+    """Keypoints of stored submaps, found again by votes of the query's keypoints."""
+
+    def __init__(self) -> None:
+        self.rows: list[int] = []
+        self._submaps: list[Keypoints] = []
+
+    def add(self, row: int, submap: Keyframe) -> None:
+        """Add the submap of a row of the database."""
+        self.rows.append(row)
+        self._submaps.append(keypoints_of(submap))
+
+    def search(self, submap: Keyframe, admissible: NDArray[np.intp]) -> list[int]:
+        """Rows whose submaps share most keypoints with one, best first.
+
+        Args:
+            submap: of the newest keyframe.
+            admissible: rows that may be returned.
+        """
+        query, allowed = keypoints_of(submap), np.flatnonzero(np.isin(self.rows, admissible))
+        if len(query.places) < const.MIN_KEYPOINTS or not len(allowed):
+            return []
+        votes = self._votes(query, allowed)
+        chosen = [int(one) for one in np.argsort(-votes, kind="stable")[: const.SUBMAPS_COMPARED] if votes[one] > 0]
+        counts = {int(allowed[one]): common_keypoints(query, self._submaps[allowed[one]]) for one in chosen}
+        return [self.rows[index] for index in sorted(counts, key=lambda index: -counts[index]) if counts[index]]
+
+    def _votes(self, query: Keypoints, allowed: NDArray[np.intp]) -> NDArray[np.float32]:
+        """(A,) for every allowed submap: by how much its keypoints are more like the query's than most others'."""
+        similarity = query.descriptors @ np.concatenate([self._submaps[one].descriptors for one in allowed]).T
+        owner = np.repeat(np.arange(len(allowed)), [len(self._submaps[one].places) for one in allowed])
+        if not len(owner):  # ground on which nothing stands out
+            return np.zeros(len(allowed), np.float32)
+        kept = min(const.KEYPOINT_VOTES, similarity.shape[1] - 1)
+        best = np.argpartition(-similarity, kept, axis=1)[:, : kept + 1]
+        value = np.take_along_axis(similarity, best, axis=1)
+        votes = np.zeros((len(query.places), len(allowed)), np.float32)
+        np.maximum.at(votes, (np.arange(len(votes))[:, None], owner[best]), value - value.min(axis=1, keepdims=True))
+        total: NDArray[np.float32] = votes.sum(axis=0)
+        return total
