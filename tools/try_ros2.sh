@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Try every verb of the `ros2` command on the nodes, in two namespaces at once, and print a table "tried | expected | got".
+# Run every verb of the `ros2` command on nodes in two namespaces; print a table "tried | expected | got".
 #
 #   source install/setup.bash && src/umf_ros/tools/try_ros2.sh [--write docs/ros.md]
 #
@@ -26,7 +26,7 @@ row() { # command, what is expected (an extended regular expression), what that 
 }
 
 launch() { # namespace: both nodes, until they are ready
-  # what is started in the background ignores Ctrl-C, and hands that on
+  # background processes ignore SIGINT by default, and so do their children
   env --default-signal=INT,TERM ros2 launch umf_ros loop_closure.launch.py namespace:="$1" results_dir:="$folder/run_$1" \
     >"$folder/$1.log" 2>&1 &
   launched+=($!)
