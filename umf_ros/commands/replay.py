@@ -29,6 +29,7 @@ from umf_ros.core.errors import ConfigError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from umf_ros.core.config import Settings
     from umf_ros.localizer import Localization
 
 MinProbability = Annotated[
@@ -96,6 +97,7 @@ def command(
         mode=mode or ("localization" if map_folder else None),
         map=str(map_folder) if map_folder else None,
     )
+    _tell_inputs(console, settings)
     warnings: list[str] = []
     reader = open_frames(recording, settings, partial(_warn, console, warnings), odometry, odometry_frame)
     read_ground_truth(None, ground_truth)  # its errors are reported now, not after the run
@@ -144,6 +146,15 @@ def command(
             status = finish_run(folder, recording, console, ground_truth, shown).exit_code
     replay.raise_if_frames_failed()
     raise typer.Exit(status)
+
+
+def _tell_inputs(console: Console, settings: Settings) -> None:
+    """Print which inputs were found where no parameter and no data set names them."""
+    from umf_ros.core.config import TRANSFORMS
+    from umf_ros.sensors.topic_finder import describe_inputs
+
+    if settings.calibration == TRANSFORMS:
+        console.print(describe_inputs(settings), markup=False, highlight=False, soft_wrap=True)
 
 
 def _warn(console: Console, warnings: list[str], text: str) -> None:

@@ -38,6 +38,8 @@ def without_password(address: str) -> str:
     return address
 
 
+TRANSFORMS = "tf"
+"""Calibration in place of a file: `/tf_static` and camera_info say how the rig is built, or its messages wait."""
 Dataset = Annotated[str, AfterValidator(_known)]
 """Name of a data set that has a file in `config/datasets`."""
 
@@ -235,7 +237,9 @@ class Settings(Group):
     dataset: Dataset = Field(
         DEFAULT_DATASET, description="preset of calibration and topics, a file in `config/datasets` by its name"
     )
-    calibration: str = Field("", description="calibration file (YAML); empty: the data set's")
+    calibration: str = Field(
+        "", description="calibration file (YAML); tf: /tf_static and camera_info alone; empty: the data set's"
+    )
     mode: Literal["mapping", "localization"] = Field(
         "mapping", description="remember new places, or say where the rover is in the map that `map` names"
     )
@@ -267,6 +271,8 @@ class Settings(Group):
     @property
     def uses_transforms(self) -> bool:
         """Whether `/tf_static` says where the sensors are: a data set that was chosen has a calibration of its own."""
+        if self.calibration == TRANSFORMS:
+            return True
         return self.frames.extrinsics == "tf" and self.dataset == DEFAULT_DATASET
 
 

@@ -43,8 +43,9 @@ from umf_ros.nodes.conversions import (
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.sensors.calibration import calibration_of
+from umf_ros.sensors.calibration import Calibration, calibration_of
 from umf_ros.sensors.decode import OdometrySample, decode_odometry, stamp_ns
+from umf_ros.sensors.topic_finder import BACK_END
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: nothing is lost while the optimiser works
@@ -65,7 +66,7 @@ class PoseGraphNode(BaseNode):
     def __init__(self) -> None:
         self._front_end_busy = False
         self._asked_s: float | None = None
-        super().__init__("pose_graph_node", "folder for trajectories, graph and verdicts; empty: none")
+        super().__init__("pose_graph_node", "folder for trajectories, graph and verdicts; empty: none", BACK_END)
 
     def _open(self) -> None:
         settings = self._settings
@@ -89,12 +90,15 @@ class PoseGraphNode(BaseNode):
         if self._durable.unsettled:
             self._worker.submit(lambda: self._settle_left())
         topics = topics_of(settings)
-        self._odometry_frames = self._hear_transforms()
+        is_aided = bool(settings.absolute.gnss or settings.absolute.imu)
+        calibration = calibration_of(settings) if is_aided else None
+        self._odometry_frames = self._hear_transforms(calibration)
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
             self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
         self._subscribe("closures", Odometry, "loop_closures", self._on_closure, CLOSURES_QOS, rare=True)
-        self._hear_absolute()
+        if calibration is not None:
+            self._hear_absolute(calibration)
         self.create_subscription(String, "~/reject_edge", self._guarded("reject_edge", self._on_reject), 10)
         hear = self._guarded("front-end", self._on_front_end)
         self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", hear, 10)
@@ -153,13 +157,11 @@ class PoseGraphNode(BaseNode):
     def _on_front_end(self, event: TransitionEvent) -> None:
         self._front_end_busy = event.goal_state.label == "shuttingdown"
 
-    def _hear_absolute(self) -> None:
+    def _hear_absolute(self, calibration: Calibration) -> None:
         """Hear GNSS and IMU where their topics are named."""
         topics, qos = self._settings.absolute, sensor_qos(self._settings.qos, ODOMETRY_DEPTH)
-        if not topics.gnss and not topics.imu:
-            return
-        calibration = calibration_of(self._settings)
-        self._decoder = AbsoluteDecoder(calibration.antenna, calibration.body_T_imu, self._odometry_frames.pose_of)
+        find = self._odometry_frames.pose_of
+        self._decoder = AbsoluteDecoder(calibration.antenna, calibration.body_T_imu, find)
         if topics.gnss:
             self._subscribe("gnss", NavSatFix, topics.gnss, partial(self._on_absolute, Aid.GNSS), qos)
         if topics.imu:

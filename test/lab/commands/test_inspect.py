@@ -159,4 +159,4 @@ def test_a_data_set_that_camera_info_contradicts_is_not_recognised(
 ) -> None:
     entries = [*traverse(25.0), ("/stereo/left/camera_info", START_NS + 1, camera_info(START_NS, 50.0, (1242, 375)))]
     ended = umf("inspect", write(tmp_path / "bag.mcap", entries, monkeypatch))
-    assert "data set:" not in ended.text and "1242 x 375 pixels" in ended.text and "--write" in ended.text
+    assert "of the data set" not in ended.text and "1242 x 375 pixels" in ended.text and "--write" in ended.text
