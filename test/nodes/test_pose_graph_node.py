@@ -224,7 +224,7 @@ def test_no_message_ends_the_node(rig: Rig, process: Process) -> None:
 
 
 def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Path) -> None:
-    parameters = f"results_dir:={tmp_path / 'results'}", "pose_graph.max_gap_s:=3"
+    parameters = f"results_dir:={tmp_path / 'results'}", "pose_graph.max_gap_s:=3", "dataset:=simulated"
     process = Process(MODULE, tmp_path / "one.log", *parameters)
     process.wait_for("ready")
     rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
@@ -250,7 +250,7 @@ def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Pat
 
 
 def test_a_namespace_is_a_robot(rig: Rig, process: Process, tmp_path: Path) -> None:
-    other = Process(MODULE, tmp_path / "other.log", "__ns:=/other")
+    other = Process(MODULE, tmp_path / "other.log", "__ns:=/other", "dataset:=simulated")
     other.wait_for("ready")
     rig.until(lambda: rig.closures.get_subscription_count() and "other/pose_graph_node: pose graph" in rig.inputs)
     assert {name for name, _ in rig.get_topic_names_and_types()} >= {"/other/loop_closures", "/other/odom"}

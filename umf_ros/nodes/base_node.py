@@ -61,6 +61,7 @@ class BaseNode(LifecycleNode, ABC):
         self._settings, self._results = declare(self, results)
         self._wanted, self._finder = wanted, None
         if must_find(self._settings, wanted):
+            self._check_results()  # before it waits for topics
             self._finder = TopicFinder(self._settings, self.get_namespace(), wanted)
         self.failure: UmfError | None = None
         self._watches: list[InputWatch] = []
@@ -189,8 +190,7 @@ class BaseNode(LifecycleNode, ABC):
         """Once per second of the machine's clock."""
 
     def _configure(self) -> None:
-        if self._results:
-            check_writable(Path(self._results))
+        self._check_results()
         before, self._unwritten = self._entities(), None
         try:
             with watchdog.watching(watchdog.PATIENT_S):
@@ -201,6 +201,10 @@ class BaseNode(LifecycleNode, ABC):
             gc.freeze()
         finally:
             self._own = [item for item in self._entities() if item not in before]
+
+    def _check_results(self) -> None:
+        if self._results:
+            check_writable(Path(self._results))
 
     def _entities(self) -> list[Any]:
         return [*self.publishers, *self.subscriptions, *self.services]

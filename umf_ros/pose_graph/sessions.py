@@ -138,13 +138,14 @@ class Sessions:
     def _stamps(self, closures: Closures, every_keyframe: bool = False) -> list[Stamps]:
         """Stamps of the first or of every keyframe of each session, and of the endpoints of closures."""
         ends = [closures["match"], closures["query"]]
+        held = np.concatenate(ends)
         return [
             np.unique(
                 np.concatenate(
                     [
                         chain.stamps[: None if every_keyframe else 1],
                         *(end["stamp"][end["session"] == session] for end in ends),
-                        self.reference.stamps(session),
+                        self.reference.stamps(session, held[held["session"] == session]["travel"]),
                     ]
                 )
             )
