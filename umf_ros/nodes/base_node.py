@@ -59,7 +59,7 @@ class BaseNode(LifecycleNode, ABC):
         """Declare the parameters; `results` says what the folder `results_dir` is for, `wanted` are inputs."""
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
         self._settings, self._results = declare(self, results)
-        self._wanted, self._finder = wanted, None
+        self._input_names, self._finder = wanted, None
         if must_find(self._settings, wanted):
             self._check_results()  # before it waits for topics
             self._finder = TopicFinder(self._settings, self.get_namespace(), wanted)
@@ -87,7 +87,7 @@ class BaseNode(LifecycleNode, ABC):
         """Configure and activate, as soon as the inputs are found."""
         if not self._find_inputs(SETTLING_S):
             if self._is_due("inputs", 30.0):
-                wanted = either(list(self._wanted))
+                wanted = either(list(self._input_names))
                 self.get_logger().info(f"waiting for topics of {wanted} (parameters topics.*, dataset)")
             return
         self._starting = False
@@ -104,7 +104,7 @@ class BaseNode(LifecycleNode, ABC):
         found = self._finder.look(types, time.monotonic(), settling_s)
         if found is not None:
             self._settings, self._finder = found, None
-            self.get_logger().info(describe_inputs(found, self._wanted))
+            self.get_logger().info(describe_inputs(found, self._input_names))
         return found is not None
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.srv import AddDiagnostics
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from lifecycle_msgs.msg import TransitionEvent
 from nav_msgs.msg import Odometry
@@ -27,6 +28,7 @@ from umf_ros.absolute.measurement import AbsoluteDecoder, Aid
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, topics_of
 from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.durable_graph import JOURNAL, DurableGraph
 from umf_ros.localizer import MapFollower
@@ -35,6 +37,7 @@ from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import (
     CLOSURES_QOS,
     LATCHED_QOS,
+    closure_by_hand,
     closure_from_message,
     is_between_rovers,
     parse_pair,
@@ -102,9 +105,12 @@ class PoseGraphNode(BaseNode):
         self.create_subscription(String, "~/reject_edge", self._guarded("reject_edge", self._on_reject), 10)
         hear = self._guarded("front-end", self._on_front_end)
         self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", hear, 10)
-        self._offer_in_turn("~/reject_last", self._reject_last)
-        self._offer_in_turn("~/save", self._save)
-        self._offer_in_turn("~/reset", self._reset)
+        self._offer_in_turn("~/reject_last", lambda _: self._reject_last())
+        self._offer_in_turn("~/save", lambda _: self._save())
+        self._offer_in_turn("~/reset", lambda _: self._reset())
+        self._offer_in_turn("~/add_closure", self._add_by_hand, AddDiagnostics)
+        self._offer_in_turn("~/reject_edge", partial(self._decide_by_hand, state=State.REJECTED), AddDiagnostics)
+        self._offer_in_turn("~/undo_edit", partial(self._decide_by_hand, state=State.PENDING), AddDiagnostics)
 
     def _finish(self) -> None:
         """Process the queue, settle the graph and write the results."""
@@ -133,26 +139,26 @@ class PoseGraphNode(BaseNode):
     def _retune(self, settings: Settings) -> None:
         self._worker.submit(lambda: self._durable.graph.retune(settings.pose_graph))
 
-    def _offer_in_turn(self, name: str, action: Callable[[], str]) -> None:
+    def _offer_in_turn(self, name: str, action: Callable[[Any], str], kind: type = Trigger) -> None:
         """Offer a service whose action the worker does when it is its turn: poses go out meanwhile."""
 
-        def act(answered: Future) -> None:
+        def act(request: Any, answered: Future) -> None:
             try:
                 with watchdog.task(name, watchdog.PATIENT_S):
-                    answered.set_result((True, action()))
+                    answered.set_result((True, action(request)))
             except Exception as error:
                 if not isinstance(error, UmfError):
                     self._complain(error, name)
                 answered.set_result((False, str(error)))
 
-        async def answer(_: Any, response: Any) -> Any:
+        async def answer(request: Any, response: Any) -> Any:
             answered = Future()
-            self._worker.submit(lambda: act(answered))
+            self._worker.submit(lambda: act(request, answered))
             response.success, response.message = await answered
             return response
 
         # a group of its own: those in one group wait for each other, the timers too
-        self.create_service(Trigger, name, answer, callback_group=ReentrantCallbackGroup())
+        self.create_service(kind, name, answer, callback_group=ReentrantCallbackGroup())
 
     def _on_front_end(self, event: TransitionEvent) -> None:
         self._front_end_busy = event.goal_state.label == "shuttingdown"
@@ -204,8 +210,8 @@ class PoseGraphNode(BaseNode):
         self._worker.submit(lambda: self._announce(self._durable.add_closure(closure)))
 
     def _on_reject(self, message: String) -> None:
-        match, query = parse_pair(message.data)
-        self._worker.submit(lambda: self._announce(self._durable.revoke(match, query)))
+        pair = parse_pair(message.data)
+        self._worker.submit(lambda: self._announce(self._durable.decide_by_hand(*pair, State.REJECTED)))
 
     def _add_odometry(self, sample: OdometrySample) -> None:
         reset = self._durable.take_odometry(sample.stamp_ns, sample.odom_T_body)
@@ -287,8 +293,23 @@ class PoseGraphNode(BaseNode):
         accepted = [v.closure for v in self._durable.graph.closures() if v.state is State.ACCEPTED]
         if not accepted:
             raise UmfError("no closure is accepted")
-        self._announce(self._durable.revoke(accepted[-1].match_stamp_ns, accepted[-1].query_stamp_ns))
-        return f"closure {_name(accepted[-1])} revoked"
+        last = accepted[-1]
+        self._announce(self._durable.decide_by_hand(last.match_stamp_ns, last.query_stamp_ns, State.REJECTED))
+        return f"closure {_name(last)} revoked"
+
+    def _decide_by_hand(self, request: AddDiagnostics.Request, state: State) -> str:
+        """Decide about the closures between two keyframes that the request's text names."""
+        pair = parse_pair(request.load_namespace)
+        self._announce(self._durable.decide_by_hand(*pair, state))
+        told = [verdict for verdict in self._durable.graph.closures() if _ends(verdict.closure) == pair]
+        return "; ".join(f"closure {_name(one.closure)} {one.state.value}: {one.reason}" for one in told)
+
+    def _add_by_hand(self, request: AddDiagnostics.Request) -> str:
+        """Accept the closures between two keyframes; with a pose in the request, that is a new one."""
+        pair, closure = closure_by_hand(request.load_namespace)
+        if closure is not None:
+            self._announce(self._durable.add_closure(closure))
+        return self._decide_by_hand(AddDiagnostics.Request(load_namespace=pair), State.ACCEPTED)
 
     def _save(self) -> str:
         folder = self._results or "pose_graph_results"
@@ -325,6 +346,10 @@ def _as_status(verdict: ClosureVerdict) -> DiagnosticStatus:
     level = OK if verdict.state is State.ACCEPTED else WARN
     values = {"verdict": verdict.state.value, "mahalanobis": verdict.residual, "misfit_m": verdict.residual_m}
     return status(level, _name(verdict.closure), verdict.reason, values)
+
+
+def _ends(closure: LoopClosure) -> tuple[int, int]:
+    return closure.match_stamp_ns, closure.query_stamp_ns
 
 
 def _name(closure: Any) -> str:

@@ -11,11 +11,12 @@ from scipy.sparse.csgraph import dijkstra
 
 from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.g2o import EDGE
 from umf_ros.core.geometry import Array, adjoint, invert, propagate
 from umf_ros.pose_graph.closures import Closures
 from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.odometry import POINT, CorrectedPath, OdometryChain, PathPoints, Rows, Stamps, noise_between
-from umf_ros.pose_graph.solver import EDGE, Graph, GraphSolver
+from umf_ros.pose_graph.solver import Graph, GraphSolver
 
 # metres at which an angular error counts like a displacement when paths through the graph are compared
 _LEVER_M = 10.0

@@ -46,7 +46,7 @@ def find_topics(types: Mapping[str, str]) -> FoundTopics:
     }
     cameras = _cameras({topic: types[topic] for topic in fits["left_image"]})
     infos = {camera: info for camera, topic in cameras.items() if (info := _info(topic)) in fits["left_info"]}
-    seeing = sorted(infos or cameras)
+    seeing = sorted(camera for camera in infos or cameras if camera is not None)
     left, right = _pair(seeing)
     chosen = {name: fits[name][0] if len(fits[name]) == 1 else "" for name in ("cloud", "odometry")}
     ambiguous = {name: fits[name] for name in chosen if len(fits[name]) > 1}
@@ -76,13 +76,13 @@ def _info(image: str) -> str:
     return f"{image.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
 
 
-def _pair(cameras: list[str | None]) -> tuple[str | None, str | None]:
+def _pair(cameras: list[str]) -> tuple[str | None, str | None]:
     """Left and right of a pair, a single camera, or none of several."""
     if len(cameras) == 1:
         return cameras[0], None
     if len(cameras) == 2:
         for left, right in (cameras, cameras[::-1]):
-            if left and right and "left" in left and left.replace("left", "right") == right:
+            if "left" in left and left.replace("left", "right") == right:
                 return left, right
     return None, None
 
