@@ -416,7 +416,12 @@ def test_fixes_over_dds_are_decided_about_and_told(ros_context: None, tmp_path: 
     world = open_ground(10_004, 300.0)
     rig = Rig(world.graph)
     fixes, results = rig.create_publisher(NavSatFix, "/gnss/fix", 50), tmp_path / "results"
-    arguments = ("absolute.gnss:=/gnss/fix", "pose_graph.max_gap_s:=3", "pose_graph.odometry_sigma_deg:=0.1")
+    arguments = (
+        "absolute.gnss:=/gnss/fix",
+        "topics.odometry:=/odom",
+        "pose_graph.max_gap_s:=3",
+        "pose_graph.odometry_sigma_deg:=0.1",
+    )
     process = Process(MODULE, tmp_path / "node.log", f"results_dir:={results}", *arguments)
     try:
         process.wait_for("ready")
