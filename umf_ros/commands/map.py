@@ -44,18 +44,19 @@ Pair = Annotated[
 ]
 
 
-class _MakeOrEdit(TyperGroup):
-    """`umf map RECORDINGS` makes a map; `umf map edit` is the command beside that."""
+class _MakeOrChange(TyperGroup):
+    """`umf map RECORDINGS` makes a map; `umf map edit` and `umf map grow` are the commands beside that."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Name the usual command where none is named."""
-        return super().parse_args(ctx, args if args[:1] == ["edit"] else ["make", *args])
+        return super().parse_args(ctx, args if args[:1] in (["edit"], ["grow"]) else ["make", *args])
 
 
-app = typer.Typer(cls=_MakeOrEdit, rich_markup_mode="rich")
+ALSO = "umf map edit decides about closures of a map by hand, umf map grow adds a drive that localised in it."
+app = typer.Typer(cls=_MakeOrChange, rich_markup_mode="rich")
 
 
-@app.command("make", epilog="umf map edit FOLDER decides about closures of a map by hand.")
+@app.command("make", epilog=ALSO)
 def command(
     recordings: Recordings,
     out: MapPath = Path("map"),
@@ -135,6 +136,27 @@ def edit(
         summary = write_results(target, joint)
     for (match, query), state in edits.items():
         console.print(f"  {match} {query}: {state.value} by hand", markup=False, soft_wrap=True)
+    _tell(map_folder, summary, console)
+
+
+@app.command("grow")
+def grow_map(
+    map_folder: Annotated[Path, typer.Argument(help="Folder of the map.")],
+    run: Annotated[Path, typer.Argument(help="Run folder of a drive that localised in it with localization.update.")],
+) -> None:
+    """Make what a rover saw while localising in a map a session of that map.
+
+    The nodes do so themselves at ~/save and at the end; this is for a run that was killed.
+    """
+    from rich.console import Console
+
+    from umf_ros.maps.growth import grow
+
+    console = Console()
+    with console.status("Solving the joint graph"):
+        session, summary = grow(map_folder, run)
+    if session is None:
+        console.print(f"{run}: nothing new for the map", markup=False, soft_wrap=True)
     _tell(map_folder, summary, console)
 
 

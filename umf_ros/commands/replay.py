@@ -106,7 +106,8 @@ def command(
     network = make_detector_embedder(settings)
     viewer = RerunLog(rerun) if rerun else None
     # a store or a map that cannot be used is reported before there is a folder
-    detector = LoopDetector(settings, network) if settings.database.path or settings.localizing else None
+    known = settings.database.path or (settings.localizing and not settings.grows_map)
+    detector = LoopDetector(settings, network) if known else None
     begun = unfinished_folder(out, bag, settings) if resume and not settings.localizing else None
     folder = begun or create_folder(out, bag)
     detector = detector or LoopDetector(with_places(settings, folder), network)
@@ -128,6 +129,7 @@ def command(
     with undisturbed():
         replay.finish(count_drops(reader.counters))
         if not interrupted() or settings.localizing:
+            _grow(console, settings, folder)
             finish_folder(folder)
         if viewer:
             viewer.finish(folder)
@@ -155,6 +157,18 @@ def _tell_inputs(console: Console, settings: Settings) -> None:
 
     if settings.calibration == TRANSFORMS:
         console.print(describe_inputs(settings), markup=False, highlight=False, soft_wrap=True)
+
+
+def _grow(console: Console, settings: Settings, folder: Path) -> None:
+    """Make what was seen while localising a session of the map, where that is asked for."""
+    if not settings.grows_map:
+        return
+    from umf_ros.maps.growth import grow
+    from umf_ros.maps.outputs import sentence
+
+    session, summary = grow(Path(settings.map), folder)
+    told = "nothing new for the map" if session is None else f"session {session.name}: {sentence(summary)}"
+    console.print(f"{settings.map}: {told}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _warn(console: Console, warnings: list[str], text: str) -> None:

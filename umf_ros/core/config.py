@@ -194,6 +194,14 @@ class PoseGraphSettings(Group):
     )
 
 
+class LocalizationSettings(Group):
+    """What becomes of a rover's drive in a map."""
+
+    update: bool = Field(
+        False, description="it becomes a session of the map at ~/save and at the end; needs a folder of results"
+    )
+
+
 class FrameIds(Group):
     """Names of the coordinate frames (REP-105)."""
 
@@ -243,7 +251,8 @@ class Settings(Group):
     mode: Literal["mapping", "localization"] = Field(
         "mapping", description="remember new places, or say where the rover is in the map that `map` names"
     )
-    map: str = Field("", description="folder of a map that `umf map` made, for mode localization; it stays as it is")
+    map: str = Field("", description="folder of a map that `umf map` made, for mode localization")
+    localization: LocalizationSettings = LocalizationSettings()
     topics: Topics = Topics()
     absolute: AbsoluteTopics = AbsoluteTopics()
     qos: Qos = Qos()
@@ -267,6 +276,11 @@ class Settings(Group):
     def localizing(self) -> bool:
         """Whether places are looked for in a map that stays as it is."""
         return self.mode == "localization"
+
+    @property
+    def grows_map(self) -> bool:
+        """Whether what is seen while localising becomes a part of the map."""
+        return self.localizing and self.localization.update
 
     @property
     def uses_transforms(self) -> bool:

@@ -14,11 +14,14 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from rclpy.task import Future
+from std_srvs.srv import Trigger
 
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics
@@ -27,6 +30,7 @@ from umf_ros.core.io import check_writable
 from umf_ros.nodes.conversions import from_time, latched
 from umf_ros.nodes.diagnostics import WARN, InputWatch
 from umf_ros.nodes.parameters import changed_settings, declare
+from umf_ros.nodes.process import Worker
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.tf import PATIENCE_S, TOPIC, BodyFrames, StaticTransforms
 from umf_ros.sensors.topic_finder import FRONT_END, SETTLING_S, TopicFinder, describe_inputs, must_find
@@ -321,6 +325,29 @@ class BaseNode(LifecycleNode, ABC):
             return response
 
         self.create_service(kind, name, answer)
+
+    def _offer_in_turn(
+        self, worker: Worker[Callable[[], None]], name: str, action: Callable[[Any], str], kind: type = Trigger
+    ) -> None:
+        """Offer a service whose action a worker does when it is its turn: the executor goes on meanwhile."""
+
+        def act(request: Any, answered: Future) -> None:
+            try:
+                with watchdog.task(name, watchdog.PATIENT_S):
+                    answered.set_result((True, action(request)))
+            except Exception as error:
+                if not isinstance(error, UmfError):
+                    self._complain(error, name)
+                answered.set_result((False, str(error)))
+
+        async def answer(request: Any, response: Any) -> Any:
+            answered = Future()
+            worker.submit(lambda: act(request, answered))
+            response.success, response.message = await answered
+            return response
+
+        # a group of its own: those in one group wait for each other, the timers too
+        self.create_service(kind, name, answer, callback_group=ReentrantCallbackGroup())
 
     def _diagnose(self, own: DiagnosticStatus) -> None:
         """Publish the node's own health and that of its inputs."""

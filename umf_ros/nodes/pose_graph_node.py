@@ -16,12 +16,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from lifecycle_msgs.msg import TransitionEvent
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.task import Future
 from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from umf_ros.absolute.measurement import AbsoluteDecoder, Aid
@@ -105,12 +102,16 @@ class PoseGraphNode(BaseNode):
         self.create_subscription(String, "~/reject_edge", self._guarded("reject_edge", self._on_reject), 10)
         hear = self._guarded("front-end", self._on_front_end)
         self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", hear, 10)
-        self._offer_in_turn("~/reject_last", lambda _: self._reject_last())
-        self._offer_in_turn("~/save", lambda _: self._save())
-        self._offer_in_turn("~/reset", lambda _: self._reset())
-        self._offer_in_turn("~/add_closure", self._add_by_hand, AddDiagnostics)
-        self._offer_in_turn("~/reject_edge", partial(self._decide_by_hand, state=State.REJECTED), AddDiagnostics)
-        self._offer_in_turn("~/undo_edit", partial(self._decide_by_hand, state=State.PENDING), AddDiagnostics)
+        self._offer_in_turn(self._worker, "~/reject_last", lambda _: self._reject_last())
+        self._offer_in_turn(self._worker, "~/save", lambda _: self._save())
+        self._offer_in_turn(self._worker, "~/reset", lambda _: self._reset())
+        self._offer_in_turn(self._worker, "~/add_closure", self._add_by_hand, AddDiagnostics)
+        self._offer_in_turn(
+            self._worker, "~/reject_edge", partial(self._decide_by_hand, state=State.REJECTED), AddDiagnostics
+        )
+        self._offer_in_turn(
+            self._worker, "~/undo_edit", partial(self._decide_by_hand, state=State.PENDING), AddDiagnostics
+        )
 
     def _finish(self) -> None:
         """Process the queue, settle the graph and write the results."""
@@ -138,27 +139,6 @@ class PoseGraphNode(BaseNode):
 
     def _retune(self, settings: Settings) -> None:
         self._worker.submit(lambda: self._durable.graph.retune(settings.pose_graph))
-
-    def _offer_in_turn(self, name: str, action: Callable[[Any], str], kind: type = Trigger) -> None:
-        """Offer a service whose action the worker does when it is its turn: poses go out meanwhile."""
-
-        def act(request: Any, answered: Future) -> None:
-            try:
-                with watchdog.task(name, watchdog.PATIENT_S):
-                    answered.set_result((True, action(request)))
-            except Exception as error:
-                if not isinstance(error, UmfError):
-                    self._complain(error, name)
-                answered.set_result((False, str(error)))
-
-        async def answer(request: Any, response: Any) -> Any:
-            answered = Future()
-            self._worker.submit(lambda: act(request, answered))
-            response.success, response.message = await answered
-            return response
-
-        # a group of its own: those in one group wait for each other, the timers too
-        self.create_service(kind, name, answer, callback_group=ReentrantCallbackGroup())
 
     def _on_front_end(self, event: TransitionEvent) -> None:
         self._front_end_busy = event.goal_state.label == "shuttingdown"
