@@ -195,7 +195,7 @@ class PoseGraphSettings(Group):
 
 
 class LocalizationSettings(Group):
-    """What becomes of a rover's drive in a map."""
+    """Use of a drive that localised in a map."""
 
     update: bool = Field(
         False, description="it becomes a session of the map at ~/save and at the end; needs a folder of results"

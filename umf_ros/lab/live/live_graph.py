@@ -22,7 +22,7 @@ from umf_ros.durable_graph import JOURNAL, DurableGraph
 START_TIMEOUT_S = 180.0
 STOP_TIMEOUT_S = 60.0
 READY, WAITING = "ready", "waiting for topics"
-"""What a node says first: of the latter, it has to hear the player before it is ready."""
+"""First line of a node; one that waits has to hear the player before it is ready."""
 PLAYER = "umf_ros.lab.live.bag_player_node"
 NODES = ("umf_ros.nodes.loop_closure_node", "umf_ros.nodes.pose_graph_node")
 # a recording of the simulator must arrive whole, however busy the machine is; its sensors are where its file says
