@@ -55,7 +55,7 @@ def map_folder(tmp_path: Path) -> MapFolder:
 
 
 def drive(run: Path, last_m: int = LAST_M, first_m: int = FIRST_M) -> None:
-    """What a rover leaves that localises on the circle: places in its own odometry, closures with the map."""
+    """Leave the run of a rover that localises on the circle: places in its own odometry, closures with the map."""
     run.mkdir(exist_ok=True)
     start = on_circle(np.array([FIRST_M]))[0]
     with closing(PlaceDatabase(Database(path=str(run / PLACES)), *IDENTITY)) as seen, closing(RunFile(run)) as file:
