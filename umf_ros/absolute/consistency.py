@@ -45,6 +45,8 @@ _FEW_STRETCHES = 15
 _MOUNTING = {Aid.GNSS: (0.5, 1.0), Aid.GRAVITY: (np.deg2rad(2.5), np.deg2rad(1.0))}
 _LEAST_SIGMA_M = 0.05
 _STEP = np.log(1.2)
+MOST_HELD = 400
+"""Factors of a session and source: each is a vertex, and all are solved with every event (*by hand*: over 4 km)."""
 # by this factor the path grows until all is decided again; until then, only what its end can change
 _REJUDGE = 1.1
 
@@ -254,6 +256,12 @@ class Track:
         self._misfits, self._distances = np.append(self._misfits, more), np.append(self._distances, more)
         if self._measurements[known:] and min(one.stamp_ns for one in measurements) < last_ns:
             self._judged_whole = 0
+
+    @property
+    def held(self) -> dict[int, Factor]:
+        """Factors that hold the map, by stretch: all of them or, of a long path, evenly spread ones."""
+        every = -(-len(self.factors) // MOST_HELD)
+        return {cell: one for cell, one in self.factors.items() if every < 2 or cell % every == 0}
 
     @property
     def stamps(self) -> Rows:

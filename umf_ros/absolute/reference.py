@@ -222,7 +222,7 @@ class AbsoluteReference:
             one.stamp_ns
             for (own, _), track in self._tracks.items()
             if own == session
-            for cell, one in track.factors.items()
+            for cell, one in track.held.items()
             if cell not in held
         ]
         stamps += [
@@ -305,7 +305,7 @@ class AbsoluteReference:
         for (session, source), track in sorted(
             self._tracks.items(), key=lambda one: (one[0][1] is Aid.GNSS, one[0][0])
         ):
-            before = {cell: factor.numbers for cell, factor in track.factors.items()}
+            before = {cell: factor.numbers for cell, factor in track.held.items()}
             component, measured = paths.components[session], self._measured(source, track)
             path = self._path(track, session, paths, at_last)
             if source is Aid.GNSS and track.mounting is None and not self._has_gnss(component, paths):
@@ -321,7 +321,7 @@ class AbsoluteReference:
             track.judge(measured, path, known, at_last)
             if track.factors and not known:
                 self.worlds[component] = _upright(apply(path.poses, measured).mean(axis=0))
-            changed = changed or before != {cell: factor.numbers for cell, factor in track.factors.items()}
+            changed = changed or before != {cell: factor.numbers for cell, factor in track.held.items()}
         return changed
 
     def _path(self, track: Track, session: int, paths: Paths, at_last: bool) -> MeasuredPath:
@@ -443,15 +443,14 @@ class AbsoluteReference:
 
 def _attached(track: Track, session: int, points: NDArray[np.void]) -> Factors:
     """Factors of a track, each at the vertex that is nearest to the middle of its stretch: the odometry carries it."""
-    own = np.flatnonzero(points["session"] == session)
-    travel, middles = points["travel"][own], (np.array(list(track.factors)) + 0.5) * STRETCH_M
+    own, factors = np.flatnonzero(points["session"] == session), track.held
+    travel, middles = points["travel"][own], (np.array(list(factors)) + 0.5) * STRETCH_M
     after = np.searchsorted(travel, middles).clip(1, max(1, len(own) - 1))
     before = middles - travel[after - 1] < travel[after.clip(max=len(own) - 1)] - middles
     rows = own[np.where(before, after - 1, after.clip(max=len(own) - 1))]
-    poses = invert(points["pose"][rows]) @ np.array([one.middle for one in track.factors.values()])
+    poses = invert(points["pose"][rows]) @ np.array([one.middle for one in factors.values()]).reshape(-1, 4, 4)
     return [
-        (row, partial(one.make, pose))
-        for row, pose, one in zip(rows.tolist(), poses, track.factors.values(), strict=True)
+        (row, partial(one.make, pose)) for row, pose, one in zip(rows.tolist(), poses, factors.values(), strict=True)
     ]
 
 
