@@ -26,7 +26,7 @@ READY, WAITING = "ready", "waiting for topics"
 PLAYER = "umf_ros.lab.live.bag_player_node"
 NODES = ("umf_ros.nodes.loop_closure_node", "umf_ros.nodes.pose_graph_node")
 # a recording of the simulator must arrive whole, however busy the machine is; its sensors are where its file says
-WHOLE = ("qos.reliability:=reliable", "qos.depth:=200", "frames.extrinsics:=calibration")
+WHOLE = ("dataset:=simulated", "qos.reliability:=reliable", "qos.depth:=200", "frames.extrinsics:=calibration")
 
 
 class NodeProcess:
