@@ -1,6 +1,8 @@
 """Start the loop-closure front-end and the pose-graph back-end; optionally a bag player and RViz.
 
 ros2 launch umf_ros loop_closure.launch.py params_file:=/path/to/params.yaml bag:=/path/to/recording.mcap
+
+Without a parameter file the nodes find their topics by type, and the rig by /tf_static and camera_info.
 """
 
 from pathlib import Path
@@ -18,7 +20,7 @@ from umf_ros.core.errors import ConfigError
 from umf_ros.nodes.start import check_parameter_file, full_name, is_true
 
 ARGUMENTS = [
-    ("params_file", "", "parameter file; empty: config/loop_closure.yaml of the package"),
+    ("params_file", "", "parameter file; empty: none, topics are found by type"),
     ("config", "", "former name of params_file"),
     ("namespace", "", "namespace of the nodes and their topics; one per robot"),
     ("log_level", "info", "log level of the nodes: debug, info, warn, error or fatal"),
@@ -44,11 +46,12 @@ def start_nodes(context, *_):
     """
     value = {name: LaunchConfiguration(name).perform(context) for name, *_ in ARGUMENTS}
     share = FindPackageShare("umf_ros").perform(context)
-    config = value["params_file"] or value["config"] or f"{share}/config/loop_closure.yaml"
+    config = value["params_file"] or value["config"]
     try:
         own = _own_parameters(value)
         rviz = is_true("rviz", value["rviz"])
-        check_parameter_file(Path(config), [full_name(value["namespace"], name) for name in NODES])
+        if config:
+            check_parameter_file(Path(config), [full_name(value["namespace"], name) for name in NODES])
     except ConfigError as error:
         raise RuntimeError(str(error)) from None
     if value["bag"] and not Path(value["bag"]).exists():
@@ -70,7 +73,7 @@ def start_nodes(context, *_):
         )
 
     viewer = [_viewer(context, share, value["namespace"])] if rviz else []
-    nodes = [node(name, parameters=[config, own]) for name in NODES]
+    nodes = [node(name, parameters=[*([config] if config else []), own]) for name in NODES]
     # neither node is useful alone: if one ends, launch ends the other
     ends = [
         RegisterEventHandler(OnProcessExit(target_action=one, on_exit=[EmitEvent(event=Shutdown())])) for one in nodes

@@ -27,8 +27,9 @@ row() { # command, what is expected (an extended regular expression), what that 
 
 launch() { # namespace: both nodes, until they are ready
   # background processes ignore SIGINT by default, and so do their children
+  # --dataset: no topics exist yet that could be found by type
   env --default-signal=INT,TERM ros2 launch umf_ros loop_closure.launch.py namespace:="$1" results_dir:="$folder/run_$1" \
-    >"$folder/$1.log" 2>&1 &
+    params_file:="$(ros2 pkg prefix --share umf_ros)/config/loop_closure.yaml" >"$folder/$1.log" 2>&1 &
   launched+=($!)
   for _ in $(seq 120); do [ "$(grep -c ': ready' "$folder/$1.log")" -ge 2 ] && return; sleep 0.5; done
 }

@@ -28,6 +28,8 @@ _HELP = {
     "fields": "the cloud needs fields x, y and z",
     "stamp": "the driver must set header.stamp",
     "pose": "the odometry must send unit quaternions",
+    "transforms": "calibration names a file that says how the sensors are mounted",
+    "camera_info": "calibration names a file with the intrinsics",
     "late": "sync.max_wait_s waits longer",
     "queue full": "sync.queue_size keeps more",
 }
