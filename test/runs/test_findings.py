@@ -12,6 +12,7 @@ from finished_runs import BELOW, START_NS, accepted, candidate, closure, examine
 from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, traverse, write_mcap
 
 from umf_ros.bags.inputs import Advice, useless_inputs
+from umf_ros.bags.overlay import Overlay
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.sensor_check import Disagreement, SensorReport
 from umf_ros.core.config import load_settings
@@ -146,6 +147,10 @@ LIDAR = Disagreement(0.0, np.array([0.0, 9.0, 1.0]))
 FINE = Disagreement(0.0, np.array([0.5, 1.0, -2.5]))
 
 
+def laid_over(scale: float) -> Overlay:
+    return Overlay(np.array([0.1, 0.2, -0.1]), scale, 0.003, np.array([0.1, 0.001, 0.002]))
+
+
 @pytest.mark.parametrize(
     ("sensors", "said"),
     [
@@ -153,7 +158,7 @@ FINE = Disagreement(0.0, np.array([0.5, 1.0, -2.5]))
         (SensorReport(left_contrast=5.0), "the left images show little"),
         (SensorReport(returns=120), "scans have 120 returns in the median"),
         (SensorReport(intensity_max=0.0), "all intensities are 0"),
-        (SensorReport(stereo_scale=1.5), "stereo sees everything 1.50 times as far as the LiDAR"),
+        (SensorReport(overlay=laid_over(1.5)), "stereo sees everything 1.5 times as far as the LiDAR"),
         (SensorReport(lidar=LIDAR, camera=FINE), "the LiDAR's mounting is off by 9 deg, mostly about y (+9 deg)"),
         (SensorReport(lidar=LIDAR, camera=LIDAR), "the odometry is not of the body frame"),
         (SensorReport(forward=np.array([0, 0, 0.9])), "the odometry is not of the body: by its poses"),
@@ -173,7 +178,7 @@ def test_what_is_wrong_with_the_sensors_is_said_with_its_number(
 
 
 def test_sensors_that_agree_are_not_mentioned(tmp_path: Path) -> None:
-    fine = SensorReport(50.0, 50.0, 9000.0, 200.0, 1.01, FINE, FINE, np.array([0.99, 0.1, 0.0]))
+    fine = SensorReport(50.0, 50.0, 9000.0, 200.0, laid_over(1.005), FINE, FINE, np.array([0.99, 0.1, 0.0]))
     assert look_first(examined(tmp_path, [closure(50, 10)], verdict=accepted(), sensors=fine)) == []
 
 

@@ -7,14 +7,12 @@ import sys
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import yaml
 
 from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.inputs import Advice
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.sensor_check import SensorCheck, SensorReport, about_sensors
@@ -79,6 +77,13 @@ def faults(settings: Settings) -> list[Planted]:
             message.data = np.full_like(np.asarray(message.data), 7)
         return message
 
+    def long_baseline(topic: str, message: Any) -> Any:
+        if topic == topics.right_info:
+            projection = np.array(message.p)
+            projection[3] *= 1.5
+            message.p = projection
+        return message
+
     return [
         Planted("none", ()),
         Planted("no cloud", ("no scans on", topics.cloud), without_clouds),
@@ -88,7 +93,7 @@ def faults(settings: Settings) -> list[Planted]:
         Planted("gap rules", ("gap rules exclude every pair",), settings={"loop": {"min_time_gap_s": 3600.0}}),
         Planted("wrong odometry frame", ("odometry is not of the body",), options=_camera_poses),
         Planted("empty right image", ("right images are empty",), empty_right),
-        Planted("wrong baseline", ("baseline is wrong",), _wide({topics.right_info}, 1.5), calibration=_long),
+        Planted("wrong baseline", ("baseline is wrong",), long_baseline, calibration=_long),
         Planted("all closures pending", ("all closures are pending",), options=_short_odometry),
         Planted("truth of another clock", ("ground truth is of another clock",), options=_other_clock),
     ]
@@ -106,33 +111,20 @@ def _late(topics: set[str], seconds: float) -> Change:
     return change
 
 
-def _wide(topics: set[str], times: float) -> Change:
-    """States another baseline in the camera_info of the right camera."""
-
-    def change(topic: str, message: Any) -> Any:
-        if topic in topics:
-            projection = np.array(message.p)
-            projection[3] *= times
-            message.p = projection
-        return message
-
-    return change
-
-
-def _turned(calibration: dict[str, Any], degrees: float = TURN_DEG, axis: int = 2) -> None:
+def _turned(calibration: dict[str, Any]) -> None:
     pose = calibration["body_T_lidar"]
-    half = np.radians(degrees) / 2
-    turn = from_quaternion((0, 0, 0), (*np.sin(half) * np.eye(3)[axis], np.cos(half)))
+    half = np.radians(TURN_DEG) / 2
+    turn = from_quaternion((0, 0, 0), (0, 0, np.sin(half), np.cos(half)))
     wrong = turn @ from_quaternion((0, 0, 0), pose["quaternion"])
     pose["quaternion"] = [float(value) for value in to_quaternion(wrong)]
 
 
-def _long(calibration: dict[str, Any], times: float = 1.5) -> None:
+def _long(calibration: dict[str, Any]) -> None:
     if "camera" in calibration:
-        calibration["camera"]["baseline"] *= times
+        calibration["camera"]["baseline"] *= 1.5
     else:
         across = calibration["raw_camera"]["left_T_right"]
-        across["translation"] = [times * metres for metres in across["translation"]]
+        across["translation"] = [1.5 * metres for metres in across["translation"]]
 
 
 def _odometry(bag: Bag) -> Trajectory:
@@ -240,29 +232,6 @@ def check_sensors(bag: Bag, settings: Settings) -> SensorReport:
         else:
             check.take(item)
     return check.report(Trajectory(np.array(stamps, np.int64), np.stack(poses)) if stamps else None)
-
-
-SMALL_FAULTS = {"none": "", "baseline 1 %": "baseline is wrong", "turn 1 deg": "are mounted", "clock 20 ms": "clock is"}
-"""Faults that only stereo over scans shows, and words of the finding that names each."""
-
-
-def small_fault(path: Path, name: str, axis: int) -> list[Advice]:
-    """Findings about a recording with one of the small faults, a turn about x, y or z (0 to 2) of the body."""
-    bag = open_bag(path)
-    settings = settings_for(bag, None, "auto")
-    topics, right = topics_of(settings), Path(settings.calibration or load_preset(settings.dataset).calibration)
-    content = yaml.safe_load(right.read_text(encoding="utf-8"))
-    if name == "baseline 1 %":
-        bag = ChangedBag(bag, _wide({topics.right_info}, 1.01))
-        _long(content, 1.01)
-    elif name == "turn 1 deg":
-        _turned(content, 1.0, axis)
-    elif name == "clock 20 ms":
-        bag = ChangedBag(bag, _late({topics.cloud}, 0.02))
-    with TemporaryDirectory() as folder:
-        calibration = Path(folder) / "calibration.yaml"
-        calibration.write_text(yaml.safe_dump(content), encoding="utf-8")
-        return list(about_sensors(check_sensors(bag, settings.model_copy(update={"calibration": str(calibration)}))))
 
 
 def measured_offset(bag: Bag, sensor: str, seconds: float) -> float | None:

@@ -2,9 +2,9 @@
 
 python test/support/s3li_disorders.py OUT [--seed 20001] [--only NAME,NAME]
 
-Simulates one drive of 40 m of the twin for every disorder, without that disorder, and runs it as `umf s3li` does. The
-readers expect each disorder: without it, positions in UTC are read as GPS time, and 0.1 s are added to scans that are on
-time. A row holds the first lines that were printed about it, and the figures.
+Simulates one drive of 40 m of the twin for every disorder, without that disorder, and runs it as `umf s3li` does.
+The readers expect each disorder: without it, positions in UTC are read as GPS time, and 0.1 s are added to scans that
+are on time. A row holds the first lines that were printed about it, and the figures.
 """
 
 from __future__ import annotations

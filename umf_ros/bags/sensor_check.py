@@ -210,7 +210,6 @@ MAX_STEPS = 150  # by hand: bounds the time
 MOVES_M = 0.03  # by hand: a parked rover says nothing of its clocks
 DEPTH_EVERY, DEPTH_FRAMES, DEPTH_POINTS = 4, 60, 400  # by hand: bounds the time
 DEPTH_RANGE_M = (2.0, 15.0)  # by hand: where a third of a pixel is a few per cent
-MIN_DEPTHS = 200  # by hand
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,8 +220,7 @@ class SensorReport:
         left_contrast, right_contrast: median standard deviation of an image's grey values.
         returns: median number of a scan's returns.
         intensity_max: largest intensity; NaN where the driver sends none.
-        stereo_scale: median of stereo's depth by the LiDAR's.
-        overlay: the same, mounting and clock, where stereo's points are laid over the scan.
+        overlay: baseline, mounting and clock by stereo's points that are laid over the scans.
         lidar, camera: how their motion differs from the odometry's.
         forward: (3,) mean direction of motion by odometry, body axes.
     """
@@ -231,11 +229,10 @@ class SensorReport:
     right_contrast: float = nan
     returns: float = nan
     intensity_max: float = nan
-    stereo_scale: float = nan
+    overlay: Overlay | None = None
     lidar: Disagreement | None = None
     camera: Disagreement | None = None
     forward: Array | None = None
-    overlay: Overlay | None = None
 
 
 class SensorCheck:
@@ -245,7 +242,6 @@ class SensorCheck:
         self._contrasts: tuple[list[float], list[float]] = [], []
         self._returns: list[float] = []
         self._intensity_max = nan
-        self._depth_ratios: list[Array] = []
         self._overlaid: list[Array] = []
         self._frames = 0
         self._last: Frame | None = None
@@ -257,7 +253,7 @@ class SensorCheck:
         self._frames += 1
         self._look(frame)
         if self._frames % DEPTH_EVERY == 1:
-            self._compare_depths(frame)
+            self.compare_depths(frame)
         waited_s = MIN_STEP_S if self._last is None else (frame.stamp_ns - self._last.stamp_ns) * 1e-9
         if waited_s < MIN_STEP_S:
             return
@@ -267,10 +263,8 @@ class SensorCheck:
 
     def report(self, odometry: Trajectory | None) -> SensorReport:
         """Hold the measurements against the odometry as it was recorded."""
-        ratios = np.concatenate(self._depth_ratios) if self._depth_ratios else np.empty(0)
         left, right, returns = (_median(values) for values in (*self._contrasts, self._returns))
-        scale = float(np.median(ratios)) if len(ratios) >= MIN_DEPTHS else nan
-        found = SensorReport(left, right, returns, self._intensity_max, scale, overlay=lay_over(self._overlaid))
+        found = SensorReport(left, right, returns, self._intensity_max, lay_over(self._overlaid))
         if odometry is None:
             return found
         lidar, camera = (compare_motion(steps, odometry) for steps in (self._scan_steps, self._view_steps))
@@ -286,9 +280,9 @@ class SensorCheck:
             if frame.intensity is not None and len(frame.intensity):
                 self._intensity_max = float(np.fmax(self._intensity_max, frame.intensity.max()))
 
-    def _compare_depths(self, frame: Frame) -> None:
-        """Stereo's depth by the LiDAR's, where both look."""
-        if frame.left is None or frame.right is None or frame.points is None or len(self._depth_ratios) >= DEPTH_FRAMES:
+    def compare_depths(self, frame: Frame) -> None:
+        """Lay stereo's points over the scan, where both look."""
+        if frame.left is None or frame.right is None or frame.points is None or len(self._overlaid) >= DEPTH_FRAMES:
             return
         camera = frame.camera
         pixels, depth = camera.project(frame.points.astype(float), frame.body_T_camera)
@@ -298,9 +292,8 @@ class SensorCheck:
         if len(chosen) and camera.baseline > 0:
             disparity = disparities(frame.left, frame.right, pixels[chosen], camera)
             known = np.isfinite(disparity)
-            chosen, disparity = chosen[known], disparity[known]
-            self._depth_ratios.append(camera.fx * camera.baseline / disparity / depth[chosen])
-            self._overlaid.append(overlay_equations(frame, disparity, pixels[chosen], chosen))
+            chosen = chosen[known]
+            self._overlaid.append(overlay_equations(frame, disparity[known], pixels[chosen], chosen))
 
     def _step(self, earlier: Frame, later: Frame) -> None:
         if len(self._scan_steps) + len(self._view_steps) >= 2 * MAX_STEPS:
@@ -340,8 +333,6 @@ LAG_S = 0.1
 """By hand: twice the step that lags are tried in."""
 MOUNTING_DEG = 6.0
 """Measured on simulated drives: right mountings come out within 3.3 deg, the worst about the vertical."""
-SCALE = 0.08
-"""Measured on simulated drives: a right baseline comes out within 1 %."""
 FINE_DEG, FINE_SCALE, FINE_S = 0.5, 0.006, 0.01
 """Measured on simulated drives: what is right comes out within half of it, where stereo is laid over the scans."""
 SURE = 3.0
@@ -361,34 +352,31 @@ def about_sensors(seen: SensorReport) -> Iterator[Advice]:
         remedy = "--odometry-frame camera, imu or lidar says whose poses the file holds (of the camera z looks ahead)"
         yield Advice("fault", what, remedy)
     known = {name: one for name in _SENSORS if (one := getattr(seen, name)) is not None}
-    coarse = [*_clocks({name: one.lag_s for name, one in known.items()})]
-    coarse += _mountings({name: one.mounting_deg for name, one in known.items() if one.mounting_deg is not None})
-    if abs(seen.stereo_scale - 1) > SCALE:
-        coarse.append(_baseline(seen.stereo_scale))
-    yield from coarse
-    if seen.overlay is not None and not coarse:
-        yield from _overlaid(seen.overlay)
+    by_motion = [*_clocks({name: one.lag_s for name, one in known.items()})]
+    by_motion += _mountings({name: one.mounting_deg for name, one in known.items() if one.mounting_deg is not None})
+    yield from by_motion
+    if seen.overlay is not None:
+        yield from _overlaid(seen.overlay, bool(by_motion))
 
 
-def _baseline(scale: float) -> Advice:
-    what = f"stereo sees everything {scale:.3g} times as far as the LiDAR: the baseline is wrong by that factor"
-    return Advice(
-        "fault", what, f"baseline of the calibration, or P[3] of the right camera_info: divide by {scale:.3f}"
-    )
-
-
-def _overlaid(overlay: Overlay) -> Iterator[Advice]:
-    """The error that is largest for what it spoils: it looks like a little of the others."""
-    turn, units = overlay.turn_deg, np.array([FINE_DEG, FINE_SCALE, FINE_S])
-    sizes = np.abs(np.array([float(np.linalg.norm(turn)), overlay.scale - 1, overlay.lag_s])) / units
+def _overlaid(overlay: Overlay, is_known: bool) -> Iterator[Advice]:
+    """The error that is largest for what it spoils, as it looks like a little of the others; unless it `is_known`."""
+    turn, scale, units = overlay.turn_deg, overlay.scale, np.array([FINE_DEG, FINE_SCALE, FINE_S])
+    sizes = np.abs(np.array([float(np.linalg.norm(turn)), scale - 1, overlay.lag_s])) / units
     bounds, worst = SURE * overlay.deviations / units, int(sizes.argmax())
     seen = "by the ground that both see"
-    if sizes[worst] > max(bounds[worst], 1):
+    if sizes[worst] <= max(bounds[worst], 1):
+        pass
+    elif worst == 1:
+        what = f"stereo sees everything {scale:.3g} times as far as the LiDAR: the baseline is wrong by that factor"
+        remedy = f"baseline of the calibration, or P[3] of the right camera_info: divide by {scale:.3f}"
+        yield Advice("fault", what, remedy)
+    elif worst == 0 and not is_known:
         what = f"{seen}, LiDAR and camera are mounted otherwise than stated: {_turn(turn)} sets the LiDAR right"
-        mounting = Advice("warning", what, "body_T_lidar or body_T_camera of the calibration")
+        yield Advice("warning", what, "body_T_lidar or body_T_camera of the calibration")
+    elif not is_known:
         what = f"{seen}, the LiDAR's clock is about {-overlay.lag_s:+.3f} s off the camera's"
-        clock = Advice("warning", what, "the stamps of their drivers (PTP, or a constant): no parameter corrects them")
-        yield (mounting, _baseline(overlay.scale), clock)[worst]
+        yield Advice("warning", what, "the stamps of their drivers (PTP, or a constant): no parameter corrects them")
     for bound, name in zip(bounds, ("mounting to 1 deg", "baseline to 1 %", "clock to 20 ms"), strict=True):
         if bound > 2:
             what = f"the recording cannot tell the {name}"

@@ -190,13 +190,11 @@ def replay_sequence(one: S3liSequence, folder: Path) -> Record:
     if found and odometry is not None and (lag := clock_lag_s(odometry, found[1])):
         late = f"the odometry fits the satellites' positions {-lag:+.1f} s later than their stamps say"
         notes.append(f"{late}: is {found[0].name} in GPS time? its figures are not to be trusted")
-    scale = about.sensors.stereo_scale
-    if one.calibrations and math.isfinite(scale):
-        notes.append(f"with {one.calibrations[0].name}, stereo sees {scale:.2f} times as far as the LiDAR")
+    overlay = about.sensors.overlay
     notes += [one.line for one in look_first(replace(about, missed=[])) if one.severity != "note"]
     record = judged_record(about, odometry)
     minutes = round((time.monotonic() - started) / 60, 2)
-    return record | {"warnings": notes, "minutes": minutes, "stereo_scale": _number(scale)}
+    return record | {"warnings": notes, "minutes": minutes, "stereo_scale": overlay and _number(overlay.scale)}
 
 
 def _open(one: S3liSequence, folder: Path, notes: list[str]) -> tuple[Any, Settings, Trajectory | None]:
