@@ -15,9 +15,12 @@ from rich.console import Console
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
-from umf_ros.bags.reader import open_bag
+from umf_ros.bags.reader import Bag, open_bag
+from umf_ros.bags.sensor_check import SensorCheck, SensorReport
+from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.tasks import spread
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.evaluation.results import TextTable
 from umf_ros.replay import Replay
@@ -25,6 +28,7 @@ from umf_ros.runs.reader import read_run, remember_recording
 from umf_ros.runs.report import finish_run, judge
 from umf_ros.runs.truth import JudgedRun
 from umf_ros.runs.writer import count_drops
+from umf_ros.sensors.decode import OdometrySample
 
 _NOTHING = "/none"
 SENSORS: dict[str, dict[str, Any]] = {
@@ -82,6 +86,18 @@ def stretches_of(bag: Path) -> list[Stretch]:
     legs = json.loads(notes[0]["legs"]) if notes else []
     named = [Stretch(leg["label"], leg["from_ns"], leg["to_ns"]) for leg in legs if leg["label"] != "first"]
     return [*named, whole] if len(named) > 1 else [whole]
+
+
+def check_sensors(bag: Bag, settings: Settings) -> SensorReport:
+    """Return the check of a recording's measurements against each other."""
+    check, stamps, poses = SensorCheck(), [], []
+    for item in FrameReader(bag, settings, warn=lambda text: None).stream():
+        if isinstance(item, OdometrySample):
+            stamps.append(item.stamp_ns)
+            poses.append(item.odom_T_body)
+        else:
+            check.take(item)
+    return check.report(Trajectory(np.array(stamps, np.int64), np.stack(poses)) if stamps else None)
 
 
 def replay_all(
