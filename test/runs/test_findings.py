@@ -123,6 +123,35 @@ def test_closures_that_the_graph_did_not_use_are_pending_not_rejected(tmp_path: 
     assert "the graph used none of them (1 pending)" in sentence and "rejected" not in sentence
 
 
+@pytest.mark.parametrize(
+    ("state", "reason", "said", "helps"),
+    [
+        (
+            State.REFUSED,
+            ClosureReason.BEFORE_ODOMETRY,
+            "the graph refused 1 of 1 closures (no odometry at",
+            "must reach",
+        ),
+        (
+            State.REJECTED,
+            ClosureReason.CONTRADICTS,
+            "the graph rejected 1 of 1 closures (contradicts the",
+            "odometry worse",
+        ),
+    ],
+)
+def test_closures_without_odometry_are_not_laid_to_its_errors(
+    tmp_path: Path, state: State, reason: ClosureReason, said: str, helps: str
+) -> None:
+    found = look_first(examined(tmp_path, [closure(50, 10)], verdict=accepted(state, reason), truth=trajectory()))
+    told = next(one for one in found if one.what.startswith("the graph"))
+    assert (
+        told.what.startswith(said)
+        and helps in told.remedy
+        and ("sigma in the median" in told.what) == (state is State.REJECTED)
+    )
+
+
 def test_false_closures_come_with_the_threshold_that_excludes_them(tmp_path: Path) -> None:
     closures = [closure(50, 10, probability=0.99), closure(52, 12, error_m=0.9, probability=0.93)]
     about = examined(tmp_path, closures, verdict=accepted(), truth=trajectory())
